@@ -4,7 +4,6 @@ puts what the command prints in place of a line of a page that is this command a
 
 from __future__ import annotations
 
-import ast
 import inspect
 import re
 import sys
@@ -16,7 +15,7 @@ from typing import Any, get_args
 import msgspec
 from msgspec.inspect import type_info
 
-from safevar_sumo import ads, openscenario
+from safevar_sumo import ads
 from safevar_sumo.ads import ADS
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, PUBLISHED_SCORING
 from safevar_sumo.results import FILES
@@ -240,56 +239,6 @@ def characteristics() -> str:
     )
 
 
-def messages(folder: Path) -> Iterator[tuple[str, str, str]]:
-    """The refusals of the modules in a folder: the name of the module, the message with `...` for
-    what a file says, and what is expected.
-    """
-
-    def text(node: ast.expr) -> str:
-        match node:
-            case ast.Constant(value=str() as found):
-                return found
-            case ast.JoinedStr(values=parts):
-                return "".join(map(text, parts))
-            case ast.Call(func=ast.Name(id="one_of")):
-                return "one of ..."
-        return "..."
-
-    for path in sorted(folder.glob("*.py")):
-        tree = ast.parse(path.read_text())
-        named = [
-            (node.targets[0].id, node.value)
-            for node in sorted(ast.walk(tree), key=lambda node: getattr(node, "lineno", 0))
-            if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
-        ]
-
-        def texts(argument: ast.expr, named: list[tuple[str, ast.expr]] = named) -> list[str]:
-            """What an argument says, or the variable that it names: the one assigned last."""
-            known = getattr(argument, "id", getattr(argument, "attr", ""))
-            values = [value for name, value in named if name == known]
-            if isinstance(argument, ast.Name):
-                values = [one for one in values if one.lineno < argument.lineno][-1:]
-            return [one for one in map(text, values or [argument]) if one.strip(".")]
-
-        for call in ast.walk(tree):
-            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name):
-                named_first = {"unsupported": 0, "InputError": 1, "Unplaced": 1, "unknown_name": 1}
-                place = named_first.get(call.func.id, len(call.args))
-                for argument in call.args[place : place + 1]:
-                    is_of_names = call.func.id == "unknown_name"
-                    rest = [] if is_of_names else call.args[place + 1 : place + 2]
-                    legal = "; ".join(one for each in rest for one in texts(each)) or "one of ..."
-                    for message in texts(argument):
-                        yield path.stem, message, legal
-
-
-def refusals() -> str:
-    """What the reader of OpenSCENARIO refuses, and what it expects."""
-    found = dict.fromkeys(messages(Path(openscenario.__file__).parent))
-    rows = [(part, f"`{message}`", legal) for part, message, legal in found]
-    return _table(("part", "message", "what to write instead"), rows)
-
-
 def published_systems() -> str:
     """The source of the driving systems that are put in front of published libraries."""
     folder = Path(ads.__file__).parent
@@ -302,7 +251,6 @@ def published_systems() -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "readme": readme,
     "published_systems": published_systems,
-    "refusals": refusals,
     "characteristics": characteristics,
     "study_keys": study_keys,
     "vehicles": models(VEHICLES),

@@ -16,7 +16,6 @@ from tests.size import elements_in, function_lengths_in, sizes, sources_of
 
 LIMITS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["size"]
 DOUBLE = {
-    *("Crossing", "FloatArray", "compare", "evaluate"),  # of OpenSCENARIO
     *("Failure", "Failures", "FullBraking", "Parameter", "Search"),  # of repair and tolerance
     *("columns_of", "parameters_of"),
 }

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from safevar_sumo.records import BoolArray, Command, FloatArray, Observation, Quantity
+from safevar_sumo.records import BoolArray, Command, FloatArray
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.vehicles import Vehicle, VehicleState
-from safevar_sumo.vehicles.base import Prepared, State, led_state
+from safevar_sumo.vehicles.base import Prepared, State
 
 MAX_ERROR, MIN_ERROR = 1.0 * KMH, -0.5 * KMH
 """Tolerance of the test speed until the system brakes [m/s]: +1.0 and -0.5 km/h (Euro NCAP, AEB
@@ -62,8 +62,9 @@ class DrivingRobot:
         # The test speed of each vehicle; NaN without a test.
         n = len(state.speed)
         speeds = (point.scenario.test_speed for point in points)
-        self._test_speed = self._of_points(
-            [np.nan if speed is None else speed for speed in speeds], n
+        known = [np.nan if speed is None else speed for speed in speeds]
+        self._test_speed: FloatArray = np.concatenate(
+            [np.broadcast_to(speed, n // len(points)) for speed in known]
         )
         self.has_test_speed: BoolArray = ~np.isnan(self._test_speed)
         """Which vehicles are in a scenario with a `test_speed`."""
@@ -73,16 +74,6 @@ class DrivingRobot:
         # The robot controls the speed with the pedals of the start.
         self._prepared = prepared
         self._vehicle = vehicle
-        self._points = points
-        self._profile_until = self._of_points([point.scenario.profile_until for point in points], n)
-        self.profile_end = float(self._profile_until.max())
-        """When the last profile of speeds ends [s]; 0 without one."""
-        if self.profile_end:  # it holds the test speed later
-            is_led = self._profile_until > 0
-            highest = self._of_points([point.scenario.profile_highest for point in points], n)
-            self._at_highest = vehicle.at_start(prepared, np.where(is_led, highest, state.speed))
-            held = np.where(is_led, self._test_speed, state.speed)
-            state = vehicle.at_start(prepared, held)
         self._start_pedal = state.throttle - state.brake
         self._brake_threshold = state.brake + ACTION_THRESHOLD
         self._step = step
@@ -94,47 +85,6 @@ class DrivingRobot:
         robot drove; NaN without a test.
         """
         self._error_share = np.zeros(n)  # the error divided by the tolerance in its direction [-]
-
-        # When a system acts too early for the test.
-        self._depends_until = self._of_points([point.scenario.depends_until for point in points], n)
-        self._sample = 0
-        self.acted_early = np.full(n, np.nan)
-        """Times at which systems act before motions no longer depend on the vehicle [s]; NaN for
-        all others.
-        """
-
-    @staticmethod
-    def _of_points(values: Sequence[Quantity], n: int) -> FloatArray:
-        """Values of points for their n vehicles, shape (N,)."""
-        return np.concatenate([np.broadcast_to(value, n // len(values)) for value in values])
-
-    def at_first(self, seen: Observation) -> Observation:
-        """What the driving system sees; at first, where the robot will lead, the highest speed of
-        the profile and nobody: so a cruise control is set to that speed.
-        """
-        if self._sample or not self.profile_end:
-            return seen
-        is_led = self._profile_until > 0
-        shown = {
-            name: np.where(is_led, getattr(self._at_highest, name), getattr(seen, name))
-            for name in ("speed", "throttle", "brake")
-        }
-        return seen._replace(gap=np.where(is_led, np.inf, seen.gap), **shown)
-
-    def lead(self, state: State) -> State:
-        """The state after a step, in which the vehicle has the speed of its profile and its pedals
-        hold that speed; sensors and commands keep their history.
-        """
-        time = self._sample * self._step
-        if not self.profile_end or time - self._step >= self.profile_end:
-            return state
-        is_led = self._is_driving & (time - self._step < self._profile_until)
-        profiles = [
-            point.scenario.profile_speed(time) if np.any(point.scenario.profile_until) else 0.0
-            for point in self._points
-        ]
-        speeds = np.where(is_led, self._of_points(profiles, len(is_led)), state.speed)
-        return led_state(is_led, self._vehicle.at_start(self._prepared, speeds), state)
 
     def drive(self, command: Command, state: State, is_open: BoolArray) -> tuple[Command, State]:
         """The command of the robot while it drives, otherwise of the system; and the state, with
@@ -148,9 +98,7 @@ class DrivingRobot:
         self._is_needed = not self._has_braked.all()  # this is the last call that it is needed for
 
         # How far the speed has strayed from the test speed, relative to the tolerance.
-        time = self._sample * self._step
-        is_led = time < self._profile_until
-        error = np.where(self._is_driving & ~is_led, state.speed - self._test_speed, 0.0)
+        error = np.where(self._is_driving, state.speed - self._test_speed, 0.0)
         error_share = np.where(error > 0, error / MAX_ERROR, error / MIN_ERROR)
         is_larger = is_open & (error_share > self._error_share)
         np.copyto(self.error, error, where=is_larger)
@@ -159,20 +107,10 @@ class DrivingRobot:
         # The robot drives until the system brakes or lets go of the accelerator.
         self._has_braked |= command.brake > self._brake_threshold
         system_pedal = command.throttle - command.brake
-        # Only a brake ends a profile: before its end nobody eases off.
-        self._max_system_pedal = np.where(
-            is_led, -np.inf, np.maximum(self._max_system_pedal, system_pedal)
-        )
+        self._max_system_pedal = np.maximum(self._max_system_pedal, system_pedal)
         self._is_driving = ~self._has_braked & (
             system_pedal >= np.minimum(self._max_system_pedal, self._start_pedal) - ACTION_THRESHOLD
         )
-
-        # Until then the motion of others may still depend on the vehicle.
-        self._sample = self._sample + 1
-        acts = (
-            is_open & ~self._is_driving & (time < self._depends_until) & np.isnan(self.acted_early)
-        )
-        np.copyto(self.acted_early, time, where=acts)
 
         # A controller with a proportional and an integral part holds the speed.
         error = np.where(self._is_driving, error, 0.0)
@@ -188,7 +126,5 @@ class DrivingRobot:
 
     @property
     def invalid(self) -> BoolArray:
-        """Which vehicles left the tolerance before the system acted, or acted too early; shape
-        (N,).
-        """
-        return np.asarray((self._error_share > 1) | ~np.isnan(self.acted_early))
+        """Which vehicles left the tolerance before the system acted, shape (N,)."""
+        return np.asarray(self._error_share > 1)

@@ -16,7 +16,6 @@ from safevar_sumo.errors import InputError, check_name, warn
 from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, RATING_POINTS, UNSAFE_SHARE
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
-from safevar_sumo.questions.check_scenario import TABLES, check_scenario
 from safevar_sumo.questions.options import Range
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.scenarios import (
@@ -281,27 +280,20 @@ LONG = 10.0
 """Time from which on `check` says first how long it takes [s]."""
 
 
-@contents("passed", "vehicles", "points", findings=FINDINGS, **TABLES)
-def check(
-    name: str, *, ego: str | None = None, vehicles: Annotated[int | None, Range(1, 10_000)] = None
-) -> Answer:
+@contents("passed", "vehicles", "points", findings=FINDINGS)
+def check(name: str, *, vehicles: Annotated[int | None, Range(1, 10_000)] = None) -> Answer:
     """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep
     the promises that results rest on.
 
     NAME is the name or path of a study, all of whose code is checked, or a driving system, by its
     name or package.module:Name, which then drives in the study smoke. The exit code is 0 if NAME
-    passes, 1 with findings, 2 if it cannot be loaded. A file of OpenSCENARIO (*.xosc) passes if it
-    plays; what happens in it is said too, and drawn with --plot.
+    passes, 1 with findings, 2 if it cannot be loaded.
 
     Parameters
     ----------
-    ego
-        The vehicle under test in a file of OpenSCENARIO; Ego if it is left out.
     vehicles
         Number of vehicles that are simulated; by default up to 100, as many as take at most 60 s.
     """
-    if name.endswith(".xosc"):
-        return check_scenario(name, ego or "Ego", FINDINGS)
     # What loads SUMO is imported where it is needed.
     from safevar_sumo.campaign import check_algorithms
     from safevar_sumo.campaign.user_checks import find_in_new_process

@@ -13,10 +13,9 @@ from safevar_sumo.errors import InputError, check_name, check_text
 from safevar_sumo.protocol.rater import expand_protocol
 from safevar_sumo.questions.scope import points_of_tests
 from safevar_sumo.scenarios import searchable_in, weather_of
-from safevar_sumo.scenarios.declared import read_study, with_ranges
+from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import OBJECTIVES, RANGES, MatrixTest, Study, unit_text
 from safevar_sumo.study.encounters import Axes, AxisTable, are_numbers
-from safevar_sumo.study.scenario_file import MODEL
 from safevar_sumo.sumo.system import assemble
 
 N_SIMILAR_POINTS = 4
@@ -39,28 +38,17 @@ def part_of_study(study: Study, ranges: bool, point: str | None, up_to: str | No
         If the study has no such part.
     """
     if ranges and study.encounters != RANGES:
-        whole = with_ranges(_read_again(study))
+        whole = with_ranges(study)
         if whole.encounters != RANGES:
             problem = f"no axis of study {study.name!r} has a range"
             raise InputError("ranges", problem, "a study with such an axis")
-        study = replace(whole, origin=replace(whole.origin, ranges=True))
+        study = whole
     if point is not None:
         study = at_point(study, point)
     if up_to is None:
         return study
     cut = study_up_to(study, up_to)
     return replace(cut, origin=replace(cut.origin, up_to=up_to))
-
-
-def _read_again(study: Study) -> Study:
-    """A study whose scenario is a file, in the ranges that its file leaves: its reader alone knows
-    which values remain beside them. Any other one as it is.
-    """
-    if study.scenario.model != MODEL or not study.origin.called:
-        return study
-    found = read_study(study.origin.called, encounters=RANGES)
-    names = ("encounters", "scenario", "matrix", "constraints")
-    return replace(study, **{name: getattr(found, name) for name in names})
 
 
 def at_point(study: Study, name: str) -> Study:

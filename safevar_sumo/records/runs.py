@@ -145,9 +145,8 @@ class SimulationRuns:
 
     `collision_speed` is the vehicle's own speed, at the end of the step in which bodies overlap.
     `test_speed_error` is the largest deviation from the test's speed before the driving system
-    acted, NaN if no speed is prescribed [m/s]; `acted_early` the time at which the system acted
-    while the motion of others still depended on the vehicle, NaN otherwise [s]; `warning_ttc` the
-    time to collision at which the system first warned its driver, NaN if it never did [s].
+    acted, NaN if no speed is prescribed [m/s]; `warning_ttc` the time to collision at which the
+    system first warned its driver, NaN if it never did [s].
     `centre_to_centre`: the scenario measures its safety degree between the middles of bodies.
     `allowed_impact_speed` is the relative speed up to which the test case allows an impact [m/s].
     `lacks` says of quantities which runs do not have them, shape (N,): a run without a trace has
@@ -161,7 +160,6 @@ class SimulationRuns:
     collision_speed: FloatArray
     contact: Contact = NO_CONTACT
     test_speed_error: FloatArray = field(default_factory=lambda: UNDEFINED)
-    acted_early: FloatArray = field(default_factory=lambda: UNDEFINED)
     warning_ttc: FloatArray = field(default_factory=lambda: UNDEFINED)
     centre_to_centre: bool = False
     allowed_impact_speed: FloatArray = field(default_factory=lambda: ZERO)

@@ -305,10 +305,6 @@ def export(
         simulate_with_original(target.study, system, setting, filtered=False)
     )
     write_files(comparison, to, out, solution, physics)
-    if to == "openscenario" and comparison.runs.trace.speed[0, -1] <= 0:
-        return (
-            f"{to}: {out}\nnote: Ego starts from standstill, so no study can name {out / SCENARIO}"
-        )
     return f"{to}: {out}"
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pandas as pd
 
@@ -152,8 +150,6 @@ def answer_of_setting(
         who = "changed" if is_changed else "original"
         verdict.append(points_in_words(f"The {who} vehicle", failing, len(system.matrix)))
 
-    verdict += _acted_early(system, setting)
-
     # The model's own uncertainty.
     if with_spread:
         remarks += remarks_on_sets(study)
@@ -189,21 +185,6 @@ def _points(study: Study, system: System, setting: FloatArray) -> tuple[pd.DataF
     table = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
     table.attrs["lead_rows"] = np.argsort(table[SAFETY_DEGREE], kind="stable").tolist()
     return table, [one.point.name for one in results if _fails(study, one)]
-
-
-def _acted_early(system: System, setting: FloatArray) -> Iterator[str]:
-    """Points at which the driving system acts while others still move by a vehicle that keeps its
-    speed.
-    """
-    if any(np.any(point.scenario.depends_until > 0) for point in system.points):
-        for result in simulate_all_points(system, setting[np.newaxis]):
-            (acted,) = result.runs.acted_early
-            if np.isfinite(acted):  # NaN: it never did
-                at = f"{result.point.name}: " if result.point.name else ""
-                yield (
-                    f"Remark: {at}invalid test: {result.point.scenario.dependence}, and the driving"
-                    f" system acts at {acted:.1f} s: other simulators would show another encounter."
-                )
 
 
 def remark_table(remarks: list[str]) -> pd.DataFrame:

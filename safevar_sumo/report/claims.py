@@ -324,13 +324,11 @@ class Packed:
         """The user code that would run: files of the pack, and what the study and the questions
         name.
 
-        Networks count, since SUMO's options beside them may name files to write; scenes of
-        OpenSCENARIO do not.
+        Networks count, since SUMO's options beside them may name files to write.
         """
         study = self.case.study
         prefix = f"{CODE}/"
-        names = [name for name in self.files if not name.endswith((".xosc", ".xodr"))]
-        files = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+        files = [name.removeprefix(prefix) for name in self.files if name.startswith(prefix)]
         named = [
             name
             for name in (*study.search.algorithms, *self.packed.questions)

@@ -16,7 +16,6 @@ from safevar_sumo.scenarios.base import (
     WorldScenario as WorldScenario,
 )
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.scenarios.from_file import OpenScenario as OpenScenario
 from safevar_sumo.scenarios.lane_change import CutIn, CutOut
 from safevar_sumo.scenarios.metadrive import LearnedDriver
 from safevar_sumo.scenarios.point import SPEED_DIMENSION as SPEED_DIMENSION, Point as Point
@@ -43,7 +42,6 @@ SCENARIOS: Mapping[str, type[Scenario]] = {
     "cut_out": CutOut,
     "learned_driver": LearnedDriver,
     "lead_vehicle_stopped": LeadVehicleStopped,
-    "openscenario": OpenScenario,
     "stop": Stop,
 }
 

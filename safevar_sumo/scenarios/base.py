@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
@@ -175,23 +175,10 @@ class Scenario:
     test_speed
         Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves
         the speed tolerance before the ADS brakes is an invalid test.
-    profile_until, profile_highest
-        Time until which a robot drives the vehicle at the speeds of `profile_speed` [s], if the
-        driving system does not brake before; and the highest of them, to which a cruise control is
-        set [m/s].
     is_hit_in_front
         Whether only contacts at the vehicle's front are collisions.
-    depends_until, dependence
-        Time until which the others move as if the vehicle kept its speed [s], and a sentence on it:
-        a run in which the ADS acts before is an invalid test.
     goes_on
         Whether a run goes on beyond `duration` while the vehicle still closes on somebody.
-    uneventful
-        Why nothing happens to a vehicle that keeps its speed, so that runs tell nothing about the
-        ADS; "" if something does, None if only a drive can tell.
-    is_uneventful
-        In which searched encounters that is so, shape (N,): a run without a collision is an invalid
-        test there.
     has_phase
         Whether all of an encounter can begin later by a part of a step, while the driving system
         decides at the same times as ever.
@@ -226,37 +213,16 @@ class Scenario:
         @property
         def test_speed(self) -> float | None: ...
         @property
-        def profile_until(self) -> float: ...
-        @property
-        def profile_highest(self) -> float: ...
-        @property
-        def depends_until(self) -> float: ...
-        @property
-        def dependence(self) -> str: ...
-        @property
-        def uneventful(self) -> str | None: ...
-        @property
-        def is_uneventful(self) -> Quantity | bool: ...
-        @property
         def has_phase(self) -> bool: ...
     else:
         has_phase = False
         pre_crash = ""
         test_speed = None
-        profile_until = profile_highest = 0.0
-        depends_until = 0.0
-        dependence = "others move as if the vehicle kept its speed"
-        uneventful = None
-        is_uneventful = False
 
     @property
     def is_hit_in_front(self) -> bool:
         """By default in a test at its speed."""
         return self.test_speed is not None
-
-    def profile_speed(self, time: float) -> Quantity:
-        """Speed of the vehicle before `profile_until` [m/s]."""
-        raise NotImplementedError
 
     def free(self) -> Mapping[str, FreeParameter]:
         """Parameters that a study may search, by name."""
@@ -276,9 +242,6 @@ class Scenario:
     def actors(self, roads: Roads) -> XmlChanges:
         """Changes to the network's traffic."""
         return {}
-
-    def read_files(self, folders: Sequence[str]) -> None:
-        """Read the files that parameters name, beside the study; by default there are none."""
 
     def check(self) -> None:
         """Refuse parameters of a study's test, by an `InputError`; those of searched encounters are

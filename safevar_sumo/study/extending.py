@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from safevar_sumo.study.encounters import Parameters
+from safevar_sumo.study.encounters import Parameters, Weather
 from safevar_sumo.study.marks import (
     OF_MATRIX,
     OF_SCENARIO,
@@ -15,8 +15,11 @@ from safevar_sumo.study.marks import (
     WHOLE,
     keys_with,
 )
-from safevar_sumo.study.scenario_file import WEATHER
+from safevar_sumo.study.parameters import free_parameters
 from safevar_sumo.study.schema import Origin, Study, Tables
+
+WEATHER = tuple(free_parameters(Weather))
+"""Parameters of the weather, which a study may search as well."""
 
 
 class StudyTables(NamedTuple):
@@ -90,13 +93,13 @@ def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:
 
 
 def _names_scenario(table: object, base_table: object) -> bool:
-    """Whether a table [scenario] names a file or another model than that of its base, whose matrix
-    is not about it.
+    """Whether a table [scenario] names another model than that of its base, whose matrix is not
+    about it.
     """
     if not isinstance(table, dict):
         return False
     base_model = base_table.get("model") if isinstance(base_table, dict) else None
-    return "file" in table or table.get("model", base_model) != base_model
+    return table.get("model", base_model) != base_model
 
 
 def _set_in(scenario: object) -> set[str]:

@@ -18,7 +18,6 @@ from safevar_sumo.output import whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study.encounters import Parameters
 from safevar_sumo.study.extending import StudyTables, with_overrides
-from safevar_sumo.study.scenario_file import with_file
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
     OBJECTIVES,
@@ -37,12 +36,15 @@ SCHEMA_LINE = f"#:schema {STUDY_SCHEMA}\n"
 """First line of a written study file, by which editors find the schema on this machine."""
 
 
+RECORDED = 'scenario.model = "recorded_tracks", with a table of tracks (docs/recorded_tracks.md)'
+"""What stands in place of a file that tells how road users move."""
 ENDED_KEYS = {
     "scenario.search": (
         '[scenario.over] in its place; and encounters = "ranges", or --ranges, to search it'
     ),
     "wider": "no such key: limits are tried in the ranges of their own study",
     "matrix.point": "--point",
+    **dict.fromkeys(("scenario.file", "scenario.values", "scenario.ego"), RECORDED),
 }
 """Keys that studies had, and what stands in their place."""
 ENDED_STUDIES = {
@@ -74,6 +76,8 @@ def study_path(study: str) -> Path:
     if os.path.isdir(study):
         legal = "the name of a study, or the path of its file (TOML)"
         raise InputError("study", f"{study!r} is a directory", legal)
+    if study.endswith(".xosc"):
+        raise InputError("study", f"{study!r}: such files are not read any more", RECORDED)
     if os.path.exists(study):
         return Path(study)
     if study in ENDED_STUDIES:
@@ -87,8 +91,8 @@ def study_path(study: str) -> Path:
 
 
 def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
-    """The tables of a study, with the studies that it extends and the scenario's file, in the shape
-    of the records; `safevar_sumo.scenarios.declared.read_study` completes and checks them.
+    """The tables of a study, with the studies that it extends, in the shape of the records;
+    `safevar_sumo.scenarios.declared.read_study` completes and checks them.
     """
     raw = _raw_study(study)
     if "encounters" in changes:  # is another view of the study, and not another study
@@ -100,8 +104,7 @@ def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
         if "origin" in raw.tables:
             raise InputError("", "origin: there is no such key")
         _refuse_ended(raw.tables)
-        tables = with_file(raw.tables, raw.origin.places)
-        tables = _with_parameters(tables, "search", SearchTable)
+        tables = _with_parameters(raw.tables, "search", SearchTable)
         return raw._replace(tables=_with_parameters(tables, "repair", RepairTable))
 
 

@@ -15,14 +15,6 @@ EXTENDS = {
     "type": "string",
     "description": "The study that this file extends, by its name or the path of its file.",
 }
-FROM_FILE = {
-    "file": {
-        "type": "string",
-        "description": "A file of OpenSCENARIO, in place of model and parameters.",
-    },
-    "ego": {"type": "string", "description": "The vehicle under test in the file, by default Ego."},
-    "values": {"type": "object", "description": "Values of the file's parameters."},
-}
 
 
 def schema_text() -> str:
@@ -40,7 +32,6 @@ def schema_text() -> str:
     rows = tables["VehicleTable"]["properties"]["characteristics"]
     rows["additionalProperties"] = {"anyOf": [rows["additionalProperties"], {"const": False}]}
     tables["RepairTable"]["additionalProperties"] = {"$ref": "#/$defs/FreeParameter"}
-    tables["ScenarioTable"]["properties"] |= FROM_FILE
     return json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
 
 

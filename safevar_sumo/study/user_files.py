@@ -7,8 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from safevar_sumo.errors import InputError, about
-from safevar_sumo.study.scenario_file import MODEL, files_of_scenario
+from safevar_sumo.errors import InputError
 from safevar_sumo.study.schema import PYMOO, Study
 
 
@@ -82,10 +81,4 @@ def data_files(study: Study) -> dict[str, str]:
                     study.source, problem, f"the path of a file or folder, relative to {places[0]}"
                 )
             paths[name] = found[0]
-
-    # Files of OpenSCENARIO, at every point of the matrix.
-    if study.scenario.model == MODEL:
-        tests = study.tests
-        with about(study.source):
-            paths |= files_of_scenario(study.scenario.parameters, tests, study.origin.places)
     return paths

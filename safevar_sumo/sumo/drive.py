@@ -102,7 +102,7 @@ def drive(
             observation, state = vehicle.sense(prepared, state, observation)
             if listen is not None:
                 listen(observation)
-            command, memory = ads.drive(robot.at_first(observation), memory)
+            command, memory = ads.drive(observation, memory)
             outcomes.note_warnings(ads.warns(memory), speed, scene)
             command, state = robot.drive(command, state, outcomes.is_open)
             values = {"speed": speed, "gear": state.gear, "active": active, "pedal": state.brake}
@@ -113,7 +113,6 @@ def drive(
             # The vehicles advance by a time step.
             np.copyto(outcomes.is_checked, outcomes.is_open)
             state = vehicle.advance(prepared, state, command)
-            state = robot.lead(state)
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace()
@@ -147,20 +146,15 @@ def _runs(
     encounter: Encounter,
 ) -> SimulationRuns:
     """The runs of N vehicles that have ended."""
-    # In an encounter in which nothing happens, all but a collision says nothing.
     ended = outcomes.ended
     size = len(ended) // len(points)
-    is_idle = per_vehicle([point.scenario.is_uneventful for point in points], size) & (
-        ended != Outcome.COLLISION
-    )
     return SimulationRuns(
         trace=trace,
         encounter=encounter,
-        outcome=np.where(robot.invalid | is_idle, Outcome.INVALID_TEST, ended),
+        outcome=np.where(robot.invalid, Outcome.INVALID_TEST, ended),
         collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed),
         contact=contacts.first,
         test_speed_error=robot.error,
-        acted_early=robot.acted_early,
         warning_ttc=outcomes.warning_ttc,
         centre_to_centre=points[0].scenario.centre_to_centre,
         allowed_impact_speed=np.asarray(

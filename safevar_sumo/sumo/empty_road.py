@@ -53,8 +53,7 @@ def find_problems(system: System) -> dict[str, EmptyRoadFault]:
 
     At every point the original vehicle drives once as on an empty road, as the ADS sees nobody. If
     it does not reach the place of the encounter before the encounter is over, or brakes on its way,
-    the obstacle is not what keeps it from a collision. Neither is it where nothing happens to a
-    vehicle that keeps its speed.
+    the obstacle is not what keeps it from a collision.
     """
     if not system.mover.has("a driving system"):  # that sees nobody
         return {}
@@ -71,11 +70,7 @@ def find_problems(system: System) -> dict[str, EmptyRoadFault]:
         point.name: problem
         for point, result in zip(points, results, strict=True)
         if not point.scenario.brakes_fully
-        and (
-            problem := _problem(
-                result.runs, result.point.scenario.test_speed, point.scenario.uneventful
-            )
-        )
+        and (problem := _problem(result.runs, result.point.scenario.test_speed))
     }
 
 
@@ -94,9 +89,7 @@ def sentence_on(problems: dict[str, EmptyRoadFault], n_points: int) -> str:
     )
 
 
-def _problem(
-    runs: SimulationRuns, test_speed: float | None, uneventful: str | None
-) -> EmptyRoadFault | None:
+def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault | None:
     """What the original vehicle, the only one in `runs`, does wrong on an empty road.
 
     Who still has its test speed at the end, and comes closer to nobody, has driven as it should.
@@ -123,18 +116,17 @@ def _problem(
     approach = speed[-1] - obstacle_speed[-1]
     is_alone = not np.isfinite(gap[-1]) or approach < SLOW_APPROACH
     keeps_speed = test_speed is not None and speed[-1] > test_speed - MIN_SLOWDOWN
-    meets_undisturbed = keeps_speed and uneventful == ""
-    if meets_undisturbed or runs.outcome[0] == Outcome.COLLISION:
+    if runs.outcome[0] == Outcome.COLLISION:
         return None
 
     # Does nobody come into its way, or nearer to it at the end?
     beside = np.abs(trace.lateral[:end, 0]) - (trace.vehicle_width + obstacle_width) / 2
     stays_beside = (beside > 0).all() and beside[-1] >= beside[-2:][0]
-    if gap[-1] <= 0 and not uneventful and stays_beside:
+    if gap[-1] <= 0 and stays_beside:
         words = "meets nobody: whoever is there stays beside its way, and comes no nearer to it"
         return EmptyRoadFault(Reason.LATE, words)
     if gap[-1] <= 0 or (keeps_speed and is_alone):
-        return EmptyRoadFault(Reason.LATE, f"meets nobody: {uneventful}") if uneventful else None
+        return None
 
     # It came too late, or stands.
     distance = position[-1] - position[0]

@@ -214,7 +214,6 @@ def create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
     if member.code is not None:
         further = LEGAL_FIELDS if isinstance(scenario, TrackScenario) else {}
         check_fields(member.code, scenario, **further)
-    scenario.read_files(lookup.folders)
     return _locate_network(scenario, lookup.folders)
 
 

@@ -10,7 +10,6 @@ from functools import cached_property
 from threading import RLock
 
 import msgspec
-import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError, check_name
@@ -18,8 +17,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal
-from safevar_sumo.scenarios import VUT, Point, Scenario, WorldScenario, weather_of
-from safevar_sumo.scenarios.base import MAX_TEST_SPEED
+from safevar_sumo.scenarios import VUT, Point, WorldScenario, weather_of
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.scenarios.mover import Mover, Part
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -189,15 +187,6 @@ def assemble(study: Study) -> System:
         return _assemble(study)
 
 
-def _check_speed(scenario: Scenario, nominal: Nominal) -> None:
-    """Refuse an Ego of a file that is faster than the original vehicle, or than any test."""
-    speed = float(np.max(scenario.profile_highest))
-    highest = min(nominal.max_speed, MAX_TEST_SPEED) if speed else np.inf
-    if speed > highest:
-        problem = f"Ego drives at {speed:.1f} m/s, faster than the study's vehicle can"
-        raise InputError("", problem, f"at most {highest:.1f} m/s, or another vehicle")
-
-
 def _original_points(study: Study, lookup: Lookup, only: Point) -> tuple[Point, ...]:
     """The points in the original encounter, where encounters are ranges; `only` is the one without
     a matrix. Ranges have to be possible, also where listed encounters alone are met.
@@ -246,8 +235,6 @@ def _assemble(study: Study) -> System:
     # What the driving system knows of the original vehicle.
     region = region_of(study)
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
-    for point in points:
-        _check_speed(point.scenario, nominal)
     if study.vehicle.model not in {*VEHICLES, ""}:
         nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
     system = System(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, NamedTuple, Protocol
 
@@ -253,28 +253,14 @@ class Vehicle:
         """The state one simulation step later."""
 
 
-def led_state(is_led: BoolArray, steady: State, state: State) -> State:
-    """The state of vehicles that move as in a steady state where `is_led` is true; a delayed signal
-    keeps what it was before.
-    """
-    return _selected(is_led, steady, state, lambda steady, state: state)
-
-
 def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
-    """The state `steady` of the vehicles that roll, and `rest` of the others."""
-    return _selected(is_rolling, steady, rest, lambda steady, rest: steady.where(is_rolling, rest))
-
-
-def _selected(
-    chosen: BoolArray, first: State, second: State, of_signals: Callable[[State, State], State]
-) -> State:
-    """The state `first` of the `chosen` vehicles, and `second` of the others; a state may consist
+    """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist
     of states, and a delayed signal, the only part with a method `where`, has a way of its own.
     """
-    if hasattr(second, "where"):
-        return of_signals(first, second)
-    if isinstance(first, tuple):
-        pairs = zip(first, second, strict=True)
-        columns = [_selected(chosen, *pair, of_signals) for pair in pairs]
-        return type(first)(*columns) if hasattr(first, "_fields") else tuple(columns)
-    return second if first is None or second is None else np.where(chosen, first, second)
+    if hasattr(rest, "where"):
+        return steady.where(is_rolling, rest)
+    if isinstance(steady, tuple):
+        pairs = zip(steady, rest, strict=True)
+        columns = [_select_state(is_rolling, *pair) for pair in pairs]
+        return type(steady)(*columns) if hasattr(steady, "_fields") else tuple(columns)
+    return rest if steady is None or rest is None else np.where(is_rolling, steady, rest)

@@ -8,7 +8,6 @@ import re
 import shlex
 import textwrap
 from pathlib import Path
-from shutil import copytree
 from zipfile import ZipFile
 
 import pytest
@@ -19,7 +18,6 @@ from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, run
 from tests.made_up import HAS_AD_RSS
 from tests.scenarios.test_simulated import MODELS, STUDY
-from tests.study.test_scenario_file import FILES
 
 SLOW = pytest.mark.slow
 WIDTH, MAX_LINES = 100, 30
@@ -140,12 +138,11 @@ def test_the_fastest_questions_answer(typed: str, told: str | None) -> None:
 
 RATED = "euro_ncap_rating"
 """The rated study, about which `tests/rating` asks all questions."""
-KINDS = ("smoke", "autoware_july", RATED, "any_gap", "stop", "rig", "played")
-"""A published study, one with a matrix, a rated one, one in ranges, full braking, and studies of a
-simulator and of a file.
+KINDS = ("smoke", "autoware_july", RATED, "any_gap", "stop", "rig")
+"""A published study, one with a matrix, a rated one, one in ranges, full braking, and a study of a
+simulator.
 """
 ANY_GAP = 'extends = "sun"\nname = "any_gap"\nencounters = "ranges"\n'
-PLAYED = 'extends = "wear"\nname = "played"\n[scenario]\nfile = "files/cut_in.xosc"\n'
 KIND = """
 extends = "{}"
 name = "kind"
@@ -177,9 +174,7 @@ QUESTIONS = (
 def test_every_question_about_each_kind_of_study_has_an_answer_or_a_reason(name: str) -> None:
     Path("models.py").write_text(MODELS)
     Path("rig.toml").write_text(STUDY.replace("models:Wall", "models:Rig"))
-    Path("played.toml").write_text(PLAYED)
     Path("any_gap.toml").write_text(ANY_GAP)
-    copytree(FILES, "files")
     Path("kind.toml").write_text(KIND.format(name if name in study_names() else f"{name}.toml"))
     study = load_study("kind.toml")
     answered("study kind.toml --out results", must=True)

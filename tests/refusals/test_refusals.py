@@ -8,8 +8,7 @@ Each `[[refused]]` of a table beside this file is one mistake:
   slash;
 - `in` is a file that is there already, `adds` what is added to it, and `old` and `new` a change of
   it; a message about a command that names the file has its name, too;
-- `folder` is what the user has begun with, a name of `FOLDERS`, and `parts` are parts of it that
-  differ;
+- `folder` is what the user has begun with, a name of `FOLDERS`;
 - `base` is what the row has in common with others, a table of the same keys above the rows;
   `[default]` is in common to all.
 """
@@ -27,15 +26,9 @@ import pytest
 
 from safevar_sumo.shipped import NETWORKS
 from tests.in_process import refused
-from tests.openscenario import writing
-from tests.openscenario.test_legal import write_all_actions
 
-SCENES = Path(writing.__file__).parent / "files"
-FOLDERS: dict[str, Callable[..., object]] = {
-    "scene": writing.write,
-    "actions": write_all_actions,
-    "network": lambda folder: shutil.copytree(NETWORKS / "pedestrian_crossing", folder / "mine"),
-    "files": lambda folder: shutil.copytree(SCENES, folder / "files"),
+FOLDERS: dict[str, Callable[[Path], object]] = {
+    "network": lambda folder: shutil.copytree(NETWORKS / "pedestrian_crossing", folder / "mine")
 }
 
 
@@ -45,7 +38,6 @@ def rows(table: str = "*") -> Iterator[Any]:
         for row in tables["refused"]:
             base = tables["base"][row["base"]] if "base" in row else {}
             whole = {**tables.get("default", {}), **base, **row}
-            whole["parts"] = {**base.get("parts", {}), **row.get("parts", {})}
             slow = [pytest.mark.slow] if whole.get("slow") else []
             first = whole["told"] if isinstance(whole["told"], str) else whole["told"][0]
             yield pytest.param(whole, id=f"{path.stem}: {first.strip()[:60]}", marks=slow)
@@ -54,7 +46,7 @@ def rows(table: str = "*") -> Iterator[Any]:
 def prepare(folder: Path, row: dict[str, Any]) -> None:
     """Write the files of a row."""
     if "folder" in row:
-        FOLDERS[row["folder"]](folder, **row.get("parts", {}))
+        FOLDERS[row["folder"]](folder)
     for name in (name for name in row if "." in name or "/" in name):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)

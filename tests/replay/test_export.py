@@ -10,7 +10,6 @@ import re
 import runpy
 import subprocess
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +19,6 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study, simulate_with_original
-from safevar_sumo.errors import InputError
 from safevar_sumo.questions.part import at_point
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.comparison import Comparison, comparison_of
@@ -79,17 +77,6 @@ def exported(
     return out, comparison_of(
         simulate_with_original(load_study(study), there, setting, filtered=False)
     )
-
-
-def test_export_says_that_no_study_takes_a_file_in_which_ego_stands(
-    exported: tuple[Path, Comparison],
-) -> None:
-    out, _ = exported
-    stands = (
-        "Ego starts from standstill" in out.with_name("results").joinpath("printed.txt").read_text()
-    )
-    with pytest.raises(InputError, match="Ego stands at the start") if stands else nullcontext():
-        assemble(load_study("wear", scenario={"file": str(out / "scenario.xosc")}))
 
 
 def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Comparison]) -> None:

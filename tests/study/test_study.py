@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import shutil
 import tomllib
 import warnings
 from pathlib import Path
@@ -22,7 +21,6 @@ from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study import Limit, Origin, Study, limits_of, study_names, tables_of, write_study
 from safevar_sumo.study.file_schema import schema_text
 from safevar_sumo.sumo.system import assemble
-from tests.manual import ROOT
 
 VALIDATOR = jsonschema.Draft7Validator(json.loads(STUDY_SCHEMA.read_text()))
 
@@ -168,15 +166,10 @@ def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
     assert read_study(tables_of(study)).matrix is None
 
 
-@pytest.mark.parametrize(
-    "scenario", [{"model": "mine:Deer"}, {"model": "along"}, {"file": "scenario.xosc"}]
-)
+@pytest.mark.parametrize("scenario", [{"model": "mine:Deer"}, {"model": "along"}])
 def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
     scenario: dict[str, str], in_tmp: Path
 ) -> None:
-    shutil.copy(
-        ROOT / "tests" / "openscenario" / "files" / "crossing_pedestrian.xosc", "scenario.xosc"
-    )
     ((key, value),) = scenario.items()
     Path("mine.toml").write_text(f'extends = "wear"\n[scenario]\n{key} = "{value}"\n')
     study, remarks = with_remarks("mine.toml")
