@@ -13,7 +13,6 @@ from .questions.ask import question as question
 from .questions.compare import compare as compare
 from .questions.explain import explain as explain
 from .questions.permit import permit as permit
-from .questions.rating import rating as rating
 from .questions.repair import repair as repair
 from .questions.research_questions.answer import figures as figures, tables as tables
 from .questions.risk import risk as risk

@@ -65,9 +65,8 @@ def searched(study: Study, out: Path, warn: Callable[[str], None] = lambda messa
 
 
 def verify_everywhere(system: System, settings: FloatArray) -> None:
-    """Verify settings, shape (M, n), in SUMO at every point, of a rating at some."""
-    points = system.points if system.rater is None else system.points[:: len(system.points) // 8]
-    for point in points:
+    """Verify settings, shape (M, n), in SUMO at every point."""
+    for point in system.points:
         assert not verify_in_sumo(system.at(point), settings, np.zeros(len(settings), dtype=int))
 
 

@@ -24,7 +24,7 @@ from safevar_sumo.vehicles import CharacteristicSet
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 SHOWN = {"quickstart": (1, 2), "rq1": (2, 0), "rq2": (1, 2), "rq3": (4, 3)}
 """Number of cells that show an answer with tables and of those that show a picture, by notebook."""
-OTHERS = ("answers", "paper", "rating")
+OTHERS = ("answers", "paper")
 
 
 @pytest.fixture(scope="module")
@@ -160,17 +160,6 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     ):
         assert result in printed
     assert not [output for output in outputs if output.get("name") == "stderr"]
-
-
-@pytest.mark.slow
-def test_the_notebook_of_the_rating_tells_where_points_are_lost(tmp_path: Path) -> None:
-    for notebook in (
-        nbformat.read(NOTEBOOKS / "rating.ipynb", as_version=4),
-        _executed("rating", tmp_path, timeout=1800),
-    ):
-        texts = _texts(notebook)
-        assert any("the vehicle loses" in text for text in texts)
-        assert sum("Axes" in text for text in texts) == 2
 
 
 def main() -> None:

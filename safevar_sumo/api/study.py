@@ -339,7 +339,7 @@ def _breach_of_original(case: Case) -> str:
     the encounter.
     """
     system = assemble(case.study)
-    if system.rater or case.characteristics.scenario:
+    if case.characteristics.scenario:
         return ""
     original = drive_and_score(system, case.characteristics.original_settings)
     if not case.unsafe.of(original)[0]:

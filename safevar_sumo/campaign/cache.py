@@ -36,7 +36,7 @@ from safevar_sumo.campaign.evaluation import Selection, system_of
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.errors import warn
 from safevar_sumo.plugins import Use, digests, file_by_name, files_in
-from safevar_sumo.records import CellResults, Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.records.evaluations import COLUMNS
 from safevar_sumo.results import identity_digest
 from safevar_sumo.shipped import PACKAGE
@@ -58,7 +58,7 @@ continued [s].
 """
 NUMBER = b"number"
 """The key of an entry with the number of settings that a command has kept."""
-METRIC, CELLS, POINTS = "metric ", "cells ", "worst_points"
+METRIC, POINTS = "metric ", "worst_points"
 """Names of an entry's further arrays, or their beginnings."""
 UNUSABLE = (OSError, sqlite3.Error, diskcache.Timeout)
 """What a cache raises that cannot be read or written."""
@@ -301,8 +301,6 @@ def content_of(evaluations: Evaluations) -> bytes:
     """Evaluations without failures as the content of an entry."""
     arrays = {name: getattr(evaluations, name) for name in COLUMNS}
     arrays |= {f"{METRIC}{name}": values for name, values in evaluations.metrics.items()}
-    if evaluations.cells is not None:
-        arrays |= {f"{CELLS}{name}": one for name, one in evaluations.cells._asdict().items()}
     if evaluations.worst_points is not None:
         arrays[POINTS] = evaluations.worst_points
     buffer = BytesIO()
@@ -317,9 +315,6 @@ def evaluations_in(content: bytes | None) -> Evaluations | None:
     try:
         with np.load(BytesIO(zlib.decompress(content)), allow_pickle=False) as file:
             arrays = dict(file)
-        cells = {
-            name.removeprefix(CELLS): one for name, one in arrays.items() if name.startswith(CELLS)
-        }
         return Evaluations(
             **{name: arrays[name] for name in COLUMNS},
             metrics={
@@ -327,7 +322,6 @@ def evaluations_in(content: bytes | None) -> Evaluations | None:
                 for name, one in arrays.items()
                 if name.startswith(METRIC)
             },
-            cells=CellResults(**cells) if cells else None,
             worst_points=arrays.get(POINTS),
         )
     except (ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error):

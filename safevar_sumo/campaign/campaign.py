@@ -188,7 +188,7 @@ def _remarks(
         yield f"user code reads {files}, which no `files` of the study names: edits go unnoticed"
     if no_verdict:
         yield no_verdict
-    if original.collided[0] and not study.is_rated:
+    if original.collided[0]:
         words = Unsafe().breach_in_words(original)
         yield f"the original vehicle itself {words}: no change is needed"
 

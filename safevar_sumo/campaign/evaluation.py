@@ -24,7 +24,7 @@ from safevar_sumo.plugins.process import REPRODUCED_BY
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, IntArray, Outcome, differences
 from safevar_sumo.study import Study, user_code_names
-from safevar_sumo.sumo.matrix import MAX_COPIES, drive_and_score, evaluate_matrix
+from safevar_sumo.sumo.matrix import MAX_COPIES, drive_and_score
 from safevar_sumo.sumo.system import System, assemble, simulate_command
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
@@ -51,14 +51,11 @@ class Selection(msgspec.Struct, frozen=True):
         Numbers of the points of a matrix to simulate; None for all.
     arrays
         Whether one ADS drives all rows, with arrays as parameters.
-    each
-        Whether the evaluations have the rated results at each point of a matrix, `cells`.
     """
 
     parameters: tuple[str, ...] = ()
     points: tuple[int, ...] | None = None
     arrays: bool = True
-    each: bool = False
 
     def of(self, system: System) -> System:
         """The system at the selected points."""
@@ -225,8 +222,6 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     # The settings, and values of the driving system's parameters.
     selection = task.selection
     settings, values = np.split(rows, [len(system.characteristics)], axis=1)
-    if selection.each:
-        return evaluate_matrix(system, settings, each=True)
     if not values.size:
         return drive_and_score(system, settings, with_originals=False)
 

@@ -97,10 +97,9 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
         expected = "a drive to the encounter, without braking for nobody"
         return [Finding("reaction", words, where, "", expected)]
 
-    # In a rated study, every original vehicle collides in some cell.
     unsafe = own_criterion(study)
     original = drive_and_score(system, system.characteristics.original_settings)
-    if system.rater is not None or not unsafe.of(original)[0]:
+    if not unsafe.of(original)[0]:
         return []
     words = f"the original vehicle itself {unsafe.breach_in_words(original)}"
     point = system.points[original.points[0]].name

@@ -268,7 +268,7 @@ def _system(study: Study) -> System:
     """
     system = assemble(study)
     points = system.points[:: max(len(system.points) // MATRIX_POINTS, 1)]
-    return replace(system, points=points, rater=None)
+    return replace(system, points=points)
 
 
 def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:

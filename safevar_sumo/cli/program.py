@@ -41,7 +41,6 @@ COMMANDS_BY_GROUP = {
         "compare": "questions.compare:compare",
         "permit": "questions.permit:permit",
         "repair": "questions.repair:repair",
-        "rating": "questions.rating:rating",
     },
     "Hand over": {
         "evidence": "report.evidence:evidence",
@@ -62,6 +61,10 @@ COMMANDS_BY_GROUP = {
 COMMANDS = {
     name: function for group in COMMANDS_BY_GROUP.values() for name, function in group.items()
 }
+ENDED_COMMANDS = {
+    "rating": "study euro_ncap_pedestrian, and Euro NCAP's own calculator for its points"
+}
+"""Commands of earlier releases, and what stands in their place."""
 ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
 """An argument of a function of the library in an error, such as `method=monte_carlo`."""
 
@@ -91,7 +94,10 @@ class LazyCommands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Suggest the nearest command if the name is unknown."""
+        """Suggest the nearest command if the name is unknown, or what stands in its place."""
+        if args and args[0] in ENDED_COMMANDS:
+            problem = "a command of releases before 0.5"
+            raise InputError(args[0], problem, ENDED_COMMANDS[args[0]])
         if args and args[0] not in COMMANDS and not args[0].startswith("-") and ":" not in args[0]:
             ctx.fail(f"there is no command {args[0]!r}{did_you_mean(args[0], COMMANDS)}")
         return super().resolve_command(ctx, args)

@@ -22,7 +22,6 @@ from safevar_sumo.metrics.measures import (
     AVE_DECE,
     DRAC,
     PET,
-    RATING_POINTS as RATING_POINTS,
     REACTION_TIME,
     SAFETY_DEGREE_METRIC,
     TET,

@@ -1,5 +1,5 @@
 """The safety metrics of the published study (method section 4; Minderhoud and Bovy 2001), metrics
-of conflicts, and a rating's points.
+of conflicts.
 """
 
 from __future__ import annotations
@@ -258,10 +258,8 @@ AVE_DECE = Measure(
 )
 
 
-def _undefined_points(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """NaN, shape (N,): a single cell has no points, which the rater computes from all cells of the
-    matrix, and a single run no share.
-    """
+def _undefined_share(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+    """NaN, shape (N,): a single run has no share."""
     return np.full(len(runs.outcome), np.nan)
 
 
@@ -270,16 +268,6 @@ UNSAFE_SHARE = Measure(
     title="share of unsafe runs",
     unit="-",
     more_is_unsafe=True,
-    function=_undefined_points,
+    function=_undefined_share,
     description="Share of the repeats of a run that are unsafe by the study's own criterion.",
-)
-RATING_POINTS = Measure(
-    name="rating_points",
-    title="points kept",
-    unit="points",
-    function=_undefined_points,
-    description=(
-        "Points of Euro NCAP's crash avoidance rating, frontal collisions, in all tests that are"
-        " simulated."
-    ),
 )

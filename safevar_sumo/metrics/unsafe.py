@@ -1,6 +1,4 @@
-"""Criteria of an unsafe vehicle: a collision, a safety degree or a metric beyond a limit, lost
-points of a rating.
-"""
+"""Criteria of an unsafe vehicle: a collision, a safety degree or a metric beyond a limit."""
 
 from __future__ import annotations
 
@@ -16,7 +14,7 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import F_SAFE
 from safevar_sumo.metrics.legal import IMPACT_EXCESS, IMPACT_SPEED
-from safevar_sumo.metrics.measures import RATING_POINTS, UNSAFE_SHARE
+from safevar_sumo.metrics.measures import UNSAFE_SHARE
 from safevar_sumo.records import (
     KMH_PER_MS,
     BoolArray,
@@ -33,9 +31,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CRITERIA = (
-    "collision, points=X with X points of a rating, below=X with a safety degree X [m, or minus a"
-    " collision's closing speed in m/s], or a metric with <, <=, > or >= and a number, such as"
-    ' "drac > 6"'
+    "collision, below=X with a safety degree X [m, or minus a collision's closing speed in m/s], or"
+    ' a metric with <, <=, > or >= and a number, such as "drac > 6"'
 )
 COMPARISONS: Mapping[str, Callable[[Quantity, float], Quantity]] = {
     "<": operator.lt,
@@ -56,9 +53,6 @@ LEAST = 1e-9
 """The least by which what is unsafe is beyond a limit, in its unit."""
 ALLOWED_ROUNDING = 0.01
 """Allowed speed of an impact below which none is allowed [km/h]."""
-POINT_LOSS, POINT_DECIMALS = 1.0, 6
-"""The default limit in a rated study: the original's points minus this loss, to this many decimals.
-"""
 
 
 class MetricBound(NamedTuple):
@@ -69,18 +63,6 @@ class MetricBound(NamedTuple):
     limit: float
 
     def __str__(self) -> str:
-        return f"points={self.limit!r}" if self.is_of_lost_points else self.in_words
-
-    @property
-    def is_of_lost_points(self) -> bool:
-        """Whether at most some points of a rating are unsafe: `points=35`."""
-        return (self.measure, self.comparison) == (RATING_POINTS.name, "<=")
-
-    @property
-    def in_words(self) -> str:
-        """`drac > 6`, `at most 35 points`."""
-        if self.is_of_lost_points:
-            return f"at most {self.limit:g} points"
         return f"{self.measure} {self.comparison} {self.limit:.12g}"
 
     @property
@@ -92,7 +74,7 @@ class MetricBound(NamedTuple):
 class Unsafe:
     """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with
     `below`, a safety degree below this limit [m, or -m/s]; with a `bound`, a metric of the study
-    beyond a limit, or a collision (points of a rating are of no run: these alone).
+    beyond a limit, or a collision.
 
     `contact` is the safety degree at which bodies touch [m]: 0, or how far middles are apart then.
     """
@@ -120,11 +102,6 @@ class Unsafe:
         return self.below is None and self.bound is None
 
     @property
-    def is_of_points(self) -> bool:
-        """Whether a bound on points of a rating decides."""
-        return self.measure == RATING_POINTS.name
-
-    @property
     def is_of_impacts(self) -> bool:
         """Whether a bound on the impact decides, which may be allowed."""
         return self.measure == IMPACT_EXCESS.name
@@ -132,7 +109,7 @@ class Unsafe:
     @property
     def _stands_alone(self) -> bool:
         """Whether a collision is not unsafe in itself."""
-        return self.is_of_points or self.is_of_impacts or self._is_of_shares
+        return self.is_of_impacts or self._is_of_shares
 
     @property
     def _is_of_shares(self) -> bool:
@@ -152,7 +129,7 @@ class Unsafe:
         below 1.4 m, half of the original's`, `drac > 6, or a collision`.
         """
         if self.bound is not None:
-            return f"{self.bound.in_words}{'' if self._stands_alone else ', or a collision'}"
+            return f"{self.bound}{'' if self._stands_alone else ', or a collision'}"
         if self.below is None:
             where = ", from bumper to bumper" if self.contact else ""
             clearance = f"collision, or clearance below {self.keep:g} m{where}"
@@ -197,9 +174,9 @@ class Unsafe:
 
     @property
     def in_words(self) -> str:
-        """What an unsafe vehicle does: `collides`, `has drac > 6`, `earns at most 35 points`."""
+        """What an unsafe vehicle does: `collides`, `has drac > 6`."""
         if self.bound is not None:
-            return f"{'earns' if self.bound.is_of_lost_points else 'has'} {self.bound.in_words}"
+            return f"has {self.bound}"
         return "collides" if self.below is None else f"has a safety degree below {self.below:.3g}"
 
     def of(self, evaluations: Evaluations) -> BoolArray:
@@ -293,8 +270,6 @@ class Unsafe:
         if self.bound is not None:
             measure, comparison, limit = self.bound
             value = float(vehicle.column(measure)[0])
-            if self.bound.is_of_lost_points:
-                return f"earns {value:.6g} points, at most {limit:g}"
             if COMPARISONS[comparison](value, limit):
                 return (
                     f"has {measure} {_on_its_side(value, limit, 'g', 3)} {comparison} {limit:.12g}"
@@ -339,12 +314,10 @@ class Unsafe:
         except (TypeError, ValueError):
             limit = math.nan
 
-        # A safety degree, points, or any metric of the study.
+        # A safety degree, or any metric of the study.
         if math.isfinite(limit):
             if (quantity, comparison) in (("below", "="), (SAFETY_DEGREE, "<")):
                 return cls(below=limit)
-            if (quantity, comparison) == ("points", "="):
-                quantity, comparison = RATING_POINTS.name, "<="
             if comparison in COMPARISONS:
                 return cls(bound=MetricBound(quantity, comparison, limit))
         raise InputError("unsafe", repr(criterion), CRITERIA)
@@ -353,10 +326,8 @@ class Unsafe:
     def default(cls, original: Tables, outcomes: TextArray | pd.Series[str]) -> Unsafe:
         """The criterion if none is stated.
 
-        In a rated study, a vehicle is unsafe if it has lost at least one of the original's points.
-        In other studies the criterion is a collision if any vehicle collides or the original has no
-        safety degree to halve; otherwise, a safety degree below half of the original's safety
-        degree.
+        It is a collision if any vehicle collides or the original has no safety degree to halve;
+        otherwise, a safety degree below half of the original's safety degree.
 
         Parameters
         ----------
@@ -365,11 +336,7 @@ class Unsafe:
         outcomes
             Outcomes of the other vehicles, as an array or a column of `Outcome`.
         """
-        points = original.get(RATING_POINTS.name)
         safety_degree = original.get(SAFETY_DEGREE) or 0.0
-        if points is not None:
-            most = round(points - POINT_LOSS, POINT_DECIMALS)
-            return cls(bound=MetricBound(RATING_POINTS.name, "<=", most))
         if (outcomes == COLLISION).any() or not safety_degree > 0:
             return cls()
         return cls(float(f"{DEGREE_SHARE * safety_degree:.{LIMIT_DIGITS}g}"), is_half=True)
@@ -387,10 +354,6 @@ class Unsafe:
         unsafe = cls.default(
             {name: float(values[0]) for name, values in original.metrics.items()}, outcomes
         )
-        if unsafe.bound is not None and unsafe.bound.limit < 0:
-            earned = f"{unsafe.bound.limit + POINT_LOSS:g} points"
-            problem = f"the original vehicle earns {earned} and has none to lose"
-            raise InputError("unsafe", problem, CRITERIA)
         if unsafe == cls() and not (outcomes == COLLISION).any():
             raise InputError(
                 "unsafe",
@@ -437,5 +400,5 @@ def margin_of(study: Study, margin: float | None) -> float:
 
 CriterionLike = Unsafe | float | str
 """Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision",
-"below=X", "points=X" or a metric beyond a limit such as "drac > 6".
+"below=X" or a metric beyond a limit such as "drac > 6".
 """

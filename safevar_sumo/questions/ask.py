@@ -51,15 +51,15 @@ if TYPE_CHECKING:
 
 QUESTIONS = {
     name: f"safevar_sumo.questions.{name}"
-    for name in ("compare", "explain", "permit", "rating", "repair", "risk", "rules", "tolerance")
+    for name in ("compare", "explain", "permit", "repair", "risk", "rules", "tolerance")
 } | {"validate": "safevar_sumo.reference.agreement"}
 """The module of each question, whose function has the question's name."""
 
 
 Criterion = Annotated[Unsafe | None, CRITERION]
-"""What is unsafe: a collision, a safety degree below X [m], at most X points of a rating, or a
-metric of the study with <, <=, > or >= and a number; by default a collision if any evaluated
-setting collides, else half of the original's safety degree; of a rated study, any point lost.
+"""What is unsafe: a collision, a safety degree below X [m], or a metric of the study with <, <=, >
+or >= and a number; by default a collision if any evaluated setting collides, else half of the
+original's safety degree.
 """
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""

@@ -45,12 +45,12 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     if name not in known:
         metrics = replace_in(metrics, also=[*metrics.also, name])
     allows = matrix is not None and any(test.allowed_impact_speed for test in matrix.tests)
-    if allows and not (unsafe.is_of_impacts or unsafe.is_of_points):
+    if allows and not unsafe.is_of_impacts:
         problem = f"{str(unsafe)!r}: tests of study {study.name!r} allow an impact"
         raise InputError("unsafe", problem, "a bound on impact_excess, or collision")
 
     # And counts the point that is worst by it.
-    if matrix is not None and not unsafe.is_of_points:
+    if matrix is not None:
         matrix = replace_in(
             matrix, aggregate=f"{name} {'>' if unsafe.bound.worst_is_largest else '<'}"
         )

@@ -13,7 +13,7 @@ import pandas as pd
 
 from safevar_sumo.ads import ADS
 from safevar_sumo.errors import InputError, check_name, warn
-from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, RATING_POINTS, UNSAFE_SHARE
+from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, UNSAFE_SHARE
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.options import Range
@@ -79,7 +79,6 @@ FURTHER_OBJECTIVES: Mapping[str, object] = {
         for name, objective in OBJECTIVES.items()
         if name not in METRICS
     },
-    RATING_POINTS.name: f"Only in studies that a protocol rates: {RATING_POINTS.description}",
     UNSAFE_SHARE.name: f"Only with [scenario] repeats: {UNSAFE_SHARE.description}",
 }
 FINDINGS: Columns = {

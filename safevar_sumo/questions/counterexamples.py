@@ -165,7 +165,7 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
         breach = model.unsafe.breach_in_words(runs.take(np.array([row])))
         if model.unsafe.is_of_impacts and runs.collided[row]:
             how = f"the car {breach}"
-        where = "" if model.unsafe.is_of_points else where_in_words(points, point, scenario, values)
+        where = where_in_words(points, point, scenario, values)
         failures[row] = Failure(
             settings[row],
             f"{how}{where}{fit}",
@@ -236,7 +236,7 @@ def texts_of(point: Point, values: JsonObject) -> dict[str, str]:
 
 def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:
     """A failure at a safety degree, such as `the car hits a pedestrian at 12 km/h`."""
-    if unsafe.is_of_points or (unsafe.bound is not None and not collided):
+    if unsafe.bound is not None and not collided:
         return f"the car {unsafe.in_words}"
     if collided:
         impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing

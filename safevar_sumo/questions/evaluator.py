@@ -32,7 +32,7 @@ from safevar_sumo.campaign.evaluation import (
 )
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, SimulationError, about
-from safevar_sumo.metrics import F_SAFE, METRICS, RATING_POINTS, Unsafe
+from safevar_sumo.metrics import F_SAFE, METRICS, Unsafe
 from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.price import (
@@ -45,7 +45,7 @@ from safevar_sumo.questions.price import (
 )
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
-from safevar_sumo.records import CellResults, Evaluations, FloatArray, NamedValues, Outcome
+from safevar_sumo.records import Evaluations, FloatArray, NamedValues, Outcome
 from safevar_sumo.results.store import record, refuse_other_original
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.simulators import simulations_of_setting
@@ -206,11 +206,9 @@ class Evaluator:
         of the ADS.
 
         The values stand beside the settings, shape (M, n + P). Encounters in which the original
-        vehicle is not safe count, too. Settings that violate a constraint are not simulated, but
-        for results at each point.
+        vehicle is not safe count, too. Settings that violate a constraint are not simulated.
         """
-        evaluate = self._simulate_shown if selection.each else self._evaluate_feasible
-        return evaluate(rows, stage, 0, selection)
+        return self._evaluate_feasible(rows, stage, 0, selection)
 
     def _simulate_shown(
         self, settings: FloatArray, stage: str, verified: int, selection: Selection = EVERYTHING
@@ -332,22 +330,6 @@ class Evaluator:
 
         return self.region.draw_feasible(draw_next, number, filtered=feasible_after_filter)
 
-    def at_each_point(self, settings: FloatArray, stage: str) -> CellResults:
-        """The rated results of M settings, shape (M, n), at every point of a matrix.
-
-        Raises
-        ------
-        SimulationError
-            If a setting cannot be simulated.
-        """
-        evaluations = self.evaluate_selection(settings, Selection(each=True), stage)
-        if evaluations.cells is None:
-            reason = evaluations.reason(int(np.argmax(evaluations.failed)))
-            raise SimulationError(
-                f"study {self.study.name!r}: a vehicle cannot be simulated: {reason}"
-            )
-        return evaluations.cells
-
     def evaluate_original(self) -> Evaluations:
         """Evaluation of the original vehicle.
 
@@ -409,10 +391,6 @@ class Evaluator:
             return self.checked(stated)
         self.check_measured()
         original = original or self.evaluate_original()
-        if (
-            RATING_POINTS.name in original.metrics
-        ):  # a lost point depends on the original vehicle alone
-            return Unsafe.default_among(original, original)
         stage = "settings over the whole domain"
         settings = self.feasible_settings(CRITERION_SETTINGS)
         # The most of a few simulations is the question's, not the criterion's.
@@ -426,7 +404,7 @@ class Evaluator:
         `checked` raises.
         """
         self.checked(unsafe)
-        if unsafe.bound and not unsafe.is_of_points:
+        if unsafe.bound:
             self.account.measure = unsafe.bound.measure
             self.check_measured(unsafe.bound.measure)
 

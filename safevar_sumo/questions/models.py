@@ -66,11 +66,9 @@ class Model(NamedTuple):
 
     @property
     def in_phases(self) -> Model | None:
-        """The model of settings that end with the phase of their encounter; None without phases,
-        and for points of a rating.
-        """
+        """The model of settings that end with the phase of their encounter; None without phases."""
         evaluator = self.evaluator.in_phases
-        if evaluator is None or self.unsafe.is_of_points:
+        if evaluator is None:
             return None
         return self._replace(evaluator=evaluator, at_worst_phase=False)
 

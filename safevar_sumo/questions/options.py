@@ -41,7 +41,7 @@ Fraction = Annotated[float, Range(0, 1, is_open=True)]
 """A share such as a confidence."""
 Margin = Annotated[float | None, Range(0, 100)]
 """A distance to keep from a collision [m]."""
-CRITERION = '"METRIC < X"|collision|below=X|points=X'
+CRITERION = '"METRIC < X"|collision|below=X'
 """The form of a criterion."""
 CARS_FILE = "FILE.csv"
 """A list of cars: its path, or in the library also a DataFrame or a mapping."""

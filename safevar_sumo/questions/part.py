@@ -10,11 +10,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, check_name, check_text
-from safevar_sumo.protocol.rater import expand_protocol
 from safevar_sumo.questions.scope import points_of_tests
-from safevar_sumo.scenarios import searchable_in, weather_of
+from safevar_sumo.scenarios import searchable_in
 from safevar_sumo.scenarios.declared import with_ranges
-from safevar_sumo.study import OBJECTIVES, RANGES, MatrixTest, Study, unit_text
+from safevar_sumo.study import RANGES, MatrixTest, Study, unit_text
 from safevar_sumo.study.encounters import Axes, AxisTable, are_numbers
 from safevar_sumo.sumo.system import assemble
 
@@ -52,7 +51,7 @@ def part_of_study(study: Study, ranges: bool, point: str | None, up_to: str | No
 
 
 def at_point(study: Study, name: str) -> Study:
-    """The study in a test, or at one point of its matrix, alone; neither is rated.
+    """The study in a test, or at one point of its matrix, alone.
 
     Raises
     ------
@@ -60,29 +59,23 @@ def at_point(study: Study, name: str) -> Study:
         If no test and no point has this name.
     """
     check_text("point", name)
-    expanded = expand_protocol(study, weather_of(study.weather))
-    tests = expanded.tests
-    alone = [test for test in tests if test.name == name]
+    reduced = study
+    alone = [test for test in study.tests if test.name == name]
     points = () if alone else assemble(study).matrix
     if not alone:  # a listed encounter has no ranges
-        expanded = expanded.listed()
-        at_points = [each for test in expanded.tests for each in expanded.points_of(test)]
+        reduced = study.listed()
+        at_points = [each for test in reduced.tests for each in reduced.points_of(test)]
         pairs = zip(points, at_points, strict=True)
         alone = [test for point, test in pairs if point.name == name]
     if not alone:
-        names = [*{test.name: 0 for test in tests} | {point.name: 0 for point in points}]
+        names = [*{test.name: 0 for test in study.tests} | {point.name: 0 for point in points}]
         similar = [one for one in names if name in one] or get_close_matches(
             name, names, N_SIMILAR_POINTS, 0
         )
         legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
         raise InputError("point", repr(name), legal if points else "a study with a matrix")
 
-    # The study there, and what commands name.
-    search = study.search
-    if study.is_rated:  # one point has no rating points to search by
-        search = replace(search, objectives=[*OBJECTIVES])
-    origin = replace(study.origin, point=name)
-    return replace(expanded.with_tests(alone), origin=origin, search=search)
+    return replace(reduced.with_tests(alone), origin=replace(study.origin, point=name))
 
 
 def study_up_to(study: Study, text: str) -> Study:
@@ -95,13 +88,10 @@ def study_up_to(study: Study, text: str) -> Study:
     Raises
     ------
     InputError
-        If the study is rated, does not vary the parameter, or the value is no number or beyond the
-        values that are driven.
+        If the study does not vary the parameter, or the value is no number or beyond the values
+        that are driven.
     """
     name, _, value = (part.strip() for part in text.partition("="))
-    if study.is_rated:
-        problem = f"{text!r}: study {study.name!r} is rated, at the points of its protocol"
-        raise InputError(OPTION, problem, "a study that is not rated")
     axes = [
         axis for test in study.tests for axis in study.axes_of(test) if _values(study, test, axis)
     ]

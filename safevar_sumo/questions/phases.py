@@ -39,10 +39,10 @@ DOMAIN = Domain(unit=PHASES[PHASE].unit, original=0.0, lower=0.0, upper=1.0)
 
 
 def in_phases(study: Study, system: System) -> Study:
-    """A study that searches the phase, too, as its last parameter; itself if it is rated, or where
-    the encounters of some point have none, as bodies do not move on tracks.
+    """A study that searches the phase, too, as its last parameter; itself where the encounters of
+    some point have none, as bodies do not move on tracks.
     """
-    has_phases = system.rater is None and all(point.scenario.has_phase for point in system.points)
+    has_phases = all(point.scenario.has_phase for point in system.points)
     if not has_phases or reason_against_scenes(system) or PHASE in system.characteristics.names:
         return study
     base = study if study.ranges else study.listed().all_count

@@ -85,11 +85,9 @@ the finite population), the share itself if all collisions were simulated.
 
 def has_reference_drivers(evaluator: Evaluator) -> bool:
     """Whether reference drivers drive instead: not in a simulator of the user's own, which drives
-    itself, nor in a rating, where every vehicle collides in some cell, nor where few simulations
-    are allowed.
+    itself, nor where few simulations are allowed.
     """
-    has_driver = evaluator.system.mover.has("a driving system") and not evaluator.study.is_rated
-    return has_driver and evaluator.left is None
+    return evaluator.system.mover.has("a driving system") and evaluator.left is None
 
 
 def assess_sample(

@@ -91,7 +91,7 @@ def risk(
     confidence
         Confidence of the intervals.
     unsafe
-        What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+        What is unsafe: a collision, or a safety degree below X.
     """
     # Vehicles as the study says that they vary.
     study = evaluator.study

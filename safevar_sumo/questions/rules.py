@@ -89,7 +89,7 @@ def rules(
         Number of vehicles, sampled as [variation] says, without it uniformly over the domain; one
         half yields the rules, the other half tests them.
     unsafe
-        What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+        What is unsafe: a collision, or a safety degree below X.
     """
     study = evaluator.study
     characteristics = evaluator.characteristics

@@ -52,11 +52,10 @@ def scope_of(study: Study, *, between: bool = True) -> str:
     """
     # What drives in each test.
     points = assemble(study).points
-    protocol = "" if study.matrix is None else str(study.matrix.protocol)
     drives = [
         (
             _model_in_words((test and test.model) or study.scenario.model),
-            test.name if test else protocol,
+            test.name if test else "",
             _parameters_in_words(study, test, own, between),
         )
         for test, own in points_of_tests(study, points)

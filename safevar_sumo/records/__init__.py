@@ -28,7 +28,6 @@ from safevar_sumo.records.driving import (
 )
 from safevar_sumo.records.evaluations import (
     ROUNDING as ROUNDING,
-    CellResults as CellResults,
     Evaluations as Evaluations,
     ResultColumns as ResultColumns,
     differences as differences,

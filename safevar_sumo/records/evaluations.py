@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,22 +21,6 @@ ROUNDING = 1e-9
 """Largest accepted difference between a result in a recorded scene and in SUMO."""
 
 
-class CellResults(NamedTuple):
-    """Results of M vehicles in every cell of a rating, shape (M, number of cells).
-
-    `impact` is the relative speed of the collision [km/h], NaN without one; `warning` the true time
-    to collision at the warning [s], NaN without one; `valid` is false where the test could not be
-    driven.
-    """
-
-    impact: FloatArray
-    warning: FloatArray
-    valid: BoolArray
-
-    def of(self, vehicles: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> CellResults:
-        return CellResults._make(values[vehicles] for values in self)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Evaluations:
     """M evaluated settings with their outcomes, metrics and objectives.
@@ -45,9 +29,8 @@ class Evaluations:
     arrays have shape (M,). `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further
     metrics; an undefined value is NaN. `collision_speed` is in m/s, `f_diff` a fraction,
     `f_num_diff` a count, both of the filtered values. `reasons` says, by the bytes of a setting,
-    why the setting could not be simulated. `cells` are a rating's results, None without a rating.
-    `worst_points` are the numbers of the points at which the settings were worst, None without a
-    matrix.
+    why the setting could not be simulated. `worst_points` are the numbers of the points at which
+    the settings were worst, None without a matrix.
     """
 
     settings: FloatArray
@@ -57,7 +40,6 @@ class Evaluations:
     f_diff: FloatArray
     f_num_diff: FloatArray
     reasons: Mapping[bytes, str] = field(default_factory=dict)
-    cells: CellResults | None = None
     worst_points: npt.NDArray[np.intp] | None = None
 
     def __len__(self) -> int:
@@ -144,7 +126,6 @@ class Evaluations:
             self,
             **{name: getattr(self, name)[rows] for name in COLUMNS},
             metrics={name: values[rows] for name, values in self.metrics.items()},
-            cells=None if self.cells is None else self.cells.of(rows),
             worst_points=None if self.worst_points is None else self.worst_points[rows],
             reasons=dict(self.reasons),  # user code has a view, which no process can send
         )
@@ -184,8 +165,7 @@ class Evaluations:
         """Join batches of evaluations in order; a metric that a batch lacks is undefined in its
         rows.
 
-        There are `cells` only if all batches have them; the worst point of a batch without
-        `worst_points` is the first.
+        The worst point of a batch without `worst_points` is the first.
         """
         # Rows of all batches.
         columns = {
@@ -200,17 +180,11 @@ class Evaluations:
             name: np.concatenate([batch.column(name) for batch in batches]) for name in names
         }
 
-        # Cells of a rating, and worst points, if all or some batches have them.
-        cells = [batch.cells for batch in batches if batch.cells is not None]
-        all_cells = None
-        if len(cells) == len(batches):
-            all_cells = CellResults._make(map(np.concatenate, zip(*cells, strict=True)))
+        # Worst points, if some batches have them.
         worst_points = None
         if any(batch.worst_points is not None for batch in batches):
             worst_points = np.concatenate([batch.points for batch in batches])
-        return cls(
-            **columns, metrics=metrics, reasons=reasons, cells=all_cells, worst_points=worst_points
-        )
+        return cls(**columns, metrics=metrics, reasons=reasons, worst_points=worst_points)
 
 
 def differences(

@@ -261,7 +261,7 @@ class SimulationRuns:
     @cached_property
     def relative_speed(self) -> FloatArray:
         """Speed of a collision relative to the obstacle along the vehicle's path at the moment of
-        contact, as rated by Euro NCAP [m/s], shape (N,); NaN without a collision.
+        contact, as Euro NCAP takes it [m/s], shape (N,); NaN without a collision.
 
         A gap d that closes within a time step, from the relative speed v at the relative
         acceleration a, closes at sqrt(v^2 + 2 a d); where no gap closes, the speed at the end of

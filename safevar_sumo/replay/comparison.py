@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.api.simulation import Simulation
-from safevar_sumo.metrics import METRICS, RATING_POINTS, Measure
+from safevar_sumo.metrics import METRICS, Measure
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.words import OUTCOME_VERBS, change_texts, collision_in_words
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns, Trace
@@ -208,10 +208,7 @@ def comparison_of(simulation: Simulation) -> Comparison:
     pair = simulation.pair
     scoring = simulation.scoring
     title = simulation.study.title
-    objectives = {objective.name for objective in scoring.objectives} - {
-        *METRICS,
-        RATING_POINTS.name,
-    }
+    objectives = {objective.name for objective in scoring.objectives} - {*METRICS}
 
     # The pedals of the sample before an impact also at the impact, where a command has no effect
     # any more.
@@ -227,7 +224,6 @@ def comparison_of(simulation: Simulation) -> Comparison:
         point=pair.point,
         evaluations=pair.evaluations,
         runs=replace(pair.runs, trace=replace(trace, throttle=pedals[0], brake=pedals[1])),
-        # The points of a rating belong to all cells together.
         objectives=tuple(metric for metric in scoring.metrics if metric.name in objectives),
     )
 
@@ -252,8 +248,8 @@ def read_road(network: NetworkFiles) -> tuple[DrawnLane, ...]:
 
 
 def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:
-    """List where the replay of a solution differs from its row of solutions.csv, with both values;
-    rating points are left out, as the replay of one cell has none.
+    """List where the replay of a solution differs from its row of solutions.csv, with both
+    values.
     """
     differences = []
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
@@ -262,7 +258,7 @@ def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:
         )
     for name, values in replayed.metrics.items():
         stored = recorded.get(name, values[0])
-        if name != RATING_POINTS.name and not np.array_equal(stored, values[0], equal_nan=True):
+        if not np.array_equal(stored, values[0], equal_nan=True):
             differences.append(f"{name} was {stored:.6g} and is {values[0]:.6g} now")
     return differences
 

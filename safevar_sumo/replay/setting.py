@@ -140,11 +140,7 @@ def answer_of_setting(
 
     # The verdict; of a matrix with the points at which it fails.
     verdict = [simulation.no_verdict, *_verdict(simulation, len(system.matrix))]
-    if system.rater is not None:
-        verdict.append(
-            f"The command `rating` simulates all {len(system.matrix)} cells and variations."
-        )
-    elif system.matrix:
+    if system.matrix:
         tables["points"], failing = _points(study, system, setting)
         is_changed = simulation.setting != simulation.original.setting
         who = "changed" if is_changed else "original"

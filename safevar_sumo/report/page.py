@@ -34,7 +34,7 @@ from safevar_sumo.report.replays import page_commands, replays
 from safevar_sumo.report.sections import ReportedStudy, tested, trust
 from safevar_sumo.report.sheet import sheet_of, speeds_of, with_speed
 from safevar_sumo.report.texts import answer_about, completed, parse_question
-from safevar_sumo.results import choose_handle, read_manifest, write_whole
+from safevar_sumo.results import read_manifest, write_whole
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
@@ -140,7 +140,7 @@ def report(
     key = f"report {paths} {point} {ask} {unsafe} {quick}"
     with open_progress(progress) as show, keep_simulations(key, fresh=fresh), ExitStack() as stack:
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
-        asked = [alone if ask else usual_questions(case, point) for case in by_criterion]
+        asked = [alone if ask else usual_questions(case) for case in by_criterion]
         texts = [*chain(*map(with_speed_part, asked, by_criterion)), *joint]
         budgets = _budgets(cases, at_point, by_criterion, asked, joint, simulations)
         pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
@@ -257,16 +257,8 @@ def _later_changes(
     return later_changes
 
 
-def usual_questions(case: Case, point: str | None = None) -> list[str]:
-    """The questions of a page about results; that of a rated study is about its points, with the
-    variant that loses some by the fewest changes. A simulator has no time for the smallest changes.
-    """
-    # A rating of the worst solution.
-    if case.study.is_rated and point is None:
-        any_unsafe = case.unsafe.rows(case.solutions).any()
-        handle = choose_handle(case.solutions, case.unsafe, "fewest") if any_unsafe else None
-        return [f"rating --solution {handle}" if handle else "rating"]
-
+def usual_questions(case: Case) -> list[str]:
+    """The questions of a page about results; a simulator has no time for the smallest changes."""
     can_repair = case.study.repair.promise or case.study.limits
     left_out = SMALLEST if assemble(case.study).mover.takes_long else ""
     questions = [text for text in USUAL_QUESTIONS if text != left_out]

@@ -163,7 +163,7 @@ def _records(frame: pd.DataFrame) -> list[dict[Any, Any]]:
 
 
 def speeds_of(case: Case) -> Span | None:
-    """The speeds of a study; None if it varies none, or is rated."""
+    """The speeds of a study; None if it varies none."""
     try:
         return span_of(case.study, None)
     except InputError:
@@ -192,7 +192,7 @@ def _greatest_speed(
 
 def _is_relative(case: Case, unsafe: Unsafe) -> bool:
     """Whether a criterion compares vehicles with the original one: the default where nothing
-    collides, and in a rated study.
+    collides.
     """
     is_default = case.stated is None and not case.study.unsafe.criterion
     return is_default and not unsafe.is_collision and unsafe == case.unsafe

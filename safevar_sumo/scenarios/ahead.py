@@ -212,7 +212,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
 
     Notes
     -----
-    Robustness layers in the words of Euro NCAP's calculator (euroncap-rating-2026 5.4.9): "-2
+    Robustness layers in the words of Euro NCAP's calculator (version 5.4.9): "-2
     m/s^2" is an acceleration, hence a `target_deceleration` of 6; "+0.5s time headway" is a
     `headway` of 1.5 s; a rotation around the impact point is a `heading`.
     """

@@ -178,7 +178,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     along the lane.
 
     Where the protocol leaves a choice, this class follows Euro NCAP's calculator
-    (euroncap-rating-2026 5.4.9). `target_speed`, `start_share` and `heading` express its robustness
+    (version 5.4.9). `target_speed`, `start_share` and `heading` express its robustness
     layers. Assumptions where the calculator leaves a choice too:
 
     - With every layer the target still arrives at the impact location.

@@ -53,7 +53,7 @@ def with_ranges(study: Study) -> Study:
     """The study whose vehicles meet any encounter in the ranges of its axes; itself if none of them
     has a range.
     """
-    if study.encounters == RANGES or study.is_rated:
+    if study.encounters == RANGES:
         return study
     tables = _with_declared({**tables_of(study), "encounters": RANGES}, study.origin.places)
     tests = tables.get("matrix", {}).get("tests", [])

@@ -10,7 +10,6 @@ from typing import Literal, NamedTuple
 Part = Literal[
     "a driving system",
     "a picture",
-    "a robot",
     "a trace",
     "SUMO",
     "recorded scenes",
@@ -65,7 +64,6 @@ class Mover(NamedTuple):
 
 
 OF_SUMO: Mapping[Part, str] = {
-    "a robot": "SUMO drives the tests of a rating",
     "SUMO": "it takes no other engine",
     "recorded scenes": "its own simulator moves the vehicle",
     "roads": "it has no road to export",

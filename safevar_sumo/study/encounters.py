@@ -122,7 +122,7 @@ class Weather(Table, frozen=True, kw_only=True):
     depth on the road [mm], whose effect the vehicle `worn` computes: it takes `road_friction` as
     the grip of the same road when dry. `recognition_delay` is the additional time that the sensors
     need to recognise a road user [s], for every ADS; the reaction time of an ADS is one of its
-    parameters. `light` decides only whether a rating darkens the weather for its tests by night.
+    parameters. `light` is a label.
     """
 
     name: str
@@ -191,22 +191,16 @@ def at_values(test: MatrixTest, values: Mapping[str, Any]) -> MatrixTest:
 
 
 class MatrixTable(Table, frozen=True, kw_only=True):
-    """The test points at which every setting is simulated: those of `tests`, or all cells of a
-    `protocol`, which then rates every setting.
+    """The `tests` at whose points every setting is simulated.
 
     `aggregate` says at which point a setting counts: `worst` at that with the lowest safety degree,
     `drac >` at that with the largest value of this metric, `ttc_min <` with the smallest.
     """
 
-    tests: list[MatrixTest] = []
-    protocol: Literal["", "euro_ncap_2026"] = ""
+    tests: Annotated[list[MatrixTest], Meta(min_length=1)]
     aggregate: Annotated[str, Meta(pattern=r"^(worst|[A-Za-z][A-Za-z0-9_]{0,63} [<>])\Z")] = WORST
 
     def __post_init__(self) -> None:
-        if bool(self.tests) == bool(self.protocol):
-            raise mistake(
-                f"{len(self.tests)} tests and protocol = {self.protocol!r}", "tests, or a protocol"
-            )
         if self.aggregate != BY_EXCESS and any(test.allowed_impact_speed for test in self.tests):
             problem = f"aggregate = {self.aggregate!r}, and a test allows an impact"
             raise mistake(problem, f"{BY_EXCESS!r}, or no allowed_impact_speed")
@@ -235,9 +229,6 @@ class Encounters(Table, frozen=True, kw_only=True):
         """Refuse axes that something else sets, too, and what is about ranges without any."""
         axes = [pair for _, own in self._axes_by_test for pair in own.items()]
         for name, axis in axes:
-            if self.matrix is not None and self.is_rated:
-                problem = f"over.{name}: the cells of {self.matrix.protocol} are fixed"
-                raise InputError("", problem, "matrix.tests")
             if name in characteristics:
                 problem = f"over.{name}: a characteristic of the vehicle has this name"
                 raise InputError("", problem, "a unique name")
@@ -263,13 +254,8 @@ class Encounters(Table, frozen=True, kw_only=True):
 
     @property
     def tests(self) -> list[MatrixTest]:
-        """The tests of the matrix; none without one, and in that of a protocol."""
+        """The tests of the matrix; none without one."""
         return [] if self.matrix is None else self.matrix.tests
-
-    @property
-    def is_rated(self) -> bool:
-        """Whether settings are rated: in all cells of a protocol."""
-        return self.matrix is not None and bool(self.matrix.protocol)
 
     @property
     def axes(self) -> set[str]:
@@ -304,11 +290,9 @@ class Encounters(Table, frozen=True, kw_only=True):
 
     @property
     def states_ranges(self) -> bool:
-        """Whether an axis has a range beside or without listed values; the cells of a protocol are
-        fixed.
-        """
+        """Whether an axis has a range beside or without listed values."""
         axes = [axis for _, own in self._axes_by_test for axis in own.values()]
-        return not self.is_rated and any(axis.range for axis in axes)
+        return any(axis.range for axis in axes)
 
     @property
     def ranges(self) -> dict[str, Domain]:
@@ -373,5 +357,5 @@ class Encounters(Table, frozen=True, kw_only=True):
             for one in self.constraints
             if not one.tests or names & {*one.tests}
         ]
-        matrix = replace(self.matrix, tests=[*tests], protocol="")
+        matrix = replace(self.matrix, tests=[*tests])
         return replace(self, matrix=matrix, constraints=constraints)

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 from safevar_sumo.study.encounters import Parameters, Weather
 from safevar_sumo.study.marks import (
-    OF_MATRIX,
     OF_SCENARIO,
     OF_STUDY,
     OF_SYSTEM,
@@ -55,7 +54,6 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     ]
     marks = [OF_SYSTEM] if parts else []
     marks += [OF_VEHICLE_AND_ADS] if {"vehicle", "ads"} & {*parts} else []
-    marks += [OF_MATRIX] if "matrix" in parts else []
     for key in {key for mark in marks for key in keys_with(mark, Study)} - overrides.keys():
         tables.pop(key, None)
 
@@ -80,11 +78,8 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
 
 def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:
     """A table [scenario] that a study inherits: of another weather without the axes of its
-    parameters, and for the cells of a protocol, which are fixed, without any.
+    parameters.
     """
-    matrix = overrides.get("matrix")
-    if isinstance(matrix, dict) and matrix.get("protocol"):
-        return {key: value for key, value in scenario.items() if key not in ("over", "margin")}
     names = scenario["over"].keys() - (WEATHER if "weather" in overrides else ())
     return {
         **scenario,

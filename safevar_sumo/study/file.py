@@ -45,17 +45,21 @@ ENDED_KEYS = {
     "wider": "no such key: limits are tried in the ranges of their own study",
     "matrix.point": "--point",
     **dict.fromkeys(("scenario.file", "scenario.values", "scenario.ego"), RECORDED),
+    "matrix.protocol": "[[matrix.tests]], as in euro_ncap_pedestrian and euro_ncap_car_to_car",
+    "rating": "no such table: Euro NCAP's own calculator computes points",
 }
 """Keys that studies had, and what stands in their place."""
+_IN_RANGES = 'with --ranges or encounters = "ranges"'
 ENDED_STUDIES = {
-    "wear_joint": "wear",
-    "wear_fleet": "wear",
-    "sun_joint": "sun",
-    "alks_joint": "alks at --point cut_in",
-    "alks_joint_cut_out": "alks at --point cut_out",
-    "alks_joint_following": "alks at --point following",
+    "wear_joint": f"wear, {_IN_RANGES}",
+    "wear_fleet": f"wear, {_IN_RANGES}",
+    "sun_joint": f"sun, {_IN_RANGES}",
+    "alks_joint": f"alks at --point cut_in, {_IN_RANGES}",
+    "alks_joint_cut_out": f"alks at --point cut_out, {_IN_RANGES}",
+    "alks_joint_following": f"alks at --point following, {_IN_RANGES}",
+    "euro_ncap_rating": "euro_ncap_pedestrian or euro_ncap_car_to_car, Euro NCAP's tests",
 }
-"""Shipped studies that are a part of another one now."""
+"""Shipped studies of earlier releases, and what stands in their place."""
 
 
 def study_names() -> list[str]:
@@ -81,9 +85,8 @@ def study_path(study: str) -> Path:
     if os.path.exists(study):
         return Path(study)
     if study in ENDED_STUDIES:
-        problem = f"{study!r} is the ranges of another study now"
-        legal = f'{ENDED_STUDIES[study]}, with --ranges or encounters = "ranges"'
-        raise InputError("study", problem, legal)
+        problem = f"{study!r} is a study of releases before 0.5"
+        raise InputError("study", problem, ENDED_STUDIES[study])
     problem = f"there is no study or file {study!r}"
     names = study_names()
     legal = f"the path of a study file (TOML), or {one_of(names)}"
@@ -144,7 +147,7 @@ def checked_study(raw: StudyTables) -> Study:
     tables = dict(raw.tables)
     matrix = tables.get("matrix")
     vehicle = tables.get("vehicle")
-    if isinstance(matrix, dict) and matrix.get("tests") == [] and not matrix.get("protocol"):
+    if isinstance(matrix, dict) and matrix.get("tests") == []:
         del tables["matrix"]  # of a study that it extends
     if isinstance(vehicle, dict) and "model" in vehicle and "characteristics" not in vehicle:
         raise _without_characteristics(vehicle["model"])
@@ -158,10 +161,6 @@ def checked_study(raw: StudyTables) -> Study:
     # Records, and what concerns several of them.
     study = convert_table(tables, Study)
     study.check_axes(study.vehicle.characteristics)
-    if study.rating.claims and not study.is_rated:
-        raise InputError(
-            "", "rating.claims: the study is not rated", "matrix.protocol, or no claims"
-        )
     for name in study.spread:
         locate_parameter(msgspec.to_builtins(study), name)
     return replace(study, origin=raw.origin)

@@ -32,8 +32,6 @@ OF_VEHICLE_AND_ADS = _mark("of vehicle and ADS")
 """It is about parameters of both: a study in which one of them differs does not inherit it."""
 OF_SCENARIO = _mark("of scenario")
 """It is about one scenario: a study that names another one does not inherit it."""
-OF_MATRIX = _mark("of matrix")
-"""It is about one matrix: a study with another one does not inherit it."""
 OF_STUDY = _mark("of study")
 """It is about one study: no other one inherits it."""
 WHOLE = _mark("whole")

@@ -27,8 +27,6 @@ from safevar_sumo.study.characteristics import (
 )
 from safevar_sumo.study.encounters import Encounters, MatrixTest, ModelTable, Parameters
 from safevar_sumo.study.marks import (
-    OF_MATRIX,
-    OF_SCENARIO,
     OF_STUDY,
     OF_SYSTEM,
     OF_VEHICLE_AND_ADS,
@@ -140,14 +138,6 @@ def label_of(algorithm: str) -> str:
     )
 
 
-class RatingTable(Table, frozen=True, kw_only=True):
-    """A manufacturer's `claims` for a rating: for each test, the robustness layers that cannot be
-    simulated here, such as glare.
-    """
-
-    claims: dict[str, list[str]] = {}
-
-
 class UnsafeTable(Table, frozen=True, kw_only=True):
     """What a study calls unsafe, unless `--unsafe` says otherwise: a `criterion` as of that option,
     its `source`, such as a regulation, and the parts of this source that are `not_simulated`.
@@ -195,21 +185,21 @@ class Study(Encounters, frozen=True, kw_only=True):
     """A complete study, as in its TOML file; `load_study` reads one.
 
     `title` is its heading, `weather` a shipped weather by its name, or a table; `matrix` are the
-    test points at which the study is simulated, if there are several; `rating` are the user's
-    claims for a rating; `step_length` is the simulation's time step [s], by default the time step
-    in the network's options; `published` are the original vehicle's metrics in the published study,
-    by name, as far as known; `repeatability` are standard deviations of repeats of one setting in
-    the published study; `spread` are sets of values of parameters, by their keys in the file, such
-    as `ads.parameters.corridor`, that fit the published data equally well, a list for each
-    parameter, the study's own value first; `model_error` is the model's further error, by metric,
-    for a vehicle that differs from the original by the full width of a domain; `variation` and
-    `correlations` state how characteristics vary in the world, by name: uniformly by default;
-    `constraints` are conditions that the characteristics of one vehicle satisfy together; `limits`
-    are the values, by name, up to which characteristics may wear in service; `unmeasured` are the
-    values, by name, of characteristics that were not measured in a vehicle, each a number or a
-    table: a study that extends this one does not inherit them; `repair` states what a repair of the
-    ADS may change; `encounters` says what vehicles meet: the listed `tests`, or with `ranges` any
-    encounter in the ranges of the axes, beside the vehicle; `unsafe` is what the study calls so.
+    test points at which the study is simulated, if there are several; `step_length` is the
+    simulation's time step [s], by default the time step in the network's options; `published` are
+    the original vehicle's metrics in the published study, by name, as far as known; `repeatability`
+    are standard deviations of repeats of one setting in the published study; `spread` are sets of
+    values of parameters, by their keys in the file, such as `ads.parameters.corridor`, that fit the
+    published data equally well, a list for each parameter, the study's own value first;
+    `model_error` is the model's further error, by metric, for a vehicle that differs from the
+    original by the full width of a domain; `variation` and `correlations` state how characteristics
+    vary in the world, by name: uniformly by default; `constraints` are conditions that the
+    characteristics of one vehicle satisfy together; `limits` are the values, by name, up to which
+    characteristics may wear in service; `unmeasured` are the values, by name, of characteristics
+    that were not measured in a vehicle, each a number or a table: a study that extends this one
+    does not inherit them; `repair` states what a repair of the ADS may change; `encounters` says
+    what vehicles meet: the listed `tests`, or with `ranges` any encounter in the ranges of the
+    axes, beside the vehicle; `unsafe` is what the study calls so.
     """
 
     # A key without the mark WITHOUT_EFFECT is part of the identity of results.
@@ -219,7 +209,6 @@ class Study(Encounters, frozen=True, kw_only=True):
     ads: Annotated[ModelTable, PART_OF_SYSTEM] = ModelTable(model="")
     metrics: MetricsTable
     search: SearchTable
-    rating: Annotated[RatingTable, OF_SCENARIO, OF_MATRIX] = RatingTable()
     step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
     published: Annotated[dict[str, float], WITHOUT_EFFECT, OF_SYSTEM, WHOLE] = {}
     repeatability: Annotated[

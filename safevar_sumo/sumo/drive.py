@@ -14,7 +14,6 @@ from safevar_sumo.ads import Ads, FullBrake
 from safevar_sumo.ads.varied import with_tau
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import check_open_runs, open_rows
-from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.records import (
     STANDSTILL,
     TIME_DECIMALS,
@@ -32,6 +31,7 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.scenarios import VUT, Point, Scene
 from safevar_sumo.sumo.bodies import FirstContacts, VehicleStates, VehicleWorld
+from safevar_sumo.sumo.driving_robot import DrivingRobot
 from safevar_sumo.sumo.perception import Observer, Perception, SceneObserver, per_vehicle
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController

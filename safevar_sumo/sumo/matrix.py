@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import UserCodeError
-from safevar_sumo.metrics import RATING_POINTS, STOPPING_DISTANCE
-from safevar_sumo.protocol.rater import join_cells, rated_quantities
+from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.records import (
     Evaluations,
     FloatArray,
@@ -190,30 +189,21 @@ def _beside(
     return vehicles, np.arange(0, 2 * n, 2), np.arange(1, 2 * n, 2)
 
 
-def evaluate_matrix(system: System, settings: FloatArray, *, each: bool = False) -> Evaluations:
-    """Evaluate settings, shape (N, n), at every point: at their worst ones; of a rated study also
-    their rating points.
-
-    With `each`, the evaluations have the rated results at every point, `cells`. Traces are dropped,
-    as they would take gigabytes.
+def evaluate_matrix(system: System, settings: FloatArray) -> Evaluations:
+    """Evaluate settings, shape (N, n), at their worst points. Traces are dropped, as they would
+    take gigabytes.
     """
     # Every point once, in groups.
     results = {
-        result.point.name: (result.evaluations, rated_quantities(result.runs))
-        for result in simulate_points(system, settings)
+        result.point.name: result.evaluations for result in simulate_points(system, settings)
     }
-    at_points, quantities = zip(*(results[point.name] for point in system.points), strict=True)
+    at_points = [results[point.name] for point in system.points]
 
-    # The worst point of each setting, and what a rating earns.
-    cells = join_cells(quantities)
+    # The worst point of each setting.
     numbers = worst_points(system, at_points)
     rows = numbers * len(settings) + np.arange(len(settings))
     evaluations = Evaluations.concatenate(at_points).take(rows)
-    evaluations = replace(evaluations, worst_points=numbers)
-    if system.rater is not None:
-        metrics = {**evaluations.metrics, RATING_POINTS.name: system.rater.points(cells).total}
-        evaluations = replace(evaluations, metrics=metrics)
-    return replace(evaluations, cells=cells) if each else evaluations
+    return replace(evaluations, worst_points=numbers)
 
 
 def settings_per_batch(system: System) -> int:

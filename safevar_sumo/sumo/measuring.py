@@ -15,7 +15,6 @@ from safevar_sumo.metrics import (
     METRICS,
     OBJECTIVES,
     OPTIONAL_METRICS,
-    RATING_POINTS,
     STOPPING_DISTANCE,
     UNSAFE_SHARE,
     Measure,
@@ -65,11 +64,7 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         If a measure does not exist, is invalid, or has a name that is taken.
     """
     # Metrics that the study has anyway.
-    further = (
-        (RATING_POINTS, study.is_rated),
-        (STOPPING_DISTANCE, has_stops),
-        (UNSAFE_SHARE, study.scenario.repeats > 1),
-    )
+    further = ((STOPPING_DISTANCE, has_stops), (UNSAFE_SHARE, study.scenario.repeats > 1))
     computed = {
         **METRICS,
         **{metric.name: metric for metric, is_computed in further if is_computed},

@@ -53,7 +53,6 @@ def check_tables(study: Study, mover: Mover) -> None:
         "step_length": study.step_length,
         "spread": study.spread,
         "repair": study.repair.parameters,
-        "matrix.protocol": "" if study.matrix is None else study.matrix.protocol,
         "matrix.tests.weathers": next((test.weathers for test in tests if test.weathers), []),
     }
     for key, value in given.items():

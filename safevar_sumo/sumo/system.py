@@ -15,7 +15,6 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
-from safevar_sumo.protocol.rater import Rater, expand_protocol, rater_of
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import VUT, Point, WorldScenario, weather_of
 from safevar_sumo.scenarios.declared import with_ranges
@@ -53,7 +52,6 @@ class System:
 
     - `source` is the study, as errors name it.
     - `scenes` are the recorded scenes of all points, and of points that it is reduced to.
-    - `rater` rates results in the matrix of a protocol; None in a study that is not rated.
     - `metrics_table` has the thresholds of the metrics in `measuring`.
     - `aggregate` is that of the matrix: the least safety degree, or another measure, decides which
       point is worst.
@@ -76,7 +74,6 @@ class System:
     measuring: Measuring
     region: FeasibleRegion
     source: str = "study"
-    rater: Rater | None = None
     scenes: Scenes = field(default_factory=Scenes)
     time_limit: float = 300.0
     sees_nobody: bool = False
@@ -165,7 +162,7 @@ class System:
     def at(self, point: Point) -> System:
         """The system reduced to one point."""
         alone = point._replace(name="", parameters=(), constraints=())
-        return replace(self, points=(alone,), rater=None)
+        return replace(self, points=(alone,))
 
 
 def simulate_command(study: Study) -> str:
@@ -214,8 +211,7 @@ def _assemble(study: Study) -> System:
     _check_sensors(study, vehicle, ads)
 
     # The points at which settings are simulated, and what is measured there.
-    rater = rater_of(study)
-    matrix = matrix_points(expand_protocol(study, weather), lookup)
+    matrix = matrix_points(study, lookup)
     check_matrix(scenario, matrix)
     scenarios = (scenario, *(point.scenario for point in matrix))
     has_stops = any(member.brakes_fully for member in scenarios)
@@ -248,7 +244,6 @@ def _assemble(study: Study) -> System:
         region=region,
         source=study.source,
         scenes=Scenes(study.step_length),
-        rater=rater,
         time_limit=study.search.time_limit,
         aggregate=WORST if study.matrix is None else study.matrix.aggregate,
         repeats=study.scenario.repeats,

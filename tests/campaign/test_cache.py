@@ -11,7 +11,6 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import diskcache
@@ -22,13 +21,13 @@ from numpy.testing import assert_array_equal
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import batches, cache
 from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all
-from safevar_sumo.campaign.cache import content_of, evaluations_in, keep_simulations, simulate_anew
+from safevar_sumo.campaign.cache import keep_simulations, simulate_anew
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import Use, unload_user_modules
 from safevar_sumo.questions.catalogue import list_models
 from safevar_sumo.questions.sampling import sobol_settings
-from safevar_sumo.records import CellResults, Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -93,8 +92,6 @@ def assert_equal(one: Evaluations, other: Evaluations) -> None:
         assert_array_equal(values, other.results[name])
         assert values.dtype == other.results[name].dtype
     assert_array_equal(one.points, other.points)
-    for mine, theirs in zip(one.cells or (), other.cells or (), strict=True):
-        assert_array_equal(mine, theirs)
 
 
 @pytest.mark.parametrize("name", ["smoke", "alks", "sun"])
@@ -110,18 +107,6 @@ def test_what_was_simulated_is_read_and_is_the_same_to_the_bit(
     assert sum(simulated) == 64
     assert_equal(evaluated(study, settings, fresh=True), first)
     assert sum(simulated) == 128
-
-
-def test_results_in_the_cells_of_a_rating_are_kept_to_the_bit() -> None:
-    """NaN where a test had no impact or no warning."""
-    study = load_study("smoke")
-    rng = np.random.default_rng(3)
-    impact, warning = (np.where(rng.random((4, 9)) < 0.5, np.nan, rng.random((4, 9))) for _ in "ab")
-    evaluations = replace(
-        evaluate_all(study, some_settings(study, 4), InlinePool(), verified=0),
-        cells=CellResults(impact, warning, rng.random((4, 9)) < 0.5),
-    )
-    assert_equal(evaluations_in(content_of(evaluations)), evaluations)
 
 
 def test_what_differs_is_simulated(folder: Path, simulated: list[int]) -> None:

@@ -33,9 +33,9 @@ SMALL = {
 EVERY = [
     name
     for name in study_names()
-    if name not in ("metadrive_expert", "euro_ncap_rating") and (name != "wear_rss" or HAS_AD_RSS)
+    if name != "metadrive_expert" and (name != "wear_rss" or HAS_AD_RSS)
 ]
-"""Studies that need no extra, but for the rated one, which is one of the kinds."""
+"""Studies that need no extra."""
 IN_RANGES = ("wear --ranges", "sun --ranges", "alks --ranges --point cut_in")
 WORN = {"worn": "brakeTorque=0.5", "carla": "tireFric=1", "lgsvl": "tire_friction=0.5"}
 """A car of each vehicle model that may not drive."""
@@ -120,7 +120,6 @@ def test_every_shipped_study_has_answers_or_reasons(words: str) -> None:
         ("tolerance smoke --simulations 200", ""),
         pytest.param("explain smoke --simulations 60", "", marks=SLOW),
         pytest.param("risk smoke --simulations 90", "", marks=SLOW),
-        pytest.param("rating stop", "earns", marks=SLOW),
         ("risk autoware_july --simulations 9", None),
         pytest.param(
             "repair autoware_july --promise brakeTorque>=0.9 --quick", "smallest", marks=SLOW
@@ -136,12 +135,8 @@ def test_the_fastest_questions_answer(typed: str, told: str | None) -> None:
         assert_next_answers(text)
 
 
-RATED = "euro_ncap_rating"
-"""The rated study, about which `tests/rating` asks all questions."""
-KINDS = ("smoke", "autoware_july", RATED, "any_gap", "stop", "rig")
-"""A published study, one with a matrix, a rated one, one in ranges, full braking, and a study of a
-simulator.
-"""
+KINDS = ("smoke", "autoware_july", "any_gap", "stop", "rig")
+"""A published study, one with a matrix, one in ranges, full braking, and a study of a simulator."""
 ANY_GAP = 'extends = "sun"\nname = "any_gap"\nencounters = "ranges"\n'
 KIND = """
 extends = "{}"
@@ -181,10 +176,9 @@ def test_every_question_about_each_kind_of_study_has_an_answer_or_a_reason(name:
     few = FEW.format(260 * (4 if study.ranges or study.matrix else 1))
     first, row = next(iter(study.vehicle.characteristics.items()))
     values = f"{first}={row.original!r}", WORN.get(study.vehicle.model, f"{first}={row.lower!r}")
-    questions = () if name == RATED else QUESTIONS
-    assert_next_answers(*(answered(each.format("results", *values, few=few)) for each in questions))
-    # The usual questions where they take little time: a rating, and none that has an answer.
-    ask = "" if name in (RATED, "stop") else '--ask "rules --samples 16"'
+    assert_next_answers(*(answered(each.format("results", *values, few=few)) for each in QUESTIONS))
+    # The usual questions where they take little time, as none has an answer.
+    ask = "" if name == "stop" else '--ask "rules --samples 16"'
     answered(f"evidence results {ask} --out it.zip", must=True)
     assert json_of("verify", "it.zip", "--run-code")["numbers"]["passed"]
 

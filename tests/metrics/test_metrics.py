@@ -11,7 +11,6 @@ from numpy.random import default_rng
 from scipy import signal
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import (
     F_DIFF,
     F_SAFE,
@@ -22,14 +21,7 @@ from safevar_sumo.metrics import (
     Unsafe,
     impact_in_words,
 )
-from safevar_sumo.records import (
-    NO_CONTACT,
-    Encounter,
-    Evaluations,
-    FloatArray,
-    Outcome,
-    SimulationRuns,
-)
+from safevar_sumo.records import NO_CONTACT, Encounter, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.study import MetricsTable
 from tests.made_up import made_up_evaluations, made_up_runs
 
@@ -168,30 +160,22 @@ def test_reaction_time_begins_with_the_first_sight() -> None:
         assert value("reaction_time", driving(**seen)) == pytest.approx(expected, nan_ok=True)
 
 
-def test_who_collides_is_unsafe_by_every_measure_of_a_run_and_points_are_of_none() -> None:
+def test_who_collides_is_unsafe_by_every_measure_of_a_run() -> None:
     """The third vehicle collides with a measure on the safe side, the fourth without one."""
     nan = np.nan
     columns = {"safety_degree": [1.0, 2.0, -3.0, -1.0, 1.0], "drac": [5.0, 7.0, 1.0, nan, nan]}
-    columns["rating_points"] = [40.0, 30.0, 40.0, 30.0, 35.0]
     runs = made_up_evaluations(
         columns["safety_degree"], metrics={k: np.array(v) for k, v in columns.items()}
     )
     for text, expected in (
         ("drac > 6", [False, True, True, True, False]),
         ("drac < 6", [True, False, True, True, False]),
-        ("rating_points < 35", [False, True, False, True, False]),
-        ("points=35", [False, True, False, True, True]),
         ("below=1.5", [True, False, True, True, True]),
     ):
         criterion = Unsafe.parse(text)
         assert criterion.of(runs).tolist() == expected, text
         assert "collision" in criterion.description or "drac" not in text
         assert (criterion.robustness(runs) < 0).tolist() == expected, text
-        if criterion.is_of_points:
-            left = columns["rating_points"] - np.float64(35)
-            assert criterion.robustness(runs) == pytest.approx(left, abs=1e-8), (
-                "in points, not metres"
-            )
 
 
 def test_a_coarser_sampling_interval_counts_fewer_and_longer_samples() -> None:
@@ -264,25 +248,6 @@ def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
 def test_average_deceleration_is_that_of_the_braking_cycle() -> None:
     assert value("ave_dece", RUN) == pytest.approx(5.0, rel=1e-9)
     assert value("ave_dece", RUN, COARSE) == pytest.approx(5.0)
-
-
-def test_a_vehicle_is_unsafe_from_the_loss_of_one_point_on_which_the_original_must_have() -> None:
-    def earning(*points: float) -> Evaluations:
-        undefined = np.full(len(points), np.nan)
-        return made_up_evaluations(
-            undefined, metrics={"safety_degree": undefined, "rating_points": np.array(points)}
-        )
-
-    changed = earning(40.0, 39.25, 39.0, 38.5)
-    assert Unsafe.default_among(changed, earning(40.0)).of(changed).tolist() == [
-        False,
-        False,
-        True,
-        True,
-    ]
-    assert Unsafe.default_among(changed, earning(1.5)) == Unsafe.parse("points=0.5")
-    with pytest.raises(InputError, match=r"earns 0\.5 points and has none to lose"):
-        Unsafe.default_among(changed, earning(0.5))
 
 
 def test_a_margin_is_the_safety_degree_above_the_limit() -> None:

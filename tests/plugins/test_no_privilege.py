@@ -20,7 +20,6 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.check import trials
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
-from safevar_sumo.protocol.cells import MODELS
 from safevar_sumo.questions.repair.price import benign_scenes
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
@@ -233,21 +232,6 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
     values = system.measuring.scoring.values(found)
     assert_array_equal(values, np.stack([-found.column("tit"), found.f_safe, found.f_diff], axis=1))
     assert not [*trials.try_original(system, drive_all(system, drawn(system, 8, 2)))]
-
-
-@SLOW
-def test_a_rating_of_scenarios_in_a_users_file_is_the_same(
-    in_tmp: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    study = load_study("euro_ncap_rating")
-    own = {prefix: copied(SCENARIOS[model], in_tmp) for prefix, model in MODELS.items()}
-    points = []
-    for models in (MODELS, own):
-        monkeypatch.setattr("safevar_sumo.protocol.cells.MODELS", models)
-        system = assemble(study)
-        points.append(drive_and_score(system, drawn(system, 2, 2)).column("rating_points"))
-    assert_array_equal(*points)
-    assert points[0].max() > 0
 
 
 def test_no_module_asks_whether_something_is_a_shipped_class_of_another_one() -> None:

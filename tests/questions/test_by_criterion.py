@@ -13,7 +13,6 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.by_criterion import STAGE, study_by
 from safevar_sumo.questions.evaluator import Evaluator
@@ -46,19 +45,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, coarse: None) -> Pat
 
 
 @pytest.mark.parametrize(
-    "text", ["collision", "below=0.3", "points=35.0", "drac > 6", "ttc_min <= 1.25", "hardest >= 9"]
+    "text", ["collision", "below=0.3", "drac > 6", "ttc_min <= 1.25", "hardest >= 9"]
 )
 def test_the_text_of_a_criterion_is_the_criterion(text: str) -> None:
     assert str(Unsafe.parse(text)) == text
     assert Unsafe.parse(str(Unsafe.parse(text))) == Unsafe.parse(text)
-
-
-@SLOW
-def test_points_of_a_rating_are_of_no_point_of_its_matrix() -> None:
-    rated = load_study("euro_ncap_rating")
-    assert study_by(rated, Unsafe.parse("rating_points < 35")).matrix == rated.matrix
-    with pytest.raises(InputError, match="study 'wear' has no metric 'rating_points'"):
-        study_by(load_study("wear"), Unsafe.parse("rating_points < 35"))
 
 
 @SLOW

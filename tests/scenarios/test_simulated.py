@@ -480,7 +480,6 @@ def test_versions_belong_to_the_identity_of_results(wall: Path) -> None:
 @pytest.mark.parametrize(
     ("typed", "told"),
     [
-        ("rating wall.toml", "SUMO drives the tests of a rating"),
         ("repair wall.toml --promise all", "nothing of its driving system"),
         ("study wall.toml --engine sumo --out results", "no other engine"),
         ("simulate wall.toml --gui", "no scene for sumo-gui"),

@@ -12,13 +12,13 @@ import pytest
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.protocol.driving_robot import DrivingRobot
 from safevar_sumo.questions.part import at_point
 from safevar_sumo.records import Command, FloatArray, Outcome, SimulationRuns, differences
 from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study
 from safevar_sumo.sumo.bodies import Body, find_touches
+from safevar_sumo.sumo.driving_robot import DrivingRobot
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 from tests.made_up import drawn, original_of

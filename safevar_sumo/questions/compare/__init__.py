@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import about
-from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
@@ -67,7 +67,7 @@ from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES
 from safevar_sumo.questions.words import counted_in_words, join_phrases
 from safevar_sumo.records import Evaluations, JsonObject
-from safevar_sumo.study import SAFETY_DEGREE, limits_of
+from safevar_sumo.study import limits_of
 
 RELEASE, DO_NOT_RELEASE, DECIDE = "RELEASE", "DO NOT RELEASE", "DECIDE"
 MAX_REASONS = 3
@@ -84,7 +84,7 @@ PAIR_COLUMNS: Columns = {
     *("decision", "unsafe", "margin", "settings", *UNSAFE_IN.values(), "p", "a12"),
     *("better_in", "worse_in", "limits_grown", "limits_shrunk", "outside", "not_simulated"),
     *(*ENDS, "metres_earlier", "metres_later"),
-    *(f"{side}_{name}" for side in SIDES for name in ("gap", "needless_braking", "points")),
+    *(f"{side}_{name}" for side in SIDES for name in ("gap", "needless_braking")),
     "benign_scenes",
     lead="summary",
     summary=SUMMARY_COLUMNS,
@@ -123,7 +123,7 @@ def compare(
         Clearance that every vehicle must keep [m], as in `tolerance`; by default the larger one of
         the two studies.
     unsafe
-        What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+        What is unsafe: a collision, or a safety degree below X.
     at_tests
         Limits that hold at the points of the study's tests alone, as in `tolerance`.
     """
@@ -143,19 +143,19 @@ def compare(
     pairs, outside = pairs_of((subject, other), common, criteria, evaluator.at_most(samples, 6))
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
-    tested = _test(settings, valid, evaluators)
+    tested = _test(settings, valid)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
     titles = ("A", "B") if study.name == second.study.name else (study.name, second.study.name)
     table = _table(common, settings)
 
-    # What differs: settings, limits, the original vehicles, safety degrees or points.
+    # What differs: settings, limits, the original vehicles, safety degrees.
     alone = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
     of_originals, of_new_cars = compare_originals(evaluators, originals, criteria, titles[0])
     differences = [
         *of_new_cars,
         *compare_counts(counts, titles[0]),
         *compare_limits(alone),
-        *compare_values(tested.quantity, tested.p, tested.a12),
+        *compare_values(tested.p, tested.a12),
     ]
     decided, why = _decide(differences, titles, of_originals)
     numbers: JsonObject = {
@@ -164,7 +164,7 @@ def compare(
         **_numbers(criteria[0], counts, tested, alone["change"], pairs, outside),
         **of_originals,
     }
-    summary = summary_of(numbers, tested.pairs, tested.quantity, titles)
+    summary = summary_of(numbers, tested.pairs, titles)
     sentences = [
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
         why,
@@ -232,16 +232,14 @@ def _criteria(
 def _default_criterion(
     subjects: Sequence[Subject], evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]
 ) -> Unsafe:
-    """A collision if any vehicle of either system collides, else a safety degree; points only if
-    both are rated.
-    """
+    """A collision if any vehicle of either system collides, else a safety degree."""
     defaults = list[Unsafe]()
     for subject, evaluator, original in zip(subjects, evaluators, originals, strict=True):
         default = evaluator.choose_criterion(None, subject, original)
         if default == Unsafe():
             return default
         defaults.append(default)
-    return next((default for default in defaults if not default.is_of_points), defaults[0])
+    return defaults[0]
 
 
 def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]) -> pd.DataFrame:
@@ -278,26 +276,21 @@ def _table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
 
 
 class _PairedTest(NamedTuple):
-    """The p-value and A12 of a test in pairs, the table of the pairs, what they are, and of which
-    quantity.
-    """
+    """The p-value and A12 of a test in pairs, the table of the pairs, and what they are."""
 
     p: float
     a12: float
     pairs: pd.DataFrame
     unit: str
-    quantity: str
 
 
-def _test(settings: pd.DataFrame, runs: Pairs, evaluators: Sequence[Evaluator]) -> _PairedTest:
-    """Test the safety degree in A and B, or the points if both are rated, in pairs.
+def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
+    """Test the safety degree in A and B in pairs.
 
     A pair is the mean over the solutions of a run or, if there are fewer runs than the test needs,
     over the settings that were drawn on a line.
     """
-    are_rated = all(side.study.is_rated for side in evaluators)
-    metric = RATING_POINTS.name if are_rated else SAFETY_DEGREE
-    a, b = (run.column(metric) for run in runs.runs)
+    a, b = (run.f_safe for run in runs.runs)
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
     pairs = frame[frame["source"] == SAMPLE].groupby(LINE)[[*SIDES]].mean()
     names = [f"line {int(line)}" for line in pairs.index]
@@ -312,10 +305,9 @@ def _test(settings: pd.DataFrame, runs: Pairs, evaluators: Sequence[Evaluator]) 
     sides = pairs.to_numpy(dtype=float).T
     p = signed_rank_test(*sides).p_value
     a12 = compare_samples(*sides).effect_size
-    quantity = "rating" if are_rated else "safety degree"
     rows = pairs.reset_index(drop=True).assign(pair=names)
-    table = tabulate(f"Pairs that are tested: mean {quantity}", PAIR_COLUMNS, rows)
-    return _PairedTest(p, a12, table, unit, quantity)
+    table = tabulate("Pairs that are tested: mean safety degree", PAIR_COLUMNS, rows)
+    return _PairedTest(p, a12, table, unit)
 
 
 def _decide(
@@ -358,7 +350,7 @@ def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
     if np.isnan(tested.p):
         return "There is no pair of results to test."
     return (
-        f"A signed-rank test of the {tested.quantity} over {len(tested.pairs)} {tested.unit} gives"
+        f"A signed-rank test of the safety degree over {len(tested.pairs)} {tested.unit} gives"
         f" p = {tested.p:.2g}. The value of {titles[0]} is the larger one with a probability of"
         f" {tested.a12:.2f} (A12)."
     )

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.compare.settings import within
@@ -71,9 +71,7 @@ class Difference(NamedTuple):
     weight: int = SAFETY
 
 
-def summary_of(
-    numbers: JsonObject, pairs: pd.DataFrame, quantity: str, titles: Sequence[str]
-) -> pd.DataFrame:
+def summary_of(numbers: JsonObject, pairs: pd.DataFrame, titles: Sequence[str]) -> pd.DataFrame:
     """The table of what is compared: the new car, changed cars, needless braking, and limits."""
     both = numbers["both"]
     values: JsonObject = {
@@ -81,7 +79,7 @@ def summary_of(
         f"unsafe of {numbers['settings']} changed vehicles": [
             numbers[f"only_{side}_unsafe"] + both for side in SIDES
         ],
-        f"changed vehicles: mean {quantity}": pairs[[*SIDES]].mean(),
+        "changed vehicles: mean safety degree": pairs[[*SIDES]].mean(),
         f"needless braking in {numbers['benign_scenes']} benign scenes": [
             numbers[f"{side}_needless_braking"] for side in SIDES
         ],
@@ -111,14 +109,12 @@ def compare_counts(counts: Mapping[str, int], a: str) -> list[Difference]:
     return [one for one, count in zip(found, (only_a, only_b), strict=True) if count]
 
 
-def compare_values(quantity: str, p: float, a12: float) -> list[Difference]:
-    """A significant difference of the safety degree, or of the rating, over all pairs; p is NaN
-    without pairs.
-    """
+def compare_values(p: float, a12: float) -> list[Difference]:
+    """A significant difference of the safety degree over all pairs; p is NaN without pairs."""
     if not p < ALPHA:
         return []
     is_better = a12 < 0.5
-    return [Difference(f"has a {'higher' if is_better else 'lower'} {quantity}", is_better)]
+    return [Difference(f"has a {'higher' if is_better else 'lower'} safety degree", is_better)]
 
 
 def limits_of_both(
@@ -204,14 +200,13 @@ def compare_originals(
     """How both original vehicles end, how often they brake needlessly, and how much earlier B's
     brakes: the numbers, and what they say.
     """
-    # How both end, brake, and are rated.
+    # How both end and brake.
     in_a, in_b = (
         bool(unsafe.of(original)[0]) for unsafe, original in zip(criteria, originals, strict=True)
     )
     braking = _needless_braking(*evaluators)
-    points = _points(evaluators, originals)
     ends = _ends_of_originals(evaluators, originals)
-    numbers = {**ends, **braking, **points, **_metres_earlier(*evaluators)}
+    numbers = {**ends, **braking, **_metres_earlier(*evaluators)}
 
     # What differs, and in whose favour.
     found = _new_collisions(evaluators, a)
@@ -219,9 +214,6 @@ def compare_originals(
         of_b, of_a = ("unsafe", "safe") if in_b else ("safe", "unsafe")
         phrase = f"is {of_b} even with the original vehicle, which is {of_a} in {a}"
         found.append(Difference(phrase, is_better=in_a))
-    if points and points["a_points"] != points["b_points"]:
-        phrase = f"earns {points['b_points']:.4g} points, where {a} earns {points['a_points']:.4g}"
-        found.append(Difference(phrase, is_better=points["b_points"] > points["a_points"]))
     before, after, scenes = braking.values()
     if before != after:
         phrase = f"brakes needlessly in {after} of {scenes} benign scenes, {a} in {before}"
@@ -262,16 +254,6 @@ def _new_collisions(evaluators: Sequence[Evaluator], a: str) -> list[Difference]
     return [Difference(f"{collision}, where that of {a} does not collide{more}", False, COLLISION)]
 
 
-def _points(evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]) -> JsonObject:
-    """The rating points of both original vehicles; empty unless both studies are rated."""
-    if not all(side.study.is_rated for side in evaluators):
-        return {}
-    return {
-        f"{side}_points": float(original.column(RATING_POINTS.name)[0])
-        for side, original in zip(SIDES, originals, strict=True)
-    }
-
-
 def _ends_of_originals(
     evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]
 ) -> JsonObject:
@@ -307,12 +289,11 @@ def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
 
 def _metres_earlier(a: Evaluator, b: Evaluator) -> JsonObject:
     """By how much B's original vehicle begins to brake earlier, and later, where the difference is
-    largest [m]; None in rated studies, in other scenarios than A's, and where either does not
-    brake.
+    largest [m]; None in other scenarios than A's, and where either does not brake.
     """
     metres = np.empty(0)
     is_same_scenario = (a.study.scenario, a.study.matrix) == (b.study.scenario, b.study.matrix)
-    if is_same_scenario and not a.study.is_rated:
+    if is_same_scenario:
         metres = _onset_places(a) - _onset_places(b)
         metres = metres[np.isfinite(metres)]
     if not len(metres):

@@ -124,7 +124,7 @@ def explain(
         Handle of a solution, such as nsga2:3:0; may be repeated. By default those with
         the fewest and the smallest changes, the most severe one, and one of each distinct cause.
     unsafe
-        What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+        What is unsafe: a collision, or a safety degree below X.
     of_study
         Explain the study of results as if it had none: the smallest changes, and vehicles sampled
         over the domain.

@@ -11,7 +11,6 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.protocol.rater import UNKNOWN as UNKNOWN_COLOUR
 from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.causes import (
     Cause,
@@ -28,7 +27,7 @@ from safevar_sumo.records import Evaluations, FloatArray, TextArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.encounters import worst_points
-from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
+from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System
 
 Reasons = dict[int, str]
@@ -41,10 +40,8 @@ REQUESTED = "requested"
 """The reason for explaining a solution that the user names."""
 DISTINCT_CAUSE = "a cause of its own"
 """The reason for choosing the simplest failure with a cause that no other chosen failure has."""
-SAMPLED_SETTINGS, RATED_SAMPLED_SETTINGS = 4096, 64
-"""Number of settings drawn from the whole domain if there are no results, in an unrated and in a
-rated study.
-"""
+SAMPLED_SETTINGS = 4096
+"""Number of settings drawn from the whole domain if there are no results."""
 SAMPLED_SIMULATIONS, LEAST_SAMPLED_SETTINGS = 40_000, 1024
 """Number of simulations up to which they are as many, at all points of a matrix, and the least
 number.
@@ -153,8 +150,6 @@ def _drawn_from(study: Study, evaluator: Evaluator) -> Candidates:
     """Settings drawn from a study's whole domain."""
     affordable = SAMPLED_SIMULATIONS // len(evaluator.system.points)
     number = min(SAMPLED_SETTINGS, max(affordable, LEAST_SAMPLED_SETTINGS))
-    if study.is_rated:
-        number = RATED_SAMPLED_SETTINGS
     # Of few simulations most are for the causes of what fails here.
     number = evaluator.at_most(number, 8)
     drawn = evaluator.feasible_settings(number, study.search.seed, feasible_after_filter=True)
@@ -251,8 +246,7 @@ def _failures_that_matter(population: Population) -> Reasons:
 
 PointComparison = tuple[str, tuple[str, ...]]
 """How the runs of the original vehicle and of a failure end at the failure's worst point, in a
-sentence; and the names of the points of a test matrix at which it is unsafe (in a rated study, of
-the cells whose colour is worse than the original's), in the study's order.
+sentence; and the names of the points of a test matrix at which it is unsafe, in the study's order.
 """
 
 
@@ -290,26 +284,4 @@ def compare_at_points(
         comparisons.append(
             (sentence, tuple(filter(None, names)))
         )  # without a matrix, the only point has no name
-    return comparisons
-
-
-def compare_at_cells(evaluator: Evaluator, settings: FloatArray) -> list[PointComparison]:
-    """Compare settings with the original as `compare_at_points` does, for a rated study: at the
-    cell whose colour worsens most.
-
-    An unknown colour is neither better nor worse.
-    """
-    system = evaluator.system
-    original = evaluator.characteristics.original
-    assert system.rater is not None
-    cells = evaluator.at_each_point(np.vstack([original, settings]), "cells whose colour is worse")
-    colours = system.rater.points(cells).colours.astype(int)
-    # Steps by which a colour is worse; the original is in row 0.
-    losses = np.where(colours[0] == UNKNOWN_COLOUR, 0, np.maximum(colours[1:] - colours[0], 0))
-    comparisons = []
-    for setting, loss in zip(settings, losses, strict=True):
-        point = system.matrix[int(np.argmax(loss))]
-        evaluations = drive_and_score(system.at(point), np.stack([original, setting]))
-        worse_cells = tuple(system.matrix[index].name for index in np.flatnonzero(loss).tolist())
-        comparisons.append((_endings_in_words(system, point.name, evaluations), worse_cells))
     return comparisons

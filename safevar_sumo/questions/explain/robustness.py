@@ -40,18 +40,13 @@ def draw_neighbours(
     ).reshape(-1, n)
 
 
-def robust_shares(
-    evaluator: Evaluator,
-    settings: FloatArray,
-    unsafe: Unsafe,
-    factors: Sequence[float] = STEP_FACTORS,
-) -> FloatArray:
+def robust_shares(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> FloatArray:
     """The shares of unsafe outcomes among the neighbours of M settings, shape (M, n), with each of
-    `factors` times the study's time step; shape (M, factors).
+    `STEP_FACTORS` times the study's time step; shape (M, factors).
 
     Neighbours are simulated without the filter; those that cannot be simulated do not count.
     """
-    count = NEIGHBOUR_COUNT
+    count, factors = NEIGHBOUR_COUNT, STEP_FACTORS
     if evaluator.account.effort < 1:
         count, factors = LEAST_NEIGHBOURS, factors[:1]
     elif evaluator.left is not None:

@@ -28,10 +28,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_SETTINGS, MAX_RATED_SETTINGS = 12_000, 500
-"""Largest number of settings for the combinations at the ends, and again for the staircase; in a
-study whose settings are rated.
-"""
+MAX_SETTINGS = 12_000
+"""Largest number of settings for the combinations at the ends, and again for the staircase."""
 PARTS, COARSE_PARTS = (32, 8), (8, 4)
 """Parts of the way to the ends, as `boundary.PARTS`; and where few simulations are allowed."""
 NAMED = 3
@@ -85,11 +83,10 @@ class Smallest(NamedTuple):
     @classmethod
     def of(cls, evaluator: Evaluator, unsafe: Unsafe, fits: int) -> Self:
         """Enumerate them within what may be simulated, and see how sure they are."""
-        most = MAX_RATED_SETTINGS if evaluator.study.is_rated else MAX_SETTINGS
         # Of few simulations half enumerate and a third of the others find the staircase, as what is
         # not enumerated cannot be made smaller; the rest says how sure the causes are.
-        at_ends = enumerate_causes(evaluator, unsafe, evaluator.at_most(most, 2))
-        steps = staircase(evaluator, unsafe, at_ends, evaluator.at_most(most, 3))
+        at_ends = enumerate_causes(evaluator, unsafe, evaluator.at_most(MAX_SETTINGS, 2))
+        steps = staircase(evaluator, unsafe, at_ends, evaluator.at_most(MAX_SETTINGS, 3))
         return cls(at_ends, steps, _table(evaluator, unsafe, at_ends.causes, fits))
 
     @property

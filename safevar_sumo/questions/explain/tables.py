@@ -19,13 +19,8 @@ from safevar_sumo.questions.causes import (
 )
 from safevar_sumo.questions.counterexamples import values_as_printed
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.failures import (
-    Population,
-    Reasons,
-    compare_at_cells,
-    compare_at_points,
-)
-from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE, STEP_FACTORS, robust_shares
+from safevar_sumo.questions.explain.failures import Population, Reasons, compare_at_points
+from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE, robust_shares
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.preventability import (
@@ -106,9 +101,7 @@ SOLUTION_COLUMNS: Columns = {
     "ends": Column(
         "", "how the original vehicle and this one end, where this one is worst", is_shown=False
     ),
-    "points": Column(
-        "", "points at which it is unsafe; of a rating, cells whose colour is worse", is_shown=False
-    ),
+    "points": Column("", "points at which it is unsafe", is_shown=False),
     "avoided_by": (
         "weakest reference driver who avoids it in the same vehicle; nobody: unavoidable"
     ),
@@ -137,18 +130,12 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
         return pd.DataFrame(columns=[*SOLUTION_COLUMNS])
 
     # The failures that were chosen.
-    study = evaluator.study
     failures = population.evaluations.take(list(reasons))
     settings = failures.settings
     unsafe = population.unsafe
 
     # How they end beside the original, and who would have avoided the collision.
-    if study.is_rated:  # each neighbour is simulated in all cells
-        factors = STEP_FACTORS[:1]
-        comparisons = compare_at_cells(evaluator, settings)
-    else:
-        factors = STEP_FACTORS
-        comparisons = compare_at_points(evaluator.system, settings, unsafe)
+    comparisons = compare_at_points(evaluator.system, settings, unsafe)
     is_assessed = failures.collided & has_reference_drivers(evaluator)
     assessed = iter(assess_collisions(evaluator, failures.take(is_assessed)).to_dict("records"))
     columns = {
@@ -158,7 +145,7 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
         "safety_degree": failures.f_safe,
         "changed": failures.f_num_diff.astype(int),
         "largest_change": failures.f_diff,
-        "unsafe_neighbours": (robust_shares(evaluator, settings, unsafe, factors).mean(axis=1)),
+        "unsafe_neighbours": robust_shares(evaluator, settings, unsafe).mean(axis=1),
         "ends": [sentence for sentence, _ in comparisons],
         "points": [list(points) for _, points in comparisons],
         "avoided_by": [avoided_by(next(assessed)) if flag else None for flag in is_assessed],
@@ -269,7 +256,7 @@ def sureness(
     many of the first `sets` parameter sets each is one, and how many sets there are.
     """
     robust = np.full(len(causes), np.nan)
-    if causes and not evaluator.study.is_rated:
+    if causes:
         settings = settings_of(evaluator.characteristics, causes)
         robust = robust_shares(evaluator, settings, unsafe).mean(axis=1)
     if not (sets and causes and evaluator.study.spread):

@@ -169,9 +169,6 @@ def span_of(study: Study, by: str | None) -> Span:
         If the study varies no such speed; those that it varies are named.
     """
     study = with_ranges(study)
-    if study.is_rated:
-        problem = f"study {study.name!r} is rated, and drives each test at speeds of its own"
-        raise InputError(study.source, problem, "a study that is not rated")
     tests = points_of_tests(study, assemble(study).points)
 
     # Speeds alone are offered, also those of a simulator or a scenario's file, without a unit.

@@ -113,10 +113,6 @@ def repair(
     """
     study = evaluator.study
     evaluator.system.require("a driving system", "repair")
-    if study.is_rated:
-        text = f"{study.name!r} is rated: a repair takes all its cells for each vehicle and change"
-        legal = "the study without the rating, such as wear for euro_ncap_rating"
-        raise InputError(study.source, text, legal)
     if out is not None and quick:
         legal = "--quick without --out, or --out without --quick"
         raise InputError("quick", f"a rough repair is not written to {out}", legal)

@@ -109,13 +109,7 @@ def needless_braking(system: System, benign: list[Point]) -> list[bool]:
         for points, sees_nobody in ((benign, False), (one_per_speed, True))
         if points
         for result in simulate_all_points(
-            replace(
-                system,
-                points=tuple(points),
-                rater=None,
-                sees_nobody=sees_nobody,
-                characteristics=vehicle,
-            ),
+            replace(system, points=tuple(points), sees_nobody=sees_nobody, characteristics=vehicle),
             vehicle.original[np.newaxis],
         )
     ]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from safevar_sumo.errors import InputError
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
@@ -25,7 +24,6 @@ from safevar_sumo.questions.tolerance.limits import (
     INTERVALS,
     NEAREST,
     OF_BOX,
-    POINTS,
     answer_limits,
     phases_of,
 )
@@ -41,7 +39,6 @@ from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
     intervals=INTERVALS,
     uncertainty=UNCERTAINTY,
     fits=FITS,
-    points=POINTS,
     nearest=NEAREST,
     ranges=IN_RANGES,
 )
@@ -78,7 +75,7 @@ def tolerance(
         bumpers; by default the model's error that the study states, else 0.3 m, and 0.1 m where
         encounters are ranges, whose originals keep more.
     unsafe
-        What is unsafe: a collision, a safety degree below X, or at most X points of a rating.
+        What is unsafe: a collision, or a safety degree below X.
     fits
         Number of parameter sets of the vehicle model (those of [spread]) in which the limits hold,
         by default all; 0 for the study's own alone.
@@ -129,7 +126,4 @@ def tolerance(
     is_safe = not asked.unsafe.of(original)[0]
     if evaluator.left is None or not is_safe:
         return answer_limits(asked)
-    if study.is_rated:
-        problem = "few simulations find no limits of a rating"
-        raise InputError("simulations", problem, "no --simulations")
     return answer_roughly(asked)

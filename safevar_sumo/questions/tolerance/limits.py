@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import RATING_POINTS
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.between import moving_tests
@@ -38,13 +37,7 @@ from safevar_sumo.questions.tolerance.rows import (
     limit_rows,
     uncertainty_rows,
 )
-from safevar_sumo.questions.tolerance.scans import (
-    SCAN_STAGE,
-    SCAN_VALUES,
-    WHOLE_POINT_LOSS,
-    OneAtATimeScan,
-    scan,
-)
+from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES, OneAtATimeScan, scan
 from safevar_sumo.questions.tolerance.together import JointSearch, LimitsTogether, budget_of_set
 from safevar_sumo.questions.tolerance.words import tested_sentences, verdict_sentences
 from safevar_sumo.questions.words import constraints_in_words, counted_in_words
@@ -76,12 +69,6 @@ FITS: Columns = {
     "corners": Column(
         "", "clearance of the worst corner of the joint limits [m], or its value of a metric", ".2f"
     ),
-}
-POINTS: Columns = {
-    **CHARACTERISTIC,
-    "any_lost": Column("", "value nearest to the original that loses points", ".5g"),
-    "first_point_lost": Column("", "value nearest to the original that loses a whole point", ".5g"),
-    "least_points": Column("-", "fewest points anywhere in the domain", ".2f"),
 }
 OF_BOX = (
     *("box", "samples", "failures", "at_most", "not_simulated"),
@@ -116,7 +103,7 @@ class FoundLimits(NamedTuple):
     alone
         The limits of each characteristic alone.
     together
-        The joint limits; None in a rated study, and around an unsafe original.
+        The joint limits; None around an unsafe original.
     """
 
     scans: list[OneAtATimeScan]
@@ -135,8 +122,6 @@ def phases_of(evaluator: Evaluator, columns: int, fits: int | None) -> NamedValu
     study = evaluator.study
     points = len(evaluator.system.points)
     phases = {SCAN_STAGE: float(SCAN_VALUES * columns)}
-    if study.is_rated:
-        return phases
     sets = len(other_sets(study, fits))
     budget = budget_of(evaluator)
     own = USUAL_BOXES * budget / points
@@ -165,21 +150,17 @@ def find_limits(asked: Asked, outer: FoundLimits | None = None) -> FoundLimits:
     """Search limits within outer ones."""
     evaluator = asked.evaluator
     members = evaluator.characteristics
-    # A box of a rated study would take thousands of whole test matrices.
-    is_sought = not evaluator.study.is_rated
-    if is_sought:
-        _check_drawable(evaluator)
-    # Around an unsafe original there is nothing to scan, but points that are lost.
+    _check_drawable(evaluator)
+    # Around an unsafe original there is nothing to scan.
     is_safe = not asked.unsafe.of(asked.original)[0]
-    is_scanned = is_safe or not is_sought
-    within = None if is_scanned else [(members.original[column],) * 2 for column in asked.columns]
-    scans = scan(evaluator, asked.columns, asked.unsafe, within, None if is_scanned else 1)
+    within = None if is_safe else [(members.original[column],) * 2 for column in asked.columns]
+    scans = scan(evaluator, asked.columns, asked.unsafe, within, None if is_safe else 1)
     models = Models((Model(0, evaluator, asked.unsafe),), ())
-    if is_sought and is_safe:
+    if is_safe:
         models = models_of(evaluator, asked.unsafe, asked.fits)
     search_alone = AloneSearch(scans, asked.columns, models.own)
     together = None
-    if is_sought and is_safe:
+    if is_safe:
         outer_box = None if outer is None else outer.together
         together = _find_together(asked, scans, models, search_alone, outer_box)
     else:
@@ -320,8 +301,6 @@ def _tables(found: FoundLimits, rows: Rows, nearest: Rows, in_ranges: Rows) -> F
         tables["fits"] = tabulate(
             "The limits in each parameter set of the vehicle model", FITS, fits
         )
-    if RATING_POINTS.name in scans[0].profile:
-        tables["points"] = tabulate("Points lost by each alone", POINTS, _lost_points(scans))
     if nearest:
         tables["nearest"] = tabulate("Limits that would do", NEAREST, nearest)
     if in_ranges:
@@ -385,17 +364,3 @@ def _fit_rows(models: Models, together: LimitsTogether) -> Rows:
         if model.fit in together.validations
     }
     return [(fit, state, corners.get(fit, np.nan)) for fit, state in sorted(states.items())]
-
-
-def _lost_points(scans: Sequence[OneAtATimeScan]) -> Rows:
-    """A row of `POINTS` for each characteristic."""
-    return [
-        (
-            one.characteristic.name,
-            one.characteristic.unit,
-            one.first_loss(),
-            one.first_loss(WHOLE_POINT_LOSS),
-            one.profile[RATING_POINTS.name].min(),
-        )
-        for one in scans
-    ]

@@ -103,7 +103,7 @@ def limit_rows(
 ) -> LimitRows:
     """The rows of the table of limits, whose sentences carry their scope.
 
-    `together` is None in a rated study, and around an unsafe original. None is called kept where
+    `together` is None around an unsafe original. None is called kept where
     the answer is rough.
     """
     beyond_alone = _failures_alone(alone)

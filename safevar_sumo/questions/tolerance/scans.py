@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.metrics import RATING_POINTS, Unsafe
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.vehicles import Characteristic
 
-SCAN_VALUES, RATED_SCAN_VALUES = 201, 33
-"""Number of values over the domain, besides the original; fewer in a rated study: each takes a
-whole test matrix.
-"""
+SCAN_VALUES = 201
+"""Number of values over the domain, besides the original."""
 PARTS_PER_ROUND = 8
 """Number of parts into which a round divides each interval with a change of state."""
-ROUNDS, RATED_ROUNDS = 4, 1
-"""Number of such rounds; fewer in a rated study."""
-WHOLE_POINT_LOSS = 1 - 1e-6
-"""A loss of more rating points than this counts as a whole point."""
+ROUNDS = 4
+"""Number of such rounds."""
 SCAN_STAGE = "one characteristic at a time"
-POINT_ROUNDING = 1e-9
-"""A loss of at most so many rating points is a rounding error."""
 
 
 class OneAtATimeScan(NamedTuple):
@@ -37,9 +30,9 @@ class OneAtATimeScan(NamedTuple):
     Attributes
     ----------
     profile
-        Columns `value` [unit], `safety_degree` [m, or -m/s], `state` ("safe", "unsafe",
-        "not_simulated" or "infeasible"), and in a rated study `rating_points`, in the order of the
-        values, which are closer together where the state changes.
+        Columns `value` [unit], `safety_degree` [m, or -m/s] and `state` ("safe", "unsafe",
+        "not_simulated" or "infeasible"), in the order of the values, which are closer together
+        where the state changes.
     """
 
     characteristic: Characteristic
@@ -76,15 +69,6 @@ class OneAtATimeScan(NamedTuple):
         """The safety degree at a value of the profile [m, or -m/s]."""
         return float(self.profile.set_index("value")[SAFETY_DEGREE][value])
 
-    def first_loss(self, loss: float = 0.0) -> float:
-        """The value nearest to the original that loses more than `loss` rating points; NaN if no
-        value does.
-        """
-        points = self.profile.set_index("value")[RATING_POINTS.name]
-        original = self.characteristic.original
-        values = points.index[points < points[original] - loss - POINT_ROUNDING]
-        return min(values, key=lambda value: abs(value - original), default=math.nan)
-
 
 def scan(
     evaluator: Evaluator,
@@ -94,16 +78,12 @@ def scan(
     number: int | None = None,
 ) -> list[OneAtATimeScan]:
     """Scan the domains of some characteristics, or intervals within them, one at a time; at
-    `number` values, by default `SCAN_VALUES`, in a rated study `RATED_SCAN_VALUES`.
+    `number` values, by default `SCAN_VALUES`.
     """
     scanned = [evaluator.characteristics.members[column] for column in columns]
-    usual, rounds = (
-        (RATED_SCAN_VALUES, RATED_ROUNDS) if evaluator.study.is_rated else (SCAN_VALUES, ROUNDS)
-    )
-    if evaluator.left is not None:  # a rough answer
-        rounds = 0
+    rounds = ROUNDS if evaluator.left is None else 0  # none for a rough answer
     # All scans together take a sixth of few simulations.
-    number = evaluator.at_most(number or usual, 6 * len(scanned))
+    number = evaluator.at_most(number or SCAN_VALUES, 6 * len(scanned))
     ends = [(item.lower, item.upper) for item in scanned] if within is None else within
     values = [
         np.union1d(np.linspace(*end, number), item.original)
@@ -148,16 +128,8 @@ def _evaluate_profiles(
         ["infeasible", "not_simulated", "unsafe"],
         "safe",
     )
-    points = {
-        name: column for name, column in evaluations.metrics.items() if name == RATING_POINTS.name
-    }
     frame = pd.DataFrame(
-        {
-            "value": np.concatenate(values),
-            SAFETY_DEGREE: evaluations.f_safe,
-            "state": state,
-            **points,
-        }
+        {"value": np.concatenate(values), SAFETY_DEGREE: evaluations.f_safe, "state": state}
     )
     return [
         frame.iloc[rows].reset_index(drop=True) for rows in np.split(np.arange(len(frame)), ends)

@@ -95,9 +95,7 @@ def tested_sentences(models: Models, together: LimitsTogether | None) -> Iterato
         if together.proof is not None:
             bound = bound_in_words(together.proof.at_most).capitalize()
             yield f"{bound} of uniformly sampled vehicles within the limits are unsafe."
-        if not models.own.unsafe.is_of_points and (
-            remark := remark_on_phases(models.own.in_phases)
-        ):
+        if remark := remark_on_phases(models.own.in_phases):
             yield remark
 
 
