@@ -216,7 +216,7 @@ def _check_names(
 ) -> None:
     """Refuse keys of conditions, and a table, that no answer of the command has."""
     names_study = keys and ... in declared.numbers  # as `simulate`
-    named = declared.in_study(names_in_study(values) if names_study else {})
+    named = declared.in_study(names_in_study(values)) if names_study else declared
     for key in keys:
         named.check_key(key)
     if table is not None:
@@ -239,15 +239,12 @@ def _exit_on_failures(answer: Answer, conditions: Sequence[tuple[str, str, float
     click.get_current_context().exit(GATE_EXIT_CODE if failures else code)
 
 
-def names_in_study(values: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Names of what the study of a simulation measures; in the table of a sweep also of its
-    characteristics.
-    """
+def names_in_study(values: Mapping[str, Any]) -> list[str]:
+    """Names of what the study of a simulation measures."""
     from safevar_sumo.sumo import assemble  # takes long to load
 
     study = study_in(study_or_case(values["source"], as_it_is_now=values["as_it_is_now"]))
-    measures = [*assemble(study).measuring.measures]
-    return {"": measures, "sweep": [*measures, *study.domains]}
+    return [*assemble(study).measuring.measures]
 
 
 @contextmanager

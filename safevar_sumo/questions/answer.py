@@ -45,19 +45,10 @@ class Contents(NamedTuple):
     lead: str = ""
     next: str = ""
 
-    def in_study(self, given: Mapping[str, list[str]]) -> Contents:
-        """The names that an answer has with those that a study has `given`, by table; of numbers
-        under "".
-        """
-        tables = {
-            table: [
-                each
-                for name in names
-                for each in (given.get(table, [...]) if name is ... else [name])
-            ]
-            for table, names in {"": self.numbers, **self.tables}.items()
-        }
-        return self._replace(numbers=tables.pop(""), tables=tables)
+    def in_study(self, measures: Collection[str]) -> Contents:
+        """The names that an answer has about a study with these measures."""
+        names = [name for name in self.numbers if name != ...]
+        return self._replace(numbers=[*names, *measures])
 
     def check_key(self, key: str) -> None:
         """Refuse what is no key of `Answer.values`, but for an index; raises an InputError."""

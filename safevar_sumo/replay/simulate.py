@@ -1,11 +1,8 @@
-"""The command `simulate`: one setting of a study beside the original vehicle, or a sweep over
-many.
-"""
+"""The command `simulate`: one setting of a study beside the original vehicle."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -36,7 +33,6 @@ from safevar_sumo.replay.setting import (
     SPREAD,
     answer_of_setting,
 )
-from safevar_sumo.replay.sweep import answer_of_sweep
 from safevar_sumo.results import CHOICES, SOLUTIONS, SolutionId, choose_handle, row_of_handle
 from safevar_sumo.study import PHASE, PHASE_DECIMALS, Study
 from safevar_sumo.sumo.encounters import where_met
@@ -62,12 +58,11 @@ class Target(NamedTuple):
 
 
 @contents(
-    *("solution", "settings", "collisions", *OUTCOME_NAMES, ...),
+    *("solution", *OUTCOME_NAMES, ...),
     characteristics=CHARACTERISTICS,
     results=RESULTS,
     points=POINTS,
     spread=SPREAD,
-    sweep=[*OUTCOME_NAMES, ...],
     remarks=REMARKS,
 )
 def show_simulation(
@@ -97,7 +92,7 @@ def show_simulation(
         the fewest changes, of which as many are undone as it stays unsafe without.
     set
         The value of a characteristic, of an axis of the matrix or of the phase, in its unit, +10%
-        of the original, or a sweep FROM..TO; repeat it for others.
+        of the original; repeat it for others.
     beyond
         Also accept values beyond the domains, and settings that violate a constraint.
     trace
@@ -132,10 +127,11 @@ def show_simulation(
         target = target._replace(study=study)
         values = read_changes(changes, system.characteristics, beyond=beyond)
         if PHASE in values:
-            values[PHASE] = np.round(values[PHASE], PHASE_DECIMALS).tolist()
-        requested = _combine(values, target.setting(system), system)
+            values[PHASE] = round(values[PHASE], PHASE_DECIMALS)
+        before = system.characteristics.named(target.setting(system))
+        requested = np.array([*{**before, **values}.values()])
         if changes and not beyond:  # what a study or results hold has been checked
-            system.region.check(requested, otherwise=", or any with --beyond")
+            system.region.check(requested[np.newaxis], otherwise=", or any with --beyond")
 
     # Files that cannot be written are refused first.
     if trace is not None:
@@ -145,18 +141,9 @@ def show_simulation(
     if animate is not None:
         check_writable(animate, "animate", animation.ENDINGS, but=SOLUTIONS)
 
-    # Several values of a characteristic are a sweep.
-    if any(len(options) > 1 for options in values.values()):
-        if trace or animate or gui or spread:
-            expected = (
-                "one value for each characteristic with --trace, --animate, --gui or --spread"
-            )
-            raise InputError("set", f"{' '.join(changes)} is a sweep", expected)
-        return answer_of_sweep(target.study, system, requested, list(values))
-
     # One setting beside the original vehicle, in the tests that have its encounter.
-    system = _where_met(system, requested[0])
-    simulation = simulate_with_original(target.study, system, requested[0], filtered=False)
+    system = _where_met(system, requested)
+    simulation = simulate_with_original(target.study, system, requested, filtered=False)
     # Results belong to the whole matrix.
     if target.row and "outcome" in target.row and not changes and point is None:
         _warn_of_differences(target, target.row, simulation)
@@ -237,16 +224,6 @@ def _with_set(study: Study, fit: int) -> Study:
         if fit >= len(sets):
             raise InputError("", f"{fit}", f"a number up to {len(sets) - 1}")
     return sets[fit]
-
-
-def _combine(values: dict[str, list[float]], base: FloatArray, system: System) -> FloatArray:
-    """M settings, shape (M, n): `base`, shape (n,), with each of the M combinations of values in
-    turn.
-    """
-    combinations = list(product(*values.values()))
-    settings = np.tile(base, (len(combinations), 1))
-    settings[:, [system.characteristics.names.index(name) for name in values]] = combinations
-    return settings
 
 
 def _warn_of_differences(target: Target, row: JsonObject, simulation: Simulation) -> None:

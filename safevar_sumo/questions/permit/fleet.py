@@ -122,9 +122,7 @@ def read_fleet(
         raise InputError("--others", repr(others), NEW)
     if cars is None:
         with about(TYPED):
-            typed = {
-                name: one for name, (one,) in read_changes(values, vehicle, single=True).items()
-            }
+            typed = read_changes(values, vehicle)
         cells = _cells_of_mapping({THIS_CAR: typed}, TYPED)
     elif isinstance(cars, pd.DataFrame):
         cells = _cells_of_frame(cars)
