@@ -11,7 +11,6 @@ from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
 from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.words import EXACT, change_texts, join_phrases, points_in_words
 from safevar_sumo.records import FloatArray
-from safevar_sumo.replay.safer import why_safer
 from safevar_sumo.results import SolutionId
 from safevar_sumo.scenarios import pre_crash_sentence
 from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE, Study
@@ -73,8 +72,6 @@ OUTCOME_NAMES = (
 """What every study says of a simulation besides its metrics."""
 OF_SEARCH = ("gap", "f_safe", "f_diff", "f_num_diff")
 """Results that say what others say, or that a search minimises."""
-NOT_SAFE = "the original vehicle keeps less than a search demands of it in the same encounter"
-"""Why a setting of a study whose encounters are ranges is in no result."""
 
 
 def _meets(system: System, setting: FloatArray) -> list[str]:
@@ -232,10 +229,12 @@ def _verdict(simulation: Simulation, point_count: int) -> list[str]:
     else:
         verdict = [f"{where} {original}.", f"The {changed}: {comparison}."]
 
-    # Why it looks safer, and why a search leaves this encounter out.
-    verdict += why_safer(simulation)
+    # Why a search leaves this encounter out.
     if least is not None and not simulation.original.metrics[SAFETY_DEGREE] >= least:
-        verdict.append(f"Here {NOT_SAFE}: at least {least:.2f} m.")
+        verdict.append(
+            "Here the original vehicle keeps less than a search demands of it in the same"
+            f" encounter: at least {least:.2f} m."
+        )
     return verdict
 
 

@@ -144,22 +144,6 @@ def test_a_matrix_says_of_how_many_test_cases_a_degree_is_the_least() -> None:
     assert "simulated" not in simulate("wear").stdout
 
 
-@SLOW
-def test_why_a_heavier_car_looks_safer_is_said_from_its_pedals_and_its_frames() -> None:
-    """At 10 km/h a heavy car slows down less at first, and its driving system brakes fully."""
-    heavy = sv.simulate("wear", {"payload": 300})
-    original = heavy.original
-    assert heavy.metrics["safety_degree"] > original.metrics["safety_degree"]
-    brakes = [one.trace["brake [-]"].max() for one in (original, heavy)]
-    said = f"with up to {100 * brakes[1]:.0f} instead of {100 * brakes[0]:.0f} % of the pedal"
-    assert brakes[1] > brakes[0]
-    assert said in simulate("wear", "--set", "payload=300").stdout.replace("\n", " ")
-    lighter = simulate("rain", "--set", "dampRateZeroT_CE=2.5").stdout.replace("\n", " ")
-    assert "arrives more slowly" in lighter
-    assert "harder" not in lighter
-    assert "looks" not in simulate("wear", "--set", "payload=120").stdout
-
-
 def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
     result = simulate(
         "rain",
