@@ -176,14 +176,6 @@ def parameters_outside_sets(study: Study) -> list[str]:
     ]
 
 
-def remarks_on_sets(study: Study) -> list[str]:
-    """A sentence for each of the `parameters_outside_sets`."""
-    return [
-        f"[spread] does not vary {name}: the study's value is not the first of its list"
-        for name in parameters_outside_sets(study)
-    ]
-
-
 def with_values(study: Study, values: NamedValues) -> Study:
     """A study with other values of some parameters, which are named by their keys in the study
     file.

@@ -8,7 +8,6 @@ import pandas as pd
 from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
-from safevar_sumo.questions.model_spread import compute_model_spreads, remarks_on_sets
 from safevar_sumo.questions.words import EXACT, change_texts, join_phrases, points_in_words
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import SolutionId
@@ -50,15 +49,6 @@ POINTS: Columns = {
     "side": Column("", "side of the vehicle that touches", is_shown=False),
     "place": Column("%", "position of the contact along that side", is_shown=False),
 }
-SPREAD: Columns = {
-    "vehicle": "the simulated vehicle or the original",
-    "sets": "parameter sets that fit published data equally well",
-    "lower": Column("m", "lower end of the 90 % band of the safety degree", ".2f"),
-    "upper": Column("m", "its upper end", ".2f"),
-    "collisions": "parameter sets with which it collides",
-}
-
-
 OUTCOME_NAMES = (
     "outcome",
     "collision",
@@ -101,9 +91,7 @@ def _fails(study: Study, result: PointResult) -> bool:
     return bool(evaluations.collided[0] and not is_allowed)
 
 
-def answer_of_setting(
-    system: System, simulation: Simulation, handle: SolutionId | None, *, with_spread: bool
-) -> Answer:
+def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId | None) -> Answer:
     """A setting beside the original: its values, outcome, metrics and objectives, and the points of
     a matrix; of a solution its handle.
     """
@@ -143,16 +131,6 @@ def answer_of_setting(
         who = "changed" if is_changed else "original"
         verdict.append(points_in_words(f"The {who} vehicle", failing, len(system.matrix)))
 
-    # The model's own uncertainty.
-    if with_spread:
-        remarks += remarks_on_sets(study)
-        vehicles = {
-            "simulated": setting,
-            "original": system.characteristics.with_original_vehicle(setting),
-        }
-        bands = compute_model_spreads(study, np.stack([*vehicles.values()]))
-        rows = [(name, *band) for name, band in zip(vehicles, bands, strict=True)]
-        tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
     tables["remarks"] = remark_table(remarks)
     if texts := change_texts(system.characteristics.vehicle, system.characteristics.named(setting)):
         verdict.append(f"Changed: {', '.join(texts)}.")

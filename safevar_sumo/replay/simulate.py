@@ -30,7 +30,6 @@ from safevar_sumo.replay.setting import (
     POINTS,
     REMARKS,
     RESULTS,
-    SPREAD,
     answer_of_setting,
 )
 from safevar_sumo.results import CHOICES, SOLUTIONS, SolutionId, choose_handle, row_of_handle
@@ -62,7 +61,6 @@ class Target(NamedTuple):
     characteristics=CHARACTERISTICS,
     results=RESULTS,
     points=POINTS,
-    spread=SPREAD,
     remarks=REMARKS,
 )
 def show_simulation(
@@ -74,7 +72,6 @@ def show_simulation(
     trace: Path | None = None,
     animate: Path | None = None,
     gui: bool = False,
-    spread: bool = False,
     point: PointName = None,
     ranges: bool = False,
     up_to: UpTo = None,
@@ -102,8 +99,6 @@ def show_simulation(
     gui
         Show both simulations in sumo-gui, one upon the other: the original blue, the changed one
         orange.
-    spread
-        Add the vehicle model's own uncertainty: other parameters that fit published data as well.
     point
         Only this test, or this point, of the study's matrix.
     ranges
@@ -157,7 +152,7 @@ def show_simulation(
         animation.animate(comparison, animate)
     if gui:
         show_in_gui(comparison)
-    answer = answer_of_setting(system, simulation, target.handle, with_spread=spread)
+    answer = answer_of_setting(system, simulation, target.handle)
     return replace(answer, draw=lambda _: draw_comparison(comparison))
 
 
