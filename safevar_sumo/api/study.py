@@ -1,13 +1,11 @@
-"""The command `study`: a search with its summary, what it would take, and how far it is."""
+"""The command `study`: a search with its summary, and how far it is."""
 
 from __future__ import annotations
 
 import re
-import time
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from shlex import quote
 from typing import Annotated, Literal
@@ -15,17 +13,6 @@ from typing import Annotated, Literal
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api.running import load_for_search, run
-from safevar_sumo.campaign import RunKey, all_runs
-from safevar_sumo.campaign.batches import ask_why_no_verdict
-from safevar_sumo.campaign.campaign import (
-    RECORDED,
-    choose_engine,
-    evaluate_original,
-    measure_speed,
-    measure_verification,
-)
-from safevar_sumo.campaign.evaluation import Task
-from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
@@ -56,7 +43,7 @@ from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Study
-from safevar_sumo.sumo import assemble, drive_and_score, settings_per_batch, vehicle_remarks
+from safevar_sumo.sumo import assemble, drive_and_score, vehicle_remarks
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.without_effect import without_effect
@@ -104,7 +91,6 @@ RUN_TESTS = ("rq1-runs", "rq2-runs")
         "original_outcome",
         "original_degree",
     ),
-    *("engine", "evaluations_per_second", "seconds"),
     algorithms=[*ALGORITHMS, ...],
     fewest=CHANGES,
     **{name: TABLES[name].columns for name in RUN_TESTS},
@@ -125,10 +111,8 @@ def study(
     out: Path | None = None,
     jobs: Jobs = None,
     cluster: Annotated[str | None, "ADDRESS"] = None,
-    shard: Annotated[str | None, "K/N"] = None,
     retry_failed: bool = False,
     quiet: bool = False,
-    dry_run: bool = False,
     status: bool = False,
 ) -> Answer:
     """Search a study; run the same command again to continue where it stopped.
@@ -161,43 +145,33 @@ def study(
         Number of worker processes, by default one for each core.
     cluster
         Compute on the workers of this Dask scheduler instead.
-    shard
-        Every N-th run, from the K-th (1..N): for job arrays that share the directory.
     retry_failed
         Simulate again the settings that could not be simulated before (simulator-error).
     quiet
         Print only errors, warnings, and what an output option such as --json asks for.
-    dry_run
-        Estimate the time from a short measurement.
     status
         Show the progress of the study in its directory, without disturbing it.
     """
     as_written = part_of_study(read_study(study), ranges, point, up_to)
     directory = out or Path("results") / directory_name(as_written)
-    if unsafe is not None and (status or dry_run):
-        problem = f"beside --{'status' if status else 'dry-run'}, which simulates no search"
+    if unsafe is not None and status:
+        problem = "beside --status, which simulates no search"
         raise InputError("unsafe", problem, "one of the two options")
     if status:
         return summarise(load(directory))
 
-    # The study as it is searched, and its runs that are to be done.
+    # The study as it is searched.
     changed = _with_options(as_written, algorithms, runs=runs, evaluations=evaluations, seed=seed)
     loaded, system = load_for_search(changed)
     if unsafe is not None:
         study_by(loaded, unsafe)  # refuses what no study has, before the search
     for remark in dict.fromkeys(without_effect(system)):
         warn(remark)
-    keys = _select_runs(all_runs(loaded), shard)
-    if not keys:
-        warn(f"--shard {shard} selects none of the runs")
-    if system.mover.takes_long and not dry_run:
+    if system.mover.takes_long:
         fewer = f"{PROGRAM_COMMAND} explain {loaded.words}"
         warn(f"{fewer} --simulations N looks for the smallest changes with N simulations alone")
 
-    # Measured or searched.
-    if dry_run:
-        with open_pool(jobs, cluster) as pool:
-            return _measured(loaded, system, len(keys), engine, pool)
+    # The search, and what it found.
     try:
         with open_progress(not quiet) as show:
             parts = Parts(show, [0, FEW if system.mover.takes_long else VERDICT_COST])
@@ -208,7 +182,6 @@ def study(
                 retry_failed=retry_failed,
                 jobs=jobs,
                 cluster=cluster,
-                only=keys,
                 engine=engine,
             )
             return _found(results, system, unsafe, jobs, parts.begin(), loaded.words)
@@ -278,60 +251,6 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
         names = [name.strip() for name in algorithms.split(",")]
         changes["algorithms"] = [search.labels.get(name, name) for name in names]
     return replace_in(study, search=replace_in(search, **changes))
-
-
-def _select_runs(keys: list[RunKey], shard: str | None) -> list[RunKey]:
-    """The runs that `shard` selects."""
-    if shard is not None:
-        rank, _, count = shard.partition("/")
-        if not (
-            all(text.isdecimal() and len(text) < 10 for text in (rank, count))
-            and 1 <= int(rank) <= int(count)
-        ):
-            raise InputError("shard", repr(shard), "K/N, with K in 1..N")
-        keys = keys[int(rank) - 1 :: int(count)]
-    return keys
-
-
-def _measured(study: Study, system: System, runs: int, engine: str, pool: Pool) -> Answer:
-    """The estimated time of a search, from a short measurement."""
-    # The speed on this machine.
-    system, used, reason = choose_engine(system, engine)
-    task = Task(study=study, in_sumo=system.in_sumo, batch_size=settings_per_batch(system))
-    begin = time.monotonic()
-    evaluate_original(task, pool)
-    ask_why_no_verdict(study, pool)
-    start = time.process_time() + time.monotonic() - begin  # of this process and of a worker
-    rate = measure_speed(task, pool, runs)
-    verification = measure_verification(task, pool, runs) if used == RECORDED else 0.0
-
-    # The summary at the end loads statistics, and lets the original drive in this process.
-    begin = time.monotonic()
-    import_module("scipy.stats")
-    why_no_verdict(system)
-    summary = time.monotonic() - begin
-
-    # The time that follows for all evaluations, with the start, verification and summary.
-    evaluations = runs * study.search.evaluations
-    seconds = start + evaluations / rate + verification + summary
-    duration = f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.0f} s"
-    names = ", ".join(study.search.labels)
-    return Answer(
-        question="study",
-        study=study,
-        verdict=(
-            f"About {duration} for at most {evaluations} evaluations, {runs} runs of {names};"
-            " nothing was written."
-        ),
-        numbers={
-            "runs": runs,
-            "engine": f"{used}: {reason}",
-            "evaluations": evaluations,
-            "evaluations_per_second": rate,
-            "seconds": seconds,
-        },
-        tables={},
-    )
 
 
 def _breach_of_original(case: Case) -> str:

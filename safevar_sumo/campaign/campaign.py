@@ -5,7 +5,6 @@ be.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -15,27 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.random import default_rng
 
-from safevar_sumo.ads import PerVehicleAds
 from safevar_sumo.campaign.batches import ask_why_no_verdict, compile_vehicle
-from safevar_sumo.campaign.evaluation import (
-    Task,
-    carry_out,
-    evaluate_settings,
-    system_of,
-    verify_settings,
-)
+from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings, verify_settings
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.campaign.pool import Pool
-from safevar_sumo.campaign.runs import (
-    MAX_REPEATED,
-    REPEATED,
-    RunKey,
-    RunResult,
-    algorithm_of,
-    all_runs,
-)
+from safevar_sumo.campaign.runs import MAX_REPEATED, RunKey, RunResult, algorithm_of, all_runs
 from safevar_sumo.campaign.share import Share, carry_share
-from safevar_sumo.campaign.user_checks import check_code, random_settings, repeat_elsewhere
+from safevar_sumo.campaign.user_checks import check_code, repeat_elsewhere
 from safevar_sumo.errors import InputError, SimulationError, one_of
 from safevar_sumo.metrics import Scoring, Unsafe
 from safevar_sumo.records import Evaluations, JsonObject
@@ -49,16 +34,12 @@ from safevar_sumo.results import (
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import reason_against_scenes, settings_per_batch
 from safevar_sumo.sumo.system import System
-from safevar_sumo.terminal import Parts, Progress, show_no_progress
+from safevar_sumo.terminal import Parts, Progress
 
 BATCHES_PER_SHARE = 2
 """Number of largest batches that the populations of all runs of a share fill, at most."""
 MAX_RUNS = 256
 """Maximum number of runs in a share: each keeps a file open."""
-PROBE_TIME = 5.0
-"""Time of a measurement with a driving system that is called for each vehicle, roughly [s]."""
-PROBE_VEHICLES = 4000
-"""Largest number of vehicles in a batch of the measurement, over all points of a matrix."""
 UNSAFE_REPEATED = 150
 """Largest number of unsafe solutions that SUMO repeats after a search in recorded scenes."""
 SUMO_COST = 60
@@ -304,39 +285,3 @@ def choose_engine(system: System, name: str) -> tuple[System, str, str]:
     if reason := reason_against_scenes(system):
         return system, SUMO, reason
     return system, RECORDED, "nobody reacts to the vehicle under test"
-
-
-def measure_speed(task: Task, pool: Pool, runs: int | None = None) -> float:
-    """Evaluations per second of all workers, or of as many as have one of the `runs`, measured with
-    one batch of random settings for each; the search costs little beside them.
-    """
-    workers = min(pool.workers, runs or pool.workers)
-    system = system_of(task.study)
-    size = max(min(task.batch_size, PROBE_VEHICLES // len(system.points)), 1)
-    settings = random_settings(task.study, workers, size)
-
-    def simulate(number: int) -> None:
-        carry_out(evaluate_settings, [(task, rows[:number]) for rows in settings], pool)
-
-    # Workers load the study and warm up; a driving system that is slow gets a smaller batch.
-    is_called_for_each = isinstance(system.ads, PerVehicleAds)
-    simulate(1 if is_called_for_each else size)
-    if is_called_for_each:
-        start = time.perf_counter()
-        simulate(1)
-        size = min(max(int(PROBE_TIME / (time.perf_counter() - start)), 1), size)
-    start = time.perf_counter()
-    simulate(size)
-    return workers * size / (time.perf_counter() - start)
-
-
-def measure_verification(task: Task, pool: Pool, runs: int) -> float:
-    """The time that the verification of so many runs in SUMO takes, measured with random settings
-    [s].
-    """
-    number = min(math.ceil(runs * task.study.search.evaluations / REPEATED), MAX_REPEATED)
-    settings = random_settings(task.study, number)
-    (evaluations,) = carry_out(evaluate_settings, [(task, settings)], pool)
-    start = time.monotonic()
-    repeat_in_sumo(task, evaluations, pool, show_no_progress)
-    return time.monotonic() - start

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -92,8 +91,8 @@ def repeat_elsewhere(study: Study, pool: Pool) -> None:
         raise UserCodeError(study.source, f"{problem}{REPRODUCED_BY}{command}", SAME_ELSEWHERE)
 
 
-def random_settings(study: Study, *shape: int) -> FloatArray:
-    """Feasible settings of a study, drawn uniformly, in an array of this shape and their values."""
+def random_settings(study: Study, count: int) -> FloatArray:
+    """Feasible settings of a study, drawn uniformly, shape (count, n)."""
     region = region_of(study)
     characteristics = region.characteristics
     rng = np.random.default_rng(study.search.seed)
@@ -103,7 +102,7 @@ def random_settings(study: Study, *shape: int) -> FloatArray:
             characteristics.lower, characteristics.upper, (count, len(characteristics))
         )
 
-    return np.resize(region.draw_feasible(draw, math.prod(shape)), (*shape, len(characteristics)))
+    return np.resize(region.draw_feasible(draw, count), (count, len(characteristics)))
 
 
 def find_in_new_process(study: Study) -> list[Finding]:

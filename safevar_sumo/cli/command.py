@@ -51,13 +51,20 @@ COMMON_NAMES = {
     "Answer": ("format", "json", "details", "table", "plot", "fail_if"),
 }
 """Options that many commands have: with one meaning, help names them in a few lines."""
+ENDED_OPTIONS = {
+    "simulate --spread": "the page of `report`, which has the band, or simulate --fit K",
+    "study --dry-run": "no such option: the bar of a search shows the time that is left",
+    "study --shard": "sv.run(study, only=...), or --cluster",
+}
+"""Options that commands had, and what stands in their place."""
 OPERATORS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")
 
 
 class _Command(click.Command):
-    """A command that refuses an option with one value that is given twice. `--help` explains its
-    own options, and `--help-all` those that many commands have, too.
+    """A command that refuses an option with one value that is given twice, and options of earlier
+    releases. `--help` explains its own options, and `--help-all` those that many commands have,
+    too.
     """
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -91,6 +98,9 @@ class _Command(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         given = Counter(word.partition("=")[0] for word in args)
+        for word in given:
+            if instead := ENDED_OPTIONS.get(f"{self.name} {word}"):
+                raise InputError(word, "is an option of releases before 0.5", instead)
         for option in self.params:
             takes_one = isinstance(option, click.Option) and not (option.multiple or option.is_flag)
             if takes_one and given[option.opts[0]] > 1:

@@ -20,8 +20,7 @@ from pandas.testing import assert_frame_equal
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import RunKey, evaluation
 from safevar_sumo.campaign.batches import Batches
-from safevar_sumo.campaign.campaign import deal, measure_speed
-from safevar_sumo.campaign.evaluation import Task
+from safevar_sumo.campaign.campaign import deal
 from safevar_sumo.campaign.runs import Run
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.metrics import PUBLISHED_SCORING
@@ -157,35 +156,6 @@ def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused
         SafevarError, match=r"rs-00\.jsonl: holds other settings than this search requests"
     ):
         carried_out(study, tmp_path)
-
-
-def at_times(monkeypatch: pytest.MonkeyPatch, pool: FormulaPool, *seconds: float) -> None:
-    """The pool evaluates, and the clock shows these seconds."""
-    times = iter(seconds)
-    monkeypatch.setattr("time.perf_counter", lambda: next(times))
-    monkeypatch.setattr(evaluation, "evaluate_batch", pool.evaluate)
-
-
-@pytest.mark.parametrize(("workers", "runs"), [(1, None), (4, None), (2, 2)])
-def test_the_speed_of_a_study_is_that_of_all_workers_that_have_a_run(
-    workers: int, runs: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pool = FormulaPool(4 if runs else workers)
-    at_times(monkeypatch, pool, 10.0, 14.0)
-    task = Task(study=load_study("smoke"), batch_size=200)
-    assert measure_speed(task, pool, runs) == workers * 200 / 4
-    assert sorted(pool.sizes) == [200] * 2 * workers, "those before are not measured"
-
-
-def test_the_speed_of_a_driving_system_called_for_each_vehicle_takes_seconds(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """0.5 s for one vehicle: ten are enough."""
-    pool = FormulaPool(1)
-    at_times(monkeypatch, pool, 0.0, 0.5, 1.0, 6.0)
-    study = load_study("smoke", ads={"model": "highway_idm", "parameters": {}})
-    assert measure_speed(Task(study=study, batch_size=200), pool) == 10 / 5
-    assert pool.sizes == [1, 1, 10]
 
 
 ROOT = Path(__file__).parents[2]

@@ -78,20 +78,17 @@ def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
 
 
 @SLOW
-def test_shards_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
-    for k in (1, 2):
-        study("--out", "out", "--shard", f"{k}/2")
+def test_parts_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
+    keys = [(name, run) for name in ("nsga2", "rs", "safe_fuzzer") for run in range(2)]
+    for k in (0, 1):
+        sv.run("small.toml", "out", only=keys[k::2])
     assert not Path("out/solutions.csv").exists()
     assert len(load_runs("out").solutions.groupby(["algorithm", "run"])) == 6
     before = written(Path("out"))
     study("--out", "out")
     assert written(Path("out")) == before, "nothing was left to simulate"
     assert solutions("out") == solutions(whole)
-    assert (
-        "The search found no solution: no run is finished."
-        in run("study", "small.toml", "--out", "none", "--shard", "9/9").stdout
-    )
-    study("--out", "alone", "--shard", "2/9")
+    sv.run("small.toml", "alone", only=keys[1:2])
     assert [path.name for path in Path("alone/runs").glob("*-*")] == ["nsga2-01.jsonl"]
     expected = (
         load_runs(whole).solutions.query("algorithm == 'nsga2' and run == 1").reset_index(drop=True)
@@ -125,25 +122,6 @@ def test_the_end_of_a_study_counts_what_was_simulated_and_quiet_prints_only_what
     assert run(*again, "--quiet").stdout == ""
     assert json_of(*again, "--quiet")["numbers"]["evaluations"] == simulated
     assert "NSGA-II" in run(*again, "--quiet", "--table", "algorithms").stdout
-
-
-def test_a_dry_run_tells_what_it_would_take_and_writes_nothing() -> None:
-    output = run("study", "small.toml", "--dry-run").stdout
-    assert output.startswith("About ")
-    for word in ("nsga2, rs, safe_fuzzer", "900"):
-        assert word in output
-    numbers = json_of("study", "small.toml", "--dry-run")["numbers"]
-    assert numbers["seconds"] > 0
-    assert numbers["evaluations_per_second"] > 0
-    assert not Path("results").exists()
-
-
-@SLOW
-def test_a_dry_run_simulates_what_the_constraints_of_a_study_allow() -> None:
-    """Half of its domain has encounters that cannot be driven."""
-    assert run("study", "alks", "--ranges", "--point", "cut_out", "--dry-run").stdout.startswith(
-        "About "
-    )
 
 
 ADS = """

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from safevar_sumo.api import study as command
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import RunKey
 from safevar_sumo.campaign.campaign import UNSAFE_REPEATED, choose_sample
@@ -125,32 +123,3 @@ def test_a_search_without_a_solution_is_verified_too(study: Study) -> None:
     sample = made_up_evaluations([1.0, 1.0, 1.0], settings=drawn_settings)
     runs = [RunResult(RunKey("rs", 0), sample.take([]), sample)]
     assert len(choose_sample(study, sample.take([0]), runs)) == 3
-
-
-@pytest.mark.slow
-def test_a_dry_run_counts_the_start_and_the_verification(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Evaluations that take no time leave both."""
-    monkeypatch.setattr(command, "measure_speed", lambda *arguments: 1e9)
-    alone = command.study("smoke", dry_run=True, jobs=1).numbers["seconds"]
-    monkeypatch.setattr(command, "measure_verification", lambda *arguments: 1000.0)
-    assert 0.5 < alone < 1000
-    assert command.study("smoke", dry_run=True, jobs=1).numbers["seconds"] > 1000
-    in_sumo = command.study("smoke", dry_run=True, jobs=1, engine="sumo").numbers
-    assert in_sumo["seconds"] < 1000, "SUMO verifies nothing that it has simulated itself"
-
-
-@pytest.mark.slow
-def test_a_dry_run_counts_the_summary_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In which the original vehicle drives once more: here it takes 100 s, and the start 2 s."""
-    now = [0.0]
-
-    def take_time(system: System) -> None:
-        now[0] += 100
-
-    clock = SimpleNamespace(monotonic=lambda: now[0], process_time=lambda: 2.0)
-    monkeypatch.setattr(command, "time", clock)
-    monkeypatch.setattr(command, "why_no_verdict", take_time)
-    monkeypatch.setattr(command, "measure_speed", lambda *arguments: 1e9)
-    monkeypatch.setattr(command, "measure_verification", lambda *arguments: 0.0)
-    seconds = command.study("smoke", dry_run=True, jobs=1).numbers["seconds"]
-    assert seconds == pytest.approx(102, abs=1e-3)
