@@ -96,7 +96,7 @@ def risk(
     # Vehicles as the study says that they vary.
     study = evaluator.study
     model = VariationModel(study)
-    has_design = not (model.is_correlated or model.region or study.ranges)
+    has_design = not (model.region or study.ranges)
     of_design = has_design * BASE_POINTS * (len(evaluator.characteristics) + 2)
     phases = planned_over_sets(study, SAMPLING, samples) | {SENSITIVITY: of_design}
     evaluator.begin(phases, least=LEAST_SETTINGS)
@@ -117,7 +117,7 @@ def risk(
     low, high = clopper_pearson(failures, total, confidence)
     over_sets = SharesOverSets.of(evaluator, criterion, drawn.settings)
     indices, of_whom = given_data_indices, simulated
-    if evaluator.left is not None and not model.is_correlated:
+    if evaluator.left is not None:
         indices = regression_indices
     elif has_design:
         indices, of_whom = sobol_indices, design_of(evaluator, model)

@@ -130,7 +130,7 @@ def rules(
     low, high = clopper_pearson(failures, total)
     drawn = (
         "sampled as [variation] says"
-        if study.variation or study.correlations
+        if study.variation
         else "sampled uniformly over the whole domain"
     )
     verdict = (

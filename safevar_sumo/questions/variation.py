@@ -1,6 +1,4 @@
-"""How the characteristics of real vehicles vary, by a study's `[variation]` and
-`[[correlations]]`.
-"""
+"""How the characteristics of real vehicles vary, by a study's `[variation]`."""
 
 from __future__ import annotations
 
@@ -26,14 +24,7 @@ from safevar_sumo.vehicles.region import REJECTIONS
 
 
 class VariationModel:
-    """The random variation of a study's characteristics, by its `[variation]` and
-    `[[correlations]]`.
-
-    Raises
-    ------
-    InputError
-        If the correlations contradict each other.
-    """
+    """The random variation of a study's characteristics, by its `[variation]`."""
 
     def __init__(self, study: Study) -> None:
         with about(study.source):
@@ -46,31 +37,9 @@ class VariationModel:
         ]
         self._source = study.source
         self._quantiles = list(map(_quantile_function, self.characteristics, distributions))
-        self.is_correlated = bool(study.correlations)
-
-        # A factor with which independent normal numbers become correlated.
-        correlations = np.eye(len(distributions))
-        for correlation in study.correlations:
-            first, second = map(self.characteristics.names.index, correlation.between)
-            correlations[first, second] = correlation.value
-            correlations[second, first] = correlation.value
-        try:
-            self._factor = np.linalg.cholesky(correlations)
-        except np.linalg.LinAlgError:
-            pairs = ", ".join(
-                f"{' and '.join(pair.between)} {pair.value:g}" for pair in study.correlations
-            )
-            problem = f"correlations contradict each other: {pairs}"
-            raise InputError(study.source, problem, "a positive definite matrix") from None
 
     def settings(self, probabilities: FloatArray) -> FloatArray:
-        """Settings at N independent points of the unit cube, shape (N, n), correlated by a Gaussian
-        copula.
-        """
-        if self.is_correlated:
-            probabilities = scipy.stats.norm.cdf(
-                scipy.stats.norm.ppf(probabilities) @ self._factor.T
-            )
+        """Settings at N points of the unit cube, shape (N, n)."""
         columns = [
             quantile(column)
             for quantile, column in zip(self._quantiles, probabilities.T, strict=True)

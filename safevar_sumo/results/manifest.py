@@ -175,10 +175,11 @@ def read_manifest(directory: Path) -> JsonObject:
             f"the release that wrote them, safevar_sumo {written_by}; or another `out`",
         )
 
-    # So are those of a study with keys that ended, but for one without effect.
+    # So are those of a study with keys that ended, but for those without effect.
     study = manifest.get("study")
     if isinstance(study, dict):
-        study.pop("wider", None)
+        for key in ("wider", "correlations"):
+            study.pop(key, None)
     if isinstance(study, dict) and "search" in (study.get("scenario") or ()):
         problem = "holds results of a study with [scenario.search]"
         legal = f"the release that wrote them, safevar_sumo {written_by}; or another `out`"

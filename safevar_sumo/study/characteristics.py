@@ -133,33 +133,11 @@ class Fixed(_Distribution, frozen=True, kw_only=True, tag="fixed"):
 Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
 
 
-class Correlation(Table, frozen=True, kw_only=True):
-    """The correlation, `value`, of the two characteristics `between` after each is transformed to a
-    standard normal variable (Gaussian copula).
-    """
-
-    between: Annotated[list[str], Meta(min_length=2, max_length=2)]
-    value: Annotated[float, Meta(gt=-1, lt=1)]
-
-
-def check_variation(
-    rows: Mapping[str, Domain],
-    variation: Mapping[str, Distribution],
-    correlations: Sequence[Correlation],
-) -> None:
-    """Refuse distributions and correlations that do not fit the characteristics' domains, or each
-    other.
-    """
+def check_variation(rows: Mapping[str, Domain], variation: Mapping[str, Distribution]) -> None:
+    """Refuse distributions that do not fit the characteristics' domains."""
     for name, distribution in variation.items():
         check_name("", f"variation.{name}: there is no such characteristic", name, rows)
         _check_distribution(f"variation.{name}", rows[name], distribution)
-    pairs = [frozenset(correlation.between) for correlation in correlations]
-    for correlation, pair in zip(correlations, pairs, strict=True):
-        for name in correlation.between:
-            check_name("", f"correlations.between: there is no characteristic {name!r}", name, rows)
-        if len(pair) < len(correlation.between) or pairs.count(pair) > 1:
-            problem = f"correlations.between = {list(correlation.between)}"
-            raise InputError("", problem, "two characteristics, each pair once")
 
 
 def stated_values(distribution: Distribution) -> dict[str, float]:

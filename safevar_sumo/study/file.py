@@ -47,6 +47,7 @@ ENDED_KEYS = {
     **dict.fromkeys(("scenario.file", "scenario.values", "scenario.ego"), RECORDED),
     "matrix.protocol": "[[matrix.tests]], as in euro_ncap_pedestrian and euro_ncap_car_to_car",
     "rating": "no such table: Euro NCAP's own calculator computes points",
+    "correlations": "no such key: [[constraints]] leave out vehicles that do not occur",
 }
 """Keys that studies had, and what stands in their place."""
 _IN_RANGES = 'with --ranges or encounters = "ranges"'

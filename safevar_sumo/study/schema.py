@@ -14,7 +14,6 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.study.characteristics import (
     CharacteristicTable,
     Constraint,
-    Correlation,
     Distribution,
     Domain,
     Limit,
@@ -192,14 +191,14 @@ class Study(Encounters, frozen=True, kw_only=True):
     values of parameters, by their keys in the file, such as `ads.parameters.corridor`, that fit the
     published data equally well, a list for each parameter, the study's own value first;
     `model_error` is the model's further error, by metric, for a vehicle that differs from the
-    original by the full width of a domain; `variation` and `correlations` state how characteristics
-    vary in the world, by name: uniformly by default; `constraints` are conditions that the
-    characteristics of one vehicle satisfy together; `limits` are the values, by name, up to which
-    characteristics may wear in service; `unmeasured` are the values, by name, of characteristics
-    that were not measured in a vehicle, each a number or a table: a study that extends this one
-    does not inherit them; `repair` states what a repair of the ADS may change; `encounters` says
-    what vehicles meet: the listed `tests`, or with `ranges` any encounter in the ranges of the
-    axes, beside the vehicle; `unsafe` is what the study calls so.
+    original by the full width of a domain; `variation` states how characteristics vary in the
+    world, by name: uniformly by default; `constraints` are conditions that the characteristics of
+    one vehicle satisfy together; `limits` are the values, by name, up to which characteristics may
+    wear in service; `unmeasured` are the values, by name, of characteristics that were not measured
+    in a vehicle, each a number or a table: a study that extends this one does not inherit them;
+    `repair` states what a repair of the ADS may change; `encounters` says what vehicles meet: the
+    listed `tests`, or with `ranges` any encounter in the ranges of the axes, beside the vehicle;
+    `unsafe` is what the study calls so.
     """
 
     # A key without the mark WITHOUT_EFFECT is part of the identity of results.
@@ -219,7 +218,6 @@ class Study(Encounters, frozen=True, kw_only=True):
         dict[str, Annotated[float, Meta(ge=0, le=1e6)]], WITHOUT_EFFECT, OF_VEHICLE_AND_ADS, WHOLE
     ] = {}
     variation: Annotated[dict[str, Distribution], WITHOUT_EFFECT] = {}
-    correlations: Annotated[list[Correlation], WITHOUT_EFFECT] = []
     limits: Annotated[dict[str, Limit], WITHOUT_EFFECT] = {}
     unmeasured: Annotated[dict[str, float | UnmeasuredValue], WITHOUT_EFFECT, OF_STUDY] = {}
     repair: Annotated[RepairTable, WITHOUT_EFFECT] = RepairTable()
@@ -234,7 +232,7 @@ class Study(Encounters, frozen=True, kw_only=True):
             raise InputError(
                 "", f"scenario.kind = {self.scenario.kind!r}", "no kind: a scenario is no FMU"
             )
-        check_variation(self.domains, self.variation, self.correlations)
+        check_variation(self.domains, self.variation)
         check_limits(rows, self.limits, table="limits.")
         check_unmeasured(rows, self.unmeasured_values)
         if len({len(values) for values in self.spread.values()}) > 1 or not all(

@@ -118,29 +118,8 @@ def test_sobol_indices_of_ishigamis_function(
     assert table["characteristic"].iloc[0] == "a", "what decides most stands first"
 
 
-def test_first_order_indices_of_correlated_characteristics() -> None:
-    """Y = a + b of normal variables with correlation r: knowing one leaves (1 - r^2) of the other's
-    variance 1, so that the index is 1 - (1 - r^2) / (2 + 2 r). Sobol's design does not exist, and
-    total indices are undefined.
-    """
-    normal = {"distribution": "normal", "deviation": 1.0}
-    pair = {"between": ["a", "b"], "value": 0.5}
-    study = load_study(
-        made_up_study(3), variation={"a": normal, "b": normal, "c": normal}, correlations=[pair]
-    )
-    plant = Plant(study, nowhere, lambda settings: settings[:, 0] + settings[:, 1])
-    answer = risk(study, unsafe="collision", samples=4000, pool=plant)
-    frame = answer.tables["sensitivity"].set_index("characteristic")
-    assert frame["degree_first"].to_dict() == pytest.approx(
-        {"a": 0.75, "b": 0.75, "c": 0.0}, abs=0.04
-    )
-    assert frame["degree_total"].isna().all()
-    assert "vary as the study says (a normal, b normal and c normal), " in answer.verdict
-
-
 def drawn(**variation: dict[str, Any]) -> FloatArray:
-    correlations = variation.pop("correlations", [])
-    study = load_study(made_up_study(2), variation=variation, correlations=correlations)
+    study = load_study(made_up_study(2), variation=variation)
     return VariationModel(study).settings(default_rng(1).random((20_000, 2)))
 
 
@@ -159,12 +138,6 @@ def test_every_distribution_has_its_moments() -> None:
     tight = drawn(a={"distribution": "normal", "deviation": 50.0})[:, 0]
     assert tight.min() >= 0
     assert tight.max() <= 10
-
-
-def test_correlations_are_those_of_the_copula() -> None:
-    normal = {"distribution": "normal", "deviation": 0.5}
-    settings = drawn(a=normal, b=normal, correlations=[{"between": ["a", "b"], "value": 0.8}])
-    assert np.corrcoef(settings.T)[0, 1] == pytest.approx(0.8, abs=0.02)
 
 
 def rules_of(region: Region, n: int = 4, **options: Any) -> Answer:

@@ -452,7 +452,11 @@ def test_results_of_a_study_whose_search_was_a_key_are_read_by_their_release(
     run("study", "smoke", "--runs", "1", "--evaluations", "50", "--out", str(tmp_path))
     manifest = read_manifest(tmp_path)
     file = tmp_path / "manifest.json"
-    file.write_text(json.dumps({**manifest, "study": {**manifest["study"], "wider": "smoke"}}))
+    file.write_text(
+        json.dumps(
+            {**manifest, "study": {**manifest["study"], "wider": "smoke", "correlations": []}}
+        )
+    )
     assert read_manifest(tmp_path) == manifest
     manifest["study"]["scenario"]["search"] = {"distance": {}}
     file.write_text(json.dumps(manifest))
