@@ -137,11 +137,11 @@ SLOW_STUDIES = ("wear_idm", "wear_rss")
     params=[
         pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_STUDIES else [])
         for name in study_names()
-        if (name != "wear_rss" or HAS_AD_RSS) and name != "metadrive_expert"
+        if name != "wear_rss" or HAS_AD_RSS
     ]
 )
 def any_system(request: pytest.FixtureRequest) -> System:
-    """The system of each shipped study in turn, except that in another simulator."""
+    """The system of each shipped study in turn."""
     system = assemble(load_study(request.param))
     return replace(system, points=system.points[::30])  # only some points of a long matrix
 

@@ -37,7 +37,6 @@ PUBLISHED = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_de
 EXTRAS = {
     "study wear_rss": "ad-rss",
     "study wear_idm": "highway-env",
-    "study metadrive_expert": "metadrive",
     "study with_pymoo.toml": "pymoo",
     "study with_fmu.toml": "fmu",
     "study smoke --cluster tcp://127.0.0.1:8786": "cluster",

@@ -17,7 +17,6 @@ from safevar_sumo.scenarios.base import (
 )
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.lane_change import CutIn, CutOut
-from safevar_sumo.scenarios.metadrive import LearnedDriver
 from safevar_sumo.scenarios.point import SPEED_DIMENSION as SPEED_DIMENSION, Point as Point
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.roads import Lane as Lane, World as World
@@ -40,7 +39,6 @@ SCENARIOS: Mapping[str, type[Scenario]] = {
     "crossing": Crossing,
     "cut_in": CutIn,
     "cut_out": CutOut,
-    "learned_driver": LearnedDriver,
     "lead_vehicle_stopped": LeadVehicleStopped,
     "stop": Stop,
 }

@@ -59,6 +59,7 @@ ENDED_STUDIES = {
     "alks_joint_cut_out": f"alks at --point cut_out, {_IN_RANGES}",
     "alks_joint_following": f"alks at --point following, {_IN_RANGES}",
     "euro_ncap_rating": "euro_ncap_pedestrian or euro_ncap_car_to_car, Euro NCAP's tests",
+    "metadrive_expert": "a study with the class of docs/simulators.md",
 }
 """Shipped studies of earlier releases, and what stands in their place."""
 

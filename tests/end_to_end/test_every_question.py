@@ -30,11 +30,7 @@ SMALL = {
     "report": '--ask "rules --samples 16" --out next.html',
 }
 """The options with which a command that comes next takes little time."""
-EVERY = [
-    name
-    for name in study_names()
-    if name != "metadrive_expert" and (name != "wear_rss" or HAS_AD_RSS)
-]
+EVERY = [name for name in study_names() if name != "wear_rss" or HAS_AD_RSS]
 """Studies that need no extra."""
 IN_RANGES = ("wear --ranges", "sun --ranges", "alks --ranges --point cut_in")
 WORN = {"worn": "brakeTorque=0.5", "carla": "tireFric=1", "lgsvl": "tire_friction=0.5"}

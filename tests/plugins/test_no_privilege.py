@@ -35,12 +35,7 @@ from tests.manual import ROOT
 
 SLOW = pytest.mark.slow
 
-BASES = {
-    "pedestrian_crossing": "sun",
-    "lead_vehicle_stopped": "native",
-    "learned_driver": "metadrive_expert",
-    "stop": "stop",
-}
+BASES = {"pedestrian_crossing": "sun", "lead_vehicle_stopped": "native", "stop": "stop"}
 """A study with each scenario; all others are driven by the car of `wear`."""
 FAST = ("crossing", "stop", "carla", "aeb", "fuzzy", "nsga2")
 """Those that are copied in every run of the tests; all others are slow together."""
@@ -83,8 +78,6 @@ def with_scenario(name: str, model: str, **tables: Any) -> Study:
 def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(
     name: str, in_tmp: Path
 ) -> None:
-    if name == "learned_driver":
-        pytest.importorskip("metadrive")
     own = copied(SCENARIOS[name], in_tmp)
     free = free_parameters(SCENARIOS[name])
     assert_equal(with_scenario(name, name), with_scenario(name, own))
@@ -139,9 +132,7 @@ def test_what_a_search_leaves_out_is_what_a_class_declares_a_shipped_one_as_a_us
         load_study("wear", matrix=None, scenario={"model": "deer:Deer", "over": {"pace": {}}})
 
 
-@pytest.mark.parametrize(
-    "name", sorted(SCENARIOS.keys() - {"learned_driver", "stop"})
-)  # which have no such scenes
+@pytest.mark.parametrize("name", sorted(SCENARIOS.keys() - {"stop"}))  # which have no such scenes
 def test_benign_scenes_of_a_scenario_in_a_users_file_are_the_same(name: str, in_tmp: Path) -> None:
     names = []
     for model in (name, copied(SCENARIOS[name], in_tmp)):

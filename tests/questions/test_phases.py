@@ -33,7 +33,6 @@ from tests.in_process import InlinePool, json_of, refused
 from tests.made_up import drawn
 
 STEP = 0.05
-WITH_EXTRAS = {"metadrive_expert"}  # CI installs all others
 
 
 def at_phase(system: System, phase: float | FloatArray) -> System:
@@ -47,7 +46,7 @@ def degrees(system: System, settings: FloatArray) -> FloatArray:
     return np.stack([result.evaluations.f_safe for result in found])
 
 
-@pytest.mark.parametrize("name", sorted({*study_names()} - WITH_EXTRAS))
+@pytest.mark.parametrize("name", study_names())
 def test_an_encounter_that_begins_a_whole_step_later_is_the_same(name: str) -> None:
     study = load_study(name)
     system = assemble(study)
