@@ -7,7 +7,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +119,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     where a test is about what is said, and with which settings.
     """
     monkeypatch.setattr("safevar_sumo.questions.tolerance.scans.SCAN_VALUES", 21)
-    monkeypatch.setattr(import_module("safevar_sumo.questions.risk"), "BASE_POINTS", 64)
+    monkeypatch.setattr("safevar_sumo.questions.indices.BASE_POINTS", 64)
 
 
 @pytest.fixture

@@ -2,9 +2,9 @@
 decides?
 
 Plain Monte Carlo with the exact interval of Clopper and Pearson. What decides: Sobol indices, first
-order and total (Saltelli's design); where characteristics are correlated or constrained, for which
-Sobol's design does not exist, the first-order index from the drawn vehicles themselves (Plischke,
-Borgonovo, Smith 2013, European Journal of Operational Research 226, 536-550).
+order and total (Saltelli's design); where this design does not exist, as for constrained
+characteristics, or takes too many simulations, the first-order index from the drawn vehicles
+themselves (Plischke, Borgonovo, Smith 2013, European Journal of Operational Research 226, 536-550).
 """
 
 from __future__ import annotations
@@ -22,16 +22,14 @@ from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.indices import (
-    BASE_POINTS,
-    EXPLAINED,
-    FEWEST,
+    LEAST_VEHICLES,
     MIN_OUTCOMES,
     OF_WHAT,
     OUTPUTS,
     SENSITIVITY,
     design_of,
     given_data_indices,
-    regression_indices,
+    size_of_design,
     sobol_indices,
 )
 from safevar_sumo.questions.options import Count, Fraction
@@ -97,11 +95,15 @@ def risk(
     study = evaluator.study
     model = VariationModel(study)
     has_design = not (model.region or study.ranges)
-    of_design = has_design * BASE_POINTS * (len(evaluator.characteristics) + 2)
+    of_design = has_design * size_of_design(evaluator)
     phases = planned_over_sets(study, SAMPLING, samples) | {SENSITIVITY: of_design}
     evaluator.begin(phases, least=LEAST_SETTINGS)
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
+    if evaluator.left is not None:
+        # Few simulations are for the design only where it takes at most half of them.
+        has_design = has_design and 2 * of_design <= evaluator.left
+        samples = min(samples, evaluator.left - has_design * of_design)
     drawn = evaluator.evaluate(model.draw(samples, default_rng(study.search.seed)), SAMPLING)
 
     # How many are unsafe.
@@ -117,9 +119,7 @@ def risk(
     low, high = clopper_pearson(failures, total, confidence)
     over_sets = SharesOverSets.of(evaluator, criterion, drawn.settings)
     indices, of_whom = given_data_indices, simulated
-    if evaluator.left is not None:
-        indices = regression_indices
-    elif has_design:
+    if has_design:
         indices, of_whom = sobol_indices, design_of(evaluator, model)
     table = indices(evaluator, of_whom, criterion, confidence)
     numbers = {"unsafe": str(criterion), "samples": total, "failures": failures}
@@ -136,9 +136,8 @@ def risk(
     left_out = int(drawn.infeasible.sum())
     if failed := samples - total - left_out:
         verdict += f" {failed:,} vehicles could not be simulated and are left out."
-    least = FEWEST * len(evaluator.characteristics)
-    if of_whom is simulated and total < least:
-        verdict += f" What decides is unknown: that needs {least} vehicles."
+    if not has_design and total < LEAST_VEHICLES:
+        verdict += f" What decides is unknown: that needs {LEAST_VEHICLES} vehicles."
     else:
         verdict += deciding_in_words(table, failures)
     verdict += "" if failures else _bound_in_words(high, total, confidence)
@@ -180,14 +179,6 @@ def deciding_in_words(table: pd.DataFrame, failures: float) -> str:
     share, low, high = (first[f"degree_{index}{end}"] for end in ("", LOW, HIGH))
     in_words = table.attrs[OF_WHAT]
     words = f" No vehicle was found that changes {in_words['degree']}, so nothing decides it."
-    explained = table.attrs.get(EXPLAINED)
-    by = ""
-    if explained is not None:
-        by = (
-            f" A regression with squares and products explains {100 * max(explained, 0):.0f} % of"
-            " the variance (R^2, cross-validated)."
-        )
-        words = f"{by} As this is less than half, what decides is unknown."
     if np.isfinite(share):
         name = first["characteristic"]
         causes = (
@@ -201,7 +192,6 @@ def deciding_in_words(table: pd.DataFrame, failures: float) -> str:
                 f" What decides most is uncertain: {name} {causes}, and the interval of"
                 f" {join_phrases(rivals[:MAX_RIVALS])} overlaps with that."
             )
-        words += by
 
     # Without the outcome's own shares, what decides it is unknown.
     if failures and table[f"unsafe_{index}"].isna().all():
