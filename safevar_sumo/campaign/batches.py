@@ -37,7 +37,6 @@ from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.campaign.share import MAX_SKIPPED
 from safevar_sumo.campaign.user_checks import check_code
 from safevar_sumo.errors import InputError, UserCodeError, warn
-from safevar_sumo.plugins import Use
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, differences
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo import reason_against_scenes, settings_per_batch
@@ -114,22 +113,22 @@ def evaluate_all(
     packed_study = msgspec.msgpack.encode(study)
     if pool.shared is not None:
         return _evaluate_shared(study, settings, pool, done, verified, selection, begin)
-    use = _use_of(study, pool)
+    opened = _opened_by(study, pool)
     system = system_of(study)
     if packed_study not in pool.inputs:
-        pool.inputs[packed_study] = manifest_now(study, system, use.names)
-        _refuse_other_workers(study, use.names, pool)
+        pool.inputs[packed_study] = manifest_now(study, system, opened)
+        _refuse_other_workers(study, opened, pool)
 
     # Equal settings are simulated once, and none again that the cache has: a portion is an entry.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     batches = choose_batches(study, selection)
-    cache = cache_of(study, use)
+    cache = cache_of(study, opened)
     found = list[Evaluations]()
     portions = math.ceil(len(distinct_settings) / batches.portion) if cache else 1
     for portion in np.array_split(distinct_settings, portions):
         key = b""
         if cache:
-            key = key_of_settings(cache.key_of(study, use), selection, portion)
+            key = key_of_settings(cache.key_of(study, opened), selection, portion)
             if kept := evaluations_in(cache.get(key)):
                 found.append(kept)
                 done(len(portion))
@@ -188,9 +187,9 @@ def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:
     """Forget what an interrupted command has simulated if the original vehicle, which has just been
     simulated again, does otherwise than then.
     """
-    use = _use_of(study, pool)
-    if cache := cache_of(study, use):
-        key = hashlib.sha256(b"original" + cache.key_of(study, use)).digest()
+    opened = _opened_by(study, pool)
+    if cache := cache_of(study, opened):
+        key = hashlib.sha256(b"original" + cache.key_of(study, opened)).digest()
         kept = evaluations_in(cache.get(key))
         if kept is not None and [*differences(kept.results, original.results)]:
             warn("does not continue: the simulator drives the original vehicle otherwise now")
@@ -212,20 +211,20 @@ def check_simulator(study: Study, pool: Pool) -> None:
     """Check the class of a simulator of the user's own, as `check_code` does, unless the pool has
     checked it.
     """
-    _use_of(study, pool)
+    _opened_by(study, pool)
 
 
-def _use_of(study: Study, pool: Pool) -> Use:
-    """What the user code of a study uses. A study's code is checked once in a pool, whatever else
-    of the study questions vary.
+def _opened_by(study: Study, pool: Pool) -> list[str]:
+    """The names of the files that the user code of a study opens. A study's code is checked once in
+    a pool, whatever else of the study questions vary.
     """
     names, places = frozenset(user_code_names(study)), (study.name, *study.origin.places)
-    for (known, folders), use in pool.uses.items():
+    for (known, folders), opened in pool.opened.items():
         if names <= known and folders == places:
-            return use
+            return opened
     _refuse_other_workers(study, [], pool)
-    pool.uses[names, places] = use = check_code(study, pool)
-    return use
+    pool.opened[names, places] = opened = check_code(study, pool)
+    return opened
 
 
 def _simulate(
@@ -320,11 +319,11 @@ def ask_why_no_verdict(study: Study, pool: Pool, begin: Callable[[], None] = lam
     """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker;
     "" if they do. `begin` is called before anything is simulated.
     """
-    use = _use_of(study, pool)
-    cache = cache_of(study, use)
+    opened = _opened_by(study, pool)
+    cache = cache_of(study, opened)
     key = b""
     if cache:
-        key = hashlib.sha256(b"no verdict" + cache.key_of(study, use)).digest()
+        key = hashlib.sha256(b"no verdict" + cache.key_of(study, opened)).digest()
         content = cache.get(key)
         if content is not None:
             return content.decode()

@@ -14,7 +14,7 @@ import shutil
 import sqlite3
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import lru_cache
@@ -35,7 +35,7 @@ from diskcache.core import MODE_BINARY, MODE_RAW
 from safevar_sumo.campaign.evaluation import Selection, system_of
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.errors import warn
-from safevar_sumo.plugins import Use, digests, file_by_name, files_in
+from safevar_sumo.plugins import digests, file_by_name, files_in
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.records.evaluations import COLUMNS
 from safevar_sumo.results import identity_digest
@@ -93,16 +93,16 @@ class Cache:
         self._is_counted = is_counted
         self._guarded(self._open, None)
 
-    def key_of(self, study: Study, use: Use) -> bytes:
-        """What the simulations of a study depend on besides their settings, as a digest; `use` is
-        what its user code uses.
+    def key_of(self, study: Study, opened: Sequence[str]) -> bytes:
+        """What the simulations of a study depend on besides their settings, as a digest; `opened`
+        are the names of the files that its user code opens.
         """
         packed_study = msgspec.msgpack.encode(study)
         if packed_study not in self._keys:
             # The study and its files count as in the identity of results, and besides that where
             # the files are, this package's own files, and the versions of Python and of all that
             # is installed.
-            manifest = manifest_now(study, system_of(study), use.names)
+            manifest = manifest_now(study, system_of(study), opened)
             paths = [
                 os.path.abspath(file_by_name(name, study.origin.places))
                 for name in manifest["files"]
@@ -192,14 +192,14 @@ class CommandCache:
         self._own_folder: Path | None = None
         self._of_everybody = Cache(folder, is_read=not is_fresh)
 
-    def of(self, study: Study, use: Use) -> Cache | None:
-        """The cache of a study's simulations; `use` is what its user code uses. None if another
-        process runs the same command with the same code.
+    def of(self, study: Study, opened: Sequence[str]) -> Cache | None:
+        """The cache of a study's simulations; `opened` are the names of the files that its user
+        code opens. None if another process runs the same command with the same code.
         """
         if not user_code_names(study):
             return self._of_everybody
         if self._own_folder is None:
-            self._open_own(self._of_everybody.key_of(study, use))
+            self._open_own(self._of_everybody.key_of(study, opened))
         return self._own
 
     def end(self, *, is_interrupted: bool) -> None:
@@ -281,12 +281,12 @@ def simulate_anew() -> Iterator[None]:
         _is_forbidden.reset(token)
 
 
-def cache_of(study: Study, use: Use) -> Cache | None:
-    """Where simulations of a study are kept while a question is asked, if they are; `use` is what
-    its user code uses.
+def cache_of(study: Study, opened: Sequence[str]) -> Cache | None:
+    """Where simulations of a study are kept while a question is asked, if they are; `opened` are
+    the names of the files that its user code opens.
     """
     cache = _cache.get()
-    return cache.of(study, use) if cache else None
+    return cache.of(study, opened) if cache else None
 
 
 def key_of_settings(study_key: bytes, selection: Selection, settings: FloatArray) -> bytes:

@@ -95,12 +95,12 @@ def run_campaign(
     """
     # The directory, with the inputs of its results as they are now.
     pool.spare = None
-    use = check_code(study, pool)
+    opened = check_code(study, pool)
     is_new = not (directory / MANIFEST).exists()
     read: Iterable[str] = ()
     if not system.mover.is_exact:
-        read = use.opened if is_new else read_manifest(directory).get("files", ())
-    manifest = manifest_now(study, system, [*use.modules, *read])
+        read = opened if is_new else read_manifest(directory).get("files", ())
+    manifest = manifest_now(study, system, read)
     wanted = [*map(str, keys)]
     results = ResultsDirectory(directory, study, manifest, system.measuring.scoring, wanted)
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
@@ -121,7 +121,7 @@ def run_campaign(
     compile_vehicle(study, pool, show_search)
     no_verdict = ask_why_no_verdict(study, pool)
     original = evaluate_original(task, pool)
-    undeclared = [name for name in use.opened if name not in results.manifest["files"]]
+    undeclared = [name for name in opened if name not in results.manifest["files"]]
     for remark in _remarks(study, undeclared, no_verdict, original):
         warn(f"study {study.name!r}: {remark}")
     results.begin(original)

@@ -20,7 +20,6 @@ from typing import Any, Protocol, TypeVar
 from safevar_sumo.campaign import cluster as dask, local
 from safevar_sumo.errors import MAX_JOBS, InputError, SafevarError
 from safevar_sumo.output import temporary_folder
-from safevar_sumo.plugins import Use
 from safevar_sumo.plugins.process import MAX_DEATHS
 from safevar_sumo.records import Evaluations, JsonObject
 
@@ -57,9 +56,9 @@ class Pool:
     ----------
     workers
         Number of jobs that are carried out at the same time.
-    uses
-        What the user code of studies uses, by the names of the code, and the study's name with the
-        folders in which code is looked up.
+    opened
+        The names of the files that the user code of studies opens, by the names of the code, and
+        the study's name with the folders in which code is looked up.
     inputs
         The inputs of a study's results when it was new to the pool, a manifest, by packed study.
     verified
@@ -84,7 +83,7 @@ class Pool:
         self.workers = workers
         self._start = start
         self._started = dict[int, Worker]()
-        self.uses = dict[tuple[frozenset[str], tuple[str, ...]], Use]()
+        self.opened = dict[tuple[frozenset[str], tuple[str, ...]], list[str]]()
         self.inputs = dict[bytes, JsonObject]()
         self.verified = Counter[bytes]()
         self.compiled = set[str]()

@@ -21,7 +21,7 @@ from safevar_sumo.campaign.evaluation import (
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import UserCodeError
-from safevar_sumo.plugins import Use, digests_by_name, record_use, unload_user_modules
+from safevar_sumo.plugins import record_opened, unload_user_modules
 from safevar_sumo.plugins.process import REPRODUCED_BY
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.results import identity_digest
@@ -38,10 +38,10 @@ SAME_ELSEWHERE = "the same, to the bit; or repeats = N in [scenario]"
 """What is expected of a simulator in another process."""
 
 
-def check_code(study: Study, pool: Pool) -> Use:
+def check_code(study: Study, pool: Pool) -> list[str]:
     """Check the user code of a study in a worker, unless it has passed before with the same files;
-    returns what it used there. Where the number of simulations is limited, the check takes at most
-    a tenth of them.
+    returns the names of the files that it opened there. Where the number of simulations is limited,
+    the check takes at most a tenth of them.
 
     Raises
     ------
@@ -49,22 +49,20 @@ def check_code(study: Study, pool: Pool) -> Use:
         With file, line and advice of the first finding that makes results wrong.
     """
     if not user_code_names(study):
-        return Use({}, [])
+        return []
     digest = identity_digest(manifest_now(study, system_of(study)))
     marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / f"{digest}.json"
     with suppress(OSError, msgspec.MsgspecError):
-        known = msgspec.json.decode(marker.read_bytes(), type=Use)
-        if known.modules == digests_by_name(known.modules, study.origin.places):
-            return known
+        return msgspec.json.decode(marker.read_bytes(), type=list[str])
     job = Task(study=study), None if pool.spare is None else pool.spare[0]
-    use: Use
-    ((use, pool.checked),) = carry_out(_refuse_defects, [job], pool)
+    opened: list[str]
+    ((opened, pool.checked),) = carry_out(_refuse_defects, [job], pool)
     if pool.spare is not None:
-        return use
+        return opened
     with suppress(OSError):  # without the marker, the next process checks again
         marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.write_bytes(msgspec.json.encode(use))
-    return use
+        marker.write_bytes(msgspec.json.encode(opened))
+    return opened
 
 
 def repeat_elsewhere(study: Study, pool: Pool) -> None:
@@ -127,12 +125,14 @@ def find_in_new_process(study: Study) -> list[Finding]:
     return []
 
 
-def _refuse_defects(task: Task, most: int | None = None) -> tuple[Use, int]:
-    """What user code uses in its check, and the number of simulations in a simulator."""
+def _refuse_defects(task: Task, most: int | None = None) -> tuple[list[str], int]:
+    """The names of the files that user code opens in its check, and the number of simulations in a
+    simulator.
+    """
     from safevar_sumo.check import refuse_defects  # slow to import, and rarely needed
 
     unload_user_modules()
     before = KEPT.simulated
-    with record_use(task.study.origin.places) as use:
+    with record_opened(task.study.origin.places) as opened:
         refuse_defects(task.study, most)
-    return use, KEPT.simulated - before
+    return opened, KEPT.simulated - before

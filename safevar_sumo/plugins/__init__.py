@@ -33,4 +33,4 @@ from safevar_sumo.plugins.lookup import (
     only_from as only_from,
     unload_user_modules as unload_user_modules,
 )
-from safevar_sumo.plugins.process import Use as Use, record_use as record_use
+from safevar_sumo.plugins.process import record_opened as record_opened

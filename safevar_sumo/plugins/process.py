@@ -1,5 +1,5 @@
-"""User code in this process: what it has changed here, and what it uses though its text may not
-tell: modules imported by computed names, and files that it opens.
+"""User code in this process: what it has changed here, and files that it opens, though its text may
+not tell.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 from uuid import uuid4
 
 import platformdirs
 
 from safevar_sumo.errors import INTERRUPTS
-from safevar_sumo.plugins.files import CACHE, Files, digests, is_user_file, name_of_file
+from safevar_sumo.plugins.files import CACHE, is_user_file, name_of_file
 from safevar_sumo.shipped import PACKAGE
 
 SYSTEM_FOLDERS = ("/usr/", "/etc/", "/lib", "/proc/", "/sys/", "/dev/", "/var/")
@@ -147,26 +147,12 @@ def mark_interrupts() -> Iterator[None]:
                 signal.signal(one, handler)
 
 
-class Use(NamedTuple):
-    """What user code has used: digests of the modules in its folders by name, and names of the
-    files that it has opened.
-    """
-
-    modules: Files
-    opened: list[str]
-
-    @property
-    def names(self) -> list[str]:
-        """Names of all files."""
-        return [*self.modules, *self.opened]
-
-
 @contextmanager
-def record_use(folders: Sequence[str]) -> Iterator[Use]:
-    """Record what user code uses within the block: the record is complete at its end.
+def record_opened(folders: Sequence[str]) -> Iterator[list[str]]:
+    """Record the names of the files that user code opens to read within the block: the record is
+    complete at its end.
 
-    `folders` are those of the study's file and of the files that it extends; modules count from
-    there and from the working directory.
+    `folders` are those of the study's file and of the files that it extends.
     """
     if not this_process.is_listening:
         sys.addaudithook(_listen)  # for the life of this process
@@ -174,29 +160,24 @@ def record_use(folders: Sequence[str]) -> Iterator[Use]:
 
     # What is loaded and opened in the block.
     start = time.time()
-    use = Use({}, [])
+    names = list[str]()
     before = set(sys.modules)
     opened = this_process.opened = set[str]()
     try:
-        yield use
+        yield names
     finally:
         this_process.opened = None
+    this_process.modules |= sys.modules.keys() - before
 
-    # Modules in the study's folders, and other files that were opened.
-    loaded = sys.modules.keys() - before
-    this_process.modules |= loaded
+    # Files of the user's, in the study's folders or elsewhere.
     own_folders = [f"{os.path.abspath(folder)}{os.sep}" for folder in (*folders, os.getcwd())]
-    loaded_files = map(file_of_module, loaded)
-    files = {file for file in loaded_files if file.startswith(tuple(own_folders))}
-    files = {file for file in files if is_user_file(file)}
-    use.modules.update(digests((Path(file) for file in files if os.path.isfile(file)), folders))
     caches = (
         f"{path}{os.sep}"  # such as lists of fonts
         for path in (platformdirs.user_cache_path(), platformdirs.user_config_path())
     )
     not_the_users = (*SYSTEM_FOLDERS, *caches)
-    data = (path for path in opened - files if os.path.isfile(path) and not path.endswith(".pyc"))
-    use.opened.extend(
+    data = (path for path in opened if os.path.isfile(path) and not path.endswith(".pyc"))
+    names.extend(
         sorted(
             name_of_file(Path(path), folders)
             for path in data

@@ -18,7 +18,6 @@ from safevar_sumo.campaign.evaluation import Task, evaluate_settings
 from safevar_sumo.campaign.share import carry_share
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.plugins import Use
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
@@ -73,7 +72,7 @@ class FormulaPool(InlinePool):
     def compute(self, function: Callable[..., Any], *arguments: Any) -> Any:
         if function in (carry_share, evaluate_settings):
             return function(*arguments)
-        return (Use({}, []), 0) if function is user_checks._refuse_defects else ""
+        return ([], 0) if function is user_checks._refuse_defects else ""
 
 
 def with_search(study: Study, **changes: object) -> Study:

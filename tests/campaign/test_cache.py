@@ -24,7 +24,7 @@ from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all
 from safevar_sumo.campaign.cache import keep_simulations, simulate_anew
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import Use, unload_user_modules
+from safevar_sumo.plugins import unload_user_modules
 from safevar_sumo.questions.catalogue import list_models
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import Evaluations, FloatArray
@@ -305,7 +305,7 @@ def test_without_a_usable_folder_all_is_simulated_and_one_line_says_so(
 def test_the_oldest_simulations_make_room(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "SIZE_LIMIT", 300_000)
     with keep_simulations():
-        kept = cache.cache_of(load_study("smoke"), Use({}, []))
+        kept = cache.cache_of(load_study("smoke"), [])
         for number in range(100):
             kept.put(str(number).encode(), os.urandom(20_000))
         assert kept.get(b"99") is not None

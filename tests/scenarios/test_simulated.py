@@ -21,7 +21,6 @@ from safevar_sumo.campaign.cache import Cache, keep_simulations
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.metrics import METRICS, Unsafe
-from safevar_sumo.plugins import Use
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.records import Evaluations, differences
 from safevar_sumo.results import manifest_differences
@@ -824,8 +823,8 @@ def test_results_of_two_simulators_are_not_mixed(wall: Path, how: str) -> None:
     keys = set()
     for value in (1.0, 1.1):
         with_data(wall, how, value)
-        use = Use({}, [named] if named else [])
-        keys.add(Cache(wall.parent / f"{value}").key_of(study, use))
+        opened = [named] if named else []
+        keys.add(Cache(wall.parent / f"{value}").key_of(study, opened))
     assert len(keys) == (2 if named else 1)
 
 
