@@ -95,10 +95,10 @@ def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId
     """A setting beside the original: its values, outcome, metrics and objectives, and the points of
     a matrix; of a solution its handle.
     """
-    # Which numbers are of the filtered setting, and what came too early.
+    # Which numbers are of the filtered setting.
     study = simulation.study
     setting = simulation.evaluation.settings[0]
-    remarks = remarks_of(system)
+    remarks = _remarks_of(system)
     small = [
         f"{name} = {value:g}"
         for name, value in simulation.reset_values.items()
@@ -131,7 +131,8 @@ def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId
         who = "changed" if is_changed else "original"
         verdict.append(points_in_words(f"The {who} vehicle", failing, len(system.matrix)))
 
-    tables["remarks"] = remark_table(remarks)
+    rows = [(remark,) for remark in dict.fromkeys(remarks)]
+    tables["remarks"] = tabulate("Remarks", REMARKS, rows)
     if texts := change_texts(system.characteristics.vehicle, system.characteristics.named(setting)):
         verdict.append(f"Changed: {', '.join(texts)}.")
     verdict += _meets(system, setting)
@@ -156,10 +157,6 @@ def _points(study: Study, system: System, setting: FloatArray) -> tuple[pd.DataF
     table = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
     table.attrs["lead_rows"] = np.argsort(table[SAFETY_DEGREE], kind="stable").tolist()
     return table, [one.point.name for one in results if _fails(study, one)]
-
-
-def remark_table(remarks: list[str]) -> pd.DataFrame:
-    return tabulate("Remarks", REMARKS, [(remark,) for remark in dict.fromkeys(remarks)])
 
 
 def _without_repetition(frame: pd.DataFrame, simulation: Simulation) -> pd.DataFrame:
@@ -236,7 +233,7 @@ def _safety_comparison(simulation: Simulation) -> str:
     return f"the changed vehicle is {'less safe' if degree < original else 'safer'}"
 
 
-def remarks_of(system: System) -> list[str]:
+def _remarks_of(system: System) -> list[str]:
     remarks = [remark for point in system.points for remark in point.scenario.remarks()]
     pre_crash = pre_crash_sentence(system.points)
     return [*remarks, *without_effect(system), *vehicle_remarks(system), *filter(None, [pre_crash])]
