@@ -1,6 +1,4 @@
-"""Measures by name: the safety metrics of method section 4, metrics of comfort, measures of
-change.
-"""
+"""Measures by name: the safety metrics of method section 4, measures of change."""
 
 from safevar_sumo.metrics.base import (
     F_DIFF as F_DIFF,
@@ -10,7 +8,6 @@ from safevar_sumo.metrics.base import (
     Scoring as Scoring,
     checked_measure as checked_measure,
 )
-from safevar_sumo.metrics.comfort import BRAKE_HARSHNESS, MAX_JERK, RMS_ACCELERATION
 from safevar_sumo.metrics.legal import (
     IMPACT_EXCESS as IMPACT_EXCESS,
     IMPACT_SPEED as IMPACT_SPEED,
@@ -40,9 +37,6 @@ METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AV
 OPTIONAL_METRICS = {
     metric.name: metric
     for metric in (
-        MAX_JERK,
-        RMS_ACCELERATION,
-        BRAKE_HARSHNESS,
         STOPPING_DISTANCE,
         STOP_FROM_PEDAL,
         MFDD,
@@ -56,8 +50,7 @@ OPTIONAL_METRICS = {
 }
 """Metrics that only the studies have that name them."""
 OBJECTIVES = {objective.name: objective for objective in (F_SAFE, F_DIFF, F_NUM_DIFF)} | {
-    SAFETY_DEGREE_METRIC.name: F_SAFE,
-    "f_comfort": MAX_JERK,
+    SAFETY_DEGREE_METRIC.name: F_SAFE
 }
 """What the objectives of a search may name besides metrics."""
 PUBLISHED_SCORING = Scoring(

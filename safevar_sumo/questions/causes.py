@@ -20,7 +20,6 @@ from rich.console import Console
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Unsafe
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.research_questions.statistics import median_interval
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 from safevar_sumo.terminal import print_text
@@ -236,22 +235,14 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     """How many distinct minimal causes each finished run found, in at most `limit` of its unsafe
     solutions: those with the fewest, then the smallest changes.
 
-    Of solutions within budgets, as `within_budgets` gives them, budgets stand in place of runs, and
-    the first failures in the order of `draw` count.
-
     Returns
     -------
     pandas.DataFrame
-        Columns algorithm, run, failures (different unsafe solutions), examined, causes; alone,
-        those that no other algorithm found in the run of the same number; of budgets `of_run`, the
-        median over runs of the causes of a run's examined failures, with its interval; and cost,
-        the settings that all this took to simulate.
+        Columns algorithm, run, failures (different unsafe solutions), examined and causes.
     """
     # The first failures of each run.
     keys = ["algorithm", "run"]
     order = [F_NUM_DIFF.name, F_DIFF.name]
-    if "simulations" in case.solutions:
-        keys, order = ["algorithm", "simulations"], ["draw"]
     names = [*evaluator.characteristics.names]
     failures = case.solutions[case.unsafe.rows(case.solutions)].drop_duplicates([*keys, *names])
     examined = failures.sort_values(order, kind="stable").groupby(keys).head(limit)
@@ -273,32 +264,18 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
         name="kind",
     )
     each = examined.merge(settings.join(kinds.explode())).dropna(subset="kind")
-    found = each[[*keys, "kind"]].drop_duplicates()
 
     # How many of each run.
     counted = {
         "failures": failures,
         "examined": examined,
-        "causes": found,
-        "alone": found.drop_duplicates([keys[1], "kind"], keep=False),
+        "causes": each[[*keys, "kind"]].drop_duplicates(),
     }
     frame = pd.DataFrame(
         {name: rows.groupby(keys).size() for name, rows in counted.items()},
         pd.MultiIndex.from_tuples(case.finished_runs, names=keys),
     )
-    frame = frame.fillna(0).astype(int).reset_index().assign(cost=evaluator.simulated)
-    if "simulations" not in keys:
-        return frame
-
-    # How many in a run of each algorithm.
-    of_runs = each.groupby([*keys, "run"])["kind"].nunique()
-    runs = case.solutions.groupby("algorithm")["run"].unique()
-    counts = [
-        [of_runs.get((algorithm, budget, run), 0) for run in runs[algorithm]]
-        for algorithm, budget in frame[keys].itertuples(index=False)
-    ]
-    low, high = np.transpose([median_interval(row) for row in counts])
-    return frame.assign(of_run=[*map(np.median, counts)], of_run_low=low, of_run_high=high)
+    return frame.fillna(0).astype(int).reset_index()
 
 
 def settings_of(characteristics: CharacteristicSet, causes: Sequence[Cause]) -> FloatArray:

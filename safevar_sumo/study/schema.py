@@ -80,7 +80,7 @@ class MetricsTable(Table, frozen=True, kw_only=True):
 
     `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that TET,
     TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the
-    step). `also` names further metrics: metrics of the package, such as `max_jerk`, or users'
+    step). `also` names further metrics: metrics of the package, such as `ttc_min`, or users'
     metrics as `package.module:Name`.
     """
 

@@ -125,17 +125,15 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     assert "rs 1 of 2 runs" in run("rules", "part", "--samples", "64", "--jobs", "1").stderr
     records = output["tables"]["rq2"]["rows"]
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
-    for name in ("budget", "diversity"):
-        assert name not in output["tables"]
-        assert {*json_of("tables", "part", "--table", name)["tables"]} == {name, "remarks"}
+    assert "budget" not in output["tables"]
+    assert {*json_of("tables", "part", "--table", "budget")["tables"]} == {"budget", "remarks"}
     Path("part/runs/rs-00.jsonl").unlink()
     assert "only nsga2" in run("tables", "part", "--table", "rq2").stdout
     refused("tables", "part", "--table", "budget", message=("only nsga2",))
     for path in Path("part/runs").glob("nsga2-*"):
         path.write_bytes(path.read_bytes()[:-20])
-    for option in ((), ("--table", "diversity")):
-        told = ("no run is finished", "`study` goes on where it was interrupted")
-        refused("tables", "part", *option, message=told)
+    told = ("no run is finished", "`study` goes on where it was interrupted")
+    refused("tables", "part", message=told)
     for path in Path("part/runs").glob("nsga2-*"):
         path.unlink()
     answer = run("explain", "part", "--jobs", "1")

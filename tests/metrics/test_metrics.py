@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 from numpy.random import default_rng
-from scipy import signal
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import (
@@ -261,7 +259,7 @@ def test_a_margin_is_the_safety_degree_above_the_limit() -> None:
 SAMPLED = 0.05
 
 
-def comfort(
+def of_speeds(
     name: str, speed: FloatArray, until: float = np.inf, collision_speed: float = np.nan
 ) -> FloatArray:
     v = speed.reshape(len(speed), -1)
@@ -270,52 +268,11 @@ def comfort(
     return OPTIONAL_METRICS[name].function(runs, THRESHOLDS)
 
 
-def sampled(speed: Callable[[FloatArray], FloatArray], seconds: float = 6.0) -> FloatArray:
-    return speed(np.arange(0, seconds + SAMPLED / 2, SAMPLED))
-
-
-def test_harshness_of_a_constant_deceleration_equals_it_and_jerk_occurs_only_at_its_ends() -> None:
-    """5 m/s^2 from 15 m/s, for 3 s; at the stop the deceleration ends within the second over which
-    jerk is averaged.
-    """
-    speed = sampled(lambda t: np.maximum(15 - 5 * t, 0))
-    assert comfort("brake_harshness", speed)[0] == pytest.approx(5.0)
-    assert comfort("max_jerk", speed)[0] == pytest.approx(5.0)
-    assert comfort("max_jerk", speed, until=2.9)[0] == pytest.approx(0.0, abs=1e-9), (
-        "what follows the run's end does not count"
-    )
-
-
-def test_jerk_of_a_ramp_is_its_slope_and_harshness_the_mean_of_its_last_half_second() -> None:
-    """Deceleration 2 t: jerk 2 everywhere; the mean over the last half of the first 3 seconds is 2
-    (3 - 0.25).
-    """
-    speed = sampled(lambda t: 20 - t**2, 3.0)
-    assert comfort("max_jerk", speed)[0] == pytest.approx(2.0)
-    assert comfort("brake_harshness", speed)[0] == pytest.approx(5.5)
-    short = np.array([9.0, 9.0, 8.0, 8.0])
-    assert comfort("max_jerk", short)[0] == 0, "over all of a run that is shorter than a second"
-
-
-def test_rms_agrees_with_scipys_filters() -> None:
-    speed = np.cumsum(default_rng(1).normal(size=(200, 3)), axis=0)
-    high = 2 * np.pi * 0.4
-    corner = 2 * np.pi * 2
-    first = signal.bilinear(*signal.butter(2, high, "high", analog=True), fs=1 / SAMPLED)
-    second = signal.bilinear([corner, corner**2], [1, corner / 0.63, corner**2], fs=1 / SAMPLED)
-    expected = np.diff(speed, axis=0) / SAMPLED
-    for taps in (first, second):
-        expected = signal.lfilter(*taps, expected, axis=0)
-    assert comfort("rms_acceleration", speed) == pytest.approx(
-        np.sqrt((expected**2).mean(axis=0)), rel=1e-9
-    )
-
-
 @pytest.mark.parametrize("name", OPTIONAL_METRICS)
 def test_each_vehicle_counts_for_itself_to_the_bit_and_says_if_on_a_collision(name: str) -> None:
     speed = np.cumsum(default_rng(2).normal(size=(150, 7)), axis=0)
-    np.testing.assert_array_equal(comfort(name, speed)[4:5], comfort(name, speed[:, 4]))
-    in_collision = comfort(name, speed, collision_speed=3.0)
+    np.testing.assert_array_equal(of_speeds(name, speed)[4:5], of_speeds(name, speed[:, 4]))
+    in_collision = of_speeds(name, speed, collision_speed=3.0)
     assert OPTIONAL_METRICS[name].over_collisions or np.isnan(in_collision).all()
 
 

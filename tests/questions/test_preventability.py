@@ -21,7 +21,7 @@ from safevar_sumo.questions.explain.robustness import robust_shares
 from safevar_sumo.questions.explain.words import avoided_in_words
 from safevar_sumo.questions.part import at_point
 from safevar_sumo.questions.preventability import (
-    DRIVERS,
+    TITLES,
     assess_collisions,
     assess_sample,
     avoided_by,
@@ -88,31 +88,30 @@ def avoiders(here: Evaluator, *settings: FloatArray) -> list[str]:
 
 def verdicts(*drivers: Sequence[float], points: Sequence[str] | None = None) -> pd.DataFrame:
     """Made-up verdicts of all drivers, in their order."""
-    return pd.DataFrame(dict(zip(DRIVERS, drivers, strict=True))).assign(point=points or "")
+    return pd.DataFrame(dict(zip(TITLES, drivers, strict=True))).assign(point=points or "")
 
 
 def test_shares_are_told_with_two_digits_and_none_or_all_only_if_exact() -> None:
-    many = verdicts(*[[1.0] * 999 + [0.0]] * 2, [1.0] * 1000, *[[1.0] * 390 + [0.0] * 610] * 2)
+    many = verdicts([1.0] * 999 + [0.0], [1.0] * 1000)
     assert (
         avoided_in_words(many)
         == "In the same vehicle, a competent driver would have avoided nearly all of 1,000"
         " collisions, and full braking at the first possible moment all."
     )
-    assert avoided_in_words(verdicts(*[[np.nan]] * 5)) == ""
+    assert avoided_in_words(verdicts([np.nan], [np.nan])) == ""
 
 
 def test_who_has_no_verdict_is_counted_with_the_points() -> None:
-    """By the letter he collides in the original vehicle at the point b, where any braking is a
-    danger to the other.
-    """
+    """A competent driver collides in the original vehicle at the point b."""
     nan = np.nan
-    two = verdicts([1.0, nan], [1.0, 1.0], [1.0, nan], [0.0, nan], [0.0, 0.0], points=["a", "b"])
-    rows = drivers_frame(two, 2).replace({pd.NA: None}).to_dict("records")
-    assert [
-        (row["avoided"], row["later"], row["no_verdict"], row["no_verdict_points"]) for row in rows
-    ] == [(1, 0, 1, ["b"]), (2, 0, 0, []), (1, None, 1, ["b"])]
-    only_any, nobody = verdicts([nan], [1.0], [1.0], [nan], [nan]), verdicts(*[[nan]] * 5)
-    assert avoided_by(only_any.iloc[0].to_dict()) == "competent driver, any braking of a leader"
+    two = verdicts([1.0, nan], [1.0, 1.0], points=["a", "b"])
+    rows = drivers_frame(two, 2).to_dict("records")
+    assert [(row["avoided"], row["no_verdict"], row["no_verdict_points"]) for row in rows] == [
+        (1, 1, ["b"]),
+        (2, 0, []),
+    ]
+    only_full, nobody = verdicts([nan], [1.0]), verdicts([nan], [nan])
+    assert avoided_by(only_full.iloc[0].to_dict()) == "full braking"
     assert avoided_by(nobody.iloc[0].to_dict()) == "no verdict"
     assert drivers_frame(nobody, 1)[["share", "share_low", "share_high"]].isna().all(axis=None)
 
@@ -130,15 +129,15 @@ def test_a_child_that_comes_out_late_tells_nothing_of_a_competent_driver() -> No
 
 
 @SLOW
-def test_behind_a_leader_that_brakes_with_4_only_one_of_two_conventions_has_a_verdict() -> None:
+def test_behind_a_leader_that_brakes_with_4_a_competent_driver_has_no_verdict() -> None:
     tests = [{"name": "CCRb", "parameters": {"test": "CCRb"}, "over": {"speed": [40, 50]}}]
     study = load_study("euro_ncap_car_to_car", matrix={"tests": tests})
     here = Evaluator(replace(study, ads=BLIND), InlinePool())
     found = drivers_frame(
         *assess_sample(here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9)))
     )
-    letter, any_braking, *_ = found.to_dict("records")
-    assert (letter["no_verdict"], any_braking["share"]) == (2, 1.0)
+    letter = found.to_dict("records")[0]
+    assert letter["no_verdict"] == 2
     assert np.isnan(letter["share"])
     (point,) = letter["no_verdict_points"]
     assert point.startswith("CCRb, speed 50")
@@ -155,14 +154,14 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     whole, number = assess_sample(here, Evaluations.concatenate([every, every]))
     assert (len(whole), number) == (30, 30)
     letter = drivers_frame(whole, number).iloc[0]
-    assert (letter["avoided"], letter["later"], letter["no_verdict"]) == (10, 10, 0)
-    assert [letter[name] for name in ("share", "share_low", "share_high", "later_share")] == [
+    assert (letter["avoided"], letter["no_verdict"]) == (10, 0)
+    assert [letter[name] for name in ("share", "share_low", "share_high")] == [
         pytest.approx(1 / 3)
-    ] * 4
-    sample, number = assess_sample(here, every, max_simulations=45)
+    ] * 3
+    sample, number = assess_sample(here, every, max_sample=15)
     assert (len(sample), number) == (15, 30)
     reverse = every.take(np.arange(30)[::-1])
-    pd.testing.assert_frame_equal(sample, assess_sample(here, reverse, max_simulations=45)[0])
+    pd.testing.assert_frame_equal(sample, assess_sample(here, reverse, max_sample=15)[0])
     letter = drivers_frame(sample, number).iloc[0]
     hits = letter["avoided"]
     expected = (

@@ -302,7 +302,7 @@ def test_the_table_for_a_paper_marks_each_metric_that_is_significant() -> None:
 def test_tables_have_the_columns_that_their_command_declares() -> None:
     declared = contents_of(command_function("tables"))
     tables = answer_about("two").to_dict()["tables"]
-    assert {*declared.tables} - {*tables} == {"causes", "budget", "diversity"}
+    assert {*declared.tables} - {*tables} == {"causes", "budget"}
     counts = ("n1", "n2", "n", "rank", "solutions", "collisions", "count")
     for name, table in tables.items():
         assert {*table["columns"]} == {*declared.tables[name]}, name

@@ -23,7 +23,6 @@ from safevar_sumo.questions.case import (
 )
 from safevar_sumo.questions.options import Fraction, Jobs, Range, options_of
 from safevar_sumo.questions.research_questions import changes
-from safevar_sumo.questions.research_questions.budgets import DRAWN, within_budgets
 from safevar_sumo.questions.research_questions.comparisons import (
     DEFAULT,
     Choices,
@@ -42,7 +41,6 @@ from safevar_sumo.questions.research_questions.tables import (
     AS_PUBLISHED,
     CAUSES,
     CHOSEN,
-    DIVERSITY,
     FUNCTIONS,
     ON_REQUEST,
     OVER_RUNS,
@@ -82,9 +80,8 @@ def tables(
     figures.
 
     RQ1 over runs leads; JSON has every table, `--details` all but those that pool the solutions of
-    runs, `rq1` and `rq2`, and `--table` prints any. Two tables are computed only by `--table NAME`:
-    `budget` compares the algorithms after equal numbers of simulations, and `diversity` simulates
-    the distinct minimal causes of their failures.
+    runs, `rq1` and `rq2`, and `--table` prints any. One is computed only by `--table budget`: it
+    compares the algorithms after equal numbers of simulations.
 
     Parameters
     ----------
@@ -101,7 +98,7 @@ def tables(
     jobs
         Number of worker processes that simulate causes, by default one for each core.
     table
-        `budget` or `diversity`: compute this table alone.
+        `budget`: compute this table alone.
     """
     # The options, the cases, and the algorithm that is compared.
     {option.name: option for option in options_of(tables)}["alpha"].check(alpha)
@@ -112,11 +109,7 @@ def tables(
         known = {label for case in cases for label in (*case.algorithms, *case.study.search.labels)}
         check_name("algorithm", f"the results have no {algorithm!r}", label_of(algorithm), known)
     causes_of_cases = {
-        case.name: _causes_of_runs(
-            within_budgets(case) if table == DIVERSITY else case, causes or DRAWN, jobs
-        )
-        for case in cases
-        if (causes or table == DIVERSITY) and case.has_runs
+        case.name: _causes_of_runs(case, causes, jobs) for case in cases if causes and case.has_runs
     }
 
     # Tables, figures, and the command that gives them.

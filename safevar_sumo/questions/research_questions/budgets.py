@@ -7,9 +7,6 @@ fewer settings than a budget counts with all of them.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from itertools import product
-
 import numpy as np
 import pandas as pd
 import scipy
@@ -29,15 +26,11 @@ BUDGETS = (100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000, 100_000, 
 """Numbers of simulations of a run after which algorithms are compared, besides its whole budget."""
 POWER = 0.8
 """Probability with which a planned number of runs shows an effect."""
-DRAWN = 20
-"""Usual number of failures of an algorithm whose minimal causes are simulated, at each budget."""
 
 
-def within_budgets(case: Case) -> Case:
-    """A case whose solutions are all settings that its finished runs might return, once for each
-    budget that has them: one of `BUDGETS`, or the whole budget of a run, in the column
-    `simulations`. The column `draw` has a random order of all settings, and in place of runs are
-    budgets finished.
+def within_budgets(case: Case) -> pd.DataFrame:
+    """All settings that the finished runs of a case might return, once for each budget that has
+    them: one of `BUDGETS`, or the whole budget of a run, in the column `simulations`.
 
     Raises
     ------
@@ -45,20 +38,12 @@ def within_budgets(case: Case) -> Case:
         If there are no evaluations.
     """
     rows = pd.concat([rows for _, rows in frames_of_runs(case, case.evaluations)])
-    rows = rows.assign(
-        draw=np.random.default_rng(case.study.search.seed).permutation(len(rows)),
-        evaluation=rows.groupby(["algorithm", "run"]).cumcount(),
-    )
+    rows = rows.assign(evaluation=rows.groupby(["algorithm", "run"]).cumcount())
     rows = valid_evaluations(case, rows)
     whole = case.study.search.evaluations
     budgets = np.union1d(np.minimum(BUDGETS, whole), whole)
-    return replace(
-        case,
-        solutions=pd.concat(
-            [rows.query("evaluation < @budget").assign(simulations=budget) for budget in budgets]
-        ),
-        finished_runs=tuple(product(case.algorithms, budgets)),
-        stated=case.unsafe,
+    return pd.concat(
+        [rows.query("evaluation < @budget").assign(simulations=budget) for budget in budgets]
     )
 
 
@@ -85,7 +70,7 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
     # Every run within each budget, also if it has no valid setting there.
     tests = rq2_runs(case, choices)["p_value"].count()  # raises if there is a single algorithm
     reference = reference_front(case)
-    within = within_budgets(case)
+    unsafe = case.unsafe
     runs = [
         (
             *run,
@@ -94,9 +79,9 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
                 normalised(minimised_values(case, rows), reference),
                 case.study.search.reference_point,
             ),
-            within.unsafe.rows(rows).sum(),
+            unsafe.rows(rows).sum(),
         )
-        for budget, valid in within.solutions.groupby("simulations")
+        for budget, valid in within_budgets(case).groupby("simulations")
         for run, rows in frames_of_runs(case, valid)
     ]
     growth = pd.DataFrame(runs, columns=["algorithm", "n1", "simulations", "hypervolume", "unsafe"])

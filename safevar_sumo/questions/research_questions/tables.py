@@ -17,19 +17,8 @@ from safevar_sumo.questions.research_questions.fronts import (
 )
 from safevar_sumo.shipped import shipped_table
 
-CAUSES, DIVERSITY = "causes", "diversity"
-CHOSEN = (
-    "rq1-runs",
-    "rq2-runs",
-    "rq2-common",
-    "medians",
-    "budget",
-    CAUSES,
-    DIVERSITY,
-    "rq1",
-    "rq2",
-    "a12",
-)
+CAUSES = "causes"
+CHOSEN = ("rq1-runs", "rq2-runs", "rq2-common", "medians", "budget", CAUSES, "rq1", "rq2", "a12")
 """The tables that depend on a reader's choices."""
 Compute = Callable[..., pd.DataFrame]
 
@@ -77,7 +66,7 @@ FUNCTIONS: dict[str, Compute] = {
     "collisions": changes.count_collisions,
     "combinations": changes.frequent_combinations,
 }
-ON_REQUEST = {"budget": budgets.compare_budgets, DIVERSITY: comparisons.minimal_causes}
+ON_REQUEST = {"budget": budgets.compare_budgets}
 """The tables that are computed only if they are named, and then alone."""
 OVER_RUNS = ("rq1-runs", "rq2-runs", "rq2-common", "a12", "collisions", CAUSES)
 AS_PUBLISHED = ("rq1", "rq2")
