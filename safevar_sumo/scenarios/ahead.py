@@ -137,7 +137,7 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     Notes
     -----
     By default the cyclist rides at 15 km/h from the start; the protocol has 20 km/h in its rows
-    that are rated by the warning.
+    that are judged by the warning.
     """
 
     test: Literal["CPLA", "CBLA"] = "CPLA"
