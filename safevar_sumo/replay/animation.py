@@ -1,53 +1,102 @@
-"""Animations of a comparison, seen from above: a gif by Matplotlib, and an HTML page."""
+"""Animations of a comparison, seen from above, by Matplotlib: a gif, and an HTML page."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
+import re
+from base64 import b64decode, b64encode
+from collections.abc import Callable, Sequence
+from io import BytesIO
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from markupsafe import Markup, escape
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import whole_file
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import COLOURS, ORIGINAL, Comparison
-from safevar_sumo.replay.scene import SEAM_WIDTH, FlatBody, FlatScene, lane_outlines, lay_out_scene
+from safevar_sumo.scenarios import VUT
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from matplotlib.animation import FuncAnimation
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
+    from matplotlib.transforms import Affine2D
 
-WIDTH, PANEL_HEIGHT, DPI = 880, 62, 100
-"""Width of a frame, and height of the panel with texts above the road [pixels]; resolution [pixels
-per inch].
-"""
-GROUND_COLOUR, ROAD_COLOUR, SEAM_COLOUR, PATH_COLOUR = "#eef0ec", "#9aa1a9", "#e8eaec", "#cfd3cf"
-TEXT_COLOUR, PALE_TEXT_COLOUR, ACTOR_COLOUR = "#1d2329", "#5d666f", "#3f464d"
-PERSON_COLOUR, BRAKE_COLOUR, IMPACT_COLOUR = "#1d2329", "#e60000", "#ffd400"
-NAME_STYLE: Any = {"color": TEXT_COLOUR, "fontsize": 13, "ha": "center", "va": "center"}
+WIDTH, PANEL_HEIGHT = 8.8, 0.62
+"""Width of a frame, and height of the panel with texts above the road [inches]."""
+DPI, PAGE_DPI = 100, 75
+"""Resolution of an animation, and of one on a page with others [pixels per inch]."""
+MAX_FRAMES, MAX_PAGE_FRAMES = 100, 40
+"""Largest number of frames of an animation, and of one on a page with others."""
+PALETTE = 32
+"""Number of colours of a frame on a page."""
+GROUND_COLOUR, TEXT_COLOUR, PALE_TEXT_COLOUR = "#eef0ec", "#1d2329", "#5d666f"
+ACTOR_COLOUR, IMPACT_COLOUR = "#3f464d", "#ffd400"
+SEAM_WIDTH = 0.12
+"""Width of the line between two lanes [m]."""
+LAYERS = {
+    "path": [(0.0, "#cfd3cf")],
+    "road": [(0.0, "#e8eaec"), (SEAM_WIDTH, "#9aa1a9")],
+    "crossing": [(0.0, "white")],
+}
+"""How much narrower than a lane each line is that shows it [m], and its colour."""
+KINDS = ("area", *LAYERS)
+"""Kinds of lanes in the order in which they are drawn."""
+STRIPE_LENGTH = 0.5
+"""Length of a crossing's stripes, and of the space between them [m]."""
 IMPACT_STYLE: Any = {
     "marker": (11, 1, 0),  # a star with 11 points
     "markersize": 50,
     "color": IMPACT_COLOUR,
     "markeredgecolor": TEXT_COLOUR,
 }
+MARGIN = 4.0
+"""Free space around the actors [m]."""
+MIN_HEIGHT = 11.0
+"""Smallest height of a view [m]."""
+MAX_LENGTH = 60.0
+"""Largest length of road that is shown; in a longer scene the camera follows the vehicles [m]."""
+CAMERA_LEAD = 0.45
+"""Part of this length behind the front bumpers of the vehicles under test [-]."""
+MAX_DISTANCE = 30.0
+"""Distance to the vehicle under test beyond which actors are not shown [m]."""
 ENDINGS = (".gif", ".html")
 """Endings of the files that `animate` writes."""
 SECONDS_PER_FRAME = 0.1
-"""Duration of a gif's frame [s]; gifs resolve 0.01 s."""
+"""Least duration of a frame [s]; gifs resolve 0.01 s."""
 LAST_FRAME_DURATION = 2.0
-"""Duration of the last frame [s]."""
-MAX_GIF_SIZE = 1_000_000
-"""Size above which a gif gets fewer frames [bytes]."""
+"""How long the last frame of a gif is kept [s]."""
 PLAYER_FOLDER = Path(__file__).parent / "web"
-WIDTH_IN_TEXT_HEIGHTS = 65
-"""Width of a scene [heights of its text]."""
-DECIMALS = 2
-"""Decimals of a position [m]; a heading has one decimal [degrees]."""
+HTML_CHANGES = {
+    r"\\\n": "",
+    r'<link rel="stylesheet"[^>]*>': "",  # icons from the net, which `player.css` has, too
+    r"this\.current_frame = 0;": "this.current_frame = frames.length - 1;",
+    r'name="points"': 'aria-label="time"',
+}
+"""What is put in place of parts of the HTML that Matplotlib writes, by regular expressions: a page
+opens offline, shows how a drive ends, and names what one can press.
+"""
+
+
+class DrawnBody(NamedTuple):
+    """An actor of one simulation: front bumper or person's middle, x to the right and y up [m],
+    heading [rad from x]; shape (T,).
+    """
+
+    row: int
+    is_vut: bool
+    is_person: bool
+    length: float
+    width: float
+    x: FloatArray
+    y: FloatArray
+    heading: FloatArray
 
 
 def animate(comparison: Comparison, path: Path) -> None:
@@ -59,42 +108,78 @@ def animate(comparison: Comparison, path: Path) -> None:
     InputError
         If the ending is unknown, or the file cannot be written.
     """
+    from matplotlib.animation import PillowWriter
+
     comparison.refuse_without_position()
     ending = path.suffix.lower()
-    scene = lay_out_scene(comparison)
     if ending not in ENDINGS:
         raise InputError("animate", str(path), f"a file that ends in {', '.join(ENDINGS)}")
     with whole_file(path, "animate") as file:
-        if ending == ".html":
-            file.write_text(animation_page(scene), encoding="utf-8", newline="\n")
-        else:
-            _write_gif(scene, file)
-
-
-def _write_gif(scene: FlatScene, path: Path) -> None:
-    """Write a gif with as many frames as `MAX_GIF_SIZE` allows; the last one stays for a while."""
-    from matplotlib.animation import FuncAnimation, PillowWriter
-
-    figure, show = draw_scene(scene)
-    stride = max(1, round(SECONDS_PER_FRAME / scene.step))
-    last = scene.sample_count - 1
-
-    # Fewer frames until the file is small enough.
-    while True:
-        samples = [
-            *range(0, last, stride),
-            *[last] * (1 + round(LAST_FRAME_DURATION / (stride * scene.step))),
-        ]
-        animation = FuncAnimation(
-            figure, show, samples, init_func=lambda: [], cache_frame_data=False
-        )
-        animation.save(path, PillowWriter(fps=round(1 / (stride * scene.step))))
-        if path.stat().st_size <= MAX_GIF_SIZE or stride > last:
+        if ending == ".gif":
+            film, fps = film_of(comparison, MAX_FRAMES, LAST_FRAME_DURATION)
+            film.save(file, PillowWriter(fps), dpi=DPI)  # type: ignore[arg-type]
             return
-        stride *= 2
+        page = template_environment().get_template("animation.html.j2")
+        player = player_of(comparison, 1, MAX_FRAMES, DPI)
+        text = page.render(title=comparison.title, changes=comparison.changes, player=player)
+        file.write_text(text, encoding="utf-8", newline="\n")
 
 
-def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
+def player_of(
+    comparison: Comparison, number: int, frames: int = MAX_PAGE_FRAMES, dpi: int = PAGE_DPI
+) -> Markup:
+    """HTML that plays a comparison, with all that this needs, under its number on a page; without
+    JavaScript it shows the end.
+    """
+    from matplotlib.animation import HTMLWriter
+
+    film, fps = film_of(comparison, frames)
+    with TemporaryDirectory() as folder:
+        file = Path(folder, "player.html")
+        writer = HTMLWriter(fps, embed_frames=True)  # type: ignore[arg-type]
+        film.save(file, writer, dpi=dpi)
+        html = file.read_text(encoding="utf-8")
+    for pattern, text in HTML_CHANGES.items():
+        html = re.sub(pattern, text, html)
+
+    html = re.sub(r'(?<=base64,)[^"]*', _with_palette, html)
+
+    # A number for the random name, and the last frame, with what it shows in words.
+    (name,) = set(re.findall(r"_anim_img(\w+)", html))
+    frame = re.findall(r'"(data:image[^"]*)"', html)[-1]
+    verdicts = (f"{comparison.name(row)} {comparison.verdict(row)}" for row in comparison.rows)
+    words = escape(f"Seen from above: {', '.join(verdicts)}")
+    html = html.replace("<img", f'<img alt="{words}" src="{frame}"', 1)
+    return Markup(html.replace(name, str(number)))
+
+
+def _with_palette(picture: re.Match[str]) -> str:
+    """The data of a picture with a palette, which are a quarter as long."""
+    from PIL import Image
+
+    data = BytesIO()
+    with Image.open(BytesIO(b64decode(picture[0]))) as image:
+        image.convert("RGB").quantize(PALETTE).save(data, "png")
+    return b64encode(data.getvalue()).decode()
+
+
+def film_of(comparison: Comparison, frames: int, kept: float = 0.0) -> tuple[FuncAnimation, float]:
+    """At most about so many frames, of which the last one is kept for some time [s], and how many
+    there are in a second.
+    """
+    from matplotlib.animation import FuncAnimation
+
+    step = comparison.runs.trace.step
+    last = _last_sample(comparison)
+    stride = max(round(SECONDS_PER_FRAME / step), -(-last // frames), 1)
+    fps = 1 / (stride * step)
+    samples = [*range(0, last, stride), *[last] * round(1 + kept * fps)]
+    figure, show = draw_scene(comparison)
+    film = FuncAnimation(figure, show, samples, init_func=lambda: [], cache_frame_data=False)
+    return film, fps
+
+
+def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Patch]]]:
     """Draw a scene as a figure outside any window; also returns the function that shows a sample in
     it.
     """
@@ -102,175 +187,156 @@ def draw_scene(scene: FlatScene) -> tuple[Figure, Callable[[int], list[Patch]]]:
     from matplotlib.transforms import Affine2D
 
     # A road that fills the width, and a panel with readings above it.
-    height = round(WIDTH * scene.height / scene.width / 2) * 2
-    figure = Figure(figsize=(WIDTH / DPI, (PANEL_HEIGHT + height) / DPI), dpi=DPI)
+    bodies, turn = lay_out(comparison)
+    left_ends, width, bottom, top = _choose_view(bodies)
+    height = WIDTH * (top - bottom) / width
+    full_height = PANEL_HEIGHT + height
+    figure = Figure(figsize=(WIDTH, full_height))
     axis = figure.add_axes(
-        (0, 0, 1, height / (PANEL_HEIGHT + height)),
-        facecolor=GROUND_COLOUR,
-        xticks=[],
-        yticks=[],
-        ylim=(scene.bottom, scene.bottom + scene.height),
+        (0, 0, 1, height / full_height), facecolor=GROUND_COLOUR, yticks=[], ylim=(bottom, top)
     )
     axis.spines[:].set_visible(False)
+    _draw_road(axis, comparison, turn, points=72 * WIDTH / width)
 
-    # What is drawn once.
-    _draw_road(axis, scene)
-    bodies = [(body, *_draw_body(axis, body, scene)) for body in scene.bodies]
-    vuts = [body for body in scene.bodies if body.is_vut]
-    names = [axis.text(0, 0, scene.comparison.name(body.row), **NAME_STYLE) for body in vuts]
-    impacts = [axis.plot([], [], **IMPACT_STYLE)[0] for _ in vuts]
-    clock = figure.text(0.014, 0.98, "", fontsize=20, color=TEXT_COLOUR, va="top")
+    # What moves, and what is read.
+    is_pair = len(comparison.rows) > 1
+    patches = [
+        axis.add_patch(_draw_body(body, is_outline=is_pair and body.row == ORIGINAL))
+        for body in bodies
+    ]
+    impacts = [axis.plot([], [], **IMPACT_STYLE)[0] for _ in comparison.rows]
+    clock = figure.text(0.014, 1 - 0.12 / full_height, "", fontsize=15, color=TEXT_COLOUR, va="top")
+    style: Any = {"fontsize": 9.5, "weight": "bold", "va": "top", "family": "monospace"}
     texts = [
-        figure.text(
-            0.15,
-            1 - (6 + 27 * row) / (PANEL_HEIGHT + height),
-            "",
-            fontsize=13,
-            weight="bold",
-            color=COLOURS[row],
-            va="top",
-            family="monospace",
-        )
-        for row in scene.comparison.rows
+        figure.text(0.12, 1 - (0.12 + 0.23 * row) / full_height, "", color=COLOURS[row], **style)
+        for row in comparison.rows
     ]
 
     def show(sample: int) -> list[Patch]:
         # Every body at its place.
-        axis.set_xlim(scene.left_ends[sample], scene.left_ends[sample] + scene.width)
-        for body, patches, lights in bodies:
-            pose = Affine2D().rotate(body.heading[sample]).translate(body.x[sample], body.y[sample])
-            for patch in [*patches, *lights]:
-                patch.set_transform(pose + axis.transData)
-                is_shown = np.isfinite(body.x[sample]) and (
-                    patch not in lights or scene.brakes(body, sample)
-                )
-                patch.set_visible(bool(is_shown))
-
-        # The name of each vehicle under test, the original's above it and the changed one's below,
-        # and at its front bumper the impact that its reading tells.
-        for body, name, impact in zip(vuts, names, impacts, strict=True):
+        axis.set_xlim(left_ends[sample], left_ends[sample] + width)
+        for body, patch in zip(bodies, patches, strict=True):
             x, y = body.x[sample], body.y[sample]
-            side = 1 if body.row == ORIGINAL else -1
-            name.set_position((x - body.length / 2, y + side * 0.75 * body.width))
-            impact.set_data([x], [y])
-            impact.set_visible("collides" in scene.reading(body.row, sample))
+            pose = Affine2D().rotate(body.heading[sample]).translate(x, y)
+            patch.set_transform(pose + axis.transData)
+            patch.set_visible(bool(np.isfinite(x)))
+            if body.is_vut:
+                impacts[body.row].set_data([x], [y])
 
-        # The time and both readings.
-        clock.set_text(f"{sample * scene.step:.2f} s")
-        for row, text in enumerate(texts):
-            text.set_text(f"{scene.comparison.name(row):8}  {scene.reading(row, sample)}")
+        # The time, both readings, and the impact.
+        clock.set_text(f"{sample * comparison.runs.trace.step:.2f} s")
+        for row, moments in enumerate(comparison.moments):
+            texts[row].set_text(reading(comparison, row, sample))
+            has_collided = not np.isnan(comparison.runs.closing_speed[row])
+            impacts[row].set_visible(has_collided and sample >= moments.decided)
         return []  # Matplotlib draws the whole figure again
 
     return figure, show
 
 
-def _draw_road(axis: Axes, scene: FlatScene) -> None:
-    """Draw lanes, crossings, and a mark every ten metres from the start of the front bumper."""
-    from matplotlib.patches import Polygon
-
-    for lane in scene.road:
-        layers = [(lane.width, "white" if lane.kind == "crossing" else PATH_COLOUR)]
-        if lane.kind == "road":
-            layers = [(lane.width, SEAM_COLOUR), (lane.width - SEAM_WIDTH, ROAD_COLOUR)]
-        for width, colour in layers:
-            for outline in lane_outlines(lane, width):
-                axis.add_patch(Polygon(outline, color=colour, linewidth=0))
-    for mark in scene.all_marks:
-        axis.annotate(
-            f" {mark} m",
-            (mark, scene.bottom),
-            (0, 2),
-            textcoords="offset points",
-            color=PALE_TEXT_COLOUR,
-            fontsize=8,
-            annotation_clip=True,
-        )
-        axis.vlines(mark, scene.bottom, scene.bottom + 0.7, color=PALE_TEXT_COLOUR, linewidth=0.7)
+def _last_sample(comparison: Comparison) -> int:
+    """The last sample of all runs."""
+    return max(moments.end for moments in comparison.moments)
 
 
-def _draw_body(axis: Axes, body: FlatBody, scene: FlatScene) -> tuple[list[Patch], list[Patch]]:
-    """Draw an actor and its brake lights, heading along x; the front bumper, or a person's middle,
-    is at the origin.
+def lay_out(comparison: Comparison) -> tuple[list[DrawnBody], Affine2D]:
+    """The actors that ever come near the vehicle under test, which starts at the origin towards the
+    right, and what turns the scene to that.
     """
-    from matplotlib.patches import Circle, Rectangle
+    from matplotlib.transforms import Affine2D
 
-    # A person is a circle, beside the original vehicle an empty one.
-    is_empty = body.row == ORIGINAL and len(scene.comparison.rows) > 1
-    length = body.length
-    width = body.width
-    if body.is_person:
-        return [
-            axis.add_patch(
-                Circle(
-                    (0, 0),
-                    max(length, width) / 2,
-                    facecolor="white" if is_empty else PERSON_COLOUR,
-                    edgecolor=PERSON_COLOUR,
-                    zorder=3,
-                )
-            )
-        ], []
+    vut = comparison.tracks[VUT]
+    heading = vut.heading[0, 0]
+    turn = Affine2D().translate(*-vut.motion[0, 0, :2]).rotate(-heading)
+    bodies = []
+    rows = enumerate(comparison.moments)
+    for (name, track), (row, moments) in product(comparison.tracks.items(), rows):
+        # After the end of its run an actor stays in place.
+        samples = np.minimum(np.arange(_last_sample(comparison) + 1), moments.end)
+        place = track.motion[samples, row, :2]
+        distance = np.linalg.norm(place - vut.motion[samples, row, :2], axis=1)
+        if np.any(distance < MAX_DISTANCE + track.length):
+            kind = name == VUT, track.is_person, track.length, track.width
+            x, y = turn.transform(place).T
+            bodies.append(DrawnBody(row, *kind, x, y, track.heading[samples, row] - heading))
+    return bodies, turn
 
-    # A vehicle is a rectangle; the original one is an outline beneath the other.
+
+def _choose_view(bodies: Sequence[DrawnBody]) -> tuple[FloatArray, float, float, float]:
+    """The left ends of the part of the road that is shown, shape (T,), its length, and its lower
+    and upper end [m].
+    """
+    # A frame around all bodies.
+    x, y = (np.array([getattr(body, axis) for body in bodies]) for axis in "xy")
+    sizes = np.array([(body.length, body.width / 2) for body in bodies])
+    length, half_width = sizes.T[:, :, np.newaxis]
+    left, right = np.nanmin(x - length) - MARGIN, np.nanmax(x + length) + MARGIN
+    bottom, top = np.nanmin(y - half_width) - MARGIN, np.nanmax(y + half_width) + MARGIN
+    padding = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
+
+    # A camera follows the vehicles where this frame is too long.
+    width = min(right - left, MAX_LENGTH)
+    fronts = np.mean([body.x for body in bodies if body.is_vut], axis=0)
+    left_ends = np.clip(fronts - CAMERA_LEAD * width, left, right - width)
+    return left_ends, width, bottom - padding, top + padding
+
+
+def _draw_road(axis: Axes, comparison: Comparison, turn: Affine2D, points: float) -> None:
+    """Draw lanes, a metre as so many points, and a mark every ten metres from the start of the
+    front bumper.
+    """
+    from matplotlib.patches import Polygon
+    from matplotlib.ticker import MultipleLocator
+
+    transform = turn + axis.transData
+    for lane in sorted(comparison.road, key=lambda lane: KINDS.index(lane.kind)):
+        if lane.kind == "area":
+            colour = LAYERS["path"][0][1]
+            axis.add_patch(Polygon(lane.line, linewidth=0, color=colour, transform=transform))
+            continue
+        stripes = STRIPE_LENGTH / lane.width
+        style: Any = {"linestyle": (0, (stripes, stripes)) if lane.kind == "crossing" else "-"}
+        for narrower, colour in LAYERS[lane.kind]:
+            style |= {"linewidth": (lane.width - narrower) * points, "color": colour}
+            axis.plot(*lane.line.T, solid_capstyle="butt", transform=transform, **style)
+    axis.xaxis.set_major_locator(MultipleLocator(10))
+    axis.xaxis.set_major_formatter("{x:.0f} m")
+    axis.tick_params(axis="x", direction="in", pad=-15, labelsize=8, colors=PALE_TEXT_COLOUR)
+
+
+def _draw_body(body: DrawnBody, *, is_outline: bool) -> Patch:
+    """Draw an actor, heading along x; the front bumper, or a person's middle, is at the origin."""
+    from matplotlib.patches import Circle, Polygon
+
     colour = COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
-    is_beneath = body.is_vut and is_empty
-
-    def draw(
-        x: float,
-        y: float,
-        length: float,
-        width: float,
-        zorder: float = 3,
-        linewidth: float = 0.0,
-        **style: Any,
-    ) -> Patch:
-        return axis.add_patch(
-            Rectangle((x, y), length, width, zorder=zorder, linewidth=linewidth, **style)
-        )
-
-    if is_beneath:  # an outline: it is not on the road with the other
-        style: dict[str, Any] = {
-            "color": colour,
-            "fill": False,
-            "linewidth": 2.0,
-            "linestyle": "--",
-        }
-        return [draw(-length, -width / 2, length, width, zorder=4, **style)], []
-
-    # Body, windscreen, edge, and brake lights.
-    patches = [
-        draw(-length, -width / 2, length, width, color=colour, alpha=0.9),
-        draw(-0.44 * length, -0.42 * width, 0.16 * length, 0.84 * width, color="white", alpha=0.56),
-        draw(
-            -length,
-            -width / 2,
-            length,
-            width,
-            zorder=4 - body.row,
-            linewidth=1.5,
-            color=colour,
-            fill=False,
-        ),
-    ]
-    sides = (-width / 2, 0.2 * width) if body.is_vut else ()
-    return patches, [
-        draw(-length, side, 0.28, 0.3 * width, zorder=4, color=BRAKE_COLOUR) for side in sides
-    ]
+    style: Any = {"color": colour, "zorder": 3}
+    if is_outline:
+        # It is not on the road with the other.
+        style |= {"fill": False, "linewidth": 2, "linestyle": "--", "zorder": 2 + 2 * body.is_vut}
+    if body.is_person:
+        return Circle((0, 0), max(body.length, body.width) / 2, **style)
+    side = body.width / 2
+    corners = [(-body.length, side), (-side / 2, side), (0, side / 2)]
+    return Polygon([*corners, *[(x, -y) for x, y in reversed(corners)]], **style)
 
 
-@cache
-def player_files() -> dict[str, str]:
-    """The style sheet and the script of the player, to include in a page."""
-    from markupsafe import Markup
-
-    return {
-        name: Markup((PLAYER_FOLDER / f"player.{name}").read_text(encoding="utf-8"))
-        for name in ("css", "js")
-    }
+def reading(comparison: Comparison, row: int, sample: int) -> str:
+    """Speed and gap of a vehicle, whether it brakes and, from the nearest moment on, how its run
+    ends.
+    """
+    trace = comparison.runs.trace
+    moments = comparison.moments[row]
+    shown = min(sample, moments.end)
+    ending = "brakes" if trace.brake[shown, row] > 0 else ""
+    if sample >= moments.decided:
+        ending = comparison.verdict(row)
+    gap = trace.gap[shown, row]
+    words = f"gap {max(gap, 0):.1f} m" if np.isfinite(gap) else ""
+    return f"{comparison.name(row):8}  {trace.speed[shown, row]:4.1f} m/s  {words:10}  {ending}"
 
 
 def template_environment(*folders: Path) -> Environment:
-    """The jinja2 environment for templates in these folders and for the player; it escapes all
+    """The jinja2 environment for templates in these folders and for animations; it escapes all
     values.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -282,109 +348,3 @@ def template_environment(*folders: Path) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-
-
-def animation_page(scene: FlatScene) -> str:
-    """A self-contained page that shows one scene."""
-    template = template_environment().get_template("animation.html.j2")
-    comparison = scene.comparison
-    return template.render(
-        title=comparison.title,
-        changes=comparison.changes,
-        data=player_data(scene),
-        **player_files(),
-    )
-
-
-def player_data(scene: FlatScene) -> JsonObject:
-    """The data of the template `player`, under `played` those of its script. y points down."""
-    # Both drives, and the moments at which something happens.
-    comparison = scene.comparison
-    trace = scene.comparison.runs.trace
-    drives = []
-    jumps = []
-    for row, (braking_start, nearest, end) in enumerate(comparison.moments):
-        name = comparison.name(row)
-        samples = slice(0, end + 1)
-        ending = "is nearest" if np.isnan(comparison.runs.collision_speed[row]) else "collides"
-        moments = ((f"{name} brakes", braking_start), (f"{name} {ending}", nearest))
-        jumps += [
-            {"name": words, "sample": sample} for words, sample in moments if sample is not None
-        ]
-        drives.append(
-            {
-                "name": name,
-                "verdict": comparison.verdict(row),
-                "end": end,
-                "nearest": comparison.moments[row].decided,
-                "speed": _rounded_list(trace.speed[samples, row]),
-                "gap": _rounded_list(trace.gap[samples, row]),
-                "brakes": (trace.brake[samples, row] > 0).astype(int).tolist(),
-            }
-        )
-
-    # What the picture shows, in words; the road; and all positions over time.
-    vehicles = " and ".join(
-        f"the {drive['name']} vehicle, which {drive['verdict']}" for drive in drives
-    )
-    return {
-        "description": f"Seen from above after {scene.key_sample * scene.step:.2f} s: {vehicles}",
-        "moments": sorted(jumps, key=lambda jump: jump["sample"]),
-        "bottom": round(-scene.bottom, DECIMALS),
-        "letters": round(scene.width / WIDTH_IN_TEXT_HEIGHTS, DECIMALS),
-        "road": [
-            {
-                "kind": lane.kind,
-                "width": round(lane.width, 3),
-                "inside": round(lane.width - SEAM_WIDTH, 3),
-                "points": " ".join(f"{x:.2f},{-y:.2f}" for x, y in lane.line.tolist()),
-            }
-            for lane in scene.road
-        ],
-        "ticks": scene.all_marks,
-        "played": {
-            "step": scene.step,
-            "length": scene.sample_count,
-            "key": scene.key_sample,
-            "view": {
-                "left": _rounded_or_constant(scene.left_ends),
-                "top": round(-scene.bottom - scene.height, DECIMALS),
-                "width": round(scene.width, DECIMALS),
-                "height": round(scene.height, DECIMALS),
-            },
-            "drives": drives,
-            "bodies": [_body_data(body) for body in scene.bodies],
-        },
-    }
-
-
-def _body_data(body: FlatBody) -> JsonObject:
-    degrees = -np.rad2deg(
-        np.unwrap(body.heading) if np.isfinite(body.heading).all() else body.heading
-    )
-    return {
-        "name": body.name,
-        "person": body.is_person,
-        "length": body.length,
-        "width": body.width,
-        "drive": body.row if body.is_vut else None,
-        "x": _rounded_or_constant(body.x),
-        "y": _rounded_or_constant(-body.y),
-        "heading": _rounded_or_constant(degrees, decimals=1),
-    }
-
-
-def _rounded_list(values: FloatArray, decimals: int = DECIMALS) -> list[float | None]:
-    """Rounded numbers for JSON; null for an undefined number."""
-    # + 0.0 turns -0.0 into 0.0
-    return [
-        round(value, decimals) + 0.0 if np.isfinite(value) else None for value in values.tolist()
-    ]
-
-
-def _rounded_or_constant(
-    values: FloatArray, decimals: int = DECIMALS
-) -> list[float | None] | float | None:
-    """Rounded numbers, or a single number if all are equal."""
-    numbers = _rounded_list(values, decimals)
-    return numbers[0] if len(set(numbers)) == 1 else numbers

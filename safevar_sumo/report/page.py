@@ -28,7 +28,7 @@ from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.options import CRITERION, Cluster, Jobs, PointName, Simulations
 from safevar_sumo.questions.subject import Results, case_at, changes_since, with_own_set
 from safevar_sumo.records import JsonObject
-from safevar_sumo.replay.animation import player_files, template_environment
+from safevar_sumo.replay.animation import template_environment
 from safevar_sumo.report.budget import REPLAYS, SPEED, divided
 from safevar_sumo.report.replays import page_commands, replays
 from safevar_sumo.report.sections import ReportedStudy, tested, trust
@@ -278,7 +278,6 @@ def make_page(studies: Sequence[ReportedStudy], parts: Parts, shared: Sequence[A
         studies=[_study_parts(number, study, parts) for number, study in enumerate(studies, 1)],
         shared=list(_sections("all", shared)),
         commands=[*of_studies, *of_shared],
-        player=player_files(),
         css=Markup((TEMPLATE_FOLDER / "report.css").read_text(encoding="utf-8")),
     )
     return page.replace("^2", "²").replace("^3", "³") + "\n"  # the powers of units, as in m/s^2
@@ -302,7 +301,7 @@ def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
         "versions": study.versions,
         "is_for_workshop": study.has_workshop_parts,
         "front": front,
-        "replays": list(replays(study, parts.begin())),
+        "replays": list(replays(study, parts.begin(), first=100 * number)),
         "sections": sections,
     }
 

@@ -13,9 +13,8 @@ from safevar_sumo.errors import warn
 from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.words import change_texts, replay_command
 from safevar_sumo.records import FloatArray, JsonObject, NamedValues
-from safevar_sumo.replay.animation import player_data
+from safevar_sumo.replay.animation import player_of
 from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
-from safevar_sumo.replay.scene import lay_out_scene
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.terminal import Progress
@@ -28,9 +27,9 @@ vehicle; and, where encounters are ranges, the column of their encounters.
 """
 
 
-def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
+def replays(study: ReportedStudy, progress: Progress, first: int = 0) -> Iterator[JsonObject]:
     """Replays of chosen solutions, and of settings that answers name by their `CHANGES`: one for
-    each set of changed characteristics.
+    each set of changed characteristics. Their players have numbers from `first` on.
     """
     # The fewest changes, as `study` names them, and the chosen solutions.
     characteristics = study.case.characteristics
@@ -79,7 +78,7 @@ def replays(study: ReportedStudy, progress: Progress) -> Iterator[JsonObject]:
             "point": comparison.point.name,
             "changes": change_texts(characteristics, characteristics.named(setting)),
             "differences": differences,
-            "player": player_data(lay_out_scene(comparison)),
+            "player": player_of(comparison, first + number),
         }
     if different:
         why = why_different(is_imported=not study.case.has_runs)

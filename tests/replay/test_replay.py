@@ -4,12 +4,13 @@ animated.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
 import subprocess
+from base64 import b64decode
 from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,23 +19,23 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.questions.case import Case
 from safevar_sumo.replay import animation, gui
 from safevar_sumo.replay.animation import (
+    DPI,
     IMPACT_COLOUR,
     PANEL_HEIGHT,
-    WIDTH,
     animate,
-    animation_page,
     draw_scene,
+    lay_out,
+    player_of,
 )
 from safevar_sumo.replay.comparison import COLOURS, Comparison, comparison_of, list_differences
 from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
-from safevar_sumo.replay.scene import FlatScene, lay_out_scene
 from safevar_sumo.sumo.system import assemble
 
 
@@ -163,41 +164,45 @@ def test_the_window_plays_from_the_moment_that_it_is_there(
     assert waits == pytest.approx([comparison.runs.trace.step] * 3)
 
 
-def frame(scene: FlatScene, sample: int) -> np.ndarray:
-    """The picture of a sample below the words, shape (height, width, 3)."""
-    figure, show = draw_scene(scene)
+def frame(comparison: Comparison, sample: int) -> tuple[np.ndarray, float, float]:
+    """The picture of a sample below the words, shape (height, width, 3), its left end [m], and
+    pixels per metre.
+    """
+    figure, show = draw_scene(comparison)
     show(sample)
+    figure.set_dpi(DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[PANEL_HEIGHT:, :, :3]
+    picture = np.asarray(canvas.buffer_rgba())[int(PANEL_HEIGHT * DPI) :, :, :3]
+    left, right = figure.axes[0].get_xlim()
+    return picture, left, picture.shape[1] / (right - left)
 
 
 def test_both_vehicles_are_drawn_at_their_positions_to_scale(comparison: Comparison) -> None:
-    scene = lay_out_scene(comparison)
-    picture = frame(scene, 0)  # the changed vehicle stands on the original's place
-    scale = WIDTH / scene.width
+    # The changed vehicle stands on the original's place.
+    picture, left, scale = frame(comparison, 0)
+    vuts = [body for body in lay_out(comparison)[0] if body.is_vut]
     rows, columns = of_colour(picture, COLOURS[0])
-    vut = next(body for body in scene.bodies if body.is_vut)
-    assert columns.max() - columns.min() == pytest.approx(vut.length * scale, abs=4)
-    assert rows.max() - rows.min() == pytest.approx(vut.width * scale, abs=4)
-    end = frame(scene, scene.sample_count - 1)
-    for row, body in enumerate(one for one in scene.bodies if one.is_vut):
-        _, columns = of_colour(end, COLOURS[row])
-        assert columns.max() == pytest.approx((body.x[-1] - scene.left_ends[-1]) * scale, abs=4)
+    assert np.ptp(columns) == pytest.approx(vuts[0].length * scale, abs=4)
+    assert np.ptp(rows) == pytest.approx(vuts[0].width * scale, abs=4)
+    picture, left, scale = frame(comparison, len(vuts[0].x) - 1)
+    for row, body in enumerate(vuts):
+        _, columns = of_colour(picture, COLOURS[row])
+        assert columns.max() == pytest.approx((body.x[-1] - left) * scale, abs=4)
 
 
 def test_an_impact_is_marked_from_its_moment_on_at_the_bumper_of_the_vehicle_that_collides(
     comparison: Comparison,
 ) -> None:
-    scene = lay_out_scene(comparison)
-    changed = [body for body in scene.bodies if body.is_vut][1]
+    changed = [body for body in lay_out(comparison)[0] if body.is_vut][1]
     impact = comparison.moments[1].decided
-    assert of_colour(frame(scene, impact - 1), IMPACT_COLOUR).size == 0
-    for sample in (impact, scene.sample_count - 1):
-        marked = of_colour(frame(scene, sample), IMPACT_COLOUR)
-        front = (changed.x[sample] - scene.left_ends[sample]) * WIDTH / scene.width
-        assert marked[1].min() <= front + 4
-        assert marked[1].max() == pytest.approx(front, abs=1.2 * WIDTH / scene.width)
+    assert of_colour(frame(comparison, impact - 1)[0], IMPACT_COLOUR).size == 0
+    for sample in (impact, len(changed.x) - 1):
+        picture, left, scale = frame(comparison, sample)
+        marked = of_colour(picture, IMPACT_COLOUR)[1]
+        front = (changed.x[sample] - left) * scale
+        assert marked.min() <= front + 4
+        assert marked.max() == pytest.approx(front, abs=1.2 * scale)
 
 
 @pytest.mark.slow
@@ -212,21 +217,23 @@ def test_a_gif_lasts_as_long_as_the_drive_and_has_the_same_bytes_twice(
         animate(comparison, path)
     assert first.read_bytes() == again.read_bytes()
     assert first.stat().st_size < 1_000_000
-    seconds = lay_out_scene(comparison).sample_count * comparison.runs.trace.step
+    last = max(moments.end for moments in comparison.moments)
+    seconds = last * comparison.runs.trace.step
     with Image.open(first) as image:
-        assert image.n_frames == pytest.approx(seconds / 0.25, abs=2)
+        durations = [one.info["duration"] for one in ImageSequence.Iterator(image)]
+    assert durations[0] == 250
+    assert sum(durations) == pytest.approx(1000 * (seconds + 2), abs=500)
 
 
-def test_the_page_holds_every_place_to_the_centimetre(comparison: Comparison) -> None:
-    page = animation_page(lay_out_scene(comparison))
-    scene = lay_out_scene(comparison)
-    data = json.loads(
-        re.search(r'<script type="application/json">(.*?)</script>', page, re.DOTALL)[1]
-    )  # type: ignore[index]
-    assert data["step"] == scene.step
-    vuts = [body for body in data["bodies"] if body["drive"] is not None]
-    for shown, body in zip(vuts, [one for one in scene.bodies if one.is_vut], strict=True):
-        assert np.allclose(shown["x"], body.x, atol=0.0051)
-    assert [drive["end"] for drive in data["drives"]] == [
-        moments.end for moments in comparison.moments
-    ]
+def test_a_player_needs_nothing_else_and_has_its_own_names(comparison: Comparison) -> None:
+    first, again, other = (player_of(comparison, number, 3, 20) for number in (1, 1, 2))
+    assert first == again
+    assert "http" not in first
+    names = [set(re.findall(r'id="(\w+)"', player)) for player in (first, other)]
+    assert not set.intersection(*names)
+    pictures = re.findall('"data:image/png;base64,([^"]*)"', first)
+    sizes = {Image.open(BytesIO(b64decode(picture))).size for picture in pictures}
+    assert len(sizes) == 1
+    assert len(pictures) == pytest.approx(5, abs=1), "of which one is a still"
+    assert pictures[0] == pictures[-1]
+    assert f"changed {comparison.verdict(1)}" in first
