@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from safevar_sumo.study.encounters import Parameters, Weather
 from safevar_sumo.study.marks import (
@@ -56,6 +56,8 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     marks += [OF_VEHICLE_AND_ADS] if {"vehicle", "ads"} & {*parts} else []
     for key in {key for mark in marks for key in keys_with(mark, Study)} - overrides.keys():
         tables.pop(key, None)
+    if "matrix" in parts:
+        tables |= _for_tests(tables, overrides)
 
     # A study without a title of its own is called by its name.
     if parts or base.tables.get("title", "") == base.tables.get("name"):
@@ -78,13 +80,58 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
 
 def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:
     """A table [scenario] that a study inherits: of another weather without the axes of its
-    parameters.
+    parameters, and for tests of other models with these alone.
     """
     names = scenario["over"].keys() - (WEATHER if "weather" in overrides else ())
+    tests = _tables_in(_table_in(overrides, "matrix"), "tests")
+    if tests and all(test.get("model") not in (None, scenario.get("model")) for test in tests):
+        names &= {*WEATHER}
     return {
         **scenario,
         "over": {name: scenario["over"][name] for name in scenario["over"] if name in names},
     }
+
+
+def _for_tests(tables: Tables, overrides: Tables) -> Parameters:
+    """The constraints and distributions that a study with tests of its own inherits: of what can
+    vary in these tests.
+    """
+    # What can vary, the vehicle's characteristics and the axes.
+    tests = _tables_in(_table_in(tables, "matrix"), "tests")
+    known = {*_table_in(_table_in(tables, "vehicle"), "characteristics")}
+    for place in (_table_in(tables, "scenario"), *tests):
+        known |= {*_table_in(place, "over")}
+
+    # Constraints in tests that are still there.
+    names = {str(test.get("name")) for test in tests}
+    kept = [
+        {**one, "tests": [name for name in _list_in(one, "tests") if str(name) in names]}
+        for one in _tables_in(tables, "constraints")
+        if known >= {*_table_in(one, "sum")}
+        and (not one.get("tests") or names & {*map(str, _list_in(one, "tests"))})
+    ]
+    chosen = known | {*_table_in(overrides, "variation")}
+    varied = _table_in(tables, "variation")
+    return {
+        "constraints": tables.get("constraints") if "constraints" in overrides else kept,
+        "variation": {name: varied[name] for name in varied if name in chosen},
+    }
+
+
+def _tables_in(tables: Tables, key: str) -> list[Parameters]:
+    """A list of tables; empty where there is none."""
+    return [row for row in _list_in(tables, key) if isinstance(row, dict)]
+
+
+def _list_in(tables: Tables, key: str) -> list[Any]:
+    value = tables.get(key)
+    return value if isinstance(value, list) else []
+
+
+def _table_in(tables: object, key: str) -> Parameters:
+    """An inner table; empty where there is none."""
+    table = tables.get(key) if isinstance(tables, dict) else None
+    return dict(table) if isinstance(table, dict) else {}
 
 
 def _names_scenario(table: object, base_table: object) -> bool:

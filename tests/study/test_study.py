@@ -166,6 +166,29 @@ def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
     assert read_study(tables_of(study)).matrix is None
 
 
+CRASH = {
+    "name": "crash",
+    "model": "car_to_car",
+    "parameters": {"vut_length": 4.7, "vut_width": 1.85, "test": "CCRs"},
+}
+
+
+def test_what_is_about_tests_that_a_study_replaces_ends_with_them() -> None:
+    """Constraints that name them or their axes, axes of other models, distributions and ranges."""
+    crash = {"tests": [{**CRASH, "over": {"speed": [20, 40]}}]}
+    assert read_study("alks", matrix=crash).constraints == []
+    assert read_study("alks", matrix={"tests": []}, weather="clear").constraints == []
+    cut_out = next(test for test in tables_of(read_study("alks"))["matrix"]["tests"][1:])
+    (kept,) = read_study("alks", matrix={"tests": [cut_out, *crash["tests"]]}).constraints
+    assert kept.tests == ["cut_out"]
+
+    varied = {"walking_speed": {"distribution": "normal", "mean": 1.8, "deviation": 0.2}}
+    base = tables_of(read_study("sun", encounters="ranges", variation=varied))
+    heir = read_study({"extends": "sun", "name": "heir", "variation": {}}, matrix=crash)
+    assert {*heir.scenario.over} == {"road_friction", "recognition_delay"}
+    assert read_study(base, matrix=crash).variation == {}
+
+
 @pytest.mark.parametrize("scenario", [{"model": "mine:Deer"}, {"model": "along"}])
 def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
     scenario: dict[str, str], in_tmp: Path
