@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+import time
+
+ENDING_TIME = 5.0
+"""Time that threads and exit functions of user code have when a command has ended [s]."""
 
 
 def main() -> None:
@@ -13,7 +18,19 @@ def main() -> None:
     _put_installed_modules_first()
     from safevar_sumo import cli
 
-    cli.run_command_line()
+    try:
+        cli.run_command_line()
+    except SystemExit as end:
+        threading.Thread(target=_end_at_last, args=(end.code,), daemon=True).start()
+        raise
+
+
+def _end_at_last(code: object) -> None:
+    """End this process, and simulators, if threads or exit functions keep it from ending."""
+    time.sleep(ENDING_TIME)
+    if kept := sys.modules.get("safevar_sumo.sumo.kept"):
+        kept.close_simulator()
+    os._exit(code if isinstance(code, int) else 1)
 
 
 def _put_installed_modules_first() -> None:

@@ -116,10 +116,10 @@ def carry_out(
     # Two workers died at the same work, probably in user code.
     except WorkerLostError as error:
         task, *arguments = jobs[error.job]
-        first = arguments[0] if arguments else ""
+        first = next(iter(arguments), None)
         work = f"{len(first)} settings" if isinstance(first, np.ndarray) else str(first)
         names = user_code_names(task.study)
-        work = work or "the check of user code"
+        work = "the check of user code" if first is None else work
         problem = f"two workers were lost at the same work, {work}: {error}"
         if names:
             where = f", probably in {' and '.join(names)}"

@@ -23,6 +23,7 @@ from safevar_sumo.errors import INTERRUPTS
 from safevar_sumo.plugins import ImportPath
 from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.plugins.process import (
+    CLOSED,
     MARK,
     REPRODUCED_BY,
     end_children,
@@ -74,6 +75,7 @@ class ProcessWorker:
             return ""
 
         # The last words of the worker name the line of user code.
+        self._process.join()
         words = (
             self._last_words.read_text(encoding="utf-8", errors="replace")
             if self._last_words.exists()
@@ -87,9 +89,10 @@ class ProcessWorker:
         place = f" in {frames[0][0]}, line {frames[0][1]}" if frames else ""
         first_line = words.partition("\n")[0]
         place += first_line if first_line.startswith(REPRODUCED_BY) else ""
+        if CLOSED in words:
+            return f"{CLOSED}{place}"
         if TIMEOUT_MARK in words:
             return f"a batch took longer than the time limit, `search.time_limit`{place}"
-        self._process.join()
         for _ in range(
             1000
         ):  # the executor's thread may have waited for the process, and be about to note its code

@@ -152,8 +152,8 @@ class Pool:
 
     def _skipped(self) -> int:
         """Number of settings of which so many workers have died that they are skipped."""
-        files = self.attempts.iterdir() if self.attempts and self.attempts.exists() else ()
-        return sum(file.stat().st_size > MAX_DEATHS for file in files)
+        folders = self.attempts.iterdir() if self.attempts and self.attempts.exists() else ()
+        return sum(len([*folder.iterdir()]) > MAX_DEATHS for folder in folders)
 
     def everywhere(
         self, function: Callable[..., Any], *arguments: Any, most: int | None = None

@@ -30,7 +30,7 @@ from safevar_sumo.errors import (
     describe_error,
 )
 from safevar_sumo.plugins.files import is_user_file
-from safevar_sumo.plugins.process import Interrupt, mark_interrupts, this_process
+from safevar_sumo.plugins.process import Interrupt, find_damage, mark_interrupts, this_process
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
 UserValue = Any
@@ -51,13 +51,17 @@ def user_errors(source: str) -> Iterator[None]:
     """
     with about(source), mark_interrupts():
         try:
-            yield
+            with find_damage() as damage:
+                yield
         except (UserCodeError, SimulationError, EnvironmentFault, Interrupt):
             raise
         except BaseException as error:
             if user_error := user_error_of(error):
                 raise user_error from error
             raise
+        for problem in damage:
+            legal = "code that leaves streams and descriptors of its process open"
+            raise UserCodeError(source, problem, legal)
 
 
 def user_error_of(error: BaseException) -> UserCodeError | None:

@@ -58,6 +58,8 @@ class _Process:
         Marks the child processes of simulators in this process.
     worker
         The number of this process among those that simulate on this machine.
+    descriptor
+        A file that is open as long as user code leaves descriptors alone.
     """
 
     added_folders: list[str] = field(default_factory=list)
@@ -70,6 +72,7 @@ class _Process:
     worker: int = 0
     attempts: Path | None = None
     mark: str = field(default_factory=lambda: uuid4().hex)
+    descriptor: int = field(default_factory=lambda: os.open(os.devnull, os.O_RDONLY))
 
 
 this_process = _Process()
@@ -79,6 +82,8 @@ MAX_DEATHS = 1
 """Number of workers that may die of a job: another process may have killed one."""
 REPRODUCED_BY = "; to reproduce it: "
 """What stands before a command that simulates a setting again."""
+CLOSED = "user code has closed descriptors of its process"
+"""What a worker that can send no result any more writes last."""
 
 
 def note_work(text: str) -> None:
@@ -103,6 +108,35 @@ def set_variables(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def find_damage() -> Iterator[list[str]]:
+    """Give a list that says after the block which parts of its process user code has closed.
+    Streams that it has replaced by None are restored; a worker without descriptors ends.
+    """
+    damage = list[str]()
+    before = sys.stdout, sys.stderr
+    try:
+        yield damage
+    finally:
+        if None in (sys.stdout, sys.stderr) and None not in before:
+            damage.append("user code has set sys.stdout or sys.stderr to None")
+            sys.stdout, sys.stderr = before
+        try:
+            os.fstat(this_process.descriptor)
+        except OSError:
+            damage.append(CLOSED)
+            _end_without_pipes()
+
+
+def _end_without_pipes() -> None:
+    """End this process, if it is a worker, and say why."""
+    if (words := this_process.last_words) is not None:
+        with suppress(OSError), Path(words.name).open("r+", encoding="utf-8") as file:
+            file.seek(0, os.SEEK_END)
+            file.write(f"{CLOSED}\n")
+        os._exit(1)
 
 
 def end_children(mark: str) -> None:
@@ -145,6 +179,24 @@ def mark_interrupts() -> Iterator[None]:
         for one, handler in handlers.items():
             if signal.getsignal(one) is interrupt:  # user code may have set its own
                 signal.signal(one, handler)
+
+
+@contextmanager
+def defer_interrupts() -> Iterator[None]:
+    """Within the block, Ctrl-C and the like wait until its end: a compiler would print the
+    exception, and go on.
+    """
+    waiting = list[int]()
+    is_main = threading.current_thread() is threading.main_thread()
+    interrupts = INTERRUPTS if is_main else ()
+    before = [signal.signal(one, lambda number, _: waiting.append(number)) for one in interrupts]
+    try:
+        yield
+    finally:
+        for one, handler in zip(interrupts, before, strict=True):
+            signal.signal(one, handler)
+        for number in waiting[:1]:
+            signal.raise_signal(number)
 
 
 @contextmanager

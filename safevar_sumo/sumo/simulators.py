@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from hashlib import sha256
+from pathlib import Path
 from typing import Any
+from uuid import uuid4
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import portalocker
 
 from safevar_sumo.errors import UserCodeError
 from safevar_sumo.metrics import OPTIONAL_METRICS, UNSAFE_SHARE
+from safevar_sumo.output import ALONE
 from safevar_sumo.plugins import UserCode, user_errors
 from safevar_sumo.plugins.process import (
     MARK,
@@ -94,17 +98,29 @@ def _attempt(what: str, system: System) -> Iterator[None]:
     if this_process.attempts is None or not system.skips_failed:
         yield
         return
-    this_process.attempts.mkdir(exist_ok=True)
-    attempts = this_process.attempts / sha256(what.encode()).hexdigest()
-    if attempts.exists() and attempts.stat().st_size > MAX_DEATHS:
+    # An attempt is a file that its process has locked, from the moment it is there.
+    others = this_process.attempts / sha256(what.encode()).hexdigest()
+    others.mkdir(parents=True, exist_ok=True)
+    if sum(map(_has_died, others.iterdir())) > MAX_DEATHS:
         problem = "two workers died, or exceeded the time limit, in simulate"
         raise UserCodeError(system.source, f"{problem}{REPRODUCED_BY}{what}")
-    with attempts.open("a") as file:
-        file.write("x")
-    try:
-        yield
-    finally:
-        attempts.unlink()
+    name = uuid4().hex
+    attempt = others / name
+    with this_process.attempts.with_name(name).open("x") as file:
+        portalocker.lock(file, ALONE)
+        os.replace(file.name, attempt)
+        try:
+            yield
+        finally:
+            attempt.unlink()
+
+
+def _has_died(attempt: Path) -> bool:
+    """Whether the process of an attempt has died during it: nobody has locked its file."""
+    with suppress(FileNotFoundError, portalocker.LockException), attempt.open("r+") as file:
+        portalocker.lock(file, ALONE)
+        return attempt.exists()
+    return False
 
 
 @contextmanager

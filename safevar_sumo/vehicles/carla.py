@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
+from safevar_sumo.plugins.process import defer_interrupts
 from safevar_sumo.records import (
     GRAVITY,
     TIME_ROUNDING,
@@ -335,6 +336,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """The gap as the camera measures it: the wheel radius sets the height of the camera."""
         return seen._replace(gap=seen.gap * prepared.assumed_height), state
 
+    @defer_interrupts()
     def compile(self, *, only_load: bool = False) -> bool:
         from safevar_sumo.vehicles.carla_step import Car, CarlaState, advance
         from safevar_sumo.vehicles.compiled import is_compiled

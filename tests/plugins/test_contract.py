@@ -4,9 +4,10 @@ names it.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,6 +16,8 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError, UserCodeError
+from safevar_sumo.plugins.contract import user_errors
+from safevar_sumo.plugins.process import defer_interrupts, this_process
 from safevar_sumo.records import differences
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
@@ -154,6 +157,40 @@ def test_a_command_is_interrupted_by_ctrl_c(name: str, mine: Mine, folder: Path)
     mine(SCALAR + PRESSED.format(name))
     with handled_by_default(name):
         assert "interrupted" in run("simulate", str(folder / "mine.toml"), expect=130).stderr
+
+
+def test_ctrl_c_waits_for_a_compiler() -> None:
+    done = []
+
+    @defer_interrupts()
+    def compile_it() -> None:
+        signal.raise_signal(signal.SIGINT)
+        done.append("compiled")
+
+    with handled_by_default("SIGINT"), pytest.raises(KeyboardInterrupt):
+        compile_it()
+    assert done == ["compiled"]
+
+
+def take_streams() -> None:
+    sys.stdout = sys.stderr = None  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (take_streams, r"sys\.stdout or sys\.stderr to None"),
+        (lambda: os.close(this_process.descriptor), "closed descriptors of its process"),
+    ],
+)
+def test_a_process_without_streams_or_descriptors_is_an_error(
+    damage: Callable[[], None], told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(this_process, "descriptor", os.open(os.devnull, os.O_RDONLY))
+    before = sys.stdout, sys.stderr
+    with pytest.raises(UserCodeError, match=told), user_errors("mine.toml"):
+        damage()
+    assert (sys.stdout, sys.stderr) == before
 
 
 def test_what_user_code_tells_numpy_ends_with_its_call(mine: Mine) -> None:

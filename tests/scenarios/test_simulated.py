@@ -7,8 +7,10 @@ from __future__ import annotations
 import os
 import re
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from zipfile import ZipFile
@@ -21,6 +23,7 @@ from safevar_sumo.campaign.cache import Cache, keep_simulations
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.metrics import METRICS, Unsafe
+from safevar_sumo.plugins.process import this_process
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.records import Evaluations, differences
 from safevar_sumo.results import manifest_differences
@@ -729,6 +732,72 @@ def test_settings_that_fail_may_be_skipped_and_tried_again(wall: Path, failure: 
     before = Path("count").stat().st_size
     run(*options, "--retry-failed")
     assert Path("count").stat().st_size > before
+
+
+def test_an_attempt_counts_as_a_death_only_when_its_process_has_died(
+    wall: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other workers may be at the same setting; what ends meanwhile is no error."""
+    monkeypatch.setattr(this_process, "attempts", tmp_path / "attempts")
+    system = replace(system_of(wall), skips_failed=True)
+    with ExitStack() as stack:
+        for _ in range(3):
+            stack.enter_context(simulators._attempt("it", system))
+        (folder,) = (tmp_path / "attempts").iterdir()
+        assert len([*folder.iterdir()]) == 3
+    for number in range(2):
+        (folder / f"dead-{number}").touch()
+        if number == 0:
+            with simulators._attempt("it", system):
+                pass
+    with pytest.raises(UserCodeError, match="two workers died"), simulators._attempt("it", system):
+        pass
+    assert {path.name for path in folder.iterdir()} == {"dead-0", "dead-1"}
+
+
+LEAKS = """
+import atexit, os, sys, threading, time
+from models import Rig
+
+class Leaks(Rig):
+    def simulate(self, setting):
+        DAMAGE
+        return super().simulate(setting)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "threading.Thread(target=time.sleep, args=(999,)).start()",
+        "atexit.register(time.sleep, 999)",
+    ],
+)
+def test_threads_and_exit_functions_of_a_simulator_keep_no_command(wall: Path, damage: str) -> None:
+    Path("leaks.py").write_text(LEAKS.replace("DAMAGE", damage))
+    wall.write_text(STUDY.replace("models:Wall", "leaks:Leaks"))
+    command = [sys.executable, "-m", "safevar_sumo", "study", "wall.toml", "--jobs", "1"]
+    assert subprocess.run([*command, "--out", "results"], timeout=200).returncode == 0
+    assert Path("results/solutions.csv").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("worker_processes")
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        ("os.closerange(3, 64)", "user code has closed descriptors"),
+        ("sys.stdout = None", "set sys.stdout or sys.stderr to None"),
+    ],
+)
+def test_a_simulator_that_takes_its_process_apart_is_named(
+    wall: Path, damage: str, told: str
+) -> None:
+    Path("leaks.py").write_text(LEAKS.replace("DAMAGE", damage))
+    wall.write_text(STUDY.replace("models:Wall", "leaks:Leaks"))
+    message = (told, "leaks:Leaks" if "close" in damage else "leaks.py:5")
+    refused("study", "wall.toml", "--out", "results", "--jobs", "1", message=message)
 
 
 @pytest.mark.slow
