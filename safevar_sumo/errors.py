@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import signal
 import warnings
 from collections.abc import Collection, Iterable, Iterator
@@ -18,6 +19,15 @@ INTERRUPT_EXIT_CODE = 130
 """Exit code after Ctrl-C, as in shells: 128 plus the signal's number."""
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 """Signals that end the program as Ctrl-C does."""
+CONTROLS = re.compile(r"[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Characters that steer a terminal or hide text, and halves of characters."""
+
+
+def printable(text: str) -> str:
+    """A text of users and their code as every output has it: a question mark for each control
+    character but a tab and the end of a line.
+    """
+    return CONTROLS.sub("?", text)
 
 
 _subject: ContextVar[str] = ContextVar("subject", default="study")

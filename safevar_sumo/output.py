@@ -1,12 +1,14 @@
-"""Files that users name: output files, written as a whole or not at all; and files beside a study.
-Temporary files and folders, also those of killed processes.
+"""Files that users name: regular input files; output files, written as a whole or not at all; and
+files beside a study. Temporary files and folders, also those of killed processes.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import shutil
+import stat
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -24,8 +26,24 @@ SETTLING_TIME = 0.1
 PREFIX, LOCK = "safevar-", "lock"
 """Beginning of the names of temporary folders, and the file in them that their process has locked.
 """
+MAX_INPUT = 100_000_000
+"""Largest size of an input file [bytes]."""
+MAX_UNPACKED = 1_000_000_000
+"""Largest size of all files of an archive together, unpacked [bytes]."""
 WRITABLE = "a file in a directory that can be written, with space for it"
 """What an error about an output file expects."""
+
+
+def read_file(path: Path, largest: int = MAX_INPUT) -> bytes:
+    """The content of an input file; raises OSError for a pipe or device, which may never end, and
+    for a file that is too large.
+    """
+    about = path.stat()
+    is_endless = not (stat.S_ISREG(about.st_mode) or path.is_dir())  # which cannot be read
+    if is_endless or about.st_size > largest:
+        problem = f"it is no regular file of at most {largest / 1e6:,.0f} MB"
+        raise OSError(errno.EINVAL, problem, str(path))
+    return path.read_bytes()
 
 
 @contextmanager

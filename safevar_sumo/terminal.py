@@ -19,6 +19,8 @@ from rich.progress import BarColumn, Progress as Bar, ProgressColumn, Task, Text
 from rich.table import Table
 from rich.text import Text
 
+from safevar_sumo.errors import printable
+
 Progress = Callable[[str, int, int], None]
 """A function that shows progress, called with the phase, and with the number of simulations that
 are done and their total, both of the whole command; the total is an estimate while it is not known
@@ -105,7 +107,7 @@ def printable_text(text: object, style: str = "") -> Text:
 
 def print_text(console: Console, text: str) -> None:
     """Print a line of text without wrapping and markup."""
-    console.print(text, soft_wrap=True, markup=False, highlight=False)
+    console.print(printable(text), soft_wrap=True, markup=False, highlight=False)
 
 
 def show_no_progress(phase: str, done: int, total: int) -> None:

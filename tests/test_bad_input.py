@@ -5,6 +5,7 @@ code 2; whatever is in a study file is a study or an error of one kind, never a 
 from __future__ import annotations
 
 import math
+import os
 import tempfile
 from pathlib import Path
 
@@ -14,10 +15,20 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
+from safevar_sumo.output import MAX_INPUT
 from safevar_sumo.records import JsonObject
+from safevar_sumo.results import MANIFEST
 from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import refused
 
+PIPES = [
+    ("simulate", "pipe"),
+    ("simulate", "extends.toml"),
+    ("permit", "wear", "--cars", "pipe"),
+    ("verify", "pipe"),
+    ("report", "results"),
+]
 TABLES = tables_of(load_study("smoke"))
 SCALARS = st.one_of(
     st.integers(),
@@ -73,3 +84,21 @@ def test_a_study_with_anything_in_one_place_is_read_or_refused(
         assert isinstance(study, Study)
         numbers = list(study.vehicle.characteristics.values())
         assert all(math.isfinite(row.original) and row.lower < row.upper for row in numbers)
+
+
+@pytest.mark.parametrize("command", PIPES, ids=" ".join)
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_a_pipe_or_device_is_no_input(command: tuple[str, ...], kind: str, in_tmp: Path) -> None:
+    """Either may never end; /dev/zero does not."""
+    Path("results").mkdir()
+    for path in Path("pipe"), Path("results", MANIFEST):
+        os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
+    Path("extends.toml").write_text('extends = "pipe"')
+    refused(*command, message=("no regular file of at most",))
+
+
+def test_a_file_that_is_too_large_is_no_input(in_tmp: Path) -> None:
+    with open("huge.toml", "wb") as file:
+        file.truncate(MAX_INPUT + 1)
+    with pytest.raises(InputError, match=r"huge\.toml: .*no regular file of at most 100 MB"):
+        load_study("huge.toml")

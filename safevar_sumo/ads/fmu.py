@@ -7,14 +7,17 @@ from __future__ import annotations
 import sys
 import weakref
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 
 from safevar_sumo.ads.base import ScalarAds, Trim, trim_at
 from safevar_sumo.errors import InputError, check_name, missing_extra, unknown_name
+from safevar_sumo.output import MAX_UNPACKED, read_file
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.records import NamedValues, Nominal, Observation
 from safevar_sumo.study.encounters import ModelTable
@@ -67,6 +70,10 @@ class Fmu:
         try:
             from fmpy import extract, read_model_description  # an extra
 
+            with ZipFile(BytesIO(read_file(Path(path)))) as archive:
+                size = sum(entry.file_size for entry in archive.infolist())
+            if size > MAX_UNPACKED:
+                raise ValueError(f"unpacked it has {size / 1e9:.1f} GB")
             extract(path, self._folder.name)
             self._model: Any = read_model_description(self._folder.name, validate=False)
         except ImportError:

@@ -24,6 +24,7 @@ from safevar_sumo.errors import (
     InputError,
     SafevarError,
     did_you_mean,
+    printable,
 )
 from safevar_sumo.shipped import PROGRAM, PROGRAM_COMMAND
 
@@ -182,7 +183,9 @@ def run_command_line() -> None:
     """
     # A warning is a line, without its place in the code; a signal to end is an interruption; a
     # crash has its line.
-    warnings.showwarning = lambda message, *_, **__: click.echo(f"warning: {message}", err=True)
+    warnings.showwarning = lambda message, *_, **__: click.echo(
+        f"warning: {printable(str(message))}", err=True
+    )
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     with suppress(AttributeError, OSError, ValueError):  # standard error is no file
@@ -245,5 +248,5 @@ def _exit_on_interrupt() -> Iterator[None]:
 def _exit_with_error(message: str, code: int) -> NoReturn:
     for interrupt in INTERRUPTS:  # another Ctrl-C must change neither exit code nor message
         signal.signal(interrupt, signal.SIG_IGN)
-    click.echo(f"{PROGRAM}: {message}", err=True)
+    click.echo(f"{PROGRAM}: {printable(message)}", err=True)
     sys.exit(code)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import pandas as pd
 from rich.console import Console
 
+from safevar_sumo.errors import printable
 from safevar_sumo.questions.tables import (
     LATEX_PREAMBLE,
     MAX_LEAD_ROWS,
@@ -174,15 +175,16 @@ def render(answer: Answer, form: str, table: str | None = None, *, details: bool
     """
     if form == "csv":
         frame = answer.table(table) if table or answer.listing is None else answer.listing
-        return frame.map(csv_cell).to_csv(index=False, lineterminator="\n")
+        cells = frame.map(csv_cell).rename(columns=csv_cell)
+        return cells.to_csv(index=False, lineterminator="\n")
     if table is not None:
         answer = answer.only(table)
     if form == "json":
         return json.dumps(answer.to_dict(), indent=2, allow_nan=False) + "\n"
     if form == "latex":
-        return _latex(answer)
+        return printable(_latex(answer))
     if form == "html":
-        return _html(answer)
+        return printable(_html(answer))
 
     # Text as on a terminal of fixed width.
     console = Console(width=WIDTH, no_color=True, force_terminal=False)

@@ -13,7 +13,9 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from safevar_sumo.errors import printable
 from safevar_sumo.questions.bars import LEGEND
+from safevar_sumo.questions.changes import NUMBER_PATTERN
 from safevar_sumo.terminal import WholeTable
 
 LOW = "_low"
@@ -146,9 +148,20 @@ def cell_text(value: Any, number_format: str = ".4g") -> str:
     return str(value)
 
 
+FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
+"""How cells begin that a spreadsheet calculates."""
+SIGNED = re.compile(rf"{NUMBER_PATTERN}|[+-]inf")
+
+
 def csv_cell(value: Any) -> Any:
-    """A value as CSV has it: a list as words."""
-    return " ".join(map(str, value)) if isinstance(value, list) else value
+    """A value as CSV has it: a list as words, and an apostrophe before a text that a spreadsheet
+    would calculate.
+    """
+    value = " ".join(map(str, value)) if isinstance(value, list) else value
+    if not isinstance(value, str):
+        return value
+    is_formula = value.startswith(FORMULA_STARTS) and not SIGNED.fullmatch(value)
+    return printable(f"'{value}" if is_formula else value)
 
 
 def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:

@@ -8,6 +8,7 @@ A row holds one solution: the characteristics, then `MaxPercentage`, `SaftyDegre
 from __future__ import annotations
 
 from collections import Counter
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import METRICS
+from safevar_sumo.output import read_file
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
 from safevar_sumo.results import UNKNOWN, write_imported
@@ -91,8 +93,9 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     """
     # A table of texts.
     try:
+        file = BytesIO(read_file(path))
         lines = pd.read_csv(
-            path, dtype=str, skipinitialspace=True, skip_blank_lines=False, encoding="utf-8-sig"
+            file, dtype=str, skipinitialspace=True, skip_blank_lines=False, encoding="utf-8-sig"
         )
         if not isinstance(lines.index, pd.RangeIndex):
             raise ValueError("rows have more values than the header has columns")

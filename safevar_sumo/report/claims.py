@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -59,7 +60,10 @@ STUDY, ANSWERS, PAGE, CODE = "study.toml", "answers.json", "report.html", "code"
 FILES = {MANIFEST, SOLUTIONS, STUDY, ANSWERS, PAGE}
 LISTS, CARS = "lists", "cars"
 """The folder of the lists of cars in a pack, and the option of a question that names one."""
-SAME, DIFFERS, CANNOT = "same", "differs", "cannot be run"
+SAME, DIFFERS, CANNOT, UNCHECKED = "same", "differs", "cannot be run", "unchecked"
+VERDICTS = SAME, DIFFERS, CANNOT, UNCHECKED
+MAX_ASKED = 1_000_000
+"""Largest sum of the numbers, such as of vehicles, that all questions of a study state."""
 MALFORMED = (
     LookupError,
     ValueError,
@@ -78,21 +82,24 @@ CONTEXT, SHOWN = 40, 200
 """Characters of a long line that are shown before the first one that differs, and in all."""
 
 
+WHOLE_NUMBER = re.compile(r"[+-]?\d[\d_]*")
 CLAIMS = {
     "study": "study of the pack",
     "claim": "what the pack holds",
-    "verdict": f"{SAME}, {DIFFERS} or {CANNOT}",
+    "verdict": f"{SAME}, {DIFFERS}, {CANNOT} or {UNCHECKED}",
     "packed": "value in the pack, if it differs",
     "here": "value here, or the reason why there is none",
 }
 
 
 class Claim(NamedTuple):
-    """What a pack claims under a name, and the function that computes it again."""
+    """What a pack claims under a name, and the function that computes it again; None if that was
+    not asked for.
+    """
 
     name: str
     packed: bytes
-    compute: Callable[[], bytes]
+    compute: Callable[[], bytes] | None
 
 
 class Packed:
@@ -159,7 +166,13 @@ class Packed:
                 f"{total:,} evaluations are far more than {number_of(len(runs), 'run')} may have"
             )
 
-        # No question writes a file.
+        # No question writes a file, or takes for ever.
+        words = [word for text in self.packed.questions for word in split(text)]
+        numbers = [int(word) for word in words if WHOLE_NUMBER.fullmatch(word)]
+        asked = sum([*numbers, *self.packed.simulations.values()])
+        if asked > MAX_ASKED:
+            problem = f"its questions ask for {asked:,} vehicles and simulations"
+            raise InputError("ask", problem, f"at most {MAX_ASKED:,} in a pack")
         for text in self.packed.questions:
             if "--out" in split(text):
                 raise InputError("ask", f"{text!r} writes a file", "a question without --out")
@@ -180,6 +193,10 @@ class Packed:
             raise ValueError(f"{SOLUTIONS}: the column {min(wrong)} is missing, new or there twice")
         if count_solutions(solutions, self.packed.runs) != self.packed.solutions:
             raise ValueError(f"{SOLUTIONS} has other rows than {DESCRIPTION} says")
+        each = solutions.drop_duplicates(["algorithm", "run", *study.domains])
+        for outcome, count in each["outcome"].value_counts().items():
+            if count > (stated := self.packed.outcomes.get(str(outcome), 0)):
+                raise ValueError(f"{count} solutions of {stated} simulations have {outcome}")
 
     @cached_property
     def shown(self) -> Case:
@@ -313,11 +330,12 @@ class Packed:
         yield Claim("report", self.files[PAGE], self.page)
 
         # The whole search, if it is asked for.
-        if search:
-            yield Claim(
-                "search: outcomes", json_bytes(self.packed.outcomes), lambda: self.searched[0]
-            )
-            yield Claim("search: solutions", solutions, lambda: self.searched[1])
+        outcomes = "search: outcomes", json_bytes(self.packed.outcomes)
+        if not search:
+            yield Claim(*outcomes, None)
+            return
+        yield Claim(*outcomes, lambda: self.searched[0])
+        yield Claim("search: solutions", solutions, lambda: self.searched[1])
 
     @property
     def code(self) -> list[str]:
@@ -395,6 +413,8 @@ def count_solutions(solutions: pd.DataFrame, runs: Sequence[tuple[str, int]]) ->
 
 def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
     """A row of `CLAIMS`: a claim, computed again; the lines shown are the first that differ."""
+    if claim.compute is None:
+        return study, claim.name, UNCHECKED, "", "--search repeats the search"
     try:
         here = claim.compute()
     except SafevarError as error:

@@ -41,6 +41,8 @@ from safevar_sumo.report.claims import (
     PAGE,
     SAME,
     STUDY,
+    UNCHECKED,
+    VERDICTS,
     Claim,
     Packed,
     compare_claim,
@@ -190,7 +192,9 @@ def _pack_study(
         packed = Packed(described, files, study.origin.places, how["jobs"], show_part, pool)
         answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
         packed.ask_speed()
+        opened = {name: "" for names in pool.opened.values() for name in names}
     packed.pool = None
+    files |= _files_of_user(study, opened, [])
     files |= {STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
     return msgspec.structs.replace(described, simulations=packed.simulations()), files
 
@@ -243,7 +247,7 @@ def _files_of_user(
     return {f"{CODE}/{name}": path.read_bytes() for name, path in sorted(paths.items())}
 
 
-@contents("passed", "sha256", "claims", "same", "differs", "cannot", claims=CLAIMS)
+@contents("passed", "sha256", "claims", "same", "differs", "cannot", "unchecked", claims=CLAIMS)
 def verify(
     pack: str | Path,
     *,
@@ -318,20 +322,20 @@ def verify(
         verdict=(
             f"{counts[SAME]} of {number_of(len(claims), 'claim')} are the same, {counts[DIFFERS]}"
             f" differ, {counts[CANNOT]} cannot be run."
-            f"{_not_compared(description, studies.values(), search)}"
+            f"{_not_compared(description, studies.values(), counts[UNCHECKED])}"
         ),
         numbers={
-            "passed": counts[SAME] == len(claims),
+            "passed": counts[SAME] + counts[UNCHECKED] == len(claims),
             "sha256": digest_of(path),
             "claims": len(claims),
-            **{verdict.partition(" ")[0]: counts[verdict] for verdict in (SAME, DIFFERS, CANNOT)},
+            **{verdict.partition(" ")[0]: counts[verdict] for verdict in VERDICTS},
         },
         tables={"claims": claims},
     )
 
 
-def _not_compared(description: Description, studies: Iterable[Packed], search: bool) -> str:
-    """A sentence on what a pack says that `verify` does not compare, after a space; "" without."""
+def _not_compared(description: Description, studies: Iterable[Packed], unchecked: int) -> str:
+    """Sentences on what a pack says that `verify` does not check or compare, each after a space."""
     # Versions and machines may differ, as their results are compared.
     pairs = {DESCRIPTION: ({"versions": description.versions}, {"versions": versions_here()})}
     pairs |= {f"{packed.packed.folder}/{MANIFEST}": packed.versions for packed in studies}
@@ -340,8 +344,9 @@ def _not_compared(description: Description, studies: Iterable[Packed], search: b
         for file, both in pairs.items()
         for key, stated, here in changed_values(*both)
     ]
-    parts += [] if search else ["how many simulations had which outcome (--search compares)"]
-    return f" Not compared: {'; '.join(parts)}." if parts else ""
+    repeats = "how many simulations had which outcome (--search repeats them)"
+    sentence = f" {unchecked} unchecked: {repeats}." if unchecked else ""
+    return f"{sentence} Not compared: {'; '.join(parts)}." if parts else sentence
 
 
 def _unpack(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import lzma
 import stat
@@ -20,14 +21,12 @@ from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Scoring
-from safevar_sumo.output import whole_file
+from safevar_sumo.output import MAX_UNPACKED, read_file, whole_file
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results.identity import PACKAGES
 from safevar_sumo.study import Study
 
 DESCRIPTION = "pack.json"
-MAX_BYTES = 1_000_000_000
-"""Largest size of a pack's files together, unpacked."""
 MAX_FILES = 10_000
 MAX_EVALUATIONS = 100_000_000
 MORE_IN_DIRECTORY, DIRECTORY_END = 16, 22
@@ -140,7 +139,7 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
     """
     # The archive, and its description.
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(io.BytesIO(read_file(path, MAX_UNPACKED))) as archive:
             _check_entries(path, archive.infolist())
             _check_layout(path, archive.infolist())
             files = {entry.filename: archive.read(entry) for entry in archive.infolist()}
@@ -207,9 +206,9 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
     # Neither too many files nor too much data.
     if len(names) > MAX_FILES or len(names) != len(set(names)):
         _refuse(path, f"holds {len(names)} files, at most {MAX_FILES} are allowed, each once")
-    if (size := sum(entry.file_size for entry in entries)) > MAX_BYTES:
+    if (size := sum(entry.file_size for entry in entries)) > MAX_UNPACKED:
         _refuse(
-            path, f"unpacked it has {size / 1e9:.1f} GB, at most {MAX_BYTES / 1e9:g} are allowed"
+            path, f"unpacked it has {size / 1e9:.1f} GB, at most {MAX_UNPACKED / 1e9:g} are allowed"
         )
 
 

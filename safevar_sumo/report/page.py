@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from safevar_sumo.campaign.cache import keep_simulations
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.errors import InputError, check_text, warn
+from safevar_sumo.errors import InputError, check_text, printable, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer
@@ -280,6 +280,7 @@ def make_page(studies: Sequence[ReportedStudy], parts: Parts, shared: Sequence[A
         commands=[*of_studies, *of_shared],
         css=Markup((TEMPLATE_FOLDER / "report.css").read_text(encoding="utf-8")),
     )
+    page = printable(page)
     return page.replace("^2", "²").replace("^3", "³") + "\n"  # the powers of units, as in m/s^2
 
 

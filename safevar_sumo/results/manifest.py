@@ -12,7 +12,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from safevar_sumo.errors import InputError, SafevarError, about
-from safevar_sumo.output import whole_file
+from safevar_sumo.output import read_file, whole_file
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results.identity import FORMAT
 from safevar_sumo.study import Study, convert_table
@@ -149,7 +149,7 @@ def read_manifest(directory: Path) -> JsonObject:
     # The manifest, in whatever format it is.
     file = directory / MANIFEST
     try:
-        manifest = json.loads(file.read_text(encoding="utf-8", errors="replace"))
+        manifest = json.loads(read_file(file).decode(errors="replace"))
         written_by = manifest["versions"]["safevar_sumo"]
         format_number = manifest.get("format", 1)
     except (FileNotFoundError, NotADirectoryError):

@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from importlib.metadata import version
+from io import BytesIO
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -16,6 +17,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
+from safevar_sumo.output import read_file
 from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
 from safevar_sumo.results.identity import (
     FORMAT,
@@ -332,7 +334,10 @@ def read_imported(path: Path, characteristics: Collection[str]) -> pd.DataFrame:
     columns = ["algorithm", *characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS, "outcome"]
     try:
         frame = pd.read_csv(
-            file, keep_default_na=False, na_values=[""], float_precision="round_trip"
+            BytesIO(read_file(file)),
+            keep_default_na=False,
+            na_values=[""],
+            float_precision="round_trip",
         )
         return frame[columns].astype({**numbers, "f_num_diff": int})
     except (OSError, KeyError, ValueError) as error:

@@ -14,7 +14,7 @@ import tomli_w
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, about, did_you_mean, one_of
-from safevar_sumo.output import whole_file
+from safevar_sumo.output import read_file, whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study.encounters import Parameters
 from safevar_sumo.study.extending import StudyTables, with_overrides
@@ -218,7 +218,7 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
     """
     # The tables of the file.
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        tables = tomllib.loads(read_file(path).decode("utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
         reason = (isinstance(error, OSError) and error.strerror) or error
         legal = "the path of a study file"

@@ -176,6 +176,24 @@ def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
     assert pd.read_csv(io.StringIO(ANSWER.render("csv", "parts")))["length"][0] == 1.234
 
 
+@pytest.mark.parametrize("form", ["text", "csv", "latex", "html"])
+def test_no_control_character_of_a_name_reaches_a_reader(form: str) -> None:
+    columns = {"name": Column("", "it\x1b]0;x\x07")}
+    names = tabulate("Names\x1b[2J", columns, [("\x1b[31mred\u202e\r\x9b",)])
+    answer = replace(ANSWER, verdict="Old\x1b[2J parts.", tables={"names": names})
+    printed = answer.render(form)
+    assert "31mred" in printed
+    assert not re.search("[\\0-\\x08\\x0b-\\x1f\\x7f-\\x9f\u202e]", printed)
+
+
+def test_a_spreadsheet_calculates_no_cell_of_a_csv() -> None:
+    cells = ["=1+1", "@SUM(A1)", "+cmd", "-2+3", "\t=1", "\r=1", "-2.5e3", "+4", "-inf", "a=1"]
+    names = tabulate("Names", {"name": Column("", "it")}, [(cell,) for cell in cells])
+    printed = replace(ANSWER, tables={"names": names}).render("csv")
+    cells_there = pd.read_csv(io.StringIO(printed), dtype=str)["name"].tolist()
+    assert cells_there == ["'=1+1", "'@SUM(A1)", "'+cmd", "'-2+3", "'\t=1", "'?=1", *cells[6:]]
+
+
 def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
     other = tabulate("Others", {"name": Column("", "it")}, [("none",)])
     rows = [("parts", "one is old"), ("others", "none is"), ("all", "they are made up")]

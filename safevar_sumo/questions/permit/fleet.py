@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.errors import InputError, about, check_name, check_text, did_you_mean
+from safevar_sumo.output import read_file
 from safevar_sumo.questions.changes import NUMBER_PATTERN, read_changes
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import BoolArray, FloatArray
@@ -171,7 +172,7 @@ def _cells_of_file(path: Path) -> _Cells:
     """The cells of a CSV file, as Excel and others write it; `places` are numbers of lines."""
     # A text in UTF-8.
     try:
-        content = path.read_bytes()
+        content = read_file(path)
         text = content.decode("utf-8-sig")
     except OSError as error:
         problem = f"cannot be read: {error.strerror or error}"
