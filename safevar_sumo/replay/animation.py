@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from markupsafe import Markup, escape
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, printable
 from safevar_sumo.output import whole_file
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import COLOURS, ORIGINAL, Comparison
@@ -122,7 +122,7 @@ def animate(comparison: Comparison, path: Path) -> None:
         page = template_environment().get_template("animation.html.j2")
         player = player_of(comparison, 1, MAX_FRAMES, DPI)
         text = page.render(title=comparison.title, changes=comparison.changes, player=player)
-        file.write_text(text, encoding="utf-8", newline="\n")
+        file.write_text(printable(text), encoding="utf-8", newline="\n")
 
 
 def player_of(
