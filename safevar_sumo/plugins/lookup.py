@@ -161,8 +161,8 @@ class Lookup:
         return member
 
     def with_paths(self, member: Member, parameters: Parameters, key: str) -> Parameters:
-        """Parameters of a member; for user code, the names of the study's data files become
-        absolute paths.
+        """Parameters of a member; the names of the study's data files become absolute paths: for
+        user code all, otherwise that of the parameter `file`.
 
         Raises
         ------
@@ -170,7 +170,11 @@ class Lookup:
             If a text names a file that is none of the data files: results would depend on it
             unnoticed.
         """
-        return dict(parameters) if member.code is None else self._with_paths(parameters, key)
+        if member.code is not None:
+            return dict(self._with_paths(parameters, key))
+        file = parameters.get("file")
+        path = {"file": self.files.get(file, file)} if isinstance(file, str) else {}
+        return {**parameters, **path}
 
     def _with_paths(self, value: Any, key: str) -> Any:
         if isinstance(value, dict):

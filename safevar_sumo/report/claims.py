@@ -342,11 +342,13 @@ class Packed:
         """The user code that would run: files of the pack, and what the study and the questions
         name.
 
-        Networks count, since SUMO's options beside them may name files to write.
+        Networks count, since SUMO's options beside them may name files to write; tables of tracks
+        do not.
         """
         study = self.case.study
         prefix = f"{CODE}/"
-        files = [name.removeprefix(prefix) for name in self.files if name.startswith(prefix)]
+        names = [name for name in self.files if not name.endswith(".csv")]
+        files = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
         named = [
             name
             for name in (*study.search.algorithms, *self.packed.questions)

@@ -19,6 +19,7 @@ from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.lane_change import CutIn, CutOut
 from safevar_sumo.scenarios.point import SPEED_DIMENSION as SPEED_DIMENSION, Point as Point
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
+from safevar_sumo.scenarios.recorded_tracks import RecordedTracks
 from safevar_sumo.scenarios.roads import Lane as Lane, World as World
 from safevar_sumo.scenarios.simulated import Simulator as Simulator
 from safevar_sumo.scenarios.stop import Stop
@@ -40,6 +41,7 @@ SCENARIOS: Mapping[str, type[Scenario]] = {
     "cut_in": CutIn,
     "cut_out": CutOut,
     "lead_vehicle_stopped": LeadVehicleStopped,
+    "recorded_tracks": RecordedTracks,
     "stop": Stop,
 }
 

@@ -66,7 +66,8 @@ class Track(NamedTuple):
     kind
         A kind of `BODIES`, `screen`, or any other word, such as `van`.
     length, width
-        Size in the direction in which the body faces, and across [m].
+        Size in the direction in which the body faces, and across [m]. A body without size is not
+        there: it is neither seen nor hit, and does not count.
     x, y
         The body's middle [m].
     along, left

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.study.encounters import MatrixTest
 from safevar_sumo.study.schema import PYMOO, Study
 
 
@@ -55,7 +57,8 @@ def user_code(study: Study) -> list[tuple[str, str]]:
 
 
 def data_files(study: Study) -> dict[str, str]:
-    """The paths of the data files and folders that a study names, by their names.
+    """The paths of the data files and folders that a study names, by their names: in `files`, or as
+    the parameter `file` of a shipped scenario.
 
     Raises
     ------
@@ -66,19 +69,29 @@ def data_files(study: Study) -> dict[str, str]:
     paths = {}
 
     # Each file or folder beside the study.
-    for key, table in (
-        ("vehicle", study.vehicle),
-        ("ads", study.ads),
-        ("scenario", study.scenario),
-    ):
-        for name in table.files:
-            found = [
-                os.path.abspath(path) for place in places if (path := Path(place, name)).exists()
-            ]
-            if not found:
-                problem = f"{key}.files: there is no file {name!r}"
-                raise InputError(
-                    study.source, problem, f"the path of a file or folder, relative to {places[0]}"
-                )
-            paths[name] = found[0]
+    named = [
+        ("vehicle.files", study.vehicle.files),
+        ("ads.files", study.ads.files),
+        ("scenario.files", study.scenario.files),
+        ("scenario.parameters.file", _scenario_files(study)),
+    ]
+    for key, name in ((key, name) for key, names in named for name in names):
+        found = [os.path.abspath(path) for place in places if (path := Path(place, name)).exists()]
+        if not found:
+            problem = f"{key}: there is no file {name!r}"
+            raise InputError(
+                study.source, problem, f"the path of a file or folder, relative to {places[0]}"
+            )
+        paths[name] = found[0]
     return paths
+
+
+def _scenario_files(study: Study) -> list[str]:
+    """The values of the parameter `file` of shipped scenarios, in all tests."""
+    texts = list[Any]()
+    for test in study.tests or [MatrixTest(name="it")]:
+        if ":" not in (test.model or study.scenario.model):
+            axes = study.axes_of(test)
+            texts += axes["file"].at if "file" in axes else []
+            texts += [study.scenario.parameters.get("file"), test.parameters.get("file")]
+    return [*dict.fromkeys(text for text in texts if isinstance(text, str))]

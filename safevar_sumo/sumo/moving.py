@@ -48,9 +48,9 @@ class Moving(NamedTuple):
     lateral, lateral_speed
         Position of its middle across the lane, from the side that the body comes from, and its rate
         of change [m, m/s].
-    is_in_path, is_cleared, is_avoidable
-        Whether it is in the vehicle's path; has left it for good; or stays in it to the end, so
-        that a vehicle that is never faster again has avoided it.
+    is_there, is_in_path, is_cleared, is_avoidable
+        Whether it has a size; is in the vehicle's path; has left it for good, or is gone; or stays
+        in it to the end, so that a vehicle that is never faster again has avoided it.
     level
         `IN_PATH`, `BESIDE` (who moves there) or 0 (who stands there); of several bodies those of
         the highest level count. Below 0 for a body that is not met at all.
@@ -69,6 +69,7 @@ class Moving(NamedTuple):
     most_vx: FloatArray
     lateral: FloatArray
     lateral_speed: FloatArray
+    is_there: BoolArray
     is_in_path: BoolArray
     is_cleared: BoolArray
     is_avoidable: BoolArray
@@ -97,9 +98,10 @@ class Moving(NamedTuple):
         # How it moves, and when it is in the vehicle's path.
         vx = slim(track.speed * track.along)
         vy = slim(np.diff(track.y, axis=0, prepend=track.y[:1]) / step)
-        is_in_path = slim(
-            (np.abs(track.y) < vehicle_width / 2 + half_width + TIE) & (track.kind != SCREEN)
-        )
+        is_there: BoolArray = slim((track.length > 0) | (track.width > 0))
+        is_beside = np.abs(track.y) >= vehicle_width / 2 + half_width + TIE
+        is_in_path = slim(is_there & ~is_beside & (track.kind != SCREEN))
+        is_gone = ~np.maximum.accumulate(is_there[::-1], axis=0)[::-1]
         has_entered = np.maximum.accumulate(is_in_path, axis=0)
         will_touch = np.maximum.accumulate(is_in_path[::-1], axis=0)[::-1]
 
@@ -120,8 +122,9 @@ class Moving(NamedTuple):
             most_vx=slim(_from_now_on(np.maximum, vx)),
             lateral=slim(track.y * sign),
             lateral_speed=slim(vy * sign),
+            is_there=is_there,
             is_in_path=is_in_path,
-            is_cleared=slim(has_entered & ~will_touch),
+            is_cleared=slim((has_entered & ~will_touch) | is_gone),
             is_avoidable=slim(has_entered & is_in_path[-1]),
             level=np.full_like(level, -1) if track.kind == SCREEN else level,
             is_rotated=bool(_rotated(track).any()),

@@ -136,7 +136,10 @@ def check_start(tracks: Sequence[Track], own: Body) -> None:
         {**bodies, "the vehicle under test": own}.items(), 2
     ):
         n = max(len(body.speed), len(other.speed))
-        depth = find_overlaps(_repeated(body, n), _repeated(other, n)).max()
+        # Without a size nobody is there.
+        pair = _repeated(body, n), _repeated(other, n)
+        are_there = np.all([one.length + one.width > 0 for one in pair], axis=0)
+        depth = np.where(are_there, find_overlaps(*pair), 0.0).max()
         if depth > TOUCH:
             problem = f"at 0 s {name} is {depth:.2f} m inside {other_name}"
             raise InputError(

@@ -166,9 +166,9 @@ class Traffic:
         return self._scene_of(seen[0], over) if len(seen) == 1 else self._nearest(seen, over)
 
     def _is_visible(self, number: int, front: FloatArray) -> BoolArray:
-        """Whether nobody is on the line from the sensors to a body's middle."""
+        """Whether a body is there, and nobody on the line from the sensors to its middle."""
         track = self._bodies[number].track
-        visible = ALL_TRUE
+        visible = self._row(self._bodies[number].is_there)
         for k in self._hides:
             if k != number:
                 line = (front - self.setback, 0.0, self._row(track.x), self._row(track.y))
@@ -201,13 +201,14 @@ class Traffic:
             second = (half - position) / change
             enter = np.maximum(enter, np.minimum(first, second))
             leave = np.minimum(leave, np.maximum(first, second))
-        return np.asarray((enter < leave) & (leave > 0) & (enter < 1))
+        blocks = (enter < leave) & (leave > 0) & (enter < 1)
+        return np.asarray(blocks & self._row(other.is_there))
 
     def _scene_of(self, seen: _Seen, over: BoolArray) -> Scene:
         body = self._bodies[seen.body]
         zeros = np.zeros(self.n)
         return Scene(
-            gap=seen.gap,
+            gap=np.where(self._row(body.is_there), seen.gap, np.inf),
             lateral=zeros + self._row(body.lateral),
             lateral_speed=zeros + self._row(body.lateral_speed),
             over=np.broadcast_to(over, self.n),
@@ -371,7 +372,8 @@ class Traffic:
                 *body.track[:2], *(self._table(column, samples) for column in body.track[2:])
             )
             apart = distance_between(track, front - self.length / 2, self.length, self.width)
-        counts = ~self._ended[number, samples] & self._table(self._counts[number], samples)
+        counts = self._table(body.is_there & self._counts[number], samples)
+        counts = counts & ~self._ended[number, samples]
         return apart, rate, counts
 
     def _table(self, column: Sampled, samples: slice) -> Sampled:

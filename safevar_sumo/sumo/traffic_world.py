@@ -18,7 +18,7 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Track
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import PERSONS, SCREEN
-from safevar_sumo.sumo.bodies import BodyPairs, VehicleStates
+from safevar_sumo.sumo.bodies import BodyPairs, Film, VehicleStates
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.moving import Sampled, row
@@ -75,7 +75,7 @@ class Placed(NamedTuple):
     @classmethod
     def of(cls, track: Track, ids: list[str], start: Frame) -> Placed:
         is_person = track.kind in PERSONS
-        ahead = 0.0 if is_person else track.length / 2
+        ahead = 0.0 if is_person else track.length.max(axis=0) / 2
         x, y = start.point(track.x + track.along * ahead, track.y + track.left * ahead)
         east, north = start._replace(origin=(0.0, 0.0)).point(track.along, track.left)
         angle = np.degrees(np.arctan2(east, north)) % 360
@@ -144,12 +144,20 @@ class TrafficWorld(SumoWorld):
     def _hits(self, is_open: BoolArray) -> dict[int, float]:
         return {}
 
+    def film(self, tracks: dict[str, Film], sample: int, length: int) -> None:
+        """Nobody is filmed without a size."""
+        super().film(tracks, sample, length)
+        for actor in self._actors:
+            size = self._at_copies(actor.track.length) + self._at_copies(actor.track.width)
+            tracks[actor.track.name].motion[sample, size == 0] = np.nan
+
     def _add(self, actor: Placed) -> None:
         """Add an actor to every copy, wherever it may be put."""
         types = self.api.vehicletype
         track = actor.track
-        lengths = self._of_copies(track.length)
-        widths = self._of_copies(track.width)
+        # Who is not there yet has the size that it will have.
+        sizes = (column.max(axis=0, keepdims=True) for column in (track.length, track.width))
+        lengths, widths = map(self._of_copies, sizes)
         for id_, route, length, width in zip(actor.ids, self._routes, lengths, widths, strict=True):
             types.copy("DEFAULT_PEDTYPE" if actor.is_person else "DEFAULT_VEHTYPE", id_)
             types.setLength(id_, length)

@@ -74,7 +74,7 @@ def with_scenario(name: str, model: str, **tables: Any) -> Study:
     return replace(study, scenario=replace(study.scenario, model=model))
 
 
-@pytest.mark.parametrize("name", each(sorted(SCENARIOS)))
+@pytest.mark.parametrize("name", each(sorted(SCENARIOS.keys() - {"recorded_tracks"})))
 def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(
     name: str, in_tmp: Path
 ) -> None:
@@ -132,7 +132,9 @@ def test_what_a_search_leaves_out_is_what_a_class_declares_a_shipped_one_as_a_us
         load_study("wear", matrix=None, scenario={"model": "deer:Deer", "over": {"pace": {}}})
 
 
-@pytest.mark.parametrize("name", sorted(SCENARIOS.keys() - {"stop"}))  # which have no such scenes
+@pytest.mark.parametrize(
+    "name", sorted(SCENARIOS.keys() - {"recorded_tracks", "stop"})
+)  # which have no such scenes
 def test_benign_scenes_of_a_scenario_in_a_users_file_are_the_same(name: str, in_tmp: Path) -> None:
     names = []
     for model in (name, copied(SCENARIOS[name], in_tmp)):

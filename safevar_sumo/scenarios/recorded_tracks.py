@@ -1,0 +1,173 @@
+"""How other road users moved, from a table beside the study."""
+
+from __future__ import annotations
+
+import os
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from msgspec import Struct
+
+from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.records import FloatArray, Quantity
+from safevar_sumo.scenarios.ahead import VEHICLE_SPEED
+from safevar_sumo.scenarios.base import Grade
+from safevar_sumo.scenarios.tracks import Speed, Track, TrackScenario
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COLUMNS = ["time", "name", "x", "y", "heading", "speed", "length", "width"]
+"""Columns of a table."""
+ABOVE_ZERO = ["name", "length", "width"]
+"""Columns that are not empty and not 0."""
+LONGEST_STEP = 2.0
+"""Longest time between two rows of a body, in usual steps of the table [-]."""
+SAME = 1e-6
+"""Difference up to which two times are one [s]."""
+DIGITS = 9
+"""Decimals of places [m] and directions: the last bits of a sine differ between machines."""
+
+
+class RecordedTracks(
+    TrackScenario, Struct, dict=True, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
+    """Others move as a table says, whatever the vehicle does. It begins at the first row of `ego`,
+    with that body's size, and drives straight on. For `speed` and `grade` see `LaneTest`.
+
+    Parameters
+    ----------
+    file
+        Path of a CSV file, relative to the study's, with the columns time [s], name, x and y of a
+        body's middle [m], heading counter-clockwise [rad], speed [m/s], length and width [m].
+    ego
+        The name of the vehicle under test in the file.
+    """
+
+    file: str
+    ego: str = "ego"
+    speed: Annotated[Speed, VEHICLE_SPEED] = 40.0
+    grade: Grade = 0.0
+    goes_on = False  # after the last row nobody is there
+
+    @cached_property
+    def _bodies(self) -> dict[str, pd.DataFrame]:
+        return read_tracks(self.file)
+
+    @cached_property
+    def _start(self) -> pd.Series:
+        """The first row of `ego`."""
+        if self.ego in self._bodies:
+            return self._bodies[self.ego].iloc[0]
+        problem = f"scenario.parameters.ego = {self.ego!r}: the file has no row of it"
+        raise InputError("", problem, one_of(self._bodies))
+
+    def check(self) -> None:
+        """Refuse a file without anybody else."""
+        if self.duration <= 0:
+            problem = f"{key_of(self.file)}: nobody else is there once {self.ego} is"
+            raise InputError("", problem, "rows of another name, and of a later time")
+
+    @property
+    def duration(self) -> float:
+        """The time from the start to the last row of the others [s]."""
+        ends = [rows["time"].iloc[-1] for name, rows in self._bodies.items() if name != self.ego]
+        return float(max(ends, default=-np.inf) - self._start["time"])
+
+    @property
+    def test_speed(self) -> Quantity:
+        """Speed that the vehicle holds until its driving system acts [m/s]."""
+        return self.start_speed
+
+    @property
+    def vut_length(self) -> float:
+        """Length of `ego` [m]."""
+        return float(self._start["length"])
+
+    @property
+    def vut_width(self) -> float:
+        """Width of `ego` [m]."""
+        return float(self._start["width"])
+
+    def tracks(self, times: FloatArray) -> list[Track]:
+        """All bodies but `ego`; before its first row and after its last one a body has no size."""
+        start = self._start
+        ahead = np.exp(1j * start["heading"])
+        front = start["x"] + 1j * start["y"] + start["length"] / 2 * ahead
+        now = times + start["time"]
+        tracks = []
+        for name, rows in self._bodies.items():
+            if name != self.ego:
+                known = rows["time"].to_numpy()
+                x, y, heading, speed, length, width = (
+                    np.interp(now, known, rows[column]) for column in COLUMNS[2:]
+                )
+                place = np.round((x + 1j * y - front) / ahead, DIGITS)
+                facing = np.round(np.exp(1j * heading) / ahead, DIGITS)
+                is_there = (now > known[0] - SAME) & (now < known[-1] + SAME)
+                size = length * is_there, width * is_there
+                columns = place.real, place.imag, facing.real, facing.imag, speed
+                tracks.append(Track(name, "recorded", *size, *columns))
+        return tracks
+
+
+def key_of(file: str) -> str:
+    """The key of a file, as errors name it."""
+    return f"scenario.parameters.file = {os.path.basename(file)!r}"
+
+
+def read_tracks(file: str) -> dict[str, pd.DataFrame]:
+    """The rows of each body by name, in the order of time, with headings that do not jump.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, lacks a column or a value, or knows a body twice at one time or
+        not all the time.
+    """
+    import pandas as pd
+
+    # Texts, so that errors show what stands in the file.
+    try:
+        table = pd.read_csv(file, dtype=str, keep_default_na=False, skipinitialspace=True)
+    except (OSError, ValueError) as error:
+        problem = f"{key_of(file)}: cannot be read: {error}"
+        raise InputError("", problem, "a CSV file") from None
+    missing = [name for name in COLUMNS if name not in table]
+    if missing:
+        problem = f"{key_of(file)}: there is no column {missing[0]}"
+        raise InputError("", problem, f"the columns {', '.join(COLUMNS)}")
+
+    # Numbers; of a name its length.
+    values = table[COLUMNS].assign(name=table["name"].str.len())
+    values = values.apply(pd.to_numeric, errors="coerce").astype(float)
+    legal = np.isfinite(values)
+    legal[ABOVE_ZERO] &= values[ABOVE_ZERO] > 0
+    for row, column in np.argwhere(~legal.to_numpy())[:1]:
+        name = COLUMNS[column]
+        expected = "above 0" if name in ABOVE_ZERO else "that is finite"
+        problem = f"{key_of(file)}: row {row + 1}: {name} = {table[name].iloc[row]!r}"
+        raise InputError("", problem, "a name" if name == "name" else f"a number {expected}")
+
+    # Rows of each body.
+    names = table["name"]
+    bodies = {
+        str(name): rows.sort_values("time") for name, rows in values.groupby(names, sort=False)
+    }
+    steps = {name: np.diff(rows["time"]) for name, rows in bodies.items()}
+    usual = np.median(np.concatenate([*steps.values()])) if len(table) > len(bodies) else 0.0
+    for name, rows in bodies.items():
+        _check_steps(f"{key_of(file)}: {name}", rows["time"].to_numpy(), LONGEST_STEP * usual)
+        rows["heading"] = np.unwrap(rows["heading"])
+    return bodies
+
+
+def _check_steps(body: str, times: FloatArray, longest: float) -> None:
+    """Refuse two rows at one time, and a step longer than the longest one."""
+    steps = np.diff(times)
+    for row in np.flatnonzero(steps <= 0)[:1]:
+        raise InputError("", f"{body} has two rows at {times[row]:g} s", "one row at a time")
+    for row in np.flatnonzero(steps > longest + SAME)[:1]:
+        problem = f"{body} has no row from {times[row]:g} to {times[row + 1]:g} s"
+        raise InputError("", problem, f"a row every {longest:g} s, or another name after the gap")
