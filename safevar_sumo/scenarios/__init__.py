@@ -72,7 +72,8 @@ def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
     if scenario.brakes_fully:
         return {}
     of_weather = WEATHER_PARAMETERS if scenario.mover.has("weather") else {}
-    return {**scenario.free(), **of_weather, **(PHASES if scenario.has_phase else {})}
+    phases = PHASES if scenario.has_phase else {}
+    return {**free_parameters(type(scenario)), **of_weather, **phases}
 
 
 def weather_of(choice: str | Weather) -> Weather:

@@ -16,7 +16,6 @@ from safevar_sumo.plugins import TRUTH, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Quantity, Trace
 from safevar_sumo.scenarios.mover import SUMO, Mover
 from safevar_sumo.scenarios.roads import Roads, World
-from safevar_sumo.study import FreeParameter, free_parameters
 
 VUT = "vut"
 """Id of the vehicle under test in every network's traffic."""
@@ -223,10 +222,6 @@ class Scenario:
     def is_hit_in_front(self) -> bool:
         """By default in a test at its speed."""
         return self.test_speed is not None
-
-    def free(self) -> Mapping[str, FreeParameter]:
-        """Parameters that a study may search, by name."""
-        return free_parameters(type(self))
 
     def at(self, values: Mapping[str, Quantity]) -> Scenario:
         """This scenario at other values of parameters, created anew."""

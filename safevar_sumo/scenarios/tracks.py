@@ -20,7 +20,7 @@ from safevar_sumo.plugins import Legal, Returned, UserCode, quoted
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Quantity
 from safevar_sumo.scenarios.base import MAX_TEST_SPEED, Grade, Scenario, XmlChanges, as_text
 from safevar_sumo.scenarios.roads import Roads
-from safevar_sumo.study import PHASE
+from safevar_sumo.study import PHASE, free_parameters
 
 KMH = 1 / KMH_PER_MS
 """m/s per km/h."""
@@ -236,7 +236,7 @@ class TrackScenario(Scenario):
     @property
     def has_phase(self) -> bool:
         """All bodies can begin later, unless the scenario has a parameter of that name itself."""
-        return PHASE not in self.free()
+        return PHASE not in free_parameters(type(self))
 
     def tracks_begun(self, times: FloatArray, later: Quantity) -> Sequence[Track]:
         """The bodies at T `times`, shape (T, 1), of an encounter that begins `later` [s], a number

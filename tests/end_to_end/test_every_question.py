@@ -17,6 +17,7 @@ from safevar_sumo.study import study_names
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, run
 from tests.made_up import HAS_AD_RSS
+from tests.manual import files_of
 from tests.scenarios.test_simulated import MODELS, STUDY
 
 SLOW = pytest.mark.slow
@@ -131,8 +132,10 @@ def test_the_fastest_questions_answer(typed: str, told: str | None) -> None:
         assert_next_answers(text)
 
 
-KINDS = ("smoke", "autoware_july", "any_gap", "stop", "rig")
-"""A published study, one with a matrix, one in ranges, full braking, and a study of a simulator."""
+KINDS = ("smoke", "autoware_july", "any_gap", "stop", "rig", "walk")
+"""A published study, one with a matrix, one in ranges, full braking, and studies of a
+simulator and of a table.
+"""
 ANY_GAP = 'extends = "sun"\nname = "any_gap"\nencounters = "ranges"\n'
 KIND = """
 extends = "{}"
@@ -166,6 +169,8 @@ def test_every_question_about_each_kind_of_study_has_an_answer_or_a_reason(name:
     Path("models.py").write_text(MODELS)
     Path("rig.toml").write_text(STUDY.replace("models:Wall", "models:Rig"))
     Path("any_gap.toml").write_text(ANY_GAP)
+    for file, text in files_of("docs/recorded_tracks.md").items():
+        Path(file).write_text(text)
     Path("kind.toml").write_text(KIND.format(name if name in study_names() else f"{name}.toml"))
     study = load_study("kind.toml")
     answered("study kind.toml --out results", must=True)
