@@ -10,7 +10,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.scenarios import Track
+from safevar_sumo.scenarios import VUT, Track
 from safevar_sumo.scenarios.tracks import SCREEN
 from safevar_sumo.sumo.bodies import TOUCH, Body, find_overlaps
 
@@ -31,8 +31,8 @@ def check_shapes(tracks: Sequence[Track], n_samples: int, n_encounters: int, ste
     InputError
         With the actor, the time [s] and what is expected.
     """
-    # A name for each actor.
-    for name, count in Counter(track.name for track in tracks).items():
+    # A name for each actor; the vehicle under test has one, too.
+    for name, count in Counter([VUT, *(track.name for track in tracks)]).items():
         if count > 1:
             raise InputError(
                 "",
