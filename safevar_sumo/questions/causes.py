@@ -38,14 +38,15 @@ number is stated, of all subsets.
 class Cause(NamedTuple):
     """A minimal subset of a failure's changes that is unsafe by itself, all else as in the original
     vehicle: the values of these characteristics in their units; outcome and safety degree
-    [m, or -m/s] of a vehicle with these changes only. `encounter` are the failure's parameters of
-    the scenario, in a study that searches them.
+    [m, or -m/s] of a vehicle with these changes only, and the share of its runs that is unsafe.
+    `encounter` are the failure's parameters of the scenario, in a study that searches them.
     """
 
     changes: NamedValues
     outcome: str
     safety_degree: float
     encounter: NamedValues
+    unsafe_runs: float = 1.0
 
 
 def find_minimal_causes(
@@ -72,6 +73,13 @@ def find_minimal_causes(
     expected = sum(_subset_counts([*map(len, changed)], complete))
     with evaluator.phases.stage(SUBSETS, expected):
         for size in range(max(map(len, changed), default=0) + 1):
+            number = sum(
+                comb(len(columns), size)
+                for columns, of_row in zip(changed, found, strict=True)
+                if not of_row
+            )
+            if size > complete and evaluator.left is not None and number > evaluator.left:
+                break
             subsets = (
                 (row, list(columns))
                 for row, of_row in enumerate(found)
@@ -84,7 +92,8 @@ def find_minimal_causes(
                 for partial, (row, columns) in zip(partial_settings, chunk, strict=True):
                     partial[columns] = settings[row, columns]
                 evaluations = evaluator.evaluate(partial_settings, SUBSETS)
-                for index in np.flatnonzero(unsafe.of(evaluations)).tolist():
+                of_runs = unsafe.runs(evaluations).mean(axis=0)
+                for index in np.flatnonzero(of_runs).tolist():
                     row, columns = chunk[index]
                     values = settings[row].tolist()
                     cause = Cause(
@@ -92,6 +101,7 @@ def find_minimal_causes(
                         outcome=str(evaluations.outcome[index]),
                         safety_degree=float(evaluations.f_safe[index]),
                         encounter={names[column]: values[column] for column in of_scenario},
+                        unsafe_runs=float(of_runs[index]),
                     )
                     causes[row].append(cause)
                     found[row].append({*columns})
@@ -137,14 +147,17 @@ def select_affordable_rows(
     settings: FloatArray, evaluator: Evaluator, max_evaluations: int
 ) -> list[int]:
     """All rows of `settings`, or a random sample of them, so that finding their minimal causes
-    takes at most about `max_evaluations`.
+    takes at most about `max_evaluations`; where few simulations are allowed, at least one if its
+    single changes may be simulated.
     """
     changes = evaluator.characteristics.number_changed(settings).astype(int).tolist()
     costs = np.array(_subset_counts(changes), dtype=float)
     if costs.sum() <= max_evaluations:
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.seed).permutation(len(settings))
-    return sorted(order[np.cumsum(costs[order]) <= max_evaluations].tolist())
+    least = int(evaluator.left is not None and len(evaluator.characteristics) < max_evaluations)
+    number = max(least, np.count_nonzero(np.cumsum(costs[order]) <= max_evaluations))
+    return sorted(order[:number].tolist())
 
 
 def count_needed(

@@ -313,13 +313,8 @@ class Evaluator:
             self.characteristics.with_original_vehicle(drawn), "encounters of the original"
         )
 
-    def feasible_settings(
-        self, number: int, seed: int = 0, *, feasible_after_filter: bool = False
-    ) -> FloatArray:
-        """`number` settings that cover the feasible part of the domain evenly.
-
-        With `feasible_after_filter`, they are also feasible after the filter.
-        """
+    def feasible_settings(self, number: int, seed: int = 0) -> FloatArray:
+        """`number` settings that cover the feasible part of the domain evenly."""
         drawn = 0
 
         def draw_next(count: int) -> FloatArray:
@@ -328,7 +323,7 @@ class Evaluator:
             drawn += count
             return sobol_settings(self.characteristics, drawn, seed)[-count:]
 
-        return self.region.draw_feasible(draw_next, number, filtered=feasible_after_filter)
+        return self.region.draw_feasible(draw_next, number)
 
     def evaluate_original(self) -> Evaluations:
         """Evaluation of the original vehicle.

@@ -1,5 +1,5 @@
-"""The unsafe shares of a sample over all parameter sets of the vehicle model: the study's own has
-the whole sample, each other set a tenth of it.
+"""The unsafe shares of a sample over the parameter sets of the vehicle model, each with the same
+vehicles: the first ones that `risk`, `rules` and `explain` sample.
 """
 
 from __future__ import annotations
@@ -10,45 +10,49 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.metrics.unsafe import SHARE_DECIMALS
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import models_of
-from safevar_sumo.questions.sampling import Interval
+from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.words import percentage
-from safevar_sumo.records import BoolArray, FloatArray, NamedValues
+from safevar_sumo.records import BoolArray, FloatArray, JsonObject, NamedValues
 from safevar_sumo.study import Study
 
 STAGE = "other parameter sets"
 """Phase of progress."""
-PART = 10
-"""In each other set one of so many vehicles of a sample is simulated."""
+INTERVALS = "by_set_intervals"
+"""The number of an answer that has the intervals."""
+VEHICLES = 400
+"""Number of vehicles that are simulated with each set."""
 
 
 def planned_over_sets(
     study: Study, stage: str, settings: int, fits: int | None = None
 ) -> NamedValues:
     """The phases of progress of a sample, each with its number of settings: `stage`, in which all
-    are simulated with the study's own set, and that of a tenth of them with each other one of the
-    first `fits` sets, by default of all.
+    are simulated with the study's own set, and that of its first vehicles with each of the first
+    `fits` sets, by default with all.
     """
-    return {stage: settings, STAGE: len(other_sets(study, fits)) * (settings // PART)}
+    others = len(other_sets(study, fits))
+    return {stage: settings, STAGE: (others + bool(others)) * min(settings, VEHICLES)}
 
 
 class SharesOverSets(NamedTuple):
-    """The unsafe shares of G groups of vehicles with each other parameter set.
+    """The unsafe shares of G groups of vehicles with each parameter set, that of the study first.
 
     Attributes
     ----------
-    vehicles
-        Number of vehicles that were simulated with each of them.
-    others
-        The shares, shape (sets, G); NaN for a group of which no vehicle could be simulated. No row
-        where the number of simulations is bounded, or the study has one set.
+    shares
+        Shape (sets, G); NaN for a group of which no vehicle could be simulated. No row where the
+        number of simulations is bounded, or a single set is asked about.
+    intervals
+        Their 95 % intervals, shape (sets, G, 2).
     """
 
     study: Study
-    vehicles: int
-    others: FloatArray
+    shares: FloatArray
+    intervals: FloatArray
 
     @classmethod
     def of(
@@ -59,50 +63,78 @@ class SharesOverSets(NamedTuple):
         groups: Sequence[BoolArray] = (),
         fits: int | None = None,
     ) -> Self:
-        """Simulate a tenth of M settings, shape (M, n), which are the first group, and for further
-        groups, shape (M,) each, as many of their settings, with the first `fits` sets, by default
-        with all.
+        """Simulate the first `VEHICLES` of M settings, shape (M, n), which are the first group, and
+        for further groups, shape (M,) each, as many of their settings, with the first `fits` sets,
+        by default with all.
         """
-        number = len(settings) // PART
-        is_first = np.arange(len(settings)) < number
+        is_first = np.arange(len(settings)) < VEHICLES
         in_groups = np.any([np.zeros_like(is_first), *groups], axis=0)
-        is_chosen = is_first | (in_groups & (np.cumsum(in_groups) <= number))
-        part = settings[is_chosen]
+        is_chosen = is_first | (in_groups & (np.cumsum(in_groups) <= VEHICLES))
         members = np.array([is_first, *groups])[:, is_chosen]
-        others = list[FloatArray]()
-        if evaluator.left is None and number:
-            for model in models_of(evaluator, unsafe, fits, with_unsafe_originals=True).members[1:]:
-                runs = model.evaluator.evaluate(part, STAGE)
-                counted = members & runs.valid
-                totals = counted.sum(axis=1)
-                failing = (counted & unsafe.of(runs)).sum(axis=1)
-                others.append(np.where(totals, failing / np.maximum(totals, 1), np.nan))
-        return cls(evaluator.study, number, np.array(others).reshape(-1, len(members)))
+        rows = list[list[tuple[float, float, float]]]()
+        if evaluator.left is None and other_sets(evaluator.study, fits):
+            for model in models_of(evaluator, unsafe, fits, with_unsafe_originals=True).members:
+                runs = model.evaluator.evaluate(settings[is_chosen], STAGE)
+                of_runs = unsafe.runs(runs).mean(axis=0)
+                rows.append([_share(of_runs[group & runs.valid]) for group in members])
+        table = np.array(rows).reshape(-1, len(members), 3)
+        return cls(evaluator.study, table[..., 0], table[..., 1:])
 
     def of_all(self, own: float) -> list[float]:
-        """The share of all vehicles, by the number of the set; `own` is that of the study's own."""
-        return [own, *self.others[:, 0].tolist()]
+        """The share of all vehicles, by the number of the set; `own` where a single set was asked
+        about.
+        """
+        return self.shares[:, 0].tolist() or [own]
 
-    def ends(self, group: int, own: float) -> Interval:
-        """The least and the greatest share of a group."""
-        shares = [own, *self.others[:, group]]
-        return float(np.fmin.reduce(shares)), float(np.fmax.reduce(shares))
+    @property
+    def numbers(self) -> JsonObject:
+        """The intervals of the shares of all vehicles, by the number of the set."""
+        return {INTERVALS: self.intervals[:, 0].tolist()}
 
-    def in_words(self, own: float) -> str:
-        """The least and the greatest share of all vehicles with their sets; that the study's own
-        was the only one if there are others.
+    def ends(self, group: int, own: Sequence[float]) -> tuple[float, float, float, float]:
+        """The least and the greatest share of a group, and the ends of their intervals; `own` are
+        the share and interval of more of its vehicles with the study's own set.
+        """
+        rows = np.column_stack([self.shares[:, group], self.intervals[:, group]])
+        share, low, high = np.vstack([own, rows]).T
+        return np.nanmin(share), np.nanmax(share), np.nanmin(low), np.nanmax(high)
+
+    def in_words(self) -> str:
+        """The least and the greatest share of all vehicles; that the study's own set was the only
+        one if there are others.
         """
         if not self.study.spread:
             return ""
-        if not len(self.others):
-            return " This holds for the study's own parameter set of the vehicle model alone."
-        shares = self.of_all(own)
-        ends = [
-            f"{percentage(shares[number])} % (set {number})"
-            for number in (int(np.nanargmin(shares)), int(np.nanargmax(shares)))
-        ]
+        if not len(self.shares) or np.isnan(self.shares[:, 0]).all():
+            return (
+                " This share was computed with parameter set 0 of the vehicle model (the"
+                " calibration that the study uses). Other parameter sets (alternative calibrations)"
+                " were not simulated."
+            )
+        shares = self.shares[:, 0]
+        least, greatest = map(self._in_words, (np.nanargmin(shares), np.nanargmax(shares)))
+        range_in_words = f"ranges from {least} to {greatest} over"
+        if least == greatest:
+            range_in_words = f"is {least} in each of"
         return (
-            f" Over {len(shares)} parameter sets of the vehicle model the share of unsafe vehicles"
-            f" is {' to '.join(ends)}, with {self.vehicles:,} vehicles in each set but the study's"
-            " own."
+            f" The share of unsafe vehicles {range_in_words} the {len(self.shares)} parameter sets"
+            " of the vehicle model (alternative calibrations)."
+            f" With each of these sets the first {VEHICLES} of the sampled vehicles were simulated."
         )
+
+    def _in_words(self, number: np.intp) -> str:
+        """The share of all vehicles with a set, and its number if no other interval overlaps."""
+        others = np.delete(self.intervals[:, 0], number, axis=0)
+        low, high = self.intervals[number, 0]
+        is_apart = ((others[:, 1] < low) | (others[:, 0] > high)).all()
+        name = f"set {number}, " if is_apart else ""
+        interval = f"{name}95 % confidence interval {percentage(low)} to {percentage(high)} %"
+        return f"{percentage(self.shares[number, 0])} % ({interval})"
+
+
+def _share(of_runs: FloatArray) -> tuple[float, float, float]:
+    """The unsafe share of vehicles, each by the share of its runs, with its interval."""
+    if not len(of_runs):
+        return np.nan, np.nan, np.nan
+    count = round(float(of_runs.sum()), SHARE_DECIMALS)
+    return count / len(of_runs), *clopper_pearson(count, len(of_runs))

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.answer import Answer
 
 Form = Literal["text", "json", "csv", "latex", "html"]
-SENTENCE_END = re.compile(r"(?<=[^.]{2}\.) (?=[A-Z])")
+SENTENCE_END = re.compile(r"(?<=[^.]{2}\.) (?=[A-Z0-9])")
 """Between two sentences."""
 MAX_SENTENCES = 3
 """Number of sentences of the verdict that one screen has."""
@@ -44,7 +44,7 @@ SCOPE = "Scope: "
 NOTES = (
     *(SCOPE, "Remark: ", "Changed: ", "Criterion: ", "Not simulated: ", "Counted as unsafe: "),
     "Safe means: ",
-    *("Only encounters count", "Only vehicles that satisfy", "Left out", "The fewest changes"),
+    *("Only encounters count", "Only vehicles that satisfy", "Left out", "If all changes go"),
 )
 """Beginnings of sentences of a verdict that one screen has below the table."""
 MAX_ROWS = 200

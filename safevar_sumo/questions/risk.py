@@ -33,7 +33,7 @@ from safevar_sumo.questions.indices import (
     sobol_indices,
 )
 from safevar_sumo.questions.options import Count, Fraction
-from safevar_sumo.questions.over_sets import SharesOverSets, planned_over_sets
+from safevar_sumo.questions.over_sets import INTERVALS, SharesOverSets, planned_over_sets
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
@@ -66,7 +66,16 @@ COLUMNS = [
 
 @question
 @contents(
-    *("unsafe", "samples", "failures", "probability", "interval", "confidence", "by_set"),
+    *(
+        "unsafe",
+        "samples",
+        "failures",
+        "probability",
+        "interval",
+        "confidence",
+        "by_set",
+        INTERVALS,
+    ),
     lead="sensitivity",
     next="explain",
     sensitivity=COLUMNS,
@@ -124,13 +133,13 @@ def risk(
     table = indices(evaluator, of_whom, criterion, confidence)
     numbers = {"unsafe": str(criterion), "samples": total, "failures": failures}
     numbers |= {"probability": failures / total, "interval": [low, high], "confidence": confidence}
-    numbers["by_set"] = over_sets.of_all(failures / total)
+    numbers |= {"by_set": over_sets.of_all(failures / total), **over_sets.numbers}
 
     # In words.
     verdict = (
         f"{_probability_in_words(study, criterion, failures, total)} ({100 * confidence:g} %"
         f" confidence interval {percentage(low)} to {percentage(high)} %)."
-        f"{over_sets.in_words(failures / total)}"
+        f"{over_sets.in_words()}"
         f"{NO_PROBABILITY if not study.variation else ''}"
     )
     left_out = int(drawn.infeasible.sum())

@@ -22,10 +22,10 @@ from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.options import Count
-from safevar_sumo.questions.over_sets import SharesOverSets, planned_over_sets
+from safevar_sumo.questions.over_sets import INTERVALS, SharesOverSets, planned_over_sets
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson
-from safevar_sumo.questions.variation import VariationModel
+from safevar_sumo.questions.variation import VariationModel, sampled_in_words
 from safevar_sumo.questions.words import join_phrases, percentage, with_scope
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
@@ -48,6 +48,12 @@ UNLIMITED = np.array([[-np.inf], [np.inf]])
 """Ends of a characteristic without limits; a box has the lower ends in row 0 and the upper ends in
 row 1.
 """
+ENDS = {
+    "least": "least density",
+    "greatest": "greatest density",
+    "least_low": "lowest end of an interval",
+    "greatest_high": "highest end of an interval",
+}
 COLUMNS: Columns = {
     "rule": "region: limits of some characteristics; all others anywhere in their domains",
     **with_interval(
@@ -57,8 +63,8 @@ COLUMNS: Columns = {
         "coverage", Column("-", "share of all unsafe vehicles that lie within the region", ".2f")
     ),
     **{
-        f"density_{end}": Column("-", f"{end} density over all parameter sets", ".2f", False)
-        for end in ("least", "greatest")
+        f"density_{end}": Column("-", f"{meaning} over all parameter sets", ".2f", False)
+        for end, meaning in ENDS.items()
     },
 }
 
@@ -71,6 +77,7 @@ COLUMNS: Columns = {
     "share",
     "interval",
     "by_set",
+    INTERVALS,
     lead="rules",
     next="explain",
     rules=COLUMNS,
@@ -93,7 +100,6 @@ def rules(
     """
     study = evaluator.study
     characteristics = evaluator.characteristics
-    # In each other set a tenth of those that test rules is simulated, and as many within the rules.
     evaluator.begin(planned_over_sets(study, SAMPLED_STAGE, samples), least=LEAST_SETTINGS)
 
     # One half of the vehicles yields the rules, the other half tests them.
@@ -116,28 +122,23 @@ def rules(
     # Rules are boxes in which unsafe vehicles are dense.
     trained = np.tile(training.settings, (len(of_runs), 1))  # with repeats, each run is one
     boxes, remark = _boxes(trained, of_runs.ravel(), characteristics)
-    groups = [is_within(box, testing.settings) for box in boxes]
-    over_sets = SharesOverSets.of(evaluator, criterion, testing.settings, groups)
+    groups = [is_within(box, vehicles) & ~is_first_half for box in boxes]
+    over_sets = SharesOverSets.of(evaluator, criterion, vehicles, groups)
     rows = []
     for number, box in enumerate(boxes, 1):
         own = shares(box, testing.settings, unsafe_in_test)
-        rows.append((conditions(box, characteristics), *own, *over_sets.ends(number, own[0])))
+        rows.append((conditions(box, characteristics), *own, *over_sets.ends(number, own[:3])))
     frame = pd.DataFrame(rows, columns=[*COLUMNS])
     frame = frame.sort_values("coverage", ascending=False, kind="stable", ignore_index=True)
     table = tabulate("Regions in which many vehicles are unsafe", COLUMNS, frame)
 
     # The share of unsafe vehicles, and the rule that covers most of them.
     low, high = clopper_pearson(failures, total)
-    drawn = (
-        "sampled as [variation] says"
-        if study.variation
-        else "sampled uniformly over the whole domain"
-    )
     verdict = (
-        f"Of {total:,} vehicles {drawn}, {criterion.number_in_words(failures)}:"
+        f"Of {total:,} vehicles {sampled_in_words(study)}, {criterion.number_in_words(failures)}:"
         f" {percentage(failures / total)} % (95 % confidence interval"
         f" {percentage(low)} to {percentage(high)} %)."
-        f"{over_sets.in_words(failures / total)}{remark}"
+        f"{over_sets.in_words()}{remark}"
         f"{_rule_in_words(table, failures / total)}"
     )
     numbers = {
@@ -147,6 +148,7 @@ def rules(
         "share": failures / total,
         "interval": [low, high],
         "by_set": over_sets.of_all(failures / total),
+        **over_sets.numbers,
     }
     verdict = with_scope(study, int(evaluations.infeasible.sum()), verdict, criterion.remark)
     return Answer(
@@ -164,8 +166,9 @@ def _rule_in_words(table: pd.DataFrame, share: float) -> str:
     rule = denser.iloc[0]
     over_sets = ""
     if rule["density_least"] < rule["density_greatest"]:
-        ends = f"{100 * rule['density_least']:.0f} to {100 * rule['density_greatest']:.0f} %"
-        over_sets = f" ({ends} over the parameter sets)"
+        least, greatest, low, high = (f"{100 * rule[f'density_{end}']:.0f}" for end in ENDS)
+        interval = f"with 95 % confidence {low} to {high} %"
+        over_sets = f" ({least} to {greatest} % over the parameter sets, {interval})"
     return (
         f" {100 * rule['coverage']:.0f} % of the unsafe vehicles have {rule['rule']}. Of all"
         f" vehicles in this region {100 * rule['density']:.0f} % are unsafe{over_sets}."

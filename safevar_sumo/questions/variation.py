@@ -48,10 +48,14 @@ class VariationModel:
             np.stack(columns, axis=1), self.characteristics.lower, self.characteristics.upper
         )
 
-    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Random vehicles that satisfy the constraints, shape (number, n)."""
+    def draw(self, number: int, rng: np.random.Generator, *, filtered: bool = False) -> FloatArray:
+        """Random vehicles that satisfy the constraints, shape (number, n); if `filtered`, after the
+        filter.
+        """
         settings = self.region.draw_feasible(
-            lambda count: self.settings(rng.random((count, len(self.characteristics)))), number
+            lambda count: self.settings(rng.random((count, len(self.characteristics)))),
+            number,
+            filtered=filtered,
         )
         if len(settings) < number:
             raise InputError(
@@ -61,6 +65,12 @@ class VariationModel:
                 "a [variation] and [[constraints]] that agree",
             )
         return settings
+
+
+def sampled_in_words(study: Study) -> str:
+    """How vehicles are sampled: `sampled uniformly over the whole domain`."""
+    manner = "as [variation] says" if study.variation else "uniformly over the whole domain"
+    return f"sampled {manner}"
 
 
 def _quantile_function(

@@ -91,12 +91,14 @@ def verdicts(*drivers: Sequence[float], points: Sequence[str] | None = None) -> 
     return pd.DataFrame(dict(zip(TITLES, drivers, strict=True))).assign(point=points or "")
 
 
-def test_shares_are_told_with_two_digits_and_none_or_all_only_if_exact() -> None:
-    many = verdicts([1.0] * 999 + [0.0], [1.0] * 1000)
-    assert (
-        avoided_in_words(many)
-        == "In the same vehicle, a competent driver would have avoided nearly all of 1,000"
-        " collisions, and full braking at the first possible moment all."
+def test_what_drivers_avoid_is_counted_among_the_collisions_with_a_verdict() -> None:
+    of_driver = [1.0] + [0.0] * 42 + [np.nan] * 1336
+    full = [1.0] * 1061 + [0.0] * 318
+    many = verdicts(of_driver, full)
+    assert avoided_in_words(many) == (
+        "A competent driver (as in UN R157) in the same vehicle would have avoided 1 of 43"
+        " collisions with a verdict (1,379 examined). Full braking at the first possible moment"
+        " would have avoided 1,061 of 1,379 examined collisions."
     )
     assert avoided_in_words(verdicts([np.nan], [np.nan])) == ""
 

@@ -14,15 +14,17 @@ from hypothesis import given, strategies as st
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.evaluator import Evaluator, open_evaluator
+from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.combinations import enumerate_causes, staircase
 from safevar_sumo.questions.explain.smallest import Smallest
 from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.over_sets import VEHICLES
+from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of
-from tests.questions.conftest import ORIGINAL, made_up_evaluator, nowhere
+from tests.questions.conftest import ORIGINAL, Region, made_up_evaluator
 
 COLLISION = Unsafe()
 SIDES = (0.0, ORIGINAL, 10.0)
@@ -62,7 +64,7 @@ def test_likely_combinations_come_first_and_an_unfinished_size_is_not_called_com
     assert enumerate_causes(evaluator, COLLISION, 5).complete_up_to == 0
 
 
-def test_the_staircase_ends_at_the_first_share_without_any() -> None:
+def test_the_staircase_goes_on_below_the_first_share_without_any() -> None:
     """One change alone from 80 % of the way on, two from 50 % on."""
 
     def region(settings: FloatArray) -> BoolArray:
@@ -74,11 +76,103 @@ def test_the_staircase_ends_at_the_first_share_without_any() -> None:
     assert [(step.share, step.size) for step in steps] == [
         *((share, 1) for share in (1.0, 0.9, 0.8)),
         *((share, 2) for share in (0.7, 0.6, 0.5)),
-        (0.4, 0),
+        *((share, 0) for share in (0.4, 0.3, 0.2, 0.1)),
     ]
     assert steps[-1].tried == 6 + 12 + 8
-    nothing = made_up_evaluator(2, nowhere)
-    assert len(staircase(nothing, COLLISION, enumerate_causes(nothing, COLLISION, 99), 99)) == 1
+    assert not any(step.is_cut for step in steps)
+
+
+def test_with_few_settings_single_changes_are_simulated_at_every_share() -> None:
+    """Two changes are enough at the ends; one alone would be, between 25 and 35 % of the way."""
+
+    def region(settings: FloatArray) -> BoolArray:
+        share = (settings - ORIGINAL) / 5
+        is_between = (share[:, 0] > 0.25) & (share[:, 0] < 0.35)
+        return is_between | (share[:, :2].min(axis=1) > 0.9)
+
+    evaluator = made_up_evaluator(6, region)
+    at_ends = enumerate_causes(evaluator, COLLISION, 200)
+    steps = staircase(evaluator, COLLISION, at_ends, 12 * 9)
+    assert [(step.size, step.tried, step.is_cut) for step in steps[1:]] == [
+        *[(0, 12, True)] * 6,
+        (1, 12, False),
+        *[(0, 12, True)] * 2,
+    ]
+
+
+def smallest_of(n: int, region: Region) -> tuple[Smallest, str]:
+    """The answer about a region, and its sentences."""
+    evaluator = made_up_evaluator(n, region)
+    smallest = Smallest.of(evaluator, COLLISION, 0)
+    return smallest, " ".join(filter(None, smallest.sentences(evaluator, COLLISION)))
+
+
+def way(settings: FloatArray) -> FloatArray:
+    """The share of the way to the upper ends, below 0 to the lower ones."""
+    return (settings - ORIGINAL) / 5
+
+
+def test_one_change_at_half_its_way_leads_where_all_ends_are_safe() -> None:
+    smallest, verdict = smallest_of(2, lambda rows: np.abs(way(rows)[:, 0] - 0.5) < 0.049)
+    (row,) = smallest.table.to_dict("records")
+    assert (row["causes"], row["begins_at"], row["boundary"]) == ({"a": 7.5}, 0.46, {"a": 7.3})
+    assert row["safe_again"] == 0.55
+    assert verdict.startswith("One change is enough for a collision: a at 7.3 N m, 46 % of the way")
+    assert "The unsafe range has a gap: at 55 % of the way the vehicle is safe again." in verdict
+    assert "None of the 4 changes of a single characteristic to an end" in verdict
+    assert "If all changes go 50 % of the way to the ends, 1 change is enough" in verdict
+
+
+def test_a_beginning_is_rounded_to_the_unsafe_side() -> None:
+    """0.3008 of the way is not 30 %, where nothing is unsafe."""
+    smallest, verdict = smallest_of(2, lambda rows: way(rows)[:, 0] > 0.3007)
+    assert smallest.table["begins_at"].tolist() == [0.31]
+    assert "a at 6.55 N m, 31 % of the way" in verdict
+    assert "If all changes go 30 to 10 % of the way to the ends, none of 24" in verdict
+    tooth, _ = smallest_of(1, lambda rows: np.abs(way(rows)[:, 0] - 0.3755) < 0.001)
+    assert tooth.table.empty, "narrower than the steps"
+    narrow, _ = smallest_of(
+        1, lambda rows: (np.abs(way(rows)[:, 0] - 0.3755) < 0.001) | (way(rows)[:, 0] > 0.9)
+    )
+    (row,) = narrow.table.to_dict("records")
+    assert (row["begins_at"], row["safe_again"]) == (0.375, 0.4), "0.38 would be safe"
+
+
+def test_a_cause_begins_where_none_of_its_parts_is_unsafe() -> None:
+    """Five changes from 84.3 % of the way on; one of them alone near 44 % of it."""
+
+    def region(settings: FloatArray) -> BoolArray:
+        share = way(settings)
+        return (np.abs(share[:, 0] - 0.438) < 0.004) | (share.min(axis=1) > 0.843)
+
+    smallest, verdict = smallest_of(5, region)
+    found = {row.size: (row.begins_at, row.safe_again) for row in smallest.table.itertuples()}
+    assert found[5][0] == 0.85
+    assert np.isnan(found[5][1])
+    assert found[1] == (0.44, 0.45)
+    assert verdict.startswith("One change is enough for a collision: a at 7.2 N m, 44 % of the way")
+
+
+def test_combinations_that_contain_a_cause_and_cures_are_counted() -> None:
+    """`a` up is unsafe, but not with `b` up."""
+
+    def region(settings: FloatArray) -> BoolArray:
+        return (way(settings)[:, 0] > 0.5) & (way(settings)[:, 1] < 0.5)
+
+    smallest, verdict = smallest_of(4, region)
+    counts = [0, 0, 0, 0]
+    for sides in product(SIDES, repeat=4):
+        size = sum(side != ORIGINAL for side in sides)
+        has_cause = sides[0] == 10 and size > 1
+        is_unsafe = bool(region(np.array([sides]))[0])
+        flags = has_cause, size and not has_cause, is_unsafe and not has_cause
+        for place, counted in enumerate((*flags, has_cause and not is_unsafe)):
+            counts[place] += bool(counted)
+    names = ("containing", "tried", "causes", "cures")
+    assert [smallest.numbers[name] for name in names] == counts
+    assert smallest.numbers["containing_tried"] == counts[0]
+    assert "26 further combinations of two to four changes contain a smaller cause" in verdict
+    assert "9 of the 26 simulated ones are safe" in verdict
 
 
 @pytest.mark.parametrize(
@@ -106,22 +200,21 @@ def test_the_answer_leads_with_the_smallest_changes() -> None:
     numbers = answer["numbers"]
     assert numbers["complete_up_to"] == 4
     assert numbers["causes"] == len(rows)
-    assert answer["verdict"].startswith(
-        "All 24 single changes to an end of the domain are safe. Of the 264 pairs one collides:"
-    )
+    assert answer["verdict"].startswith("Two changes together are enough for a collision:")
+    counted = "1 of the 264 combinations of two changes causes a collision"
+    assert counted in answer["verdict"]
     assert "All causes" not in answer["verdict"]
     first, *_, last = answer["tables"]["staircase"]["rows"]
     assert (first["share"], first["fewest"], last["fewest"]) == (1.0, 2, None)
 
-    # A tenth of the sampled vehicles with the other parameter set.
+    # The vehicles of `risk` with both parameter sets.
     study = load_study("rain")
-    with open_evaluator(study, InlinePool()) as evaluator:
-        drawn = evaluator.feasible_settings(4096, study.search.seed, feasible_after_filter=True)
-        tenth = evaluator.characteristics.filter(drawn)[:409]
-    other = drive_and_score(assemble(studies_of_sets(study)[1]), tenth).collided.mean()
-    own = numbers["failures"] / numbers["settings"]
-    assert numbers["by_set"] == [own, other]
-    assert "Over 2 parameter sets of the vehicle model the share of unsafe" in answer["verdict"]
+    drawn = VariationModel(study).draw(VEHICLES, np.random.default_rng(study.search.seed))
+    shares = [
+        drive_and_score(assemble(one), drawn).collided.mean() for one in studies_of_sets(study)[:2]
+    ]
+    assert numbers["by_set"] == shares
+    assert "over the 2 parameter sets" in answer["verdict"].replace("each of", "over")
 
 
 def test_the_study_of_results_is_explained_as_without_results(slippery: Path) -> None:
@@ -133,7 +226,7 @@ def test_the_study_of_results_is_explained_as_without_results(slippery: Path) ->
 @pytest.mark.slow
 def test_of_a_searched_scenario_each_combination_meets_critical_encounters() -> None:
     answer = sv.explain("sun", ranges=True, fits=0, quick=True, pool=InlinePool())
-    assert "Scope: each combination was simulated in the original encounter" in answer.verdict
+    assert "Scope: the original encounter and the 16 encounters in which" in answer.verdict
 
 
 def test_the_verdict_claims_no_more_than_was_simulated() -> None:
@@ -146,7 +239,6 @@ def test_the_verdict_claims_no_more_than_was_simulated() -> None:
     evaluator = made_up_evaluator(4, region)
     smallest = Smallest.of(evaluator, COLLISION, 0)
     sentences = " ".join(smallest.sentences(evaluator, COLLISION))
-    assert "pairs one collides: a and b." in sentences
-    assert "combinations of three one collides without a smaller cause: b, c and d." in sentences
-    last = smallest.steps[-1]
-    assert f"none of {last.tried} combinations of up to four changes at" in sentences
+    assert "1 of the 24 combinations of two changes causes a collision: a and b." in sentences
+    assert "1 of the 28 combinations of three changes causes a collision: b, c and d." in sentences
+    assert "none of 480 simulated combinations (up to four changes) causes a collision" in sentences

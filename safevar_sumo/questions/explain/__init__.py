@@ -47,7 +47,7 @@ from safevar_sumo.questions.explain.tables import (
 )
 from safevar_sumo.questions.explain.words import others_in_words, verdict_on_failures
 from safevar_sumo.questions.options import Range
-from safevar_sumo.questions.over_sets import planned_over_sets
+from safevar_sumo.questions.over_sets import INTERVALS, planned_over_sets
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
     FULL,
@@ -88,6 +88,7 @@ LATER = {REFERENCE_DRIVERS: 3000, OTHER_SETS: 1000, BOUNDARIES: 3000}
         "other_outcomes",
         "left_out",
         "by_set",
+        INTERVALS,
         "original_outcome",
         "original_degree",
     ),
@@ -151,10 +152,11 @@ def explain(
     is_caused = bool(study.ranges or not population.unsafe.of(population.original)[0])
 
     # The smallest changes of all, of a study; and the minimal causes of a sample of the failures,
-    # of a smaller one where few simulations are allowed.
+    # with what is left where few simulations are allowed.
     has_smallest = of_study and is_caused
     smallest = Smallest.of(evaluator, population.unsafe, fits) if has_smallest else None
-    limit = limit if evaluator.left is None else evaluator.left // 4
+    if evaluator.left is not None:
+        limit = evaluator.left // (2 if of_study else 4) * len(evaluator.system.points)
     top = 0 if of_study else top
     reasons, sample, causes, complete = choose_failures(population, evaluator, limit, top)
     of_chosen, of_sample = (
@@ -228,6 +230,7 @@ def _counts(population: Population, subject: Subject, analysed: int, explained: 
         "other_outcomes": population.otherwise,
         "left_out": left_out,
         "by_set": None if over_sets is None else over_sets.of_all(population.share),
+        INTERVALS: None if over_sets is None else over_sets.numbers[INTERVALS],
         "original_outcome": str(original.outcome[0]),
         "original_degree": float(original.f_safe[0]),
         "analysed": analysed,

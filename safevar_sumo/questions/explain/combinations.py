@@ -44,12 +44,18 @@ class Enumeration(NamedTuple):
     simulated, existing
         How many combinations of each size were simulated, and how many there are that contain no
         smaller cause and violate no constraint.
+    containing
+        The combinations of each size that contain a smaller cause and violate no constraint.
+    is_cut
+        Whether a larger size was left out, or cut, because it is too large.
     """
 
     share: float
     causes: list[Cause]
     simulated: dict[int, int]
     existing: dict[int, int]
+    containing: dict[int, list[Combination]]
+    is_cut: bool
 
     @property
     def tried(self) -> int:
@@ -95,51 +101,84 @@ def enumerate_causes(
     columns = {column for column, _ in changes}
     room = limit // (1 + len(evaluator.critical_encounters))
     effects = dict.fromkeys(changes, np.inf)  # what each leaves by itself
-    found = Enumeration(share, [], {}, {})
+    causes = list[Cause]()
+    simulated, existing = dict[int, int](), dict[int, int]()
+    containing = dict[int, list[Combination]]()
     unsafe_ones = list[Combination]()
+    is_cut = False
 
     for size in range(1, len(columns) + 1):
         # A size is begun while all its combinations can be put in order.
-        if comb(len(columns), size) * 2**size > MAX_COMBINATIONS:
+        if only_fewest and causes:
             break
-        candidates = [
-            each for each in _of_size(changes, size) if not any(one <= each for one in unsafe_ones)
-        ]
-        if candidates:
-            is_feasible = evaluator.region.feasible(_settings(members, candidates))
-            candidates = [each for each, flag in zip(candidates, is_feasible, strict=True) if flag]
-        if only_fewest and (found.causes or len(candidates) > room):
+        is_cut = comb(len(columns), size) * 2**size > MAX_COMBINATIONS
+        if is_cut:
+            break
+        every = [*_of_size(changes, size)]
+        is_feasible = evaluator.region.feasible(_settings(members, every)).tolist()
+        feasible = [each for each, flag in zip(every, is_feasible, strict=True) if flag]
+        larger = {each for each in feasible if any(one <= each for one in unsafe_ones)}
+        candidates = [each for each in feasible if each not in larger]
+        is_cut = len(candidates) > room
+        if is_cut and (only_fewest or not room):
             break
 
         # Those whose single changes are worst come first.
         candidates.sort(key=lambda each: sum(effects[change] for change in each))
         chosen = candidates[:room]
         room -= len(chosen)
-        if candidates and not chosen:
-            break
-        found.existing[size] = len(candidates)
-        found.simulated[size] = len(chosen)
-        left, causes = _robustness(evaluator, unsafe, chosen)
+        existing[size] = len(candidates)
+        simulated[size] = len(chosen)
+        containing[size] = [each for each in feasible if each in larger]
+        left, as_causes = _robustness(evaluator, unsafe, chosen)
         if size == 1:
             effects |= {change: value for (change,), value in zip(chosen, left, strict=True)}
         for index in np.flatnonzero(left < 0).tolist():
-            found.causes.append(causes[index])
+            causes.append(as_causes[index])
             unsafe_ones.append(chosen[index])
-    return found
+        if is_cut:
+            break
+    return Enumeration(share, causes, simulated, existing, containing, is_cut)
+
+
+def count_cures(
+    evaluator: Evaluator, unsafe: Unsafe, found: Enumeration, limit: int
+) -> dict[int, int]:
+    """How many of the combinations that contain a smaller cause are safe, by their size; only of
+    the sizes that are simulated as a whole with at most `limit` settings.
+    """
+    cures = dict[int, int]()
+    room = limit // (1 + len(evaluator.critical_encounters))
+    for size, containing in found.containing.items():
+        room -= len(containing)
+        if room < 0:
+            break
+        if not containing:
+            continue
+        settings = _settings(evaluator.characteristics, containing)
+        runs = evaluator.evaluate_over_encounters(settings, unsafe, COMBINATIONS)
+        cures[size] = int(np.count_nonzero(runs.valid & ~unsafe.of(runs)))
+    return cures
 
 
 def staircase(
     evaluator: Evaluator, unsafe: Unsafe, at_ends: Enumeration, limit: int
 ) -> list[Enumeration]:
-    """The fewest changes that are unsafe while no change goes beyond a share of the way to its end,
-    for each of `SHARES`, down to the first without any; with at most `limit` simulated settings.
+    """The fewest changes that are unsafe at each of `SHARES` of the way to their ends, with at most
+    `limit` simulated settings. At the ends more changes may be necessary than before, so fewer are
+    simulated at every share.
     """
     steps = [at_ends]
-    while steps[-1].causes and len(steps) < len(SHARES):
-        step = enumerate_causes(evaluator, unsafe, limit, SHARES[len(steps)], only_fewest=True)
+    encounters = 1 + len(evaluator.critical_encounters)
+    fewer = encounters * sum(
+        number for size, number in at_ends.simulated.items() if size < at_ends.size
+    )
+    for rest, share in zip(range(len(SHARES) - 2, -1, -1), SHARES[1:], strict=True):
+        most = limit - rest * fewer if at_ends.causes else limit // (rest + 1)
+        step = enumerate_causes(evaluator, unsafe, most, share, only_fewest=True)
         if not step.tried:
             break
-        limit -= step.tried * (1 + len(evaluator.critical_encounters))
+        limit -= step.tried * encounters
         steps.append(step)
     return steps
 
@@ -189,9 +228,15 @@ def _robustness(
             outcome=str(outcome),
             safety_degree=float(degree),
             encounter={item.name: members.named(setting)[item.name] for item in members.scenario},
+            unsafe_runs=float(of_runs),
         )
-        for combination, outcome, degree, setting in zip(
-            chosen, runs.outcome, runs.f_safe, runs.settings, strict=True
+        for combination, outcome, degree, setting, of_runs in zip(
+            chosen,
+            runs.outcome,
+            runs.f_safe,
+            runs.settings,
+            unsafe.runs(runs).mean(axis=0),
+            strict=True,
         )
     ]
     return np.where(runs.valid, unsafe.robustness(runs), np.inf), causes

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import default_rng
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
@@ -21,7 +22,8 @@ from safevar_sumo.questions.causes import (
     select_affordable_rows,
 )
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.over_sets import SharesOverSets
+from safevar_sumo.questions.over_sets import VEHICLES, SharesOverSets
+from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import ending_in_words
 from safevar_sumo.records import Evaluations, FloatArray, TextArray
 from safevar_sumo.results import CHOICES, UNKNOWN, SolutionId, handles_of, row_of_handle
@@ -95,8 +97,8 @@ def gather_failures(
     criterion: Unsafe | None,
     fits: int,
 ) -> Population:
-    """Evaluate all solutions of results, or settings drawn from a study's whole domain, a tenth of
-    these with each other one of the first `fits` parameter sets.
+    """Evaluate all solutions of results, or settings that vary as a study says, of which the
+    first ones, without the filter, are also simulated with the first `fits` parameter sets.
 
     Raises
     ------
@@ -130,7 +132,8 @@ def gather_failures(
         counts = np.flatnonzero(~evaluations.infeasible)
         evaluations = evaluations.take(counts)
         names = [names[row] for row in counts]
-        over_sets = SharesOverSets.of(evaluator, unsafe, evaluations.settings, fits=fits)
+        vehicles = VariationModel(subject).draw(VEHICLES, default_rng(subject.search.seed))
+        over_sets = SharesOverSets.of(evaluator, unsafe, vehicles, fits=fits)
 
     # Named settings are explained whatever they do.
     rows = (
@@ -147,12 +150,12 @@ Candidates = tuple[FloatArray, list[str], TextArray]
 
 
 def _drawn_from(study: Study, evaluator: Evaluator) -> Candidates:
-    """Settings drawn from a study's whole domain."""
+    """Settings that vary as a study says, after the filter."""
     affordable = SAMPLED_SIMULATIONS // len(evaluator.system.points)
     number = min(SAMPLED_SETTINGS, max(affordable, LEAST_SAMPLED_SETTINGS))
     # Of few simulations most are for the causes of what fails here.
     number = evaluator.at_most(number, 8)
-    drawn = evaluator.feasible_settings(number, study.search.seed, feasible_after_filter=True)
+    drawn = VariationModel(study).draw(number, default_rng(study.search.seed), filtered=True)
     settings = evaluator.characteristics.filter(drawn)
     names = [f"drawn:{row}" for row in range(len(settings))]
     return settings, names, np.full(len(settings), UNKNOWN)

@@ -4,7 +4,7 @@ the domain with where they begin and how sure they are, the staircase, and the v
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING, NamedTuple, Self
 
@@ -13,16 +13,20 @@ import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.boundary import find_boundaries
-from safevar_sumo.questions.cause_limits import settings_of_line
-from safevar_sumo.questions.causes import BOUNDARIES, Cause, settings_of
+from safevar_sumo.questions.counterexamples import limit_text
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.combinations import Enumeration, enumerate_causes, staircase
+from safevar_sumo.questions.explain.beginnings import find_beginnings
+from safevar_sumo.questions.explain.combinations import (
+    Enumeration,
+    count_cures,
+    enumerate_causes,
+    staircase,
+)
 from safevar_sumo.questions.explain.robustness import robustness_in_words
-from safevar_sumo.questions.explain.tables import sureness
+from safevar_sumo.questions.explain.tables import RUNS, sureness
 from safevar_sumo.questions.tables import Column, Columns, Frames, tabulate
 from safevar_sumo.questions.words import EXACT, join_phrases, number_of, percentage
-from safevar_sumo.records import JsonObject
+from safevar_sumo.records import JsonObject, NamedValues
 from safevar_sumo.vehicles import CharacteristicSet
 
 if TYPE_CHECKING:
@@ -30,25 +34,33 @@ if TYPE_CHECKING:
 
 MAX_SETTINGS = 12_000
 """Largest number of settings for the combinations at the ends, and again for the staircase."""
-PARTS, COARSE_PARTS = (32, 8), (8, 4)
-"""Parts of the way to the ends, as `boundary.PARTS`; and where few simulations are allowed."""
+CURES = 4
+"""Combinations that contain a cause are as many of these settings, divided by this number."""
 NAMED = 3
 """Largest number of causes that a sentence names."""
 SMALLEST_COLUMNS: Columns = {
     "causes": Column(
         "",
-        "a smallest set of changes to an end of the domain that is unsafe, all else as in the"
-        " original; fewer of them are safe",
+        "smallest set of changes that is unsafe, all else as in the original: the values at the"
+        " ends of the domain or, where these are safe, those at which the set begins to be unsafe",
         EXACT,
         head="cause",
     ),
     "size": Column("", "number of changes", is_shown=False),
     "begins_at": Column(
         "-",
-        "share of the way from the original to these values at which it begins to be unsafe, all"
-        " changes at the same share",
-        ".2f",
+        "smallest share of the way to the ends of the domain at which these changes are unsafe and"
+        " fewer of them are safe, all at the same share; rounded up, and simulated as printed",
+        EXACT,
         head="begins at share of the way",
+    ),
+    "boundary": Column(
+        "", "the values at which it begins, simulated as they stand here", EXACT, is_shown=False
+    ),
+    "safe_again": Column(
+        "-",
+        "smallest larger share of the way at which these changes are safe again; - without any",
+        ".2f",
     ),
     "holds": Column(
         "",
@@ -59,25 +71,31 @@ SMALLEST_COLUMNS: Columns = {
     "robust_share": Column(
         "-", "share of vehicles with nearly these values that are unsafe", ".2f"
     ),
+    "unsafe_runs": RUNS,
     "outcome": Column("", "outcome with these changes only", is_shown=False),
 }
 STAIRCASE_COLUMNS: Columns = {
-    "share": Column("-", "largest share of the way to its end at which a changed part is", ".1f"),
+    "share": Column("-", "share of the way to its end at which each changed part is", ".1f"),
     "fewest": "fewest changes at this share of the way that are unsafe; - if none was found",
     "tried": "combinations of changes that were simulated",
     "causes": Column("", "the parts that are changed", head="changed parts"),
 }
-TITLE = "The smallest changes to an end of the domain, all else as in the original"
-SMALLEST_NUMBERS = ("tried", "up_to_changes", "complete_up_to", "causes")
+TITLE = "The smallest changes that are unsafe, all else as in the original"
+SMALLEST_NUMBERS = (
+    *("tried", "up_to_changes", "complete_up_to", "causes"),
+    *("containing", "containing_tried", "cures"),
+)
 
 
 class Smallest(NamedTuple):
     """The smallest changes that are unsafe: at the ends of the domain, and nearer to the original;
-    a row of `SMALLEST_COLUMNS` for each cause at the ends, the most robust first.
+    how many combinations are safe although they contain a cause, by size; and a row of
+    `SMALLEST_COLUMNS` for each cause, the most robust first.
     """
 
     at_ends: Enumeration
     steps: Sequence[Enumeration]
+    cures: dict[int, int]
     table: pd.DataFrame
 
     @classmethod
@@ -87,112 +105,140 @@ class Smallest(NamedTuple):
         # not enumerated cannot be made smaller; the rest says how sure the causes are.
         at_ends = enumerate_causes(evaluator, unsafe, evaluator.at_most(MAX_SETTINGS, 2))
         steps = staircase(evaluator, unsafe, at_ends, evaluator.at_most(MAX_SETTINGS, 3))
-        return cls(at_ends, steps, _table(evaluator, unsafe, at_ends.causes, fits))
+        cures = count_cures(evaluator, unsafe, at_ends, evaluator.at_most(MAX_SETTINGS // CURES, 8))
+        return cls(at_ends, steps, cures, _table(evaluator, unsafe, steps, fits))
 
     @property
     def numbers(self) -> JsonObject:
-        up_to = max(self.at_ends.simulated, default=0)
-        values = (self.at_ends.tried, up_to, self.at_ends.complete_up_to, len(self.at_ends.causes))
+        at_ends = self.at_ends
+        containing = {size: len(of_size) for size, of_size in at_ends.containing.items()}
+        simulated = sum(containing[size] for size in self.cures)
+        of_containing = (sum(containing.values()), simulated, sum(self.cures.values()))
+        up_to = max(at_ends.simulated, default=0)
+        values = (at_ends.tried, up_to, at_ends.complete_up_to, len(self.table), *of_containing)
         return dict(zip(SMALLEST_NUMBERS, values, strict=True))
 
     def sentences(self, evaluator: Evaluator, unsafe: Unsafe) -> Iterator[str]:
-        """The verdict: what collides, where it begins, how sure it is, and what was simulated."""
+        """The verdict: the smallest changes, how sure they are, and what was simulated."""
         members = evaluator.characteristics
-        verbs = unsafe.verbs
         sizes = [size for size, number in self.at_ends.existing.items() if number]
         fewest = self.at_ends.size or max(sizes, default=0)
-        yield from self._of_sizes(members, verbs, [size for size in sizes if size <= fewest])
-        yield from self._leading(members, verbs[0], fewest)
-        yield self._stairs(verbs[1])
-        larger = [size for size in sizes if size > fewest]
-        verbs = f"{verbs[0]} without a smaller cause", f"{verbs[1]} without a smaller cause"
-        yield from self._of_sizes(members, verbs, larger)
+        yield from self._first(members, unsafe)
+        yield from self._of_sizes(members, unsafe, [size for size in sizes if size <= fewest])
+        yield from self._stairs(unsafe)
+        yield from self._of_sizes(members, unsafe, [size for size in sizes if size > fewest])
+        yield from self._containing()
         yield self._in_none(members)
         encounters = len(evaluator.critical_encounters)
         if encounters:
             yield (
-                "Scope: each combination was simulated in the original encounter and in the"
-                f" {encounters} in which the original vehicle is least safe."
+                f"Scope: the original encounter and the {encounters} encounters in which the"
+                " original vehicle is least safe."
             )
 
+    def _first(self, members: CharacteristicSet, unsafe: Unsafe) -> Iterator[str]:
+        """The smallest changes at any simulated share of the way, and how sure they are."""
+        thing = "a collision" if unsafe.is_collision else "an unsafe vehicle"
+        if self.table.empty:
+            up_to = _up_to(max(self.at_ends.simulated, default=0))
+            yield f"No cause of {thing} was found with {up_to} to the ends of their domains."
+            return
+
+        # The fewest changes that begin nearest to the original.
+        of_size = self.table[self.table["size"] == self.table["size"].min()]
+        first, *others = of_size.sort_values("begins_at", kind="stable").to_dict("records")
+        size = first["size"]
+        way = "the ends of their domains (their ranges of values)"
+        enough = f"{_count(size).capitalize()} changes together are"
+        if size == 1:
+            way, enough = "the end of its domain (its range of values)", "One change is"
+        if first["begins_at"] < 1:
+            way = f"{percentage(first['begins_at'])} % of the way to {way}"
+        values = [
+            f"{item.short_name} at {limit_text(item, first['boundary'][item.name])}"
+            for item in members
+            if item.name in first["boundary"]
+        ]
+        yield f"{enough} enough for {thing}: {join_phrases(values)}, {way}."
+        if others:
+            other = f"other combination{'' if len(others) == 1 else 's'} of {_count(size)} changes"
+            if size == 1:
+                other = f"other change{'' if len(others) == 1 else 's'}"
+            yield f"{len(others):,} {other} {_are(len(others))} enough, too."
+
+        # How sure they are.
+        if pd.notna(first["safe_again"]):
+            again = f"{percentage(first['safe_again'])} % of the way"
+            yield f"The unsafe range has a gap: at {again} the vehicle is safe again."
+        if first["unsafe_runs"] < 1:
+            yield f"The vehicle is unsafe in {percentage(first['unsafe_runs'])} % of its runs."
+        if pd.notna(first["holds"]):
+            yield (
+                f"These changes are a cause in {first['holds']} of {first['fits']} parameter sets"
+                " of the vehicle model (alternative calibrations)."
+            )
+        yield robustness_in_words(first["robust_share"])
+
     def _of_sizes(
-        self, members: CharacteristicSet, verbs: tuple[str, str], sizes: Sequence[int]
+        self, members: CharacteristicSet, unsafe: Unsafe, sizes: Sequence[int]
     ) -> Iterator[str]:
         """How many combinations of each of some sizes are unsafe, and which."""
+        simulated, existing = self.at_ends.simulated, self.at_ends.existing
         of_size = {
             size: [one for one in self.at_ends.causes if len(one.changes) == size] for size in sizes
         }
-        simulated, existing = self.at_ends.simulated, self.at_ends.existing
         are_whole_and_safe = {
             size: not causes and simulated[size] == existing[size]
             for size, causes in of_size.items()
         }
         for is_safe, group in groupby(sizes, are_whole_and_safe.__getitem__):
             if is_safe:
-                yield f"All {join_phrases(self._in_words([*group]))} are safe."
+                parts = [[*of_part] for _, of_part in groupby(group, lambda size: min(size, 3))]
+                nouns = [_noun(part, sum(existing[size] for size in part)) for part in parts]
+                yield f"None of the {join_phrases(nouns)} {_makes_unsafe(unsafe, 0)}."
                 continue
             for size in group:
-                (noun,) = self._in_words([size])
-                part = ""
-                if simulated[size] < existing[size]:
-                    part = f", of which {simulated[size]:,} were simulated,"
+                is_whole = simulated[size] == existing[size]
                 causes = of_size[size]
-                verb = verbs[1] if len(causes) > 1 else verbs[0]
                 names = "; ".join(join_phrases(_names(members, one.changes)) for one in causes)
                 named = f": {names}" if 0 < len(causes) <= NAMED else ""
-                yield f"Of the {noun}{part} {_count(len(causes))} {verb}{named}."
+                which = "" if is_whole else "simulated "
+                beside = "" if is_whole else f" ({existing[size]:,} such combinations exist)"
+                noun = _noun([size], simulated[size], which)
+                number = f"{len(causes):,}" if causes else "None"
+                verb = _makes_unsafe(unsafe, len(causes))
+                yield f"{number} of the {noun} {verb}{beside}{named}."
 
-    def _in_words(self, sizes: Sequence[int]) -> list[str]:
-        """The combinations of some sizes: `24 single changes to an end of the domain`, `264 pairs`,
-        `1,760 combinations of three to five`.
-        """
-        existing = self.at_ends.existing
-        phrases = list[str]()
-        if 1 in sizes:
-            phrases.append(f"{number_of(existing[1], 'single change')} to an end of the domain")
-        if 2 in sizes:
-            phrases.append(number_of(existing[2], "pair"))
-        if larger := [size for size in sizes if size > 2]:
-            ends = " to ".join(map(_count, sorted({larger[0], larger[-1]})))
-            number = sum(existing[size] for size in larger)
-            phrases.append(f"{number_of(number, 'combination')} of {ends}")
-        return phrases
-
-    def _leading(self, members: CharacteristicSet, verb: str, size: int) -> Iterator[str]:
-        """Where the most robust cause of the fewest changes begins, and how sure it is."""
-        of_size = self.table[self.table["size"] == size]
-        if of_size.empty:
-            return
-        first = of_size.iloc[0]
-        names = join_phrases(_names(members, first["causes"]))
-        who = "It" if len(of_size) == 1 else f"The most robust of them, {names},"
-        ends = {1: "the end", 2: "both ends"}.get(size, "all ends")
-        facts = []
-        if pd.notna(first["begins_at"]):
-            facts.append(f"begins at {percentage(first['begins_at'])} % of the way to {ends}")
-        if pd.notna(first["holds"]):
-            facts.append(f"{verb} in {first['holds']} of {first['fits']} parameter sets")
-        yield f"{who} {' and '.join(facts)}." if facts else ""
-        yield robustness_in_words(first["robust_share"])
-
-    def _stairs(self, verb: str) -> str:
-        """The fewest changes at each share of the way."""
-        phrases = list[str]()
-        for number, group in groupby(self.steps, lambda step: step.size):
+    def _stairs(self, unsafe: Unsafe) -> Iterator[str]:
+        """The fewest changes at each share of the way that was simulated beside the ends."""
+        for (number, largest), group in groupby(
+            self.steps[1:], lambda step: (step.size, max(step.simulated))
+        ):
             steps = [*group]
-            ends = [f"{100 * steps[place].share:.0f}" for place in {0, len(steps) - 1}]
-            what = _count(number)
-            if not number:
-                largest = max(steps[0].simulated, default=0)
-                tried = number_of(steps[0].tried, "combination")
-                what = f"none of {tried} of {_up_to(largest)}"
-            phrases.append(f"{what} at {' to '.join(ends)} %")
-        if not self.at_ends.causes:
-            return ""
-        return (
-            f"The fewest changes that {verb}, all at one share of the way to their ends:"
-            f" {', '.join(phrases)}."
-        )
+            ends = [f"{100 * steps[place].share:.0f}" for place in sorted({0, len(steps) - 1})]
+            where = f"If all changes go {' to '.join(ends)} % of the way to the ends"
+            if number:
+                enough = "1 change is" if number == 1 else f"{_count(number)} changes are"
+                thing = "a collision" if unsafe.is_collision else "an unsafe vehicle"
+                yield f"{where}, {enough} enough for {thing}."
+                continue
+            tried = f"{sum(step.tried for step in steps):,} simulated combinations"
+            cut = ", because more exceed the search" if steps[0].is_cut else ""
+            yield f"{where}, none of {tried} ({_up_to(largest)}{cut}) {_makes_unsafe(unsafe, 0)}."
+
+    def _containing(self) -> Iterator[str]:
+        """How many combinations contain a smaller cause, and how many of these are safe."""
+        *_, total, tried, cures = self.numbers.values()
+        if not total:
+            return
+        sizes = [size for size, of_size in self.at_ends.containing.items() if of_size]
+        verb = "contains" if total == 1 else "contain"
+        noun = _noun(sizes, total, "further ")
+        yield f"{noun} {verb} a smaller cause and {_are(total)} not among these."
+        number = f"{cures:,} of" if cures else "None of"
+        why = ", because another change prevents the failure" if cures else ""
+        if tried:
+            yield f"{number} the {tried:,} simulated ones {_are(max(cures, 1))} safe{why}."
 
     def _in_none(self, members: CharacteristicSet) -> str:
         """Which characteristics no cause has, up to the size of which all were simulated."""
@@ -265,37 +311,60 @@ def draw_staircase(answer: Answer) -> Figure:
 
 
 def _table(
-    evaluator: Evaluator, unsafe: Unsafe, causes: Sequence[Cause], fits: int
+    evaluator: Evaluator, unsafe: Unsafe, steps: Sequence[Enumeration], fits: int
 ) -> pd.DataFrame:
     """A row of `SMALLEST_COLUMNS` for each cause, the most robust first."""
-    # Where each begins, for as many as may be simulated.
-    settings = settings_of(evaluator.characteristics, causes)
-    starts = evaluator.characteristics.with_original_vehicle(settings)
-    parts = PARTS if evaluator.left is None else COARSE_PARTS
-    # Of few simulations half are left for the neighbours and the other parameter sets.
-    known = evaluator.at_most(len(causes) * settings_of_line(parts), 2) // settings_of_line(parts)
-    begins = np.full(len(causes), np.nan)
-    if known:
-        begins[:known] = find_boundaries(
-            starts[:known],
-            settings[:known],
-            lambda rows: unsafe.of(evaluator.evaluate(rows, BOUNDARIES)),
-            parts,
-        ).unsafe_shares
-
-    # How sure each is.
+    beginnings = find_beginnings(evaluator, unsafe, steps)
+    causes = [one.cause for one in beginnings]
     robust, holds, tried = sureness(evaluator, causes, unsafe, fits)
     rows = [
-        (cause.changes, len(cause.changes), begin, held, tried, share, cause.outcome)
-        for cause, begin, held, share in zip(causes, begins, holds, robust, strict=True)
+        {
+            **one.cause._asdict(),
+            "causes": one.cause.changes,
+            "size": len(one.cause.changes),
+            "begins_at": one.share,
+            "boundary": one.boundary,
+            "safe_again": one.safe_again,
+            "holds": held,
+            "fits": tried,
+            "robust_share": share,
+        }
+        for one, held, share in zip(beginnings, holds, robust.tolist(), strict=True)
     ]
-    rows.sort(key=lambda row: (-np.nan_to_num(row[5], nan=-1), -(row[3] or 0), row[1]))
+    rows.sort(
+        key=lambda row: (
+            -np.nan_to_num(row["robust_share"], nan=-1),
+            -(row["holds"] or 0),
+            row["size"],
+        )
+    )
     frame = pd.DataFrame(rows, columns=[*SMALLEST_COLUMNS])
+    frame["safe_again"] = frame["safe_again"].astype(float).replace(np.inf, np.nan)
     return frame.astype({"holds": "Int64", "fits": "Int64"})
 
 
-def _names(members: CharacteristicSet, changes: Collection[str]) -> list[str]:
+def _names(members: CharacteristicSet, changes: NamedValues) -> list[str]:
     return [item.short_name for item in members if item.name in changes]
+
+
+def _makes_unsafe(unsafe: Unsafe, number: int) -> str:
+    """What so many changes do; of none, as of one."""
+    if unsafe.is_collision:
+        return "cause a collision" if number > 1 else "causes a collision"
+    return "make the vehicle unsafe" if number > 1 else "makes the vehicle unsafe"
+
+
+def _noun(sizes: Sequence[int], number: int, which: str = "") -> str:
+    """Combinations of sizes: `24 changes of a single characteristic to an end of its domain`."""
+    if [*sizes] == [1]:
+        change = number_of(number, f"{which}change")
+        return f"{change} of a single characteristic to an end of its domain"
+    counts = " to ".join(map(_count, sorted({sizes[0], sizes[-1]})))
+    return f"{number_of(number, f'{which}combination')} of {counts} changes"
+
+
+def _are(number: int) -> str:
+    return "is" if number == 1 else "are"
 
 
 def _count(number: int) -> str:

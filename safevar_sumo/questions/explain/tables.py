@@ -36,6 +36,12 @@ from safevar_sumo.records import FloatArray, NamedValues
 
 MAX_DISTINCT = 10
 """Maximum number of distinct causes in their table."""
+RUNS = Column(
+    "-",
+    "share of the runs with these changes only that are unsafe, where runs repeat",
+    ".2f",
+    False,
+)
 CAUSE_COLUMNS: Columns = {
     "solution": Column("", "handle of the failure", is_detail=True),
     "changes": Column(
@@ -74,6 +80,7 @@ CAUSE_COLUMNS: Columns = {
     "robust_share": Column(
         "-", "share of vehicles with nearly the values of the cause alone that are unsafe", ".2f"
     ),
+    "unsafe_runs": RUNS,
     "holds": Column(
         "",
         "number of parameter sets of the vehicle model with which these changes are a cause",
@@ -283,7 +290,8 @@ def statistics_tables(
         "characteristics": tabulate(
             f"Characteristics changed, and necessary, in {number_of(failures, 'failure')}",
             CHARACTERISTIC_COLUMNS,
-            needed,
+            # Of one failure every share is 0 or 1.
+            needed if failures > 1 else needed.head(0),
         ),
         "drivers": tabulate(
             f"Other drivers in the same vehicle: {number_of(len(verdicts), 'collision')} again",

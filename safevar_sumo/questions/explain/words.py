@@ -14,7 +14,8 @@ from safevar_sumo.questions.counterexamples import limit_text
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import Population
 from safevar_sumo.questions.explain.robustness import LEAST_NEIGHBOURS, robustness_in_words
-from safevar_sumo.questions.preventability import FULL, LETTER, avoided_shares
+from safevar_sumo.questions.preventability import FULL, LETTER
+from safevar_sumo.questions.variation import sampled_in_words
 from safevar_sumo.questions.words import (
     constraints_in_words,
     counted_in_words,
@@ -27,10 +28,13 @@ from safevar_sumo.questions.words import (
 from safevar_sumo.records import NamedValues
 from safevar_sumo.study import Study
 
+AVOIDING = {
+    LETTER: "A competent driver (as in UN R157) in the same vehicle",
+    FULL: "Full braking at the first possible moment",
+}
+"""Who might have avoided a collision."""
 BEYOND = 256
 """Number of vehicles beyond the values of a cause that are simulated."""
-SOLUTIONS, DRAWN = "different solutions of the search", "vehicles sampled over the whole domain"
-"""What the settings are of which some are unsafe."""
 
 
 def verdict_on_failures(
@@ -110,28 +114,29 @@ def others_in_words(
         yield f"All minimal causes of up to {number_of(complete, 'change')} are found."
     yield avoided_in_words(verdicts)
     over_sets = population.over_sets
-    yield _number_in_words(population, DRAWN if over_sets else SOLUTIONS)
+    drawn = f"vehicles {sampled_in_words(study)}"
+    yield _number_in_words(population, drawn if over_sets else "different solutions of the search")
     if over_sets:
-        yield over_sets.in_words(population.share).strip()
+        yield over_sets.in_words().strip()
         yield from counted_in_words(study, population.left_out)
     yield from constraints_in_words(study)
 
 
 def avoided_in_words(verdicts: pd.DataFrame) -> str:
-    """What a competent driver, and full braking, would have avoided."""
-    shares = avoided_shares(verdicts)
-    titles = {LETTER: "a competent driver", FULL: "full braking at the first possible moment"}
-    number = number_of(len(verdicts), "collision")
-    avoided = [
-        (title, share_in_words(shares[name])) for name, title in titles.items() if name in shares
-    ]
-    if not avoided:
-        return ""
-    (first, share_of_first), *others = avoided
-    and_others = "".join(f", and {title} {share}" for title, share in others)
-    return (
-        f"In the same vehicle, {first} would have avoided {share_of_first} of {number}{and_others}."
-    )
+    """What a competent driver, and full braking, would have avoided of the collisions on which each
+    has a verdict.
+    """
+    sentences = []
+    examined = f"{len(verdicts):,} examined"
+    for name, who in AVOIDING.items():
+        number = int(verdicts[name].count())
+        which = f"{number:,} examined collisions"
+        if number < len(verdicts):
+            which = f"{number:,} collisions with a verdict ({examined})"
+        if number:
+            avoided = f"{int(verdicts[name].sum()):,} of {which}"
+            sentences.append(f"{who} would have avoided {avoided}.")
+    return " ".join(sentences)
 
 
 def _number_in_words(population: Population, kind: str) -> str:
