@@ -118,8 +118,7 @@ class SharesOverSets(NamedTuple):
             range_in_words = f"is {least} in each of"
         return (
             f" The share of unsafe vehicles {range_in_words} the {len(self.shares)} parameter sets"
-            " of the vehicle model (alternative calibrations)."
-            f" With each of these sets the first {VEHICLES} of the sampled vehicles were simulated."
+            f" of the vehicle model (alternative calibrations; at most {VEHICLES} vehicles each)."
         )
 
     def _in_words(self, number: np.intp) -> str:

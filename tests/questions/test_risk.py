@@ -15,12 +15,12 @@ import pandas as pd
 import pytest
 from numpy.random import default_rng
 
-from safevar_sumo import risk, rules
+from safevar_sumo import explain, risk, rules
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.answer import HIGH, LOW, Answer
 from safevar_sumo.questions.indices import OUTPUTS
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.over_sets import STAGE
+from safevar_sumo.questions.over_sets import STAGE, VEHICLES, SharesOverSets
 from safevar_sumo.questions.risk import deciding_in_words
 from safevar_sumo.questions.rules import SAMPLED_STAGE
 from safevar_sumo.questions.sampling import clopper_pearson
@@ -260,32 +260,42 @@ def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any]
 
 
 @pytest.mark.slow
-def test_shares_have_a_range_over_the_parameter_sets() -> None:
-    """Of risk, and of rules for the whole sample and for each region."""
+def test_risk_rules_and_explain_simulate_the_same_vehicles_with_each_parameter_set() -> None:
     study = load_study("wear")
-    vehicles = VariationModel(study).draw(400, default_rng(study.search.seed))
+    vehicles = VariationModel(study).draw(VEHICLES, default_rng(study.search.seed))
+    studies = studies_of_sets(study)[:3]
     unsafe = np.array(
-        [
-            drive_and_score(assemble(one), vehicles, with_originals=False).collided
-            for one in studies_of_sets(study)
-        ]
+        [drive_and_score(assemble(one), vehicles, with_originals=False).collided for one in studies]
     )
-    expected = [unsafe[0].mean(), *unsafe[1:, :40].mean(axis=1)]
-    answer = risk(study, samples=400, unsafe="collision", pool=InlinePool())
-    assert answer.numbers["by_set"] == expected
-    told = re.findall(
-        r"Over 12 parameter sets .* \(set (\d+)\) to .* \(set (\d+)\)", answer.verdict
-    )
-    assert told == [(str(np.argmin(expected)), str(np.argmax(expected)))]
-
-    found = rules(study, samples=400, unsafe="collision", pool=InlinePool())
-    tested = unsafe[:, 200:220].mean(axis=1)
-    assert found.numbers["by_set"] == [unsafe[0].mean(), *tested[1:]]
-    table = found.tables["rules"]
-    assert (table["density_least"] <= table["density"]).all()
-    assert (table["density_greatest"] >= table["density"]).all()
+    options = {"unsafe": "collision", "pool": InlinePool()}
+    answers = [risk(study, samples=500, **options), rules(study, samples=600, **options)]
+    for answer in (*answers, explain(study, fits=3, **options)):
+        assert answer.numbers["by_set"][:3] == unsafe.mean(axis=1).tolist()
+        ends = answer.numbers["by_set_intervals"][:3]
+        assert ends == [list(clopper_pearson(count, VEHICLES)) for count in unsafe.sum(axis=1)]
+    table = answers[1].tables["rules"]
+    for least, greatest in (("density_least", "density"), ("density", "density_greatest")):
+        assert (table[least] <= table[greatest]).all()
     few = risk(study, simulations=400, unsafe="collision", pool=InlinePool())
-    assert "the study's own parameter set of the vehicle model alone" in few.verdict
+    assert "Other parameter sets (alternative calibrations) were not simulated" in few.verdict
+
+
+@pytest.mark.parametrize(
+    ("failing", "least", "greatest"),
+    [
+        ((10, 40, 60), "2.5 % (set 0, 95", "15 % (95 % confidence interval 12 to 19 %)"),
+        ((10, 20, 60), "2.5 % (95", "15 % (set 2, 95 % confidence interval 12 to 19 %)"),
+        ((9, 9, 9), "is 2.2 % (95 % confidence interval 1 to 4.2 %) in each of", "the 3"),
+    ],
+)
+def test_a_parameter_set_is_named_where_its_interval_leaves_the_others_out(
+    failing: tuple[int, ...], least: str, greatest: str
+) -> None:
+    intervals = np.array([[clopper_pearson(count, VEHICLES)] for count in failing])
+    shares = np.array([[count / VEHICLES] for count in failing])
+    words = SharesOverSets(load_study("wear"), shares, intervals).in_words()
+    assert least in words
+    assert greatest in words
 
 
 @pytest.mark.slow
@@ -294,10 +304,10 @@ def test_the_other_parameter_sets_are_planned() -> None:
     these is a bound, within which the own set answers alone.
     """
     shown = list[tuple[str, int, int]]()
-    rules("wear", samples=400, unsafe="collision", jobs=1, progress=lambda *one: shown.append(one))
-    expected = 26 * (400 + 11 * 40)  # at 26 points
+    rules("wear", samples=100, unsafe="collision", jobs=1, progress=lambda *one: shown.append(one))
+    expected = 26 * (100 + 12 * 100)  # at 26 points
     assert {total for phase, _, total in shown if phase == SAMPLED_STAGE} == {expected}
     assert shown[-1][0] == STAGE
     assert shown[-1][1] <= expected
     bounded = risk("wear", samples=400, simulations=135_000, pool=InlinePool())
-    assert "own parameter set of the vehicle model alone" in bounded.verdict
+    assert "Other parameter sets (alternative calibrations) were not" in bounded.verdict

@@ -131,11 +131,12 @@ def test_a_beginning_is_rounded_to_the_unsafe_side() -> None:
     assert "If all changes go 30 to 10 % of the way to the ends, none of 24" in verdict
     tooth, _ = smallest_of(1, lambda rows: np.abs(way(rows)[:, 0] - 0.3755) < 0.001)
     assert tooth.table.empty, "narrower than the steps"
-    narrow, _ = smallest_of(
+    narrow, of_narrow = smallest_of(
         1, lambda rows: (np.abs(way(rows)[:, 0] - 0.3755) < 0.001) | (way(rows)[:, 0] > 0.9)
     )
     (row,) = narrow.table.to_dict("records")
     assert (row["begins_at"], row["safe_again"]) == (0.375, 0.4), "0.38 would be safe"
+    assert "37.5 % of the way" in of_narrow
 
 
 def test_a_cause_begins_where_none_of_its_parts_is_unsafe() -> None:

@@ -153,7 +153,7 @@ class Smallest(NamedTuple):
         if size == 1:
             way, enough = "the end of its domain (its range of values)", "One change is"
         if first["begins_at"] < 1:
-            way = f"{percentage(first['begins_at'])} % of the way to {way}"
+            way = f"{100 * first['begins_at']:.12g} % of the way to {way}"
         values = [
             f"{item.short_name} at {limit_text(item, first['boundary'][item.name])}"
             for item in members
