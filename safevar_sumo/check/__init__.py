@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.check.trials import Finding, try_algorithm, try_simulations
+from safevar_sumo.check.trials import Finding, find_unused, try_algorithm, try_simulations
 from safevar_sumo.errors import UserCodeError, about
 from safevar_sumo.plugins import Lookup, unload_user_modules
 from safevar_sumo.scenarios.declared import read_study
@@ -52,14 +52,20 @@ CHECKS: Mapping[str, str] = {
         "choose values of the scenario's parameters at which the vehicle meets the others before"
         " they have left, and check the signs of places and speeds: the others come into its way"
     ),
+    "undefined": (
+        "let runs have what the metric reads, its `needs`, or return a number where the metric is"
+        " defined; else leave out its name"
+    ),
+    "unread": (
+        "read each value of the setting by its name, spelled as in `UNITS`, or leave out the"
+        " characteristic"
+    ),
     "original": (
         "find out with `simulate` why the original vehicle fails: check signs and units of what the"
         " code reads and commands; changes of a vehicle that is unsafe as it is explain nothing"
     ),
 }
-"""The checks, with advice on a failure. All but the last three, of which every answer itself warns,
-also keep a study from starting.
-"""
+"""The checks, with advice on a failure. The first four also keep a study from starting."""
 
 
 def study_to_check(name: str) -> Study:
@@ -87,6 +93,9 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
     if findings:
         return findings
     system = assemble(study)
+    unused = list(_first_defect(study, dict(user_code(study)), find_unused(study)))
+    if unused:
+        return unused
     problems = find_problems(system)
     where = _definition(study, "ads.model", study.ads.model)
     if problems:

@@ -29,7 +29,7 @@ from safevar_sumo.study import Study, label_of
 from safevar_sumo.sumo import reason_against_scenes
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.simulators import simulations_of_setting
+from safevar_sumo.sumo.simulators import simulations_of_setting, unread_characteristics
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.terminal import Progress, show_no_progress
@@ -41,6 +41,10 @@ LONGEST = 60.0
 """Longest time of the simulations [s]."""
 LEAST_SIMULATED = 3
 """Least number of settings, however slow the code: the original, and the ends of the domains."""
+FEW_UNUSED, MANY_UNUSED = 5, 20
+"""Number of settings in which a metric is defined somewhere, and each characteristic is read: where
+each takes long, the original and corners of the domains alone.
+"""
 TIMED, RUNS_OF_ALL = 5, 5
 """Number of settings whose time is taken; in how many runs all settings are simulated, roughly."""
 SMALLER_BATCHES = 4
@@ -169,6 +173,24 @@ def try_original(system: System, runs: SimulationRuns) -> Iterator[Finding]:
                 got = f"the metric {measure.name} reads {quantity}, which its needs do not state"
                 expected = f"needs = {(*measure.quantities, quantity)}"
                 yield Finding("contract", got, "", "the original vehicle", expected)
+
+
+def find_unused(study: Study) -> Iterator[Finding]:
+    """Metrics that the study names and that are undefined in all of a few runs, and characteristics
+    that a simulator of the user's own reads in none of them.
+    """
+    system = _system(study)
+    number = FEW_UNUSED if system.mover.takes_long else MANY_UNUSED
+    settings = system.region.repaired(_settings(system.characteristics, number))
+    tried = f"{len(settings)} vehicles: the original, and others up to the ends of the domains"
+    results = drive_and_score(system, settings).results
+    for name in map(label_of, (*study.metrics.also, *study.search.objectives)):
+        if name in results and np.isnan(results[name].astype(float)).all():
+            expected = "a value in some run"
+            yield Finding("undefined", f"{name} is undefined in all runs", "", tried, expected)
+    if unread := sorted(unread_characteristics(system, settings)):
+        expected = "a simulator that reads each characteristic of its vehicle"
+        yield Finding("unread", f"simulate never reads {', '.join(unread)}", "", tried, expected)
 
 
 def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:

@@ -89,6 +89,7 @@ FINDINGS: Columns = {
     "check": "name of the check",
     "advice": "what to do",
 }
+BLOCK: Columns = {"part": "where, found, expected, what to do", "text": "this part of a finding"}
 
 
 CACHE: Columns = {
@@ -279,7 +280,7 @@ LONG = 10.0
 """Time from which on `check` says first how long it takes [s]."""
 
 
-@contents("passed", "vehicles", "points", findings=FINDINGS)
+@contents("passed", "vehicles", "points", lead="block", block=BLOCK, findings=FINDINGS)
 def check(name: str, *, vehicles: Annotated[int | None, Range(1, 10_000)] = None) -> Answer:
     """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep
     the promises that results rest on.
@@ -318,6 +319,16 @@ def check(name: str, *, vehicles: Annotated[int | None, Range(1, 10_000)] = None
         (item.finding, item.where, item.input, item.expected, item.check, CHECKS[item.check])
         for item in findings
     ]
+    blocks = [
+        part
+        for finding, where, shown, expected, _, advice in rows
+        for part in (
+            ("where", where),
+            ("found", f"{finding}, with {shown}" if shown else finding),
+            ("expected", expected),
+            ("what to do", advice),
+        )
+    ]
     return Answer(
         question="check",
         study=study,
@@ -330,7 +341,11 @@ def check(name: str, *, vehicles: Annotated[int | None, Range(1, 10_000)] = None
             "vehicles": sum(extent.vehicles for extent in extents),
             "points": sum(extent.points for extent in extents),
         },
-        tables={"findings": tabulate("Findings", FINDINGS, rows)},
+        tables={
+            "block": tabulate("Findings", BLOCK, blocks),
+            "findings": tabulate("Findings", FINDINGS, rows),
+        },
+        folded=("findings",),
     )
 
 

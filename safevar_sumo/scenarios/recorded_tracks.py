@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 from functools import cached_property
+from io import BytesIO
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from msgspec import Struct
 
 from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.output import read_file
 from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.ahead import VEHICLE_SPEED
 from safevar_sumo.scenarios.base import Grade
@@ -130,7 +133,9 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
 
     # Texts, so that errors show what stands in the file.
     try:
-        table = pd.read_csv(file, dtype=str, keep_default_na=False, skipinitialspace=True)
+        table = pd.read_csv(
+            BytesIO(read_file(Path(file))), dtype=str, keep_default_na=False, skipinitialspace=True
+        )
     except (OSError, ValueError) as error:
         problem = f"{key_of(file)}: cannot be read: {error}"
         raise InputError("", problem, "a CSV file") from None

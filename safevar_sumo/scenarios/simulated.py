@@ -40,6 +40,8 @@ SLACK, CREEPS = 0.1, 1.0
 """Rounding of distances and speeds [m, m/s]; a speed up to which a vehicle has stopped [m/s]."""
 FACTOR = 1.5
 """Least factor between speed and way that is no error of sampling."""
+FIRST_SLACK = 0.05
+"""What the ways of the first step may differ besides [m]."""
 STEP_TOLERANCE = 1e-6
 """Largest difference between two time steps of a trace [s]."""
 
@@ -131,11 +133,11 @@ def _contradiction(
 
 
 def unit_contradiction(trace: Trace) -> str:
-    """Where the first run of a trace moves by another factor than its speed says, as with km/h for
-    m/s; "" if it does not, or has neither a position nor the gap to one standing body.
+    """Where the first run of a trace, or its first step, moves by another factor than its speed
+    says, as with km/h for m/s; "" if it does not, or has neither a position nor a gap.
     """
     here = trace.active[:, 0]
-    if not here.any():
+    if here.sum() < 2:
         return ""
     speed, gap = trace.speed[here, 0], trace.gap[here, 0]
     driven = float(np.sum(speed[1:] + speed[:-1]) * trace.step / 2)
@@ -145,6 +147,17 @@ def unit_contradiction(trace: Trace) -> str:
         is_apart = abs(way - driven) > max(speed.max() * trace.step, 1.0)
         if is_apart and max(way, driven) > FACTOR * min(way, driven):
             return f"speed and {name} disagree: {driven:.3g} m and {way:.3g} m of way"
+
+    # The first step, also towards somebody who moves.
+    closing = speed - trace.obstacle_speed[here, 0]
+    for name, rate, column in (
+        ("position", speed, trace.position[here, 0]),
+        ("gap", closing, -gap),
+    ):
+        (way,), (low, *_, high) = np.diff(column[:2]), np.sort(rate[:2]) * trace.step
+        slack = (FACTOR - 1) * max(abs(low), abs(high)) + FIRST_SLACK
+        if way < low - slack or way > high + slack:
+            return f"speed and {name} disagree in the first step: {high:.3g} m and {way:.3g} m"
     return ""
 
 

@@ -78,6 +78,53 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
     return _runs_of(results, system, point.allowed_impact_speed)
 
 
+class _Setting(dict[str, float]):
+    """A setting that knows which of its values were read."""
+
+    def __init__(self, values: Mapping[str, float]) -> None:
+        super().__init__(values)
+        self.unread = {*values}
+
+    def __getitem__(self, name: str) -> float:
+        self.unread.discard(name)
+        return super().__getitem__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        self.unread.discard(name)
+        return super().get(name, default)
+
+    def __iter__(self) -> Iterator[str]:  # copies read all
+        self.unread.clear()
+        return super().__iter__()
+
+    def values(self) -> Any:
+        self.unread.clear()
+        return super().values()
+
+    def items(self) -> Any:
+        self.unread.clear()
+        return super().items()
+
+
+def unread_characteristics(system: System, settings: FloatArray) -> set[str]:
+    """The characteristics of the vehicle that a simulator of the user's own reads in none of N
+    settings, shape (N, n); none in another system.
+    """
+    if system.mover.is_exact:
+        return set()
+    point = system.points[0]
+    names = system.characteristics.vehicle.names
+    unread = {*names}
+    for vehicle, values in zip(*system.split(settings), strict=True):
+        searched = dict(zip(system.characteristics.scenario.names, values.tolist(), strict=True))
+        scenario: Any = encounter(point, searched).scenario
+        setting = _Setting(dict(zip(names, vehicle.tolist(), strict=True)))
+        with user_errors(system.source):
+            KEPT.at(scenario).simulate(setting)
+        unread &= setting.unread
+    return unread
+
+
 def simulations_of_setting(system: System) -> int:
     """How many simulations a setting takes: at each point, as often as it is repeated, and beside
     the original vehicle where encounters are ranges.

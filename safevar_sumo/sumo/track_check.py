@@ -8,16 +8,18 @@ from itertools import combinations
 
 import numpy as np
 
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Track
-from safevar_sumo.scenarios.tracks import SCREEN
+from safevar_sumo.scenarios.tracks import SCREEN, travelled
 from safevar_sumo.sumo.bodies import TOUCH, Body, find_overlaps
 
 MOST_SPEED = 100.0
 """Largest speed of a body [m/s]; a faster change of its place is a jump."""
 UNIT_TOLERANCE = 1e-6
 """Largest difference of a direction's length from 1 [-]."""
+APART = 1.0
+"""Distance from where its speed takes it that a body may have, beside a third of its way [m]."""
 TRACKS_KEY = "scenario.model"
 """The key that errors name; the study stands before it."""
 
@@ -109,6 +111,21 @@ def check_motion(track: Track, step: float) -> None:
         expected = f"at most {MOST_SPEED:g} m/s between two samples"
         _refuse(track, step, np.abs(jumps) > MOST_SPEED, jumps, "jumps, at {:g} m/s", expected)
 
+    # It goes along the road where its speed takes it, while it is there. (Who changes lane may face
+    # along it.)
+    velocity = speed * track.along * (track.length > 0)
+    velocity, way = np.broadcast_arrays(velocity, track.x - track.x[:1])
+    driven = travelled(velocity, np.arange(len(way), dtype=float)[:, np.newaxis] * step)
+    most = np.maximum(np.abs(way), np.abs(driven))
+    _refuse(
+        track,
+        step,
+        np.abs(way - driven) > np.maximum(APART, most / 3),
+        way - driven,
+        "is {:.3g} m in x from where its speed takes it",
+        "an x that changes by vx, the speed along the road, times the time",
+    )
+
 
 def _refuse(
     track: Track, step: float, wrong: BoolArray, values: FloatArray, problem: str, expected: str
@@ -117,7 +134,7 @@ def _refuse(
     if wrong.any():
         sample, column = np.argwhere(wrong)[0].tolist()
         text = problem.format(float(values[sample, column]))
-        raise InputError(
+        raise UserCodeError(
             "", f"{TRACKS_KEY}: at {sample * step:g} s actor {track.name!r} {text}", expected
         )
 

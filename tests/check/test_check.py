@@ -168,6 +168,14 @@ DEFECTS = {
     "scenario with a text": planted(
         "scenario", "contract", SCENARIO, "self.distance, 0.0", "'far', 0.0", "returned x"
     ),
+    "scenario beside its speed": planted(
+        "scenario",
+        "contract",
+        SCENARIO,
+        "self.distance, 0.0,",
+        "self.distance + 2 * times, 0.0, -2.0,",
+        "from where its speed takes it",
+    ),
     "scenario undeclared reaction": Defect("scenario", "contract", REACTS, "in SUMO, with "),
     "metric over runs": planted(
         "metric",
@@ -234,7 +242,10 @@ DEFECTS = {
         "parked_ahead",
     ),
 }
-FAST = ("random", "mean over vehicles", "out of range", "scenario undeclared reaction")
+FAST = (
+    *("random", "mean over vehicles", "out of range"),
+    *("scenario undeclared reaction", "scenario beside its speed"),
+)
 
 
 @pytest.mark.parametrize(

@@ -273,7 +273,8 @@ class Derives:
         if self.engine is None:
             self.engine = LOG.append("engine") or object()
         self.rows.append(self.v)
-        rest = 40 - self.v**2 / 2 / setting["decel"] + 1e-3 * self.random.random()
+        rest = 40 - self.v**2 / 2 / setting["decel"] - 0 * setting["delay"]
+        rest += 1e-3 * self.random.random()
         self.v = 0
         if rest < 0:
             impact = (-2 * setting["decel"] * rest) ** 0.5
@@ -304,7 +305,8 @@ class Struct(msgspec.Struct, frozen=True):
     close_worker = classmethod(Served.close_worker.__func__)
 
     def simulate(self, setting):
-        return {"outcome": "stopped", "safety_degree": float(len(self.worker))}
+        nothing = 0.0 * sum(setting.values())
+        return {"outcome": "stopped", "safety_degree": len(self.worker) + nothing}
 
 
 class Dies(Served):
@@ -448,7 +450,11 @@ def test_runs_have_one_time_step(wall: Path) -> None:
         ("position=r['position'] * 0 + 1, gap=r['gap'] / 3.6", "speed and position disagree"),
         ("gap=20 + (r['gap'] - 40) / 1.6", "speed and gap disagree"),
         ("gap=40 + (r['gap'] - 40) / 1.4", ""),
-        ("gap=r['gap'] / 3.6, obstacle_speed=r['gap'] * 0 + 1", ""),
+        (
+            "gap=r['gap'] / 3.6, obstacle_speed=r['gap'] * 0 + 1",
+            "speed and gap disagree in the first step: 0.7 m and 0.208 m",
+        ),
+        ("gap=r['gap'] + r['time'], obstacle_speed=r['gap'] * 0 + 1", ""),
     ],
 )
 def test_a_speed_that_disagrees_with_the_way_is_a_finding(
@@ -457,6 +463,29 @@ def test_a_speed_that_disagrees_with_the_way_is_a_finding(
     wrong_system(wall, f"lambda r: {{**r, **dict({change})}}")
     wall.write_text(STUDY.replace("models:Wall", "models:Wrong"))
     assert told in run("check", "wall.toml", expect=int(bool(told))).stdout
+
+
+@pytest.mark.parametrize(
+    ("reads", "told"),
+    [
+        ('{"decel": setting["decel"], "delay": 0}', "simulate never reads delay"),
+        ("{**setting}", "drac is undefined in all runs"),
+        ('{"decel": setting.get("decel"), "delay": dict(setting)["delay"]}', "drac is undefined"),
+    ],
+)
+def test_what_a_study_names_and_a_simulator_never_has_is_a_finding_of_check_alone(
+    wall: Path, reads: str, told: str
+) -> None:
+    code = f"class Part(Rig):\n    def simulate(self, setting):\n        setting = {reads}\n"
+    with (wall.parent / "models.py").open("a") as file:
+        file.write(f"{code}        return Rig.simulate(self, setting)\n")
+    study = STUDY.replace("models:Wall", "models:Part")
+    wall.write_text(study if "never" in told else study.replace("ttc", 'also = ["drac"]\nttc', 1))
+    printed = run("check", "wall.toml", expect=1).stdout
+    parts = [line.partition(":")[0] for line in printed.splitlines()[2:6]]
+    assert parts == ["where", "found", "expected", "what to do"]
+    assert told in printed
+    run("study", "wall.toml", "--out", "results", "--runs", "1")
 
 
 @pytest.mark.parametrize("key", ["ads", "weather"])
