@@ -4,6 +4,7 @@ what the verdict claims of them.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -20,11 +21,11 @@ from safevar_sumo.questions.explain.smallest import Smallest
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.over_sets import VEHICLES
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of
-from tests.questions.conftest import ORIGINAL, Region, made_up_evaluator
+from tests.questions.conftest import ORIGINAL, Plant, Region, made_up_evaluator, made_up_study
 
 COLLISION = Unsafe()
 SIDES = (0.0, ORIGINAL, 10.0)
@@ -243,3 +244,32 @@ def test_the_verdict_claims_no_more_than_was_simulated() -> None:
     assert "1 of the 24 combinations of two changes causes a collision: a and b." in sentences
     assert "1 of the 28 combinations of three changes causes a collision: b, c and d." in sentences
     assert "none of 480 simulated combinations (up to four changes) causes a collision" in sentences
+
+
+class Repeated(Plant):
+    """A pool in which each vehicle runs four times, and collides in one run in `region`."""
+
+    def evaluate(self, settings: FloatArray) -> Evaluations:
+        evaluations = super().evaluate(settings)
+        degree = evaluations.metrics["safety_degree"]
+        runs = {f"safety_degree_{run}": degree if run == 1 else degree + 3 for run in range(1, 5)}
+        return replace(evaluations, metrics={**evaluations.metrics, **runs})
+
+
+def test_with_repeats_a_cause_has_the_share_of_its_unsafe_runs() -> None:
+    study = made_up_study(2)
+    evaluator = Evaluator(study, Repeated(study, lambda rows: rows[:, 0] > 9))
+    smallest = Smallest.of(evaluator, COLLISION, 0)
+    assert smallest.table["unsafe_runs"].tolist() == [0.25]
+    sentences = [*smallest.sentences(evaluator, COLLISION)]
+    assert "The vehicle is unsafe in 25 % of its runs." in sentences
+
+
+@pytest.mark.slow
+def test_what_is_left_of_few_simulations_explains_a_sampled_failure() -> None:
+    """Of one failure there are causes, but no shares."""
+    answer = sv.explain("native", simulations=300, unsafe="collision", pool=InlinePool())
+    assert answer.numbers["failures"] > answer.numbers["analysed"] == 1
+    assert answer.tables["characteristics"].empty
+    assert len(answer.tables["distinct_causes"])
+    assert "simulated combinations of two changes cause a collision (145 such" in answer.verdict

@@ -119,7 +119,8 @@ def _begin(
         whole = (members.changed(rows) & members.of_vehicle).sum(axis=1).tolist()
         groups = find_minimal_causes(evaluator, rows, unsafe)
         flags[flags] = [
-            len(group[0].changes) == size for group, size in zip(groups, whole, strict=True)
+            any(len(cause.changes) == size for cause in group)
+            for group, size in zip(groups, whole, strict=True)
         ]
         return flags
 
