@@ -97,7 +97,9 @@ class SharesOverSets(NamedTuple):
         """
         rows = np.column_stack([self.shares[:, group], self.intervals[:, group]])
         share, low, high = np.vstack([own, rows]).T
-        return np.nanmin(share), np.nanmax(share), np.nanmin(low), np.nanmax(high)
+        least, lowest = np.fmin.reduce([share, low], axis=1).tolist()
+        greatest, highest = np.fmax.reduce([share, high], axis=1).tolist()
+        return least, greatest, lowest, highest
 
     def in_words(self) -> str:
         """The least and the greatest share of all vehicles; that the study's own set was the only
