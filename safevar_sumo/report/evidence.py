@@ -346,7 +346,7 @@ def _not_compared(description: Description, studies: Iterable[Packed], unchecked
     ]
     repeats = "how many simulations had which outcome (--search repeats them)"
     sentence = f" {unchecked} unchecked: {repeats}." if unchecked else ""
-    return f"{sentence} Not compared: {'; '.join(parts)}." if parts else sentence
+    return f" Not compared: {'; '.join(parts)}.{sentence}" if parts else sentence
 
 
 def _unpack(
