@@ -18,7 +18,14 @@ from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.words import EXACT, join_phrases
 from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject, NamedValues
 from safevar_sumo.results import choose_handle, row_of_handle
-from safevar_sumo.scenarios import FROM_CENTRES, SPEED_DIMENSION, Point, Scenario, searchable_in
+from safevar_sumo.scenarios import (
+    FROM_CENTRES,
+    SPEED_DIMENSION,
+    Point,
+    Scenario,
+    searchable_in,
+    unit_of,
+)
 from safevar_sumo.study import PHASE, unit_text
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
@@ -223,10 +230,9 @@ def where_in_words(
 
 def texts_of(point: Point, values: JsonObject) -> dict[str, str]:
     """Values of an encounter at a point, by name, as they are printed."""
-    units = searchable_in(point.scenario)
     return {
         name: (
-            f"{value:{EXACT}}{unit_text(units[name].unit) if name in units else ''}"
+            f"{value:{EXACT}}{unit_text(unit_of(point.scenario, name))}"
             if isinstance(value, int | float)
             else str(value)
         )

@@ -9,7 +9,7 @@ from itertools import islice
 
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import KMH_PER_MS
-from safevar_sumo.scenarios import SPEED_DIMENSION, Point, searchable_in
+from safevar_sumo.scenarios import SPEED_DIMENSION, Point, searchable_in, unit_of
 from safevar_sumo.study import Domain, MatrixTest, Study, Weather, unit_text
 from safevar_sumo.study.encounters import are_numbers
 from safevar_sumo.sumo.system import assemble
@@ -87,11 +87,10 @@ def _parameters_in_words(
     """
     # Axes that are listed, and those of which any value may occur.
     over = study.lists_of(test)
-    searchable = searchable_in(points[0].scenario)
     moving = moving_axes(study, test, points) if between else {}
     phrases = {}
     for name, values in over.items():
-        unit = unit_text(searchable[name].unit) if name in searchable else ""
+        unit = unit_text(unit_of(points[0].scenario, name))
         phrases[name] = f"{_values_in_words(values, name in moving)}{unit}"
     for name, domain in study.ranges_of(test).items():
         phrases[name] = f"{domain.lower:g} to {domain.upper:g}{unit_text(domain.unit)}"

@@ -73,15 +73,22 @@ def change_texts(
 
 def undecidable_in_words(items: Iterable[Characteristic]) -> str:
     """That limits of characteristics are too near to the original, in a sentence."""
-    names = join_phrases(
-        f"{item.short_name} (measured to within {item.precision.value:g}{item.suffix})"
-        for item in items
-        if item.precision is not None
-    )
     return (
         f"Not decidable in a workshop, as the limit is nearer to the original vehicle than it is"
-        f" measured: {names}."
+        f" measured: {precise_in_words(items)}."
     )
+
+
+def precise_in_words(items: Iterable[Characteristic]) -> str:
+    """The characteristics among some of which the study states how precisely they are measured; ""
+    for none.
+    """
+    phrases = [
+        f"{item.short_name} (measured to within {item.error:g}{item.suffix})"
+        for item in items
+        if item.error
+    ]
+    return join_phrases(phrases) if phrases else ""
 
 
 def encounter_in_words(

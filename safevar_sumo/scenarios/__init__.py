@@ -3,10 +3,12 @@ module.
 """
 
 from collections.abc import Iterable, Mapping
+from math import isclose
 
 import msgspec
 
 from safevar_sumo.errors import check_name
+from safevar_sumo.records import KMH_PER_MS
 from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.base import (
     VUT as VUT,
@@ -74,6 +76,17 @@ def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
     of_weather = WEATHER_PARAMETERS if scenario.mover.has("weather") else {}
     phases = PHASES if scenario.has_phase else {}
     return {**free_parameters(type(scenario)), **of_weather, **phases}
+
+
+def unit_of(scenario: Scenario, name: str) -> str:
+    """The unit of a parameter that a matrix varies; "" if it is unknown."""
+    searchable = searchable_in(scenario)
+    if name in searchable:
+        return searchable[name].unit
+    # A scenario whose speed cannot move declares no unit, but has it in m/s, too.
+    speed = KMH_PER_MS * (scenario.test_speed or 0.0)
+    is_kmh = name == SPEED_DIMENSION and isclose(getattr(scenario, name), speed)
+    return "km/h" if is_kmh else ""
 
 
 def weather_of(choice: str | Weather) -> Weather:

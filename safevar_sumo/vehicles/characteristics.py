@@ -78,9 +78,19 @@ class Characteristic:
         """
         if self.precision is None or low == high:
             return True
-        nearest_low = max(self.original - self.precision.value, self.lower)
-        nearest_high = min(self.original + self.precision.value, self.upper)
+        nearest_low, nearest_high = self.measured(self.original)
         return low <= nearest_low and high >= nearest_high
+
+    @property
+    def error(self) -> float:
+        """How far a measured value may be from the true one; 0 where no precision is stated."""
+        return 0.0 if self.precision is None else self.precision.value
+
+    def measured(self, value: float) -> tuple[float, float]:
+        """The least and greatest value of the domain that a measured one may really be."""
+        ends = np.round([value - self.error, value + self.error], 12)
+        low, high = np.clip(ends, self.lower, self.upper).tolist()
+        return low, high
 
     @property
     def threshold(self) -> float:

@@ -13,7 +13,7 @@ from hypothesis import given, strategies as st
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.permit.assumed import assumed_cells, assumed_in_words
+from safevar_sumo.questions.permit.assumed import assumed_cells, assumed_in_words, cars_of
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study
@@ -34,7 +34,7 @@ DIALECTS = [
 def read(cars: Any, *values: str, study: Study = JOINT, **options: Any) -> Fleet:
     options = {"others": None, "ignore": (), **options}
     vehicle = CharacteristicSet.of(study).vehicle
-    answer = ("car", "up_to", "verdict", "because")
+    answer = ("car", "up_to", "verdict", "because", "rough")
     return read_fleet(study, vehicle, cars, values, **options, answer_columns=answer)
 
 
@@ -141,9 +141,28 @@ def test_what_is_assumed_is_named_with_its_value_and_where_that_is_from() -> Non
 
 def test_a_written_answer_is_read_as_the_list_that_it_is_about() -> None:
     frame = pd.DataFrame({"plate": ["a"], "treadDepth": ["3,5"]})
-    fleet = read(frame.assign(because="", verdict="", up_to=""), others="new")
-    assert fleet.settings[0, 0] == 3.5
-    pd.testing.assert_frame_equal(fleet.table, frame)
+    for text, is_rough in (("yes", True), ("no", False)):
+        answer = frame.assign(because="", verdict="", up_to="", rough=text)
+        fleet = read(answer, others="new")
+        assert fleet.settings[0, 0] == 3.5
+        assert fleet.is_rough is is_rough
+        pd.testing.assert_frame_equal(fleet.table, frame)
+
+
+def test_a_measured_value_may_be_any_within_its_precision_and_the_domain() -> None:
+    """`wear` states 0.05 for brakeTorque, and no precision of the others."""
+    frame = pd.DataFrame({"car": ["a", "b", "c"], "brakeTorque": [0.9, 0.52, None]})
+    fleet = read(frame.assign(treadDepth=3, payload=75), others="new")
+    members = CharacteristicSet.of(JOINT).vehicle
+    column = members.names.index("brakeTorque")
+    ends = [(0.85, 0.95), (0.5, 0.57), (1.0, 1.0)]  # an assumed value is none that was measured
+    for cars, setting, (low, high) in zip(
+        cars_of(members, fleet), fleet.settings, ends, strict=True
+    ):
+        assert (cars.lower[column], cars.upper[column]) == (low, high)
+        assert {*cars.vehicles[:, column]} == {low, high}
+        others = np.arange(len(members)) != column
+        assert (cars.vehicles[:, others] == setting[others]).all()
 
 
 HEAD = "car,treadDepth,brakeTorque,payload\n"
@@ -157,7 +176,11 @@ REFUSED = [
     (HEAD + "a,3,1\n", "line 2: 3 fields"),
     ("car;id,x\na,3\n", "1 field\nexpected: 2 fields with a semicolon between them"),
     (HEAD.replace(",", ";") + "a;3;1;1.250\n", "or with a point that cannot be one of thousands"),
-    (HEAD + "a,8.2,1,75\n", "a number in [1.6, 8] mm; at most 8: enter 8"),
+    (HEAD + "a,8.2,1,75\n", "8.2 is outside 1.6 to 8 mm: is this of another unit?"),
+    (HEAD + "a,3,1.05,75\n", "1.05 is outside 0.5 to 1\nexpected: a number in [0.5, 1]; at most 1"),
+    (HEAD + "a,3,1.06,75\n", "1.06 is outside 0.5 to 1: is this of another unit?"),
+    (HEAD + "a,3,0.48,75\n", "0.48 is outside 0.5 to 1: is this of another unit?"),
+    (HEAD + "a,3,55,75\n", "55 is outside 0.5 to 1: is this percent?"),
     (HEAD + "a,3,1,75\n\nb,3,1,75\n", "line 3: 0 fields"),
     (HEAD + "a,3,5,1,75\n", "5 fields\nexpected: 4 fields with a comma"),
     (HEAD + 'a,"3,5",1,75\n', "line 2, column 'treadDepth': '3,5' is no number"),
@@ -167,8 +190,8 @@ REFUSED = [
     (HEAD.replace(",", ";") + "a;3;1;1,234.5\n", "'1,234.5' is no number"),
     (HEAD + 'a,"1,234.5",1,75\n', "'1,234.5' is no number"),
     *((f"{HEAD}a,{text},1,75\n", f"'{text}' is no number") for text in ("nan", "0x3", "1_0", "3m")),
-    (HEAD + "a,1e999,1,75\n", "treadDepth = inf"),
-    (HEAD + "a,9,1,75\n", "line 2, column 'treadDepth': treadDepth = 9.0 is outside its domain"),
+    (HEAD + "a,1e999,1,75\n", "inf is outside 1.6 to 8 mm"),
+    (HEAD + "a,9,1,75\n", "line 2, column 'treadDepth': 9 is outside 1.6 to 8 mm"),
     (HEAD + "a,3,1,75\na,3,1,75\n", "line 3, column 'car': the car 'a' is there twice"),
     (HEAD + "b 1,3,1,75\nB  1,3,1,75\n", "the car 'B  1' is there twice"),
     (HEAD + "A1,3,1,75\n\uff211,3,1,75\n", "the car '\uff211' is there twice"),
@@ -201,6 +224,23 @@ def test_what_may_be_misread_is_refused_with_its_place(
     given_cars = written(tmp_path, cars) if isinstance(cars, str | bytes) else cars
     with pytest.raises(InputError, match=re.escape(told)):
         read(given_cars, others="new")
+
+
+def test_all_bad_cells_are_in_one_message_and_none_has_the_end_of_a_domain_as_advice(
+    tmp_path: Path,
+) -> None:
+    path = written(tmp_path, HEAD + "a,35,55,75\nb,3,1,75\nc,x,1,75\n")
+    with pytest.raises(InputError) as caught:
+        read(path)
+    first, second, third, expected = str(caught.value).splitlines()
+    assert first.endswith(
+        "line 2, column 'treadDepth': 35 is outside 1.6 to 8 mm: is this of another unit?"
+    )
+    assert second.endswith("line 2, column 'brakeTorque': 55 is outside 0.5 to 1: is this percent?")
+    assert "line 4, column 'treadDepth': 'x' is no number" in third
+    assert expected == "expected: a number in [1.6, 8] mm; a number in [0.5, 1]"
+    with pytest.raises(InputError, match=r"--set, column 'brakeTorque': 55 is outside .*percent"):
+        read(None, "brakeTorque=55")
 
 
 def test_options_and_constraints_are_refused_too(tmp_path: Path) -> None:

@@ -15,11 +15,13 @@ from msgspec.structs import replace
 from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.errors import InputError
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit import permit
 from safevar_sumo.questions.permit.encounters import EncounterRange, encounters_of, span_of
+from safevar_sumo.questions.permit.rows import verdict_of
 from safevar_sumo.questions.permit.search import PermitSearch
 from safevar_sumo.questions.permit.speeds import Cars
 from safevar_sumo.questions.phases import in_phases
@@ -206,12 +208,86 @@ def test_all_cars_within_limits(short: Study) -> None:
         assert not are_unsafe(short, fit, np.unique(cars, axis=0), speeds, PLACES, keep=0.1).any()
 
 
-def test_the_rough_answer_lets_no_car_drive(short: Study) -> None:
-    answer = permit(short, cars={"new": {}, "worn": {"treadDepth": 3}}, others="new", quick=True)
+@pytest.mark.slow
+def test_the_rough_answer_lets_no_car_drive_and_says_so_in_each_form(short: Study) -> None:
+    cars = {"new": {}, "worn": {"treadDepth": 3}}
+    answer = permit(short, cars=cars, others="new", quick=True)
     assert answer.numbers["rough"]
     assert "the study's own parameter set alone" in answer.verdict
     assert answer.numbers["drive"] == answer.numbers["attacked"] == 0
-    assert set(answer.table()["verdict"]) == {"up to"}
+    table = answer.table()
+    assert set(table["verdict"]) == {"up to"}
+    assert set(table["rough"]) == {True}
+    assert set(table["parameter_sets"]) == {1}
+    assert set(zip(table["margin"], table["unsafe"], strict=True)) == {(0.1, "collision")}
+    assert "rough" in answer.only("cars").render("text")
+    Path("rough.csv").write_text(answer.render("csv"))
+    assert [*pd.read_csv("rough.csv")["rough"]] == ["yes", "yes"]
+    told = permit(short, cars="rough.csv", others="new", quick=True).verdict
+    assert "the list is a rough answer" in told
+    with pytest.raises(InputError, match="a rough answer is not written"):
+        permit(short, cars=cars, others="new", quick=True, out="out.csv")
+
+
+def test_a_needed_speed_is_no_less_where_the_new_car_is_unsafe_too() -> None:
+    for up_to, need, expected in (
+        (50, 55, "up to"),
+        (55, 55, "drive"),
+        (45, 55, "up to"),
+        (50, None, "drive"),
+        (49, None, "up to"),
+        (None, None, "stop"),
+    ):
+        assert verdict_of(up_to, 50, 60, need, is_proven=True) == expected, (up_to, need)
+
+
+@pytest.mark.slow
+def test_a_speed_that_no_scenario_can_move_is_one_that_was_driven() -> None:
+    asked = {"unsafe": "stopping_distance > 50", "quick": True}
+    answer = permit("stop", cars={"a": {"brakeTorque": 0.9}}, others="new", **asked)
+    listed = [30, 50, 80, 100, 120]
+    (row,) = answer.table().to_dict("records")
+    assert row["unit"] == "km/h"
+    assert row["up_to"] in listed
+    above = listed[listed.index(row["up_to"]) + 1]
+    assert f"in the test stop at {above} km/h" in row["because"]
+    assert "5 values (30, 50, 80, 100 and 120 km/h)" in answer.tested
+    assert f"from 30 up to {row['up_to']:g} km/h" in answer.verdict
+    assert "at 30, 50, 80, 100 and 120 km/h" in answer.numbers["scope"]
+
+
+@pytest.mark.slow
+def test_a_car_passes_a_test_of_a_regulation() -> None:
+    """It is no promise for the road."""
+    told = permit("r152", cars={"a": {"brakeTorque": 0.9}}, others="new", quick=True).verdict
+    assert "a passes the test up to 40 km/h" in told
+    assert "the new car passes the test up to 40 km/h" in told
+    assert "may drive" not in told
+
+
+@pytest.mark.parametrize("unsafe_at", [0.75, 0.8, 0.85])
+def test_a_car_is_safe_with_all_values_that_its_measured_one_may_have(
+    unsafe_at: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A made-up car is unsafe above 20 km/h with one brake torque, at or between the ends."""
+    members = assemble(load_study("wear")).characteristics.vehicle
+    column = members.names.index("brakeTorque")
+
+    def robustness(self: EncounterRange, settings: FloatArray, stage: str) -> FloatArray:
+        speed = self.model.characteristics.columns(settings)["speed"]
+        distance = abs(settings[:, column] - unsafe_at) - 0.01
+        return np.where(speed > 20, distance, 1.0)
+
+    monkeypatch.setattr(EncounterRange, "robustness", robustness)
+    ends = np.tile(members.original, (2, 1))
+    ends[:, column] = 0.75, 0.85
+    (found,) = own_search(load_study("wear", encounters="ranges")).reach(
+        [Cars.measured(*ends)], [None]
+    )
+    assert found.up_to == 20
+    failure = found.least.failure
+    assert failure is not None
+    assert failure.setting[column] == pytest.approx(unsafe_at, abs=0.01)
 
 
 @pytest.mark.slow
@@ -221,6 +297,8 @@ def test_one_car_is_told_which_assumed_value_lowers_its_speed_most(short: Study)
     told = permit(short, cars={"a": stated}, **options).verdict
     words = r"the car, (.*) [a-z]+ lowers the speed most: the car is unsafe already at (\d+) km/h"
     ((worst, failing),) = re.findall(words, told)
+    two = permit(short, cars={"a": stated, "b": stated}, **options).table()
+    assert {*two["assumed_matters_most"]} == {worst.partition(" ")[0]}
     assert " a may drive from" in told, "as given"
 
     # Each of the ends as a car of a list, which has no such sentence.

@@ -22,7 +22,7 @@ from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, budget_of
 from safevar_sumo.questions.models import keeping_distance, models_of
 from safevar_sumo.questions.options import CARS_FILE, Fits, LimitTexts, Margin, Range, ValueTexts
 from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
-from safevar_sumo.questions.permit.assumed import assumed_in_words, worst_end_in_words
+from safevar_sumo.questions.permit.assumed import assumed_in_words, cars_of, worst_ends
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.questions.permit.rows import CARS, SETS, failure_columns
@@ -77,7 +77,8 @@ def permit(
     cars
         A list of measured cars, as CSV: the first column names the car, each other one is a
         characteristic in the study's unit. The answer names the values of all others that it
-        assumes. A file that `--out` wrote is such a list, too.
+        assumes. A file that `--out` wrote is such a list, too. Of a value whose precision the
+        study states, all values of the interval count.
     set
         A value that was measured on a single car, in place of a list; may be repeated.
     limits
@@ -114,7 +115,7 @@ def permit(
     needed = _needed(need, span)
     values = _grid(span, step)
     members = evaluator.characteristics.vehicle
-    _check_forms(cars, set, limits, out)
+    _check_forms(cars, set, limits, out, is_quick=quick)
     fleet = read_cars(study, cars, set, limits, others, ignore)
     criterion = keeping_distance(
         evaluator, evaluator.checked(unsafe or Unsafe()), margin, is_stated=unsafe is not None
@@ -124,14 +125,13 @@ def permit(
     budget = budget_of(evaluator) if limits else evaluator.scaled(LEAST_SIMULATIONS)
     budget = 0 if quick else budget
     search = PermitSearch(models, span, values, budget)
-    asked = [Cars.one(setting) for setting in fleet.settings]
-    if limits:
-        asked = [_within(members, limits, study, fleet.settings[0])]
-    new_car, permits, repaired = _drive(evaluator, search, fleet, asked, is_rough=quick)
-    assumed = [assumed_in_words(study, members, fleet)]
-    # Further simulations of a single car, where their number has no limit.
-    if len(permits) == 1 and not limits and evaluator.account.asked is evaluator.left is None:
-        assumed.append(worst_end_in_words(models, span, values, fleet, permits[0]))
+    within = _within(members, limits, study, fleet.settings[0])
+    asked = [within] if limits else cars_of(members, fleet)
+    has_repairs = not quick and not limits
+    new_car, permits, repaired = _drive(evaluator, search, fleet, asked, with_repairs=has_repairs)
+    # Further simulations, where their number has no limit.
+    is_free = not limits and evaluator.account.asked is evaluator.left is None
+    ends = worst_ends(search, members, fleet, asked, permits) if is_free else None
     result = PermitAnswer(
         study=study,
         span=span,
@@ -141,8 +141,10 @@ def permit(
         search=search,
         new_car=new_car,
         is_quick=quick,
+        is_rough=quick or evaluator.account.most is not None,
         is_box=bool(limits),
-        assumed=assumed,
+        assumed=assumed_in_words(study, members, fleet),
+        ends=ends,
     )
     answer = result.of(fleet, permits, repaired)
     if out is not None:
@@ -157,7 +159,7 @@ def _drive(
     fleet: Fleet,
     asked: Sequence[Cars],
     *,
-    is_rough: bool,
+    with_repairs: bool,
 ) -> tuple[Permit, list[Permit], list[Repaired]]:
     """How far the new car and each of the others are safe, and the best repair of each.
 
@@ -167,12 +169,10 @@ def _drive(
         If the new car is not safe at the least value.
     """
     members = evaluator.characteristics.vehicle
-    # Repairs of cars, not of limits.
-    has_repairs = not is_rough and len(asked[0].vehicles) == 1
-    phases = search.phases(1 + len(asked), with_repairs=has_repairs)
+    cars = [Cars.one(members.original), *asked]
+    phases = search.phases(cars, with_repairs=with_repairs)
     evaluator.begin(phases, of_list=len(asked) > 1)
-    above = [-np.inf, *[None] * len(asked)]
-    new_car, *permits = search.reach([Cars.one(members.original), *asked], above)
+    new_car, *permits = search.reach(cars, [-np.inf, *[None] * len(asked)])
     if new_car.up_to is None:
         study = evaluator.study
         words = failure_columns([new_car.least.failure])[0]["because"]
@@ -180,10 +180,10 @@ def _drive(
             f"the new car is not safe at {search.values[0]:g}{unit_text(search.span.unit)}: {words}"
         )
         raise InputError(study.source, problem, "a study in which it is, or another --unsafe")
-    if not has_repairs:
+    if not with_repairs:
         return new_car, permits, [None] * len(permits)
-    settings, measured = fleet.settings, fleet.measured
-    return new_car, permits, search.repair_first(settings, measured, members.original, permits)
+    worn = fleet.measured & (fleet.settings != members.original)
+    return new_car, permits, search.repair_first(asked, worn, members.original, permits)
 
 
 def read_cars(
@@ -211,10 +211,10 @@ def read_cars(
 
 
 def _check_forms(
-    cars: object, values: Sequence[str], limits: Sequence[str], out: str | None
+    cars: object, values: Sequence[str], limits: Sequence[str], out: str | None, *, is_quick: bool
 ) -> None:
     """Refuse several forms of cars, and none; and a file that is to be written in place of the
-    list.
+    list, or with a rough answer.
     """
     given = [
         flag
@@ -227,6 +227,9 @@ def _check_forms(
         )
     if out is None:
         return
+    if is_quick:
+        legal = "--quick without --out, or --out without --quick"
+        raise InputError("quick", f"a rough answer is not written to {out}", legal)
     path = Path(out)
     if isinstance(cars, str | Path) and path.exists() and path.samefile(cars):
         raise InputError("out", f"{out} is the list itself", "another file")

@@ -6,16 +6,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.part import study_up_to
-from safevar_sumo.questions.permit.assumed import assumed_cells
+from safevar_sumo.questions.permit.assumed import WorstEnd, assumed_cells, worst_end_in_words
 from safevar_sumo.questions.permit.encounters import Span
-from safevar_sumo.questions.permit.fleet import Fleet
+from safevar_sumo.questions.permit.fleet import ROUGH, YES, Fleet
 from safevar_sumo.questions.permit.rows import (
     CARS,
     DRIVE,
@@ -31,7 +34,7 @@ from safevar_sumo.questions.permit.search import Permit, PermitSearch, Repaired
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, tabulate
-from safevar_sumo.questions.words import join_phrases, number_of
+from safevar_sumo.questions.words import join_phrases, number_of, precise_in_words
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, unit_text
@@ -39,6 +42,8 @@ from safevar_sumo.sumo.system import assemble
 
 DIGEST = "study_digest"
 """The column of the list that holds the digest of the study, its models and versions."""
+ROUGH_LIST = "Remark: the list is a rough answer (rough = yes), whose speeds prove nothing."
+"""What to know of a list that `--quick` wrote."""
 SHOWN_WHOLE = 50
 """Number of cars up to which one screen shows all: there the list is the answer."""
 
@@ -49,8 +54,12 @@ class PermitAnswer:
 
     Attributes
     ----------
+    is_quick, is_rough
+        Whether cars drive the grid alone, and whether the answer is rough for any reason.
     assumed
-        What was not measured, in sentences that follow the one about the cars.
+        What was not measured, in a sentence that follows the one about the cars.
+    ends
+        The worst end of each car; None where none was sought.
     """
 
     study: Study
@@ -61,14 +70,19 @@ class PermitAnswer:
     search: PermitSearch
     new_car: Permit
     is_quick: bool
+    is_rough: bool
     is_box: bool
-    assumed: Sequence[str]
+    assumed: str
+    ends: Sequence[WorstEnd | None] | None
 
     def of(self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[Repaired]) -> Answer:
         """The answer about the cars of a list, in its order, each with its best repair."""
         span = self.span
         rows = self._rows(fleet, permits, repaired)
-        cars = tabulate("The cars, those that stop first", _in_unit(CARS, span), rows)
+        columns = _in_unit(CARS, span)
+        if self._is_test:
+            columns["up_to"] = columns["up_to"]._replace(head="passes the test up to")
+        cars = tabulate("The cars, those that stop first", columns, rows)
         counts = {
             verdict: int((cars["verdict"] == verdict).sum()) for verdict in (DRIVE, LIMITED, STOP)
         }
@@ -81,11 +95,12 @@ class PermitAnswer:
         end = f"{span.name}={span.high!r}"
         scope = scope_of(study_up_to(self.study, end) if span.ending else self.study)
         own = self.models.own.unsafe
-        slower = f"{number_of(too_slow, 'car')} may not drive {self.need or 0:g}{unit}"
+        cannot = f"{number_of(too_slow, 'car')} {self._no_verb(too_slow)}"
+        slower = f"{cannot} at {self.need or 0:g}{unit}"
         return Answer(
             question="permit",
             study=self.study,
-            verdict=" ".join(self._sentences(cars, counts, too_slow, scope)),
+            verdict=" ".join(self._sentences(fleet, cars, counts, slower, scope)),
             tested=self._tested(),
             numbers={
                 "unsafe": str(own),
@@ -98,7 +113,7 @@ class PermitAnswer:
                 "step": self.step,
                 "need": self.need,
                 "not_driven_above": span.high,
-                "rough": self.is_quick,
+                "rough": self.is_rough,
             },
             tables={
                 "cars": ordered,
@@ -121,9 +136,18 @@ class PermitAnswer:
         new_car = self.new_car.up_to
         assert new_car is not None
         columns = failure_columns([each.least.failure for each in permits], with_car=self.is_box)
+        own = self.models.own.unsafe
+        of_all = {
+            "rough": self.is_rough,
+            "parameter_sets": len(self.models.members),
+            "margin": own.keep,
+            "unsafe": str(own),
+        }
+        ends = self.ends or [None] * len(permits)
+        cells = assumed_cells(vehicle, fleet)
         rows = []
-        for name, permit, found, best, assumed in zip(
-            fleet.names, permits, columns, repaired, assumed_cells(vehicle, fleet), strict=True
+        for name, permit, found, best, assumed, end in zip(
+            fleet.names, permits, columns, repaired, cells, ends, strict=True
         ):
             verdict = verdict_of(
                 permit.up_to, new_car, self.span.high, self.need, is_proven=not self.is_quick
@@ -140,38 +164,47 @@ class PermitAnswer:
                 "repair_first": None if best is None else vehicle.names[best[0]],
                 "up_to_after_repair": None if best is None else best[1].up_to,
                 "assumed": assumed,
+                "assumed_matters_most": None if end is None else end.name,
             }
-            rows.append(found | row)
+            rows.append(found | row | of_all)
         return rows
 
     def _sentences(
-        self, cars: pd.DataFrame, counts: Mapping[str, int], too_slow: int, scope: str
+        self, fleet: Fleet, cars: pd.DataFrame, counts: Mapping[str, int], slower: str, scope: str
     ) -> list[str]:
         """The verdict: how many cars may drive, what is safe, and what was not driven."""
         span = self.span
         unit = unit_text(span.unit)
         top = f"{span.high:g}{unit}"
         number = len(cars)
-        new_car = f"the new car may drive {span.up_to(self.new_car.order)}"
-        goal = top if self.need is None else f"{self.need:g}{unit}"
+        new_car = f"the new car {self._verb()} {self._reach(self.new_car.order)}"
+        goal = f"{top} or as fast as the new car" if self.need is None else f"{self.need:g}{unit}"
         phrases = {
-            DRIVE: f"may drive {goal} or as fast as the new car",
-            LIMITED: f"may drive up to a lower {span.name.replace('_', ' ')}",
-            STOP: f"may not drive, not even at {span.low:g}{unit}",
+            DRIVE: f"up to {goal}",
+            LIMITED: f"up to a lower {span.name.replace('_', ' ')}",
+            STOP: f"not even at {span.low:g}{unit}",
         }
         of_all = f" of {number_of(number, 'car')}"
         parts = list[str]()
         for verdict, phrase in phrases.items():
-            if counts[verdict]:
-                parts.append(f"{counts[verdict]}{of_all if not parts else ''} {phrase}")
-        sentences = [f"{join_phrases(parts)}; {new_car}.", *self.assumed]
+            if count := counts[verdict]:
+                verb = f"{self._no_verb(count)}," if verdict == STOP else self._verb(count)
+                parts.append(f"{count}{'' if parts else of_all} {verb} {phrase}")
+        told = join_phrases(parts)
+        name, up_to = cars.iloc[0][["car", "up_to"]]
+        is_safe = not pd.isna(up_to)
         if number == 1:
-            name, up_to, because_of = cars.iloc[0][["car", "up_to", "because"]]
-            may = "may not drive" if pd.isna(up_to) else f"may drive {span.up_to(up_to)}"
-            sentences[0] = f"{name} {may}; {new_car}."
-            sentences.append(because_of)
+            may = f"{self._verb()} {self._reach(up_to)}" if is_safe else self._no_verb()
+            told = f"{name} {may}"
+        sentences = [f"{told}{self._measured_in_words(fleet)}; {new_car}.", self.assumed]
+        if number == 1:
+            if is_safe and self.ends and not fleet.measured.all():
+                sentences.append(worst_end_in_words(self.ends[0], span))
+            sentences.append(cars["because"][0])
         if self.need is not None:
-            sentences.append(f"{number_of(too_slow, 'car')} may not drive {self.need:g}{unit}.")
+            sentences.append(f"{slower}.")
+        if fleet.is_rough:
+            sentences.append(ROUGH_LIST)
         sentences.append(remark_on_phases(self.models.own.in_phases))
         if span.ending:
             tests = join_phrases(span.ending)
@@ -182,6 +215,36 @@ class PermitAnswer:
             )
         sentences += [f"Scope: {scope}.", f"Safe means: {self._safe_in_words()}."]
         return [*filter(None, sentences)]
+
+    def _verb(self, count: int = 1) -> str:
+        """What safe cars do."""
+        if not self._is_test:
+            return "may drive"
+        return "passes the test" if count == 1 else "pass the test"
+
+    def _no_verb(self, count: int = 1) -> str:
+        """What unsafe cars do."""
+        if not self._is_test:
+            return "may not drive"
+        return f"{'does' if count == 1 else 'do'} not pass the test"
+
+    def _reach(self, value: float) -> str:
+        """Up to which value cars are safe, behind the verb."""
+        return self.span.up_to(value, with_low=not self._is_test)
+
+    @property
+    def _is_test(self) -> bool:
+        """Whether the study is a test of a regulation, which is safe by its rules alone."""
+        allows_impacts = any(test.allowed_impact_speed for test in self.study.tests)
+        return allows_impacts or bool(self.study.unsafe.source)
+
+    def _measured_in_words(self, fleet: Fleet) -> str:
+        """That measured values count as they are least safe, behind how far cars are safe."""
+        vehicle = self.models.own.characteristics.vehicle
+        # Limits are no measurements.
+        is_measured = np.any(fleet.measured, axis=0, keepdims=True)[0] & (not self.is_box)
+        precise = precise_in_words(compress(vehicle, is_measured))
+        return f" with the least safe value of {precise}" if precise else ""
 
     def _safe_in_words(self) -> str:
         """What a safe car does, with the study's own parameter set and with the others."""
@@ -199,9 +262,10 @@ class PermitAnswer:
     def _tested(self) -> str:
         values = self.search.values
         unit = unit_text(self.span.unit)
-        grid = (
-            f"{len(values)} values from {values[0]:g} to {values[-1]:g}{unit}, in every test alone"
-        )
+        driven = f"from {values[0]:g} to {values[-1]:g}{unit}"
+        if self.search.is_listed:
+            driven = f"({join_phrases(f'{value:g}' for value in values)}{unit})"
+        grid = f"{len(values)} values {driven}, in every test alone"
         attacked = f"{self.search.attacked:,} simulations that search for an unsafe encounter"
         return f"{grid}; {'no search beside them' if self.is_quick else attacked}."
 
@@ -212,6 +276,7 @@ class PermitAnswer:
         # Limits are no measured values of a car.
         given = given[given.columns[:1]] if self.is_box else given
         listing = pd.concat([given, cars.drop(columns="car")], axis=1)
+        listing[ROUGH] = YES if self.is_rough else "no"
         listing[DIGEST] = identity_digest(manifest)[:12]
         return listing
 
@@ -220,9 +285,9 @@ NUMBERS = {"drive": DRIVE, "limited": LIMITED, "stop": STOP}
 """The numbers that count cars, by what they may do."""
 
 
-def _in_unit(columns: Columns, span: Span) -> Columns:
+def _in_unit(columns: Columns, span: Span) -> dict[str, Any]:
     """Columns with the unit of the parameter."""
-    named = dict(columns)
+    named = dict[str, Any](columns)
     for name in ("up_to", "new_car_up_to", "up_to_after_repair"):
         column = columns.get(name)
         if isinstance(column, Column):

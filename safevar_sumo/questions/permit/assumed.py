@@ -1,18 +1,18 @@
-"""What nobody measured on a car: the values that stand in its place, in words, and for one car the
-one of them that lowers the speed most.
+"""What nobody knows of a car: the interval of what was measured, the values in place of what was
+not, and the one of these that lowers the speed most.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit.encounters import Span
 from safevar_sumo.questions.permit.fleet import Fleet
-from safevar_sumo.questions.permit.search import Permit, PermitSearch, with_value_of
+from safevar_sumo.questions.permit.search import Permit, PermitSearch
 from safevar_sumo.questions.permit.speeds import Cars
 from safevar_sumo.questions.words import EXACT, join_phrases
 from safevar_sumo.records import FloatArray
@@ -53,36 +53,70 @@ def assumed_in_words(study: Study, vehicle: CharacteristicSet, fleet: Fleet) -> 
     return f"Assumed, as not measured: {join_phrases(phrases)}." if phrases else ""
 
 
-def worst_end_in_words(
-    models: Models, span: Span, values: FloatArray, fleet: Fleet, permit: Permit
-) -> str:
-    """Which assumed value of one car lowers its speed most at an end of its domain, and to what at
-    most, in a sentence; empty if nothing is assumed, or the car may not drive as it is.
+def cars_of(vehicle: CharacteristicSet, fleet: Fleet) -> list[Cars]:
+    """The cars of a list, with all values that their measured ones may really have."""
+    ends = np.array(
+        [
+            [item.measured(value) for item, value in zip(vehicle, setting, strict=True)]
+            for setting in fleet.settings
+        ]
+    )
+    ends = np.where(fleet.measured[..., np.newaxis], ends, fleet.settings[..., np.newaxis])
+    return [Cars.measured(*car.T) for car in ends]
+
+
+class WorstEnd(NamedTuple):
+    """The assumed value of a car that lowers its speed most at an end of its domain: the name of
+    the characteristic, the end as text, and the value at which the car is unsafe then.
     """
-    up_to = permit.up_to
-    if up_to is None or fleet.measured.all():
-        return ""
-    # The car with each assumed value at either end, side by side. Any failure shows that it may
-    # drive no faster, so the grid up to its own speed is enough, with the set that limits it.
-    vehicle = models.own.characteristics.vehicle
-    (setting,) = fleet.settings
-    cars = [
-        Cars.one(with_value_of(setting, column, ends))
-        for column in np.flatnonzero(~fleet.measured[0]).tolist()
-        for ends in (vehicle.lower, vehicle.upper)
-    ]
-    limiting = Models((models.members[permit.least.fit],), ())
-    grid = PermitSearch(limiting, span._replace(high=up_to), values[values <= up_to], budget=0)
-    found = [each.least.failure for each in grid.reach(cars, [None] * len(cars))]
-    failures = [failure for failure in found if failure is not None]
+
+    name: str
+    text: str
+    value: float
+
+
+def worst_ends(
+    search: PermitSearch,
+    vehicle: CharacteristicSet,
+    fleet: Fleet,
+    cars: Sequence[Cars],
+    permits: Sequence[Permit],
+) -> list[WorstEnd | None]:
+    """The worst end of each car; None where nothing is assumed, the car may not drive as it is, or
+    no end lowers its speed on the grid.
+    """
+    # A car with each assumed value at either end, side by side, and its other values as they are
+    # worst. Any failure shows that it may drive no faster, so the grid up to its own speed is
+    # enough, with the set that limits it.
+    variants = list[Cars]()
+    for car, permit, is_measured in zip(cars, permits, fleet.measured, strict=True):
+        failure = permit.least.failure
+        own = Cars.one(car.lower if failure is None else failure.setting[: len(vehicle)])
+        ends = [
+            own.with_value_of(column, end).lower
+            for column in np.flatnonzero(~is_measured).tolist()
+            for end in (vehicle.lower, vehicle.upper)
+        ]
+        variants.append(own._replace(vehicles=np.array(ends or [own.lower])))
+    found = list[WorstEnd | None]()
+    for car, failure in zip(cars, search.worst_ends(variants, permits), strict=True):
+        worst = car.lower if failure is None else failure.setting[: len(vehicle)]
+        other = np.flatnonzero((worst < car.lower) | (worst > car.upper))
+        if failure is None or not len(other):
+            found.append(None)
+            continue
+        item = vehicle.members[other[0]]
+        end = f"{worst[other[0]]:{EXACT}}{item.suffix}"
+        found.append(WorstEnd(item.name, end, failure.value))
+    return found
+
+
+def worst_end_in_words(worst: WorstEnd | None, span: Span) -> str:
+    """The worst end of one car, in a sentence."""
     name = span.name.replace("_", " ")
     shown = "Of these, at the ends of their domains and with the parameter set that limits the car,"
-    if not failures:
+    if worst is None:
         return f"{shown} none lowers the {name} on the grid."
-
-    # The failure at the least value, and what is not as in the car itself.
-    worst = min(failures, key=lambda failure: failure.value)
-    other = worst.setting[: len(setting)]
-    (text,) = _texts(vehicle, other)[other != setting]
     value = f"{max(worst.value, span.low):g}{unit_text(span.unit)}"
-    return f"{shown} {text} lowers the {name} most: the car is unsafe already at {value}."
+    end = f"{worst.name} {worst.text}"
+    return f"{shown} {end} lowers the {name} most: the car is unsafe already at {value}."

@@ -19,7 +19,7 @@ from safevar_sumo.questions.phases import in_phases, meet_worst_phases
 from safevar_sumo.questions.sampling import sobol_points
 from safevar_sumo.questions.scope import points_of_tests
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in
+from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in, unit_of
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import PHASE, Study, unit_text
 from safevar_sumo.study.encounters import are_numbers
@@ -54,9 +54,11 @@ class Span(NamedTuple):
     ending: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
 
-    def up_to(self, value: float) -> str:
-        """What is driven up to a value: `from 10 up to 35 km/h`."""
+    def up_to(self, value: float, *, with_low: bool = True) -> str:
+        """What is driven up to a value: `from 10 up to 35 km/h`, or `up to 35 km/h`."""
         reached = f"{value:g}{unit_text(self.unit)}"
+        if not with_low:
+            return f"up to {reached}"
         return f"from {self.low:g} up to {reached}" if value > self.low else f"at {reached} alone"
 
 
@@ -179,7 +181,7 @@ def span_of(study: Study, by: str | None) -> Span:
         lists = {name: each for name, each in study.lists_of(test).items() if are_numbers(each)}
         for axis in lists:
             if axis in searchable or SPEED_DIMENSION in axis:
-                units[axis] = searchable[axis].unit if axis in searchable else ""
+                units[axis] = unit_of(own[0].scenario, axis)
         of_test = {axis: (float(min(each)), float(max(each))) for axis, each in lists.items()}
         domains = study.ranges_of(test)
         of_test |= {axis: (each.lower, each.upper) for axis, each in domains.items()}

@@ -20,13 +20,15 @@ import pandas as pd
 from safevar_sumo.errors import InputError, about, check_name, check_text, did_you_mean
 from safevar_sumo.output import read_file
 from safevar_sumo.questions.changes import NUMBER_PATTERN, read_changes
-from safevar_sumo.questions.words import number_of
+from safevar_sumo.questions.words import EXACT, number_of
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet, region_of
 
 CAR = "car"
 """Natural header of the column that names the cars, which the answer has, too."""
+ROUGH, YES = "rough", "yes"
+"""The column of an answer that says whether it is rough, and its text then."""
 NEW = "new"
 """Value of `--others`: a characteristic without a value is as in the original vehicle."""
 TYPED, THIS_CAR = "--set", "This car"
@@ -62,12 +64,15 @@ class Fleet(NamedTuple):
         Which of them the list states, shape (K, n).
     table
         The list as it was given: all columns, as text.
+    is_rough
+        Whether the list is a rough answer.
     """
 
     names: list[str]
     settings: FloatArray
     measured: BoolArray
     table: pd.DataFrame
+    is_rough: bool = False
 
 
 class _Cells(NamedTuple):
@@ -123,7 +128,7 @@ def read_fleet(
         raise InputError("--others", repr(others), NEW)
     if cars is None:
         with about(TYPED):
-            typed = read_changes(values, vehicle)
+            typed = read_changes(values, vehicle, beyond=True)
         cells = _cells_of_mapping({THIS_CAR: typed}, TYPED)
     elif isinstance(cars, pd.DataFrame):
         cells = _cells_of_frame(cars)
@@ -146,9 +151,11 @@ def read_fleet(
     settings = _completed(cells, settings, study, vehicle, others)
     _check_constraints(cells, settings, study, vehicle)
     table = pd.DataFrame(cells.rows, columns=pd.Index(cells.header), dtype=str)
+    is_rough = False
     if is_answer:
+        is_rough = YES in [text.strip() for text in table[ROUGH]]
         table = table.drop(columns=[*written])
-    return Fleet(names, settings, measured, table)
+    return Fleet(names, settings, measured, table, is_rough)
 
 
 def list_without_names(path: Path, ignore: Collection[str]) -> bytes:
@@ -328,11 +335,20 @@ def _values(
     mark = ";" if cells.separator == ";" else "."
     mark = "," if ";" in cells.separator and has_commas else mark
     settings = np.full((len(cells.rows), len(vehicle)), np.nan)
+    faults = list[InputError]()
     for setting, row, place in zip(settings, cells.rows, cells.places, strict=True):
         for column, number in columns.items():
             if text := row[column].strip():
                 with about(f"{place}, column {cells.header[column].strip()!r}"):
-                    setting[number] = _number(text, mark, vehicle.members[number])
+                    try:
+                        setting[number] = _number(text, mark, vehicle.members[number])
+                    except InputError as fault:
+                        faults.append(fault)
+    if faults:
+        first, *later = faults
+        problems = [first.problem, *(f"{fault.source}: {fault.problem}" for fault in later)]
+        legal = dict.fromkeys(fault.legal for fault in faults)
+        raise InputError(first.source, "\n".join(problems), "; ".join(legal))
     return settings, ~np.isnan(settings)
 
 
@@ -340,15 +356,21 @@ def _number(text: str, mark: str, item: Characteristic) -> float:
     """The value of a cell; refuses what is no number with the decimal mark, or outside of the
     domain.
     """
+    domain = f"a number in [{item.lower:g}, {item.upper:g}]{item.suffix}"
     if not NUMBERS[mark].fullmatch(text):
-        domain = f"a number in [{item.lower:g}, {item.upper:g}]{item.suffix}"
         raise InputError("", f"{text!r} is no number with {MARKS[mark]}", domain)
     value = float(text.replace(",", "."))
-    # A part may be better than that of a new car, where that is an end of the domain.
-    most = f"{item.upper:g}"
-    is_better = value > item.upper == item.original
-    item.check(value, otherwise=f"; at most {most}: enter {most}" if is_better else "", switch="")
-    return value
+    if item.is_legal(value, beyond=False):
+        return value
+
+    # A part may be measured better than that of a new car, where that is an end of the domain.
+    problem = f"{value:{EXACT}} is outside {item.lower:g} to {item.upper:g}{item.suffix}"
+    if item.upper == item.original and item.upper < value <= item.upper + item.error:
+        raise InputError("", problem, f"{domain}; at most {item.upper:g}: enter {item.upper:g}")
+    # Any other value may be of another unit, with which no end of the domain is its advice.
+    is_share = not item.suffix and item.is_legal(value / 100, beyond=False)
+    unit = "percent" if is_share else "of another unit"
+    raise InputError("", f"{problem}: is this {unit}?", domain)
 
 
 def _completed(

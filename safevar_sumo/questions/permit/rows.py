@@ -17,7 +17,8 @@ from safevar_sumo.study import PHASE, unit_text
 
 PHASE_COLUMN = Column("-", "steps by which that encounter begins later", ".4f")
 DRIVE, LIMITED, STOP = "drive", "up to", "stop"
-"""Verdicts: as fast as was driven, as is needed, or as the new car; up to a speed; not at all."""
+"""Verdicts: as fast as is needed, else as was driven or as the new car; up to a speed; not at all.
+"""
 CARS: Columns = {
     "car": "name of the car",
     "up_to": Column("", "greatest value up to which it is safe", ".10g", head="may drive up to"),
@@ -34,6 +35,13 @@ CARS: Columns = {
     "up_to_after_repair": Column("", "the greatest value then", ".10g", head="then up to"),
     "simulate": Column("", "the command that simulates its failure", is_detail=True),
     "assumed": Column("", "what was not measured, with its assumed value", is_detail=True),
+    "assumed_matters_most": Column(
+        "", "the assumed value that, at an end of its domain, lowers the value most", is_detail=True
+    ),
+    "rough": Column("", "whether the answer is rough and proves nothing", is_detail=True),
+    "parameter_sets": Column("-", "number of parameter sets that were driven", "d", is_detail=True),
+    "margin": Column("m", "clearance to keep with the study's own set", is_detail=True),
+    "unsafe": Column("", "what is unsafe", is_detail=True),
 }
 SETS: Columns = {
     "car": "name of the car",
@@ -97,7 +105,7 @@ def verdict_of(
     """What a car may do; without a falsification none may drive without a limit."""
     if up_to is None:
         return STOP
-    is_enough = up_to >= min(top if need is None else need, top, new_car)
+    is_enough = up_to >= (min(top, new_car) if need is None else need)
     return DRIVE if is_enough and is_proven else LIMITED
 
 

@@ -9,13 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.models import Models
-from safevar_sumo.questions.permit.encounters import EncounterRange, Span, encounters_of
+from safevar_sumo.questions.permit.encounters import Span, encounters_of
 from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSearch
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 
 REPAIR_STAGE = "cars with one part as new"
-USUAL_PLACES = 40
-"""Usual number of encounters at a speed, those of all tests."""
+ENDS_STAGE = "cars with assumed values at ends of their domains"
+USUAL_PLACES = 100
+"""Usual number of encounters of a vehicle at a speed, those of all tests at all their phases."""
 MOST_LIMITING = 3
 """Number of failures of a car that each repair of it meets first."""
 
@@ -78,22 +79,31 @@ class PermitSearch:
     """
 
     def __init__(self, models: Models, span: Span, values: FloatArray, budget: int) -> None:
-        self.values = values
         self.attacked = 0
         self._models = models
         self.span = span
         self._budget = budget
-        self._ranges = dict[int, list[EncounterRange]]()
+        ranges = encounters_of(models.own, span)
+        self._ranges = {models.own.fit: ranges}
+        # Where no scenario can move the parameter, its listed values alone.
+        self.is_listed = all(each.column is None for each in ranges)
+        listed = np.unique([each.low for each in ranges if np.isfinite(each.low)])
+        self.values = listed if self.is_listed else values
         self._models_in_order = [*models.members]
+        self._usual = 0.0
+        """Usual number of settings of a car in all parameter sets."""
 
-    def phases(self, cars: int, *, with_repairs: bool) -> NamedValues:
+    def phases(self, cars: Sequence[Cars], *, with_repairs: bool) -> NamedValues:
         """The phases of progress, each with its usual number of settings."""
         members = self._models.members
         # Tests are simulated alone, so that settings at all points of a matrix are fewer.
         points = len(members[0].evaluator.system.points)
-        each = cars * (len(self.values) * USUAL_PLACES + self._budget) / points
+        vehicles = sum(car.together for car in cars)
+        places = len(self.values) * USUAL_PLACES
+        each = (vehicles * places + len(cars) * self._budget) / points
+        self._usual = len(members) * each / len(cars)
         phases = {self._stage(model.fit): each for model in members}
-        return phases | ({REPAIR_STAGE: 6 * each} if with_repairs else {})
+        return phases | ({REPAIR_STAGE: len(members) * each} if with_repairs else {})
 
     def _stage(self, fit: int) -> str:
         return f"cars in parameter set {fit}" if len(self._models.members) > 1 else "cars"
@@ -137,15 +147,36 @@ class PermitSearch:
                 found[car].append(Reached(model.fit, search.up_to(number), search.failures[number]))
         return [Permit(reached) for reached in found]
 
+    def worst_ends(
+        self, cars: Sequence[Cars], permits: Sequence[Permit]
+    ) -> list[LimitingFailure | None]:
+        """The failure at the least value, up to that of its permit, of each of several cars that
+        drive the grid with the parameter set that limits the permit; None where none fails.
+        """
+        found: list[LimitingFailure | None] = [None] * len(cars)
+        for fit, ranges in self._ranges.items():
+            chosen = [
+                car
+                for car, permit in enumerate(permits)
+                if permit.least.fit == fit and permit.up_to is not None
+            ]
+            caps = [permits[car].order for car in chosen]
+            if not chosen:
+                continue
+            values = self.values[self.values <= max(caps)]
+            driven = [each for each in ranges if each.low <= values[-1]]
+            search = SpeedSearch(driven, [cars[car] for car in chosen], values, caps, ENDS_STAGE)
+            search.drive_grid()
+            for car, cap, failure in zip(chosen, caps, search.failures, strict=True):
+                found[car] = failure if failure is not None and failure.value <= cap else None
+        return found
+
     def repair_first(
-        self,
-        settings: FloatArray,
-        measured: BoolArray,
-        original: FloatArray,
-        permits: Sequence[Permit],
+        self, cars: Sequence[Cars], worn: BoolArray, original: FloatArray, permits: Sequence[Permit]
     ) -> list[Repaired]:
-        """For each of K cars, shape (K, n), the measured characteristic that, as in the original,
-        raises its value most, with the car as it is then; None where no single one does.
+        """For each of K cars the characteristic among its `worn` ones, shape (K, n), that, as in
+        the original, raises its value most, with the car as it is then; None where no single one
+        does.
 
         A repaired car first meets the encounters that limit the car, or another repair: what it
         could reach at most decides which repair is driven next, and whether another one is at all.
@@ -156,42 +187,43 @@ class PermitSearch:
         top = float(self.values[-1])
         bounds = list[dict[int, float]]()
         failures = list[list[LimitingFailure]]()
-        best = list[Repaired]([None] * len(settings))
+        best = list[Repaired]([None] * len(cars))
         known = [permit.order for permit in permits]  # with the best repair so far
         for row, permit in enumerate(permits):
-            worn = np.flatnonzero(measured[row] & (settings[row] != original))
-            bounds.append(dict.fromkeys(worn.tolist() if permit.order < top else [], np.inf))
+            columns = np.flatnonzero(worn[row] & (permit.order < top)).tolist()
+            bounds.append(dict.fromkeys(columns, np.inf))
             failures.append(permit.limiting)
-        while any(bounds):
-            self._lower(bounds, failures, settings, original)
-            # The most promising repair of each car, unless a better one is known.
-            chosen = dict[int, int]()
-            for row, of_car in enumerate(bounds):
-                for column in [column for column, most in of_car.items() if most <= known[row]]:
-                    del of_car[column]
-                if of_car:
-                    chosen[row] = max(of_car, key=of_car.__getitem__)
-                    del of_car[chosen[row]]
-            cars = [
-                Cars.one(with_value_of(settings[row], column, original))
-                for row, column in chosen.items()
-            ]
-            above = [known[row] for row in chosen]
-            driven = self.reach(cars, above, REPAIR_STAGE) if cars else []
-            for (row, column), permit in zip(chosen.items(), driven, strict=True):
-                if permit.order > known[row]:
-                    best[row] = column, permit
-                    known[row] = permit.order
-                failures[row] = [
-                    each.failure for each in permit.reached if each.failure is not None
+        with self._models.own.evaluator.phases.stage(REPAIR_STAGE) as expect:
+            while any(bounds):
+                expect(self._usual * sum(map(len, bounds)))
+                self._lower(bounds, failures, cars, original)
+                # The most promising repair of each car, unless a better one is known.
+                chosen = dict[int, int]()
+                for row, of_car in enumerate(bounds):
+                    for column in [column for column, most in of_car.items() if most <= known[row]]:
+                        del of_car[column]
+                    if of_car:
+                        chosen[row] = max(of_car, key=of_car.__getitem__)
+                        del of_car[chosen[row]]
+                repaired = [
+                    cars[row].with_value_of(column, original) for row, column in chosen.items()
                 ]
+                above = [known[row] for row in chosen]
+                driven = self.reach(repaired, above, REPAIR_STAGE) if repaired else []
+                for (row, column), permit in zip(chosen.items(), driven, strict=True):
+                    if permit.order > known[row]:
+                        best[row] = column, permit
+                        known[row] = permit.order
+                    failures[row] = [
+                        each.failure for each in permit.reached if each.failure is not None
+                    ]
         return best
 
     def _lower(
         self,
         bounds: Sequence[dict[int, float]],
         failures: Sequence[Sequence[LimitingFailure]],
-        settings: FloatArray,
+        cars: Sequence[Cars],
         original: FloatArray,
     ) -> None:
         """Lower what each repair could reach at most, by the failures of other cars that it does
@@ -202,8 +234,10 @@ class PermitSearch:
         for row, of_car in enumerate(bounds):
             for failure in failures[row]:
                 for column in of_car:
+                    repaired = cars[row].with_value_of(column, original)
                     setting = failure.setting.copy()
-                    setting[: len(original)] = with_value_of(settings[row], column, original)
+                    vehicle = setting[: len(original)]
+                    np.clip(vehicle, repaired.lower, repaired.upper, out=vehicle)
                     rows.setdefault(id(failure.encounters), []).append(
                         (row, column, failure.value, setting)
                     )
@@ -215,10 +249,3 @@ class PermitSearch:
                     below = self.values[self.values < value]
                     most = float(below[-1]) if len(below) else -np.inf
                     bounds[row][column] = min(bounds[row][column], most)
-
-
-def with_value_of(setting: FloatArray, column: int, other: FloatArray) -> FloatArray:
-    """A car with one of its characteristics as in another car, such as the original."""
-    changed = setting.copy()
-    changed[column] = other[column]
-    return changed

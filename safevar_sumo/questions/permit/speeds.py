@@ -36,7 +36,7 @@ SPREAD = 128
 
 
 class Cars(NamedTuple):
-    """A car, or all cars within limits.
+    """A car, with all values that its measured ones may really have, or all cars within limits.
 
     Attributes
     ----------
@@ -56,11 +56,31 @@ class Cars(NamedTuple):
         return cls(values, values, values[np.newaxis])
 
     @classmethod
+    def measured(cls, lower: FloatArray, upper: FloatArray) -> Cars:
+        """A car whose values are between these: those at all ends drive the grid, or of many at
+        some.
+        """
+        corners = np.round(sobol_points(SPREAD, len(lower), seed=0))
+        return cls(lower, upper, np.unique(np.where(corners == 0, lower, upper), axis=0))
+
+    @classmethod
     def within(cls, lower: FloatArray, upper: FloatArray, seed: int) -> Cars:
         """All cars within limits: those at Sobol points and at as many corners drive the grid."""
         points = sobol_points(SPREAD, len(lower), seed)
         points = np.concatenate([np.round(points), points])
         return cls(lower, upper, np.unique(lower + points * (upper - lower), axis=0))
+
+    def with_value_of(self, column: int, other: FloatArray) -> Cars:
+        """A car with one of its values as in another car, such as the original."""
+        lower, upper, vehicles = (values.copy() for values in self)
+        for values in (lower, upper, vehicles):
+            values[..., column] = other[column]
+        return Cars(lower, upper, np.unique(vehicles, axis=0))
+
+    @property
+    def together(self) -> int:
+        """How many of the vehicles meet an encounter of the grid."""
+        return min(len(self.vehicles), MOST_VEHICLES)
 
     @property
     def number(self) -> int:
@@ -134,7 +154,8 @@ class SpeedSearch:
                 for car, found in enumerate(self.failures)
                 if found is None and rest[0] <= self._caps[car]
             ]
-            size = max(BLOCK, EFFICIENT // max(len(alive), 1))
+            vehicles = sum(self._cars[car].together for car in alive)
+            size = max(BLOCK, EFFICIENT // max(vehicles, 1))
             block, rest = rest[:size], rest[size:]
             for number, encounters in enumerate(self._ranges):
                 places = self._places(encounters, block)
@@ -185,8 +206,7 @@ class SpeedSearch:
 
     def _settings(self, car: int, places: FloatArray) -> FloatArray:
         """The settings in which the vehicles of a car meet encounters, some of them in each."""
-        vehicles = self._cars[car].vehicles
-        many = min(len(vehicles), MOST_VEHICLES)
+        vehicles, many = self._cars[car].vehicles, self._cars[car].together
         chosen = np.arange(many * len(places)) % len(vehicles)
         return np.hstack([vehicles[chosen], np.repeat(places, many, axis=0)])
 
