@@ -51,8 +51,8 @@ row 1.
 ENDS = {
     "least": "least density",
     "greatest": "greatest density",
-    "least_low": "lowest end of an interval",
-    "greatest_high": "highest end of an interval",
+    "lowest": "lowest end of an interval",
+    "highest": "highest end of an interval",
 }
 COLUMNS: Columns = {
     "rule": "region: limits of some characteristics; all others anywhere in their domains",
