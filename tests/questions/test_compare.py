@@ -15,6 +15,8 @@ from numpy.testing import assert_allclose
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.questions.compare.coverage import missing_in_words, missing_parts
+from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.research_questions.statistics import compare_samples
 from safevar_sumo.questions.tables import cell_text
 from safevar_sumo.questions.tolerance import scans
@@ -48,6 +50,78 @@ def _coarse_scans_and_no_benign_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def counts_of(answer: sv.Answer) -> tuple[int, int, int]:
     return tuple(answer.numbers[name] for name in ("only_a_unsafe", "only_b_unsafe", "both"))  # type: ignore[return-value]
+
+
+LISTED = {"name": "CCRs", "model": "car_to_car", "parameters": {"test": "CCRs"}}
+OTHERS = {
+    "a test with one speed less": (
+        "autoware_july",
+        {"matrix": {"tests": [{**LISTED, "over": {"speed": [30, 40, 60]}}]}},
+        ["the test case (CCRs, speed 50, clear)"],
+    ),
+    "another name of the same test": (
+        "autoware_july",
+        {"matrix": {"tests": [{**LISTED, "name": "rear", "over": {"speed": [30, 40, 50, 60]}}]}},
+        [],
+    ),
+    "another scenario under the same name": (
+        "autoware_july",
+        {"scenario": {"parameters": {"grade": -0.05}}},
+        [f"the test case (CCRs, speed {speed}, clear)" for speed in (30, 40, 50, 60)],
+    ),
+    "the first test alone": (
+        "wear",
+        ONE_TEST,
+        [
+            *(f"the test case (CPFA, speed {speed}, wet)" for speed in (10, 20, 30)),
+            *("the test CPNA", "the test CPNCO", "the test CPLA"),
+        ],
+    ),
+    "another weather": ("sun", {"weather": "carla_hard_rain"}, ["the weather clear"]),
+    "fewer parameter sets": (
+        "wear",
+        {"spread": {name: values[:3] for name, values in load_study("wear").spread.items()}},
+        ["9 parameter sets"],
+    ),
+    "a narrower range": (
+        "sun",
+        {"encounters": "ranges", "scenario": {"over": {"distance": {"lower": 9.0}}}},
+        ["the range of distance from 8 to 18"],
+    ),
+}
+
+
+@pytest.mark.parametrize("changed", OTHERS)
+def test_what_a_version_lacks_is_named_on_its_side_alone(changed: str) -> None:
+    name, changes, expected = OTHERS[changed]
+    ranges = {"encounters": changes["encounters"]} if "encounters" in changes else {}
+    with (
+        open_evaluator(load_study(name, **ranges), POOL) as a,
+        open_evaluator(load_study(name, **changes), POOL) as b,
+    ):
+        assert missing_parts(b, a)[: len(expected)] == expected
+        assert missing_parts(a, a) == missing_parts(b, b) == []
+        if changed in ("another scenario under the same name", "another weather"):
+            assert missing_parts(a, b) != []
+        else:
+            assert missing_parts(a, b) == []
+
+
+def test_a_sentence_names_four_missing_parts() -> None:
+    assert missing_in_words("B", list("abcdef")) == "B lacks a, b, c, d and 2 more."
+
+
+@SLOW
+def test_a_version_whose_failing_tests_were_deleted_is_not_released(in_tmp: Path) -> None:
+    """A version that is driven at 30 km/h alone looks better everywhere."""
+    table = {"name": "CCRs", "parameters": {"test": "CCRs"}, "over": {"speed": [30]}}
+    version = {"extends": "autoware_july", "name": "version", "matrix": {"tests": [table]}}
+    Path("version.toml").write_text(tomli_w.dumps(version))
+    answer = json_of("compare", "autoware_july", "version.toml", "--samples", "8", expect=4)
+    assert answer["numbers"]["decision"] == "decide"
+    assert "version lacks the test case (CCRs, speed 40, clear)" in answer["verdict"]
+    reverse = json_of("compare", "version.toml", "autoware_july", "--samples", "8", expect=4)
+    assert "version lacks the test case" in reverse["verdict"]
 
 
 @SLOW
@@ -129,13 +203,13 @@ VERSIONS = {
     "later": (
         {"ads": {"model": "late:Late"}},
         "do not release",
-        r"but brakes less often without need\. It collides at ([\d.]+) m/s with its original"
+        r"but brakes less often without need\. later collides at ([\d.]+) m/s with its original"
         r" vehicle in the test CPFA at 40 km/h, where that of wear does not",
     ),
     "needless": (
         {"ads": {"parameters": {"braking_share": 0.1}}},
         "decide",
-        r"brakes needlessly in \d+ of \d+ benign scenes, wear in \d+\. It is safe in",
+        r"brakes needlessly in \d+ of \d+ benign scenes, wear in \d+\. needless is safe in",
     ),
     "slower": (
         {"vehicle": {"characteristics": {"sensorLatency": {"original": 0.15}}}},
@@ -145,7 +219,7 @@ VERSIONS = {
     "hasty": (
         {"ads": {"parameters": {"response_time": 0.2}}},
         "do not release",
-        r"is less safe than wear. It is unsafe in \d+ of",
+        r"is less safe than wear. hasty is unsafe in \d+ of",
     ),
 }
 

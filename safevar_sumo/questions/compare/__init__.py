@@ -20,6 +20,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
+from safevar_sumo.questions.compare.coverage import missing_in_words, missing_parts
 from safevar_sumo.questions.compare.differences import (
     BOTH,
     COLLISION,
@@ -107,8 +108,9 @@ def compare(
 
     A version B that is less safe must not be released, and the command ends with exit code 3: its
     original vehicle collides where that of A does not, or something that concerns safety is worse,
-    and at most needless braking is better. Exit code 4 says that a person has to decide. The same
-    criterion counts for both. Where the original vehicles differ, the same changes of each original
+    and at most needless braking is better. Exit code 4 says that a person has to decide, as where
+    one side lacks tests, weathers, ranges or parameter sets of the other. The same criterion counts
+    for both. Where the original vehicles differ, the same changes of each original
     are compared. Small changes are not filtered out.
 
     Parameters
@@ -157,7 +159,13 @@ def compare(
         *compare_limits(alone),
         *compare_values(tested.p, tested.a12),
     ]
-    decided, why = _decide(differences, titles, of_originals)
+    missing = missing_parts(*evaluators), missing_parts(second, evaluator)
+    lacks = [
+        missing_in_words(title, parts)
+        for title, parts in zip(titles, missing, strict=True)
+        if parts
+    ]
+    decided, why = _decide(differences, titles, of_originals, lacks)
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
         **decided,
@@ -311,11 +319,15 @@ def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
 
 
 def _decide(
-    differences: Sequence[Difference], titles: Sequence[str], of_originals: JsonObject
+    differences: Sequence[Difference],
+    titles: Sequence[str],
+    of_originals: JsonObject,
+    lacks: Sequence[str],
 ) -> tuple[JsonObject, str]:
     """Whether to release B, and why: with a new collision never, and not if it is worse in safety
     and better in needless braking at most. What is better in some and worse in other things is for
-    a person to decide; so is every change whose needless braking was not measured.
+    a person to decide; so is every change whose needless braking was not measured. Where one side
+    `lacks` what the other is simulated in, only a new collision decides.
     """
     a, b = titles
     in_order = sorted(differences, key=lambda one: -one.weight)
@@ -324,7 +336,9 @@ def _decide(
     brakes_elsewhere = of_originals["metres_earlier"] or of_originals["metres_later"]
     is_unknown = not of_originals["benign_scenes"] and (better or brakes_elsewhere)
     decision = DECIDE
-    if worst == COLLISION or worst > best:
+    if lacks and worst < COLLISION:
+        what = f"and {a} were not simulated in the same encounters"
+    elif worst == COLLISION or worst > best:
         decision = DO_NOT_RELEASE
         but = ", but brakes less often without need" if better and best == COMFORT else ""
         what = f"is less safe than {a}{but}"
@@ -341,9 +355,10 @@ def _decide(
         if not better:
             what = f"does not differ from {a} in anything that was measured"
     shown = [*worse[: MAX_REASONS - bool(better)], *better][:MAX_REASONS]
-    reasons = "".join(f" It {phrase}." for phrase in dict.fromkeys(one.phrase for one in shown))
+    phrases = dict.fromkeys(difference.phrase for difference in shown)
+    sentences = [f"{decision}: {b} {what}.", *lacks, *(f"{b} {phrase}." for phrase in phrases)]
     numbers = {"decision": decision.lower(), "better_in": len(better), "worse_in": len(worse)}
-    return numbers, f"{decision}: {b} {what}.{reasons}"
+    return numbers, " ".join(sentences)
 
 
 def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:

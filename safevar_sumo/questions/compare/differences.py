@@ -14,6 +14,7 @@ import pandas as pd
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Column, Columns, tabulate, with_interval
 from safevar_sumo.questions.between import moving_tests
+from safevar_sumo.questions.compare.coverage import TestCase, cases_of
 from safevar_sumo.questions.compare.settings import within
 from safevar_sumo.questions.counterexamples import where_in_words
 from safevar_sumo.questions.evaluator import Evaluator
@@ -26,6 +27,7 @@ from safevar_sumo.questions.tolerance.alone import AloneLimit, AloneSearch
 from safevar_sumo.questions.tolerance.scans import SCAN_VALUES, scan
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
+from safevar_sumo.scenarios import Point
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.matrix import simulate_all_points
 
@@ -222,36 +224,40 @@ def compare_originals(
 
 
 def _new_collisions(evaluators: Sequence[Evaluator], a: str) -> list[Difference]:
-    """The fastest collision of B's original vehicle at a point where A's does not collide, if there
-    is one. A point that A does not have counts unless A's original vehicle collides anywhere.
+    """The fastest collision of B's original vehicle in a test case in which A's does not collide,
+    if there is one. Test cases that A lacks show nothing about a change.
     """
-    # Collisions of both original vehicles, by point.
-    systems = [side.system for side in evaluators]
-    in_a, in_b = (
-        {
-            result.point.name: result
-            for result in simulate_all_points(system, side.characteristics.original[np.newaxis])
-        }
-        for system, side in zip(systems, evaluators, strict=True)
-    )
-    collides_in_a = {name: bool(result.evaluations.collided[0]) for name, result in in_a.items()}
+    # Collisions of both original vehicles, by test case.
+    of_a, of_b = (_collisions_of_original(side) for side in evaluators)
+    cases_of_collisions = [case for case, _, _ in of_a]
+    cases_of_a = [case for _, _, case in cases_of(evaluators[0])]
 
     # Those that are new in B, of which the fastest is named.
     new = [
-        (float(-result.evaluations.f_safe[0]), result.point)
-        for name, result in in_b.items()
-        if result.evaluations.collided[0]
-        and not collides_in_a.get(name, any(collides_in_a.values()))
+        (speed, point)
+        for case, point, speed in of_b
+        if case in cases_of_a and case not in cases_of_collisions
     ]
     if not new:
         return []
     speed, point = max(new, key=lambda pair: pair[0])
-    where = where_in_words(systems[1].points, point, point.scenario, {})
+    where = where_in_words(evaluators[1].system.points, point, point.scenario, {})
     more = (
         f" ({len(new)} test cases are like this; this one is the fastest)" if len(new) > 1 else ""
     )
     collision = f"collides at {speed:.2f} m/s with its original vehicle{where}"
     return [Difference(f"{collision}, where that of {a} does not collide{more}", False, COLLISION)]
+
+
+def _collisions_of_original(side: Evaluator) -> list[tuple[TestCase, Point, float]]:
+    """The test cases in which a system's original vehicle collides, with point and speed [m/s]."""
+    original = side.characteristics.original[np.newaxis]
+    results = simulate_all_points(side.system, original)
+    return [
+        (case, point, float(-result.evaluations.f_safe[0]))
+        for (_, point, case), result in zip(cases_of(side), results, strict=True)
+        if result.evaluations.collided[0]
+    ]
 
 
 def _ends_of_originals(

@@ -1,0 +1,102 @@
+"""What one of two systems is simulated in and the other is not: test cases, weathers, ranges and
+parameter sets.
+
+A version whose failing tests were deleted looks safer, although nothing shows that it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+from safevar_sumo.questions.counterexamples import OF_ENCOUNTER
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.scope import points_of_tests
+from safevar_sumo.questions.words import join_phrases, number_of
+from safevar_sumo.scenarios import Point
+from safevar_sumo.study import Study, Weather
+
+MAX_PARTS_NAMED = 4
+"""Maximum number of missing parts that a sentence names."""
+OF_VEHICLE = "vehicle."
+"""Prefix of the parameters of a set that belong to the vehicle, which versions of a driving system
+have in common.
+"""
+
+
+class TestCase(NamedTuple):
+    """What vehicles meet at a point, without the name of its test, which versions may change."""
+
+    model: str
+    parameters: dict[str, Any]
+    weather: Weather
+    allowed_impact_speed: float
+
+
+def cases_of(side: Evaluator) -> Iterator[tuple[str, Point, TestCase]]:
+    """The test cases of a system, each with the name of its test and its point."""
+    scenario = side.study.scenario
+    for test, points in points_of_tests(side.study, side.system.points):
+        model = (test and test.model) or scenario.model
+        stated = {**scenario.parameters, **(test.parameters if test else {})}
+        for point in points:
+            driven = {key: value for key, value in point.parameters if key not in OF_ENCOUNTER}
+            parameters = stated | driven
+            case = TestCase(model, parameters, point.weather, point.allowed_impact_speed)
+            yield (test.name if test else model), point, case
+
+
+def missing_parts(side: Evaluator, other: Evaluator) -> list[str]:
+    """What the other system is simulated in and this one is not, as phrases."""
+    parts = [
+        *_missing_cases(side, other),
+        *_missing_ranges(side.study, other.study),
+        *_missing_sets(side.study, other.study),
+    ]
+    return [*dict.fromkeys(parts)]
+
+
+def missing_in_words(title: str, parts: Sequence[str]) -> str:
+    """A sentence such as `earlier lacks the test CCRs and the weather night.`"""
+    shown = [*parts[:MAX_PARTS_NAMED]]
+    if len(parts) > len(shown):
+        shown.append(f"{len(parts) - len(shown)} more")
+    return f"{title} lacks {join_phrases(shown)}."
+
+
+def _missing_cases(side: Evaluator, other: Evaluator) -> Iterator[str]:
+    tests, _, cases = zip(*cases_of(side), strict=True)
+    weathers = {case.weather for case in cases}
+    for test, point, case in cases_of(other):
+        in_weathers = (case._replace(weather=weather) for weather in weathers)
+        if case in cases:
+            continue
+        if case.weather not in weathers and any(same in cases for same in in_weathers):
+            yield f"the weather {case.weather.name}"
+        elif test in tests and point.name:
+            yield f"the test case ({point.name})"
+        else:
+            yield f"the test {test}"
+
+
+def _missing_ranges(study: Study, other: Study) -> Iterator[str]:
+    for name, domain in other.ranges.items():
+        narrower = study.ranges.get(name)
+        if narrower is None or narrower.lower > domain.lower or narrower.upper < domain.upper:
+            yield f"the range of {name} from {domain.lower:g} to {domain.upper:g}"
+
+
+def _missing_sets(study: Study, other: Study) -> Iterator[str]:
+    missing = _sets_of_vehicle(other) - _sets_of_vehicle(study)
+    if missing:
+        yield number_of(len(missing), "parameter set")
+
+
+def _sets_of_vehicle(study: Study) -> set[tuple[tuple[str, float], ...]]:
+    of_vehicle = {
+        name: values for name, values in study.spread.items() if name.startswith(OF_VEHICLE)
+    }
+    return {
+        tuple(zip(of_vehicle, values, strict=True))
+        for values in zip(*of_vehicle.values(), strict=True)
+    }
