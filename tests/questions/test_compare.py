@@ -108,7 +108,13 @@ def test_what_a_version_lacks_is_named_on_its_side_alone(changed: str) -> None:
 
 
 def test_a_sentence_names_four_missing_parts() -> None:
-    assert missing_in_words("B", list("abcdef")) == "B lacks a, b, c, d and 2 more."
+    with (
+        open_evaluator(load_study("wear"), POOL) as a,
+        open_evaluator(load_study("wear", **ONE_TEST), POOL) as b,
+    ):
+        (sentence,) = missing_in_words((a, b), "AB")
+    assert sentence.startswith("B lacks the test case (CPFA, speed 10, wet), ")
+    assert sentence.endswith(", the test CPNA and 2 more.")
 
 
 @SLOW
@@ -203,7 +209,8 @@ VERSIONS = {
     "later": (
         {"ads": {"model": "late:Late"}},
         "do not release",
-        r"but brakes less often without need\. later collides at ([\d.]+) m/s with its original"
+        r"but brakes less often without need\. later lacks 12 parameter sets\. later"
+        r" collides at ([\d.]+) m/s with its original"
         r" vehicle in the test CPFA at 40 km/h, where that of wear does not",
     ),
     "needless": (

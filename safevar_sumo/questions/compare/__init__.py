@@ -20,7 +20,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
-from safevar_sumo.questions.compare.coverage import missing_in_words, missing_parts
+from safevar_sumo.questions.compare.coverage import missing_in_words
 from safevar_sumo.questions.compare.differences import (
     BOTH,
     COLLISION,
@@ -148,7 +148,6 @@ def compare(
     tested = _test(settings, valid)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
     titles = ("A", "B") if study.name == second.study.name else (study.name, second.study.name)
-    table = _table(common, settings)
 
     # What differs: settings, limits, the original vehicles, safety degrees.
     alone = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
@@ -159,13 +158,7 @@ def compare(
         *compare_limits(alone),
         *compare_values(tested.p, tested.a12),
     ]
-    missing = missing_parts(*evaluators), missing_parts(second, evaluator)
-    lacks = [
-        missing_in_words(title, parts)
-        for title, parts in zip(titles, missing, strict=True)
-        if parts
-    ]
-    decided, why = _decide(differences, titles, of_originals, lacks)
+    decided, why = _decide(differences, titles, of_originals, missing_in_words(evaluators, titles))
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
         **decided,
@@ -185,7 +178,12 @@ def compare(
         verdict=" ".join(sentences),
         tested=_test_in_words(tested, titles),
         numbers=numbers,
-        tables={"summary": summary, "limits": alone, "pairs": tested.pairs, "settings": table},
+        tables={
+            "summary": summary,
+            "limits": alone,
+            "pairs": tested.pairs,
+            "settings": _table(common, settings),
+        },
         folded=("settings",),
         failures=(why,) if why.startswith(DO_NOT_RELEASE) else (),
         draw=partial(draw_pairs, titles=titles),

@@ -56,12 +56,17 @@ def missing_parts(side: Evaluator, other: Evaluator) -> list[str]:
     return [*dict.fromkeys(parts)]
 
 
-def missing_in_words(title: str, parts: Sequence[str]) -> str:
-    """A sentence such as `earlier lacks the test CCRs and the weather night.`"""
-    shown = [*parts[:MAX_PARTS_NAMED]]
-    if len(parts) > len(shown):
-        shown.append(f"{len(parts) - len(shown)} more")
-    return f"{title} lacks {join_phrases(shown)}."
+def missing_in_words(sides: tuple[Evaluator, Evaluator], titles: Sequence[str]) -> list[str]:
+    """What each of two systems lacks, as sentences: `earlier lacks the test CCRs.`"""
+    a, b = sides
+    sentences = []
+    for title, parts in zip(titles, (missing_parts(a, b), missing_parts(b, a)), strict=True):
+        shown = parts[:MAX_PARTS_NAMED]
+        if len(parts) > MAX_PARTS_NAMED:
+            shown.append(f"{len(parts) - MAX_PARTS_NAMED} more")
+        if shown:
+            sentences.append(f"{title} lacks {join_phrases(shown)}.")
+    return sentences
 
 
 def _missing_cases(side: Evaluator, other: Evaluator) -> Iterator[str]:
