@@ -197,7 +197,7 @@ def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
     """The number of settings whose simulations take at most `LONGEST`, by the time of a few, or of
     one in a simulator of the user's own; and the time that they take [s].
     """
-    timed = settings[: system.mover.at_once or TIMED]
+    timed = settings[: 1 if system.mover.takes_long else TIMED]
     # The first simulation loads what any does, and ends a driving system that does not end.
     if not system.mover.takes_long:  # which has simulated once
         short = replace(system, time_limit=min(system.time_limit, LONGEST))

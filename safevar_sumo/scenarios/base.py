@@ -6,7 +6,7 @@ import dataclasses
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -14,7 +14,6 @@ from msgspec import Meta
 
 from safevar_sumo.plugins import TRUTH, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Quantity, Trace
-from safevar_sumo.scenarios.mover import SUMO, Mover
 from safevar_sumo.scenarios.roads import Roads, World
 
 VUT = "vut"
@@ -115,6 +114,53 @@ def check_fields(code: UserCode, scenario: Any, **further: Legal) -> None:
     if scenario.test_speed is not None:
         legal["test_speed"] = Legal(0.0, MAX_TEST_SPEED, above=True)
     Returned((legal,)).check(code, "__init__", scenario, ())
+
+
+Part = Literal[
+    "a driving system",
+    "a picture",
+    "a trace",
+    "SUMO",
+    "recorded scenes",
+    "roads",
+    "sumo-gui",
+    "weather",
+]
+"""What a mover may lack, as refusals name it."""
+
+
+class Mover(NamedTuple):
+    """Who moves the vehicles of a scenario.
+
+    Attributes
+    ----------
+    kind
+        What a scenario of it is, in words. All tests of a matrix have one kind.
+    takes_long
+        Whether simulations take so long that questions count them, as it simulates one setting at
+        once; others simulate as many as fit into memory.
+    is_exact
+        Whether it repeats itself to the bit. If not, a study may repeat each setting; without
+        repeats, another process tries whether results are the same.
+    has_own_step
+        Whether it has a time step of its own, which no study states.
+    lacks
+        What it lacks; each with the reason, with which it is refused.
+    """
+
+    kind: str
+    takes_long: bool = False
+    is_exact: bool = True
+    has_own_step: bool = False
+    lacks: Mapping[Part, str] = {}
+
+    def has(self, part: Part) -> bool:
+        """Whether it does not lack a part."""
+        return part not in self.lacks
+
+
+SUMO = Mover("a scenario of SUMO")
+"""SUMO, or a scene that it has played once, or tracks of bodies."""
 
 
 ScenarioMemory = Any

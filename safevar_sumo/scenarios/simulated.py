@@ -12,10 +12,26 @@ import numpy as np
 
 from safevar_sumo.plugins import SHARE, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import FloatArray, NamedValues, Outcome, Trace
-from safevar_sumo.scenarios.base import Scenario
-from safevar_sumo.scenarios.mover import OWN_SIMULATOR, Mover
+from safevar_sumo.scenarios.base import Mover, Scenario
 from safevar_sumo.study import SAFETY_DEGREE
 
+OWN_SIMULATOR = Mover(
+    "a simulator of the user's own",
+    takes_long=True,
+    is_exact=False,
+    has_own_step=True,
+    lacks={
+        "SUMO": "it takes no other engine",
+        "recorded scenes": "its own simulator moves the vehicle",
+        "roads": "it has no road to export",
+        "sumo-gui": "it has no scene for sumo-gui",
+        "a driving system": "nothing of its driving system can be changed here",
+        "a picture": "a picture needs the position in its trace",
+        "a trace": "it states metrics alone",
+        "weather": "it moves and drives the vehicle in a weather of its own",
+    },
+)
+"""A class with `simulate`, which drives one vehicle after another; see `Simulator`."""
 SPEED = Legal(0.0, 1000.0)
 TIME, OUTCOME, IMPACT_SPEED, STRUCK_SPEED = "time", "outcome", "impact_speed", "struck_speed"
 SAMPLED = {TIME: Legal(0.0), "speed": SPEED, "separation": Legal(0.0, infinite=True)}

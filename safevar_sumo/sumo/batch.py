@@ -4,7 +4,7 @@ SUMO.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 
@@ -14,7 +14,6 @@ from safevar_sumo.plugins import user_errors
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point, Scenario, TrackScenario, WorldScenario
-from safevar_sumo.scenarios.mover import OWN_SIMULATOR
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.drive import Listener, drive, last_sample_of
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
@@ -31,13 +30,6 @@ from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traffic import OVERTIME, Traffic
 from safevar_sumo.sumo.traffic_world import TrafficWorld, start_frame
 from safevar_sumo.sumo.world import Api, SumoWorld
-
-OF_MOVERS: Mapping[str, Callable[[System, FloatArray], SimulationRuns]] = {
-    OWN_SIMULATOR.kind: simulate_each
-}
-"""How movers other than SUMO simulate N settings, shape (N, n), at the system's only point, by
-their kind: N runs in the order of the settings, where a repeated setting stands several times.
-"""
 
 
 @np.errstate(all="ignore")
@@ -67,9 +59,9 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
 
 def reason_against_scenes(system: System) -> str:
     """Why recorded scenes do not suffice, so that SUMO, in a copy of the network for each vehicle,
-    or another mover simulates a system; "" if they do.
+    or a simulator of the user's own simulates a system; "" if they do.
     """
-    if reason := system.mover.reason_against("recorded scenes"):
+    if reason := system.mover.lacks.get("recorded scenes"):
         return reason
     if system.in_sumo:
         return "requested"
@@ -90,8 +82,8 @@ def drive_all(
     """Simulate N settings of n characteristics, shape (N, n), at every point.
 
     The result holds the runs at the first point, then the runs at the second point, and so on.
-    Several points must have scenarios of tracks; SUMO and other movers simulate only one point at
-    once. `listen` is called with what the ADS observes at every sample. A study that repeats its
+    Several points must have scenarios of tracks; SUMO and other simulators simulate only one point
+    at once. `listen` is called with what the ADS observes at every sample. A study that repeats its
     settings has all of them once, then all of them again.
 
     Raises
@@ -101,8 +93,8 @@ def drive_all(
     InputError
         If a user's ADS fails, or takes longer than the time limit.
     """
-    if simulate := OF_MOVERS.get(system.mover.kind):
-        return simulate(system, np.tile(settings, (system.repeats, 1)))
+    if system.mover.takes_long:
+        return simulate_each(system, np.tile(settings, (system.repeats, 1)))
     vehicles, encounters = system.split(settings)
     on_road = system.at_encounters(encounters)
     scenario = on_road.points[0].scenario

@@ -123,21 +123,16 @@ def drive_and_score(
     A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a
     matrix, row i holds the result of setting i at its worst point. Where an encounter counts by
     what the original vehicle does in it, row i also holds the safety degree of that, unless
-    `with_originals` is false. If a study skips settings on which user code fails, a batch that
-    fails is halved until these settings are alone.
+    `with_originals` is false.
     """
     # Large batches are cut; beside each setting drives the original in its encounter.
     takes_pairs = with_originals and system.measuring.scoring.safe_original is not None
     size = max(1, batch_size(system) // (system.repeats * (1 + takes_pairs)))
-
-    def in_batches(size: int) -> Evaluations:
+    if len(settings) > size:
         batches = np.split(settings, range(size, len(settings), size))
         return Evaluations.concatenate(
             [drive_and_score(system, batch, with_originals=with_originals) for batch in batches]
         )
-
-    if len(settings) > size:
-        return in_batches(size)
 
     # The original meets the encounter of each variant, too.
     vehicles = settings
@@ -154,8 +149,6 @@ def drive_and_score(
     except UserCodeError as error:
         if not system.skips_failed:
             raise
-        if len(settings) > 1:
-            return in_batches((len(settings) + 1) // 2)
         reason = " ".join(f"{error.source}: {error.problem}".split())
         metrics = system.measuring.measures
         changes = system.characteristics.change_objectives(vehicles)
@@ -208,8 +201,8 @@ def evaluate_matrix(system: System, settings: FloatArray) -> Evaluations:
 
 def settings_per_batch(system: System) -> int:
     """Number of settings in an efficient batch."""
-    if system.mover.at_once:  # the results of a batch are journaled immediately
-        return system.mover.at_once
+    if system.mover.takes_long:  # the results of a batch are journaled immediately
+        return 1
     if reason_against_scenes(system):
         return MAX_COPIES
     if len(
@@ -233,8 +226,8 @@ def batch_size(system: System) -> int:
     """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest
     network.
     """
-    if system.mover.at_once:
-        return system.mover.at_once
+    if system.mover.takes_long:
+        return 1
     if not reason_against_scenes(system):
         return largest_batch(system)
     lanes = max(

@@ -7,7 +7,7 @@ from typing import Any
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios import Point, Scenario
-from safevar_sumo.scenarios.mover import Mover
+from safevar_sumo.scenarios.base import Mover
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 

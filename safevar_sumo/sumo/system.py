@@ -17,8 +17,8 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import VUT, Point, WorldScenario, weather_of
+from safevar_sumo.scenarios.base import Mover, Part
 from safevar_sumo.scenarios.declared import with_ranges
-from safevar_sumo.scenarios.mover import Mover, Part
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import WORST, MetricsTable, Study
 from safevar_sumo.sumo.bodies import SceneWorld
@@ -102,7 +102,7 @@ class System:
         InputError
             About the study.
         """
-        if reason := self.mover.reason_against(part):
+        if reason := self.mover.lacks.get(part):
             problem = f"{question} needs {part}, and scenario.model is {self.mover.kind}: {reason}"
             raise InputError(self.source, problem, "a study with a vehicle and a driving system")
 
