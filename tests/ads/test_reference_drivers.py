@@ -391,18 +391,6 @@ def test_a_leader_who_drives_on_after_gentle_braking_is_a_danger_at_a_ttc_of_two
     assert gaps.min() > 0
 
 
-@pytest.mark.parametrize("speed", range(30, 80, 7))
-def test_below_5_two_conventions_differ(speed: int) -> None:
-    """CCRb: 4 m/s^2 from a headway of 1 s. By the letter nothing is a danger; any braking is one
-    for the other.
-    """
-    letter = CompetentDriver(lets_go=0.0)
-    anyone = CompetentDriver(lets_go=0.0, leader_braking=0.5)
-    assert behind_a_braking_leader(letter, speed / 3.6, 1.0, 4.0) < 0
-    assert behind_a_braking_leader(letter, speed / 3.6, 1.0, 5.0) < 0, "which does not exceed 5"
-    assert behind_a_braking_leader(anyone, speed / 3.6, 1.0, 4.0) > 0
-
-
 @pytest.mark.parametrize("leader_braking", [1.0, 4.0, 9.81])
 def test_r157_avoids_a_braking_leader_from_its_least_time_gap_and_nearer_nothing_is_demanded(
     leader_braking: float,

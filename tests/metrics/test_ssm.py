@@ -1,4 +1,4 @@
-"""TTC, DRAC and PET beside SUMO's SSM device, which measures the same vehicles."""
+"""TTC and DRAC beside SUMO's SSM device, which measures the same vehicles."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from numpy.random import default_rng
 
 from safevar_sumo.metrics import OPTIONAL_METRICS
-from safevar_sumo.records import Encounter, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.records import Encounter, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 from safevar_sumo.sumo.network import program_of_sumo
 from tests.made_up import made_up_runs
@@ -26,8 +26,8 @@ WIDTH = 3.2
 THRESHOLDS = MetricsTable(ttc_threshold=2.0)
 DEVICE = (
     ("has.ssm.device", "true"),
-    ("device.ssm.measures", "TTC DRAC PET"),
-    ("device.ssm.thresholds", "1e4 0 1e4"),
+    ("device.ssm.measures", "TTC DRAC"),
+    ("device.ssm.thresholds", "1e4 0"),
 )
 Rows = dict[str, dict[float, tuple[float, float, float]]]
 
@@ -124,45 +124,3 @@ def test_behind_a_slower_car_ttc_and_drac_are_those_of_the_device(tmp_path: Path
         for name, tag in (("ttc_min", "minTTC"), ("drac", "maxDRAC")):
             of_device = float(conflicts[f"ego{i}foe{i}"].find(tag).attrib["value"])
             assert measured(name, run) == pytest.approx(of_device, rel=2e-3)
-
-
-@pytest.mark.slow
-def test_before_and_behind_who_crosses_pet_is_that_of_the_device(tmp_path: Path) -> None:
-    rng = default_rng(2)
-    traffic = ['<route id="east" edges="wc ce"/><route id="north" edges="sc cn"/>']
-    for i in range(RUNS):
-        own, its = rng.uniform(5, 8.5, 2)  # nobody slows down before the junction
-        offset = rng.choice([-1, 1]) * rng.uniform(3, 6)
-        at_crossing = 60.0 * i + 40
-        traffic.append(vehicle(f"ego{i}", "east", at_crossing - 150 / own, 50, own, ego=True))
-        traffic.append(
-            vehicle(f"foe{i}", "north", at_crossing + offset - 150 / its, 50, its, ego=False)
-        )
-    traffic[1:] = sorted(
-        traffic[1:], key=lambda text: float(text.split('depart="')[1].split('"')[0])
-    )
-    ends = {"c": (0, 0), "w": (-200, 0), "e": (200, 0), "s": (0, -200), "n": (0, 200)}
-    nodes = "".join(f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in ends.items())
-    edges = "".join(
-        f'<edge id="{one}{to}" from="{one}" to="{to}" numLanes="1" speed="50" width="{WIDTH}"/>'
-        for one, to in ("wc", "ce", "sc", "cn")
-    )
-    rows, conflicts = simulate(tmp_path, nodes, edges, traffic)
-    for i in range(RUNS):
-        ego, foe = shared(rows, f"ego{i}", f"foe{i}")
-        gap = (foe[:, 0] - WIDTH / 2 - ego[:, 0])[:, np.newaxis]
-        lateral = (foe[:, 1] - LENGTH / 2 - ego[:, 1])[:, np.newaxis]
-        is_over = (lateral >= (LENGTH + WIDTH) / 2) | (gap <= -WIDTH - LENGTH)
-        run = made_up_runs(
-            STEP,
-            ego[:, [2]],
-            gap,
-            lateral=lateral,
-            lateral_speed=foe[:, [2]],
-            obstacle_width=np.full_like(gap, LENGTH),
-            active=np.logical_not(np.logical_or.accumulate(is_over, axis=0)),
-        )
-        run.outcome[:] = Outcome.PASSED
-        run = replace(run, trace=replace(run.trace, vehicle_width=WIDTH))
-        device = float(conflicts[f"ego{i}foe{i}"].find("PET").attrib["value"])
-        assert measured("pet", run) == pytest.approx(device, abs=STEP)

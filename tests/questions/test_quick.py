@@ -36,14 +36,6 @@ def test_a_rough_tolerance_says_which_limit_fails() -> None:
     assert "Do not release" in answer.verdict
 
 
-@pytest.mark.slow
-def test_a_rough_explanation_has_the_studys_own_parameter_set_alone() -> None:
-    answer = sv.explain("smoke", quick=True)
-    assert answer.verdict.startswith("Rough answer (--quick")
-    assert answer.numbers["rough"]
-    assert answer.tables["causes"]["fits"].isna().all()
-
-
 MANY = """
 extends = "wear"
 name = "many"
@@ -88,14 +80,9 @@ def test_rough_answers_simulate_the_own_parameter_set_alone(
     ask: Callable[..., Any], options: Mapping[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(model_spread, "with_values", lambda *_: pytest.fail("another set"))
-    ask("wear", quick=True, pool=InlinePool(), **options)
-
-
-@pytest.mark.slow
-def test_a_rough_repair_is_proved_with_one_parameter_set_alone() -> None:
-    answer = sv.repair("wear", promise=("treadDepth >= 4",), quick=True)
+    answer = ask("wear", quick=True, pool=InlinePool(), **options)
     assert answer.verdict.startswith("Rough answer (--quick")
-    assert (answer.numbers["rough"], answer.numbers["fits_tried"]) == (True, 1)
+    assert answer.numbers["rough"]
 
 
 @pytest.mark.slow

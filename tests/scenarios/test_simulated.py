@@ -27,7 +27,6 @@ from safevar_sumo.plugins.process import this_process
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.records import Evaluations, differences
 from safevar_sumo.results import manifest_differences
-from safevar_sumo.study import tables_of
 from safevar_sumo.sumo import kept, simulators
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.repeats import joined
@@ -241,8 +240,6 @@ def test_a_struct_that_returns_lists_is_a_simulator_too(wall: Path) -> None:
     assert drive_and_score(system, np.array([[8.0, 0.0]])).f_safe[0] == pytest.approx(18, abs=0.5)
 
 
-ENDS = "lambda r: dict(r, "
-"""The beginning of a result that ends otherwise."""
 KEEPS = """
 from dataclasses import dataclass, field
 from threading import Lock
@@ -361,73 +358,6 @@ def test_workers_have_numbers_which_those_have_that_replace_them(wall: Path) -> 
     assert lines.count("Dies open 1") == lines.count("Dies close 1")
 
 
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        ("lambda r: 3", "a mapping with time, speed, separation, outcome"),
-        ("lambda r: {**r, 'gap_to_lead': 1}", "'gap_to_lead'"),
-        ("lambda r: {**r, 'speed': r['speed'][:-1]}", "speed of shape"),
-        ("lambda r: {**r, 'speed': -r['speed']}", "speed = -15.0"),
-        ("lambda r: {**r, 'separation': r['separation'] * np.nan}", "separation = nan"),
-        ("lambda r: {**r, 'separation': r['separation'] + np.inf}", "separation = inf"),
-        ("lambda r: {**r, 'time': r['time'] ** 2}", "equal steps"),
-        ("lambda r: {**r, 'outcome': 'crash'}", "outcome = 'crash'"),
-        ("lambda r: {**r, 'outcome': 'collision'}", "a collision without impact_speed"),
-        ("lambda r: {k: r[k] for k in r if k != 'separation'}", "a result without separation"),
-        ("lambda r: {'outcome': 'stopped'}", "a result without safety_degree"),
-        ("lambda r: {'outcome': 'stopped', 'safety_degree': -1.0}", "safety_degree = -1.0"),
-        ("lambda r: {'outcome': 'stopped', 'safety_degree': 1.0, 'ttx': 1.0}", "'ttx'"),
-        (f"{ENDS}separation=0 * r['speed'])", "'stopped' with a separation of 0"),
-        (f"{ENDS}speed=r['speed'] * 0 + 9)", "'stopped' at a speed of 9"),
-        (f"{ENDS}outcome='passed', separation=0 * r['speed'])", "'passed' with a separation of 0"),
-        (f"{ENDS}outcome='collision', impact_speed=1.0)", "a collision at a separation of 18"),
-        (
-            f"{ENDS}outcome='collision', impact_speed=36.0, separation=0 * r['speed'])",
-            "impact_speed = 36 after a speed of 0",
-        ),
-        ("lambda r: 1 / 0", "division by zero"),
-        ("lambda r: __import__('time').sleep(9)", "time limit of 0.5 s"),
-    ],
-)
-def test_a_wrong_result_is_refused_with_its_reason(wall: Path, change: str, told: str) -> None:
-    system = wrong_system(wall, change, search={"time_limit": 0.5})
-    with pytest.raises(UserCodeError) as error:
-        drive_and_score(system, np.array([[8.0, 0.0]]))
-    assert told in f"{error.value}"
-
-
-@pytest.mark.parametrize(
-    ("tables", "told"),
-    [
-        ({"ads": {"model": "idm"}}, "ads.model = 'idm'"),
-        ({"weather": "fog"}, "weather = 'fog'"),
-        ({"vehicle": {"model": "worn"}}, "vehicle.model = 'worn'"),
-        ({"step_length": 0.1}, "step_length = 0.1"),
-        ({"spread": {"scenario.parameters.speed": [1.0, 2.0]}}, "spread"),
-        (
-            {"vehicle": {"characteristics": {"mass": {"original": 1, "lower": 1, "upper": 2}}}},
-            "mass",
-        ),
-    ],
-)
-def test_what_a_simulator_does_not_use_is_refused(
-    wall: Path, tables: dict[str, object], told: str
-) -> None:
-    with pytest.raises(InputError) as error:
-        system_of(wall, **tables)
-    assert told in f"{error.value}"
-
-
-def test_a_matrix_has_one_kind_of_scenario(wall: Path) -> None:
-    parameters = {"test": "CCRs", "speed": 40.0, "headway": 4.0}
-    tests = [
-        {"name": "a", "model": "models:Wall"},
-        {"name": "b", "model": "car_to_car", "parameters": parameters},
-    ]
-    with pytest.raises(InputError, match=r"'b.*' is a scenario of SUMO, and scenario.model is a"):
-        system_of(wall, matrix={"tests": tests})
-
-
 def test_runs_have_one_time_step(wall: Path) -> None:
     """In one batch or in several, and in `check`, too."""
     change = "lambda r: {**r, 'time': r['time'] * (1 + (len(r['time']) > 60))}"
@@ -488,16 +418,6 @@ def test_what_a_study_names_and_a_simulator_never_has_is_a_finding_of_check_alon
     run("study", "wall.toml", "--out", "results", "--runs", "1")
 
 
-@pytest.mark.parametrize("key", ["ads", "weather"])
-def test_a_study_without_a_simulator_needs_a_driving_system(key: str) -> None:
-    tables = tables_of(sv.load_study("smoke"))
-    del tables[key], tables["spread"]
-    with pytest.raises(InputError) as error:
-        sv.load_study(tables)
-    assert f"{key} is missing" in f"{error.value}"
-    assert "simulate(setting)" in f"{error.value}"
-
-
 def test_versions_belong_to_the_identity_of_results(wall: Path) -> None:
     study = sv.load_study(str(wall))
     versions = manifest_now(study, assemble(study))["versions"]
@@ -508,18 +428,6 @@ def test_versions_belong_to_the_identity_of_results(wall: Path) -> None:
         manifest_now(study, assemble(study))
 
 
-@pytest.mark.parametrize(
-    ("typed", "told"),
-    [
-        ("repair wall.toml --promise all", "nothing of its driving system"),
-        ("study wall.toml --engine sumo --out results", "no other engine"),
-        ("simulate wall.toml --gui", "no scene for sumo-gui"),
-    ],
-)
-def test_what_needs_sumo_is_refused_in_a_line(wall: Path, typed: str, told: str) -> None:
-    refused(*typed.split(), message=(told,))
-
-
 def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
     run("simulate", "wall.toml", "--set", "decel=4", "--plot", "a.png", "--animate", "a.html")
     assert Path("a.png").stat().st_size
@@ -527,6 +435,7 @@ def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
     wall.write_text(STUDY.replace("models:Wall", "models:Rig"))
     refused("simulate", "wall.toml", "--animate", "b.html", message=("needs the position",))
     refused("simulate", "wall.toml", "--trace", "b.csv", message=("states metrics alone",))
+    refused("study", "wall.toml", "--engine", "sumo", "--out", "r", message=("no other engine",))
 
 
 @pytest.mark.slow
@@ -660,11 +569,6 @@ def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
     assert max(row["alone_high"] or 0 for row in limit if row["characteristic"] == "delay") < 0.05
     run("study", "wall.toml", "--out", "results")
     assert "unsafe_share" in Path("results/solutions.csv").read_text()
-
-
-def test_repeats_are_for_simulators_of_the_users_own() -> None:
-    with pytest.raises(InputError, match="repeats"):
-        sv.load_study("rain", scenario={"repeats": 2})
 
 
 def test_noise_of_one_seed_is_a_remark(wall: Path) -> None:

@@ -14,7 +14,6 @@ from numpy.random import default_rng
 
 from safevar_sumo.api.running import run
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign.runs import algorithm_of
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.questions.research_questions.answer import tables
@@ -113,59 +112,10 @@ def with_pymoo(algorithms: list[str], **search: Any) -> Study:
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "table", "error"),
-    [
-        ("NSGA3", {}, "'NSGA3'\nexpected: 'pymoo:NSGA3'"),
-        ("pymoo:NSAG3", {}, "'pymoo:NSAG3'; did you mean 'pymoo:NSGA3'?"),
-        ("pymoo:NSGA3", {"pymoo:NSAG3": {}}, "did you mean 'pymoo:NSGA3'?"),
-        (
-            "pymoo:NSGA3",
-            {"pymoo:NSGA3": {"ref_dir": 3}},
-            "search.'pymoo:NSGA3'.ref_dir: there is no such key; did you",
-        ),
-        ("pymoo:NSGA3", {"pymoo:NSGA3": {"ref_dirs": 0}}, "a whole number >= 1"),
-        ("pymoo:GA", {"pymoo:GA": {"seed": 1}}, "there is no such key"),
-        (
-            "pymoo:DE",
-            {"pymoo:DE": {"CR": "high"}},
-            "search.'pymoo:DE'.CR = 'high'\nexpected: a number",
-        ),
-        ("pymoo:RNSGA2", {}, "ref_points is missing"),
-    ],
-)
-def test_a_mistake_in_a_study_names_key_and_nearest_name(
-    algorithm: str, table: JsonObject, error: str
-) -> None:
-    study = with_pymoo([algorithm], parameters=table)
-    with pytest.raises(InputError) as refused:
-        algorithm_of(next(iter(study.search.labels)), study)
-    assert error in str(refused.value)
-    assert str(refused.value).count("\n") <= 1
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments", "error"),
-    [
-        ("pymoo:NSGA3", {"pop_size": 5}, "91 reference directions"),
-        ("pymoo:NSGA3", {"ref_dirs": 1000}, "more than 100,000 reference directions"),
-        ("pymoo:NSGA3", {"ref_dirs": [[1.0, 0.0]]}, "2 != 3"),
-        ("pymoo:DE", {"variant": "DE/best"}, "DE/<selection>/<n_diffs>/<crossover>"),
-    ],
-)
-def test_what_pymoo_refuses_is_an_error_of_the_user(
-    name: str, arguments: dict[str, Any], error: str
-) -> None:
-    with pytest.raises(InputError, match=error):
-        next(begun(built(name, **arguments), 1, 130))
-
-
-@pytest.mark.parametrize(
     ("name", "table", "error"),
     [
         ("ES", {"rule": -1.0, "phi": 2.0}, "pymoo:ES: ValueError: negative dimensions"),
         ("NRBO", {"max_iteration": 0}, "pymoo:NRBO: ZeroDivisionError"),
-        ("GA", {"pop_size": 500}, "pymoo:GA: pop_size = 500"),
-        ("GDE3", {"pop_size": 1}, "pymoo:GDE3: ValueError: pop_size = 1 is below 4"),
     ],
 )
 def test_an_option_with_which_pymoo_fails_is_refused_with_its_message(
