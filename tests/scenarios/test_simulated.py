@@ -566,7 +566,7 @@ def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
         low, high = numbers["interval"]
         assert low < share < high
     limit = json_of("tolerance", "wall.toml", "--simulations", "2000")["tables"]["limits"]["rows"]
-    assert max(row["alone_high"] or 0 for row in limit if row["characteristic"] == "delay") < 0.05
+    assert [row["together_high"] for row in limit if row["characteristic"] == "delay"] < [0.05]
     run("study", "wall.toml", "--out", "results")
     assert "unsafe_share" in Path("results/solutions.csv").read_text()
 

@@ -53,6 +53,8 @@ class _Search:
     tried
         Number of random vehicles that were safe in the box since it was cut last. Those before do
         not count: the box was chosen by what they did.
+    names_alone
+        The characteristics of which a value was found that is unsafe alone.
     broken
         A vehicle within the specified limits that is unsafe by what they allow alone, shape (n,);
         None as long as none is known.
@@ -64,6 +66,7 @@ class _Search:
     low: FloatArray = field(init=False)
     high: FloatArray = field(init=False)
     tried: int = 0
+    names_alone: list[str] = field(default_factory=list)
     broken: FloatArray | None = None
 
     def __post_init__(self) -> None:
@@ -101,6 +104,13 @@ class _Search:
         """The share of unsafe vehicles in the box is at most this (`CONFIDENCE`, one-sided)."""
         return float(1 - (1 - CONFIDENCE) ** (1 / self.tried)) if self.tried else 1.0
 
+    @property
+    def without_room(self) -> list[str]:
+        """The characteristics that could not change at all in the box."""
+        names = self.model.characteristics.names
+        is_closed = (self.low == self.high) & ~self.is_fixed
+        return [names[column] for column in self.columns if is_closed[column]]
+
     def are_unsafe(self, settings: FloatArray) -> BoolArray:
         return self.model.are_unsafe(settings, STAGE)
 
@@ -115,6 +125,8 @@ class _Search:
         ]
         settings = np.array(ends).reshape(-1, len(members))
         unsafe = settings[self.are_unsafe(settings)]
+        fails = ((unsafe != members.original) & members.of_vehicle).any(axis=0)
+        self.names_alone = np.array(members.names)[fails].tolist()
         if len(unsafe):
             starts = members.with_original_vehicle(unsafe)
             found = find_boundaries(starts, unsafe, self.are_unsafe, PARTS)
@@ -223,23 +235,20 @@ def answer_roughly(asked: Asked) -> Answer:
     search = _Search(Model(0, evaluator, asked.unsafe), asked.columns, asked.limits)
     seed = evaluator.seed
     search.limit_alone()
-    alone = search.low.copy(), search.high.copy()
     is_tested = search.find(Stream.JOINT_LIMITS.generator(seed))
 
-    # A row for each characteristic; limits alone only where there is one encounter, joint limits
-    # only where vehicles were tried within them.
-    has_encounters = len(members.scenario) > 0
-    together = (search.low, search.high) if is_tested else None
+    # A row for each characteristic; no limits alone, which need a scan, and joint limits only where
+    # vehicles were tried within them, and all have room.
+    together = (search.low, search.high) if is_tested and not search.without_room else None
     rows = []
     for column, item in enumerate(members):
         if column in asked.columns:
             ends = NOWHERE if together is None else tuple(float(one[column]) for one in together)
-            limit = NOWHERE if has_encounters else tuple(float(one[column]) for one in alone)
             specified, kept = NOWHERE, None
             if item.name in asked.limits:
                 specified = search.interval(item)
                 kept = False if search.broken is not None else None
-            known = (item.name, item.unit, item.original, *limit, *ends, *specified, kept)
+            known = (item.name, item.unit, item.original, *NOWHERE, *ends, *specified, kept)
             rows.append((*known, *[None] * (len(LIMITS) - len(known))))
     limits = tabulate(LIMITS_TITLE, LIMITS, rows)
     domains = [(members.lower[column], members.upper[column]) for column in asked.columns]
@@ -248,7 +257,7 @@ def answer_roughly(asked: Asked) -> Answer:
     return Answer(
         question="tolerance",
         study=evaluator.study,
-        verdict=_verdict(search, alone, is_tested),
+        verdict=_verdict(search, is_tested),
         tested=(
             f"{number_of(search.tried, 'random vehicle')} within the limits, with half of their"
             f" values at ends. {bound} of such vehicles are unsafe. {AT_ONE_PHASE}"
@@ -260,18 +269,21 @@ def answer_roughly(asked: Asked) -> Answer:
     )
 
 
-def _verdict(search: _Search, alone: tuple[FloatArray, FloatArray], is_tested: bool) -> str:
+def _verdict(search: _Search, is_tested: bool) -> str:
     """What was found, and which characteristics can make the vehicle unsafe on their own."""
     members = search.model.characteristics
     words = f"None of {search.tried:,} vehicles that were tried within the joint limits is unsafe."
+    if search.without_room:
+        words = (
+            "The simulations found no joint limits of use, because no safe change of"
+            f" {join_phrases(search.without_room)} was found beside the others."
+        )
     if search.broken is not None:
         named = ", ".join(change_texts(members.vehicle, members.named(search.broken)))
         words = f"The specified limits do not hold: a vehicle within them is unsafe ({named})."
     elif not is_tested:
         words = "The simulations did not suffice to try enough vehicles within joint limits."
-    is_closer = (alone[0] > members.lower) | (alone[1] < members.upper)
-    names = [item.name for item, fails in zip(members, is_closer, strict=True) if fails]
-    names = [name for name in names if name in members.vehicle.names]
+    names = search.names_alone
     return f"{words} {join_phrases(names)} can make it unsafe alone." if names else words
 
 
