@@ -4,6 +4,7 @@ once.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -247,11 +248,17 @@ class Simulation:
             impact = (self.metrics[name] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
             return f"has an {impact_in_words(*impact)}"
         if self.outcome is Outcome.COLLISION:
-            return collision_in_words(-safety_degree, self.collision_speed)
-        distance = distance_in_words(safety_degree, self.runs.middles_apart)
+            return collision_in_words(-safety_degree, self.collision_speed, self._digits)
+        distance = distance_in_words(safety_degree, self.runs.middles_apart, self._digits)
         return OUTCOME_VERBS[self.outcome] + (
             "" if np.isnan(safety_degree) else f", with a safety degree of {distance}"
         )
+
+    @property
+    def _digits(self) -> int:
+        """Decimals of a safety degree: 2, or as many more as make both of the pair differ."""
+        difference = np.ptp(self.pair.evaluations.column(SAFETY_DEGREE))
+        return max(2, math.ceil(-math.log10(difference))) if difference > 0 else 2
 
     def to_dict(self) -> JsonObject:
         """Study, setting (vcs: vehicle characteristics), outcome and all numbers as plain

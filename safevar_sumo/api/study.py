@@ -134,8 +134,8 @@ def study(
     up_to
         Only encounters up to this value of an axis, such as speed=40.
     unsafe
-        What the verdict calls unsafe: a collision, a safety degree below X, or a metric such as
-        "drac > 6".
+        What the verdict calls unsafe: a collision, a clearance below X [m], or a metric beyond a
+        limit, such as "drac > 6".
     engine
         What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor
         reacts to the vehicles; some results are verified in SUMO. sumo: always SUMO.
@@ -272,7 +272,7 @@ def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, Rows]
     """
     # The solution with the fewest changes, of which as many as possible are undone.
     members = case.characteristics
-    solutions = case.solutions.drop_duplicates([*members.names])
+    solutions = case.different_solutions
     if solutions.empty:
         return f"The search found no solution: {case.why_no_solution}.", []
     number = int(case.unsafe.rows(solutions).sum())

@@ -91,6 +91,11 @@ class Case:
         solutions = self.solutions[[*self.characteristics.names]].to_numpy(dtype=float)
         return np.concatenate([self.characteristics.original_settings, solutions])
 
+    @property
+    def different_solutions(self) -> pd.DataFrame:
+        """The solutions, of equal ones the first."""
+        return self.solutions.drop_duplicates([*self.characteristics.names])
+
     def simulated_as(self, study: Study, scoring: Scoring, evaluations: Evaluations) -> Case:
         """The case of another form of its study, in which its settings have been simulated
         again.

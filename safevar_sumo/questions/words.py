@@ -27,6 +27,8 @@ OUTCOME_VERBS = {
 
 EXACT = ".15g"
 """How values are printed with which a vehicle was simulated: all their digits."""
+LOST_SHARE = 0.05
+"""A value is printed with all its digits where rounding would change more of it."""
 
 
 def ending_in_words(outcome: str, safety_degree: float | None, contact: float) -> str:
@@ -66,7 +68,11 @@ def change_texts(
         value = values.get(item.name, item.original)
         if value != original:
             share = f" ({100 * (value - original) / abs(original):+.1f} %)" if original else ""
-            text = f"{value:{EXACT}}" if are_printed else item.text(value)
+            rounded = item.text(value)
+            # Over many decades, or next to the original, its decimals would tell another value.
+            error = abs(float(rounded) - value)
+            is_lost = float(rounded) == original or error > LOST_SHARE * abs(value)
+            text = f"{value:{EXACT}}" if are_printed or is_lost else rounded
             texts.append(f"{item.name} {original:g} -> {text}{item.suffix}{share}")
     return texts
 

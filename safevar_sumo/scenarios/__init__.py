@@ -119,12 +119,13 @@ FROM_CENTRES = " from centre to centre"
 """How a safety degree is measured where bodies touch at one above 0."""
 
 
-def distance_in_words(safety_degree: float, contact: float) -> str:
+def distance_in_words(safety_degree: float, contact: float, digits: int = 2) -> str:
     """A safety degree above 0 as text, with the gap where bodies touch at a safety degree of
     `contact` above 0 [m].
     """
-    gap = f"{FROM_CENTRES} (gap {round(safety_degree - contact, 2) + 0.0:.2f} m)" if contact else ""
-    return f"{safety_degree:.2f} m{gap}"
+    gap = f"{round(safety_degree - contact, digits) + 0.0:.{digits}f}"
+    beside = f"{FROM_CENTRES} (gap {gap} m)" if contact else ""
+    return f"{safety_degree:.{digits}f} m{beside}"
 
 
 def pre_crash_sentence(points: Iterable[Point]) -> str:

@@ -89,6 +89,16 @@ def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     assert sv.simulate("rain", {"mass": 2410.0}, filtered=True).setting["mass"] == 2404.0
 
 
+def test_a_safety_degree_has_the_digits_by_which_both_vehicles_differ() -> None:
+    mass = sv.simulate("rain").setting["mass"]
+    for change in (1e-9, 0.1):
+        changed = sv.simulate("rain", {"mass": mass * (1 + change)})
+        texts = [one.verdict.split()[-2] for one in (changed.original, changed)]
+        assert changed.metrics != changed.original.metrics
+        assert len({*texts}) == 2
+        assert (len(texts[0].partition(".")[2]) > 2) is (change < 0.1)
+
+
 def test_evaluate_is_simulate_row_by_row() -> None:
     asked = pd.DataFrame(
         {"tireFric": [1.2, 3.45, 1.2], "mass": [2500.0, 2404.0, 2500.0]}, index=list("abc")

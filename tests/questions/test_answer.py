@@ -332,6 +332,13 @@ def test_a_change_has_no_share_of_an_original_that_is_0() -> None:
     assert texts == ["mass 2404 -> 2644 kg (+10.0 %)", "recognition_delay 0 -> 0.100 s"]
 
 
+def test_a_change_over_decades_or_next_to_the_original_is_no_other_value() -> None:
+    items = CharacteristicSet.of(load_study("sun"))
+    mass = replace(items.members[items.names.index("mass")], original=1e-9, lower=0, upper=0.1)
+    texts = (change_texts([mass], {"mass": value}) for value in (3.2e-6, 0.051, 1.1e-9))
+    assert [text.split(" -> ")[1].split()[0] for [text] in texts] == ["3.2e-06", "0.051", "1.1e-09"]
+
+
 def test_limits_are_rounded_to_the_safe_side() -> None:
     one = CharacteristicSet.of(load_study("wear")).members[0]
     assert one.rounded(2.3178, upwards=True) == 2.32

@@ -55,10 +55,22 @@ def test_joint_limits_of_few_simulations_are_safe_by_the_formula(rig: str) -> No
     delay = limits.loc["delay", "together_high"]
     assert keeps(decel, delay, 0.3)
     assert not keeps(decel - 1.5, delay, 0.3)
-    alone = limits.loc["decel", "alone_low"]
-    assert keeps(alone, 0.0, 0.3)
-    assert not keeps(alone - 0.5, 0.0, 0.3)
+    assert limits[["alone_low", "alone_high"]].isna().all(axis=None), "no line was scanned"
     assert answer.numbers["kept"] is None
+
+
+def test_few_simulations_say_nothing_of_parts_that_were_not_asked_about(rig: str) -> None:
+    answer = sv.tolerance(rig, characteristics=["decel"], simulations=100, pool=InlinePool())
+    assert "decel can make it unsafe alone." in answer.verdict
+    assert "delay" not in answer.verdict
+
+
+def test_few_simulations_state_no_limits_that_leave_a_part_no_room(rig: str) -> None:
+    """The new vehicle keeps just this clearance, so that no delay is safe beside its braking."""
+    unsafe = f"below={CLEARANCE - 15**2 / 2 / 8}"
+    answer = sv.tolerance(rig, unsafe=unsafe, simulations=400, pool=InlinePool())
+    assert "no joint limits of use, because no safe change of delay was found" in answer.verdict
+    assert answer.tables["limits"][["together_low", "together_high"]].isna().all(axis=None)
 
 
 def test_no_joint_limits_are_stated_that_nothing_was_tried_in(rig: str) -> None:
@@ -135,6 +147,15 @@ def test_no_limit_alone_is_stated_that_was_tried_in_one_encounter_only(rig: str)
     answer = sv.tolerance("searched.toml", simulations=800, pool=InlinePool())
     assert answer.tables["limits"][["alone_low", "alone_high"]].isna().all(axis=None)
     assert answer.tables["limits"]["together_low"].notna().all()
+
+
+def test_a_quick_explanation_announces_an_eighth_of_a_whole_one(
+    rig: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sv.explain(rig, quick=True, pool=InlinePool())
+    announced = re.search(r"about ([\d,]+) simulations", capsys.readouterr().err)
+    assert announced
+    assert int(announced[1].replace(",", "")) <= 35_096 / 8
 
 
 def test_more_simulations_than_are_planned_are_a_bound_too() -> None:

@@ -125,7 +125,7 @@ def explain(
         Handle of a solution, such as nsga2:3:0; may be repeated. By default those with
         the fewest and the smallest changes, the most severe one, and one of each distinct cause.
     unsafe
-        What is unsafe: a collision, or a safety degree below X.
+        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
     of_study
         Explain the study of results as if it had none: the smallest changes, and vehicles sampled
         over the domain.
@@ -203,12 +203,13 @@ def _plan(subject: Subject, evaluator: Evaluator, fits: int) -> int:
     points = len(evaluator.system.points)
     if isinstance(subject, Study):
         limit = evaluator.scaled(max(STUDY_LIMIT, OF_SAMPLE * points))
-        planned = planned_over_sets(subject, TO_EXPLAIN, SAMPLED_SETTINGS, fits)
-        planned[COMBINATIONS] = MAX_SETTINGS
+        planned = planned_over_sets(subject, TO_EXPLAIN, evaluator.scaled(SAMPLED_SETTINGS), fits)
+        planned[COMBINATIONS] = evaluator.scaled(MAX_SETTINGS)
     else:
         limit = evaluator.scaled(LIMIT)
         planned = {TO_EXPLAIN: float(len(subject.solutions))}
-    evaluator.begin({**planned, SUBSETS: limit / points, **LATER}, least=LEAST_SETTINGS)
+    later = {name: evaluator.scaled(number) for name, number in LATER.items()}
+    evaluator.begin({**planned, SUBSETS: limit / points, **later}, least=LEAST_SETTINGS)
     return limit
 
 

@@ -232,8 +232,9 @@ def _verdict(case: Case) -> str:
         return f"{case.name} has no solution: {case.why_no_solution}."
 
     # Collisions, and solutions that are less safe than the original.
-    collisions = are_collisions(case.solutions).sum()
-    text = f"{case.name}: {collisions} of {len(case.solutions)} solutions collide"
+    solutions = case.different_solutions
+    collisions = are_collisions(solutions).sum()
+    text = f"{case.name}: {collisions} of {number_of(len(solutions), 'different solution')} collide"
     try:
         critical = len(changes.critical_solutions(case))
     except UnanswerableError:
