@@ -21,7 +21,6 @@ from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import WHOLE, Study, keys_with, user_code, without_skipping
 from safevar_sumo.sumo.empty_road import Reason, find_problems, sentence_on
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.measuring import own_criterion
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.traci_controller import substitute_traci
 
@@ -106,7 +105,7 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
         expected = "a drive to the encounter, without braking for nobody"
         return [Finding("reaction", words, where, "", expected)]
 
-    unsafe = own_criterion(study)
+    unsafe = system.with_contact(system.criterion)
     original = drive_and_score(system, system.characteristics.original_settings)
     if not unsafe.of(original)[0]:
         return []

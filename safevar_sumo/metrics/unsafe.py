@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 CRITERIA = (
-    "collision, below=X with a safety degree X [m, or minus a collision's closing speed in m/s], or"
-    ' a metric with <, <=, > or >= and a number, such as "drac > 6"'
+    "collision, below=X with a clearance X [m] of at least 0, or a metric with <, <=, > or >= and a"
+    ' number, such as "drac > 6"'
 )
 COMPARISONS: Mapping[str, Callable[[Quantity, float], Quantity]] = {
     "<": operator.lt,
@@ -73,8 +73,9 @@ class MetricBound(NamedTuple):
 @dataclass(frozen=True)
 class Unsafe:
     """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with
-    `below`, a safety degree below this limit [m, or -m/s]; with a `bound`, a metric of the study
-    beyond a limit, or a collision.
+    `below`, a collision, or a clearance below this limit [m]; with a `degree`, a safety degree of
+    the study below this limit [m, or -m/s]; with a `bound`, another metric beyond a limit, or a
+    collision.
 
     `contact` is the safety degree at which bodies touch [m]: 0, or how far middles are apart then.
     """
@@ -83,13 +84,16 @@ class Unsafe:
     keep: float = 0.0
     contact: float = 0.0
     bound: MetricBound | None = None
+    degree: float | None = None
     is_half: bool = field(default=False, compare=False, repr=False)
-    """Whether `below` is half of the original's safety degree, the default if nothing collides."""
+    """Whether `degree` is half of the original's safety degree, the default if nothing collides."""
 
     def __str__(self) -> str:
         if self.bound is not None:
             return str(self.bound)
-        return "collision" if self.below is None else f"below={self.below!r}"
+        if self.degree is not None:
+            return f"{SAFETY_DEGREE} < {self.degree!r}"
+        return COLLISION if self.below is None else f"below={self.below!r}"
 
     @property
     def measure(self) -> str:
@@ -99,7 +103,21 @@ class Unsafe:
     @property
     def is_collision(self) -> bool:
         """Whether a collision alone, or less distance than `keep`, is unsafe."""
-        return self.below is None and self.bound is None
+        return self.below is None and self.degree is None and self.bound is None
+
+    @property
+    def distance(self) -> float:
+        """The clearance below which a vehicle is unsafe [m], between bumpers; 0 if a collision
+        alone is.
+        """
+        return self.keep if self.below is None else self.below
+
+    @property
+    def limit(self) -> float:
+        """What is limited: a safety degree, or the value of a metric."""
+        if self.bound is not None:
+            return self.bound.limit
+        return self.contact + self.distance if self.degree is None else self.degree
 
     @property
     def is_of_impacts(self) -> bool:
@@ -130,12 +148,12 @@ class Unsafe:
         """
         if self.bound is not None:
             return f"{self.bound}{'' if self._stands_alone else ', or a collision'}"
-        if self.below is None:
+        if self.degree is None:
             where = ", from bumper to bumper" if self.contact else ""
-            clearance = f"collision, or clearance below {self.keep:g} m{where}"
-            return clearance if self.keep else "collision"
+            clearance = f"collision, or clearance below {self.distance:g} m{where}"
+            return clearance if self.distance else COLLISION
         share = ", half of the original's" if self.is_half else ""
-        return f"safety degree below {self.below:.3g} {'m' if self.below >= 0 else 'm/s'}{share}"
+        return f"safety degree below {_degree_in_words(self.degree)}{share}"
 
     @property
     def verbs(self) -> tuple[str, str]:
@@ -177,7 +195,9 @@ class Unsafe:
         """What an unsafe vehicle does: `collides`, `has drac > 6`."""
         if self.bound is not None:
             return f"has {self.bound}"
-        return "collides" if self.below is None else f"has a safety degree below {self.below:.3g}"
+        if self.below is not None:
+            return f"keeps less than {self.below:.3g} m of clearance"
+        return "collides" if self.degree is None else f"has a safety degree below {self.degree:.3g}"
 
     def of(self, evaluations: Evaluations) -> BoolArray:
         """Which evaluations are unsafe; shape (M,). An undefined measure is not, a collision is by
@@ -204,16 +224,14 @@ class Unsafe:
         return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
 
     def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
-        if self.below is not None:
-            return column(F_SAFE.name) < self.below
+        if self.degree is not None:
+            return column(F_SAFE.name) < self.degree
         collides = outcome == COLLISION
         if self.bound is not None:
             name, comparison, limit = self.bound
             is_beyond = COMPARISONS[comparison](column(name), limit)
             return is_beyond if self._stands_alone else collides | is_beyond
-        return (
-            collides | (column(F_SAFE.name) < self.contact + self.keep) if self.keep else collides
-        )
+        return collides | (column(F_SAFE.name) < self.limit) if self.distance else collides
 
     def robustness(self, evaluations: Evaluations) -> FloatArray:
         """How far evaluations are from the limit, in its unit, shape (M,): below 0 where they are
@@ -226,10 +244,9 @@ class Unsafe:
 
     def _robustness(self, evaluations: Evaluations) -> FloatArray:
         if self.bound is None:
-            limit = self.contact + self.keep if self.below is None else self.below
-            robustness = evaluations.f_safe - limit
+            robustness = evaluations.f_safe - self.limit
         else:
-            difference = evaluations.column(self.bound.measure) - self.bound.limit
+            difference = evaluations.column(self.bound.measure) - self.limit
             robustness = -difference if self.bound.worst_is_largest else difference
             if not self._stands_alone:
                 robustness = np.where(evaluations.collided, evaluations.f_safe, robustness)
@@ -241,18 +258,17 @@ class Unsafe:
         """What has a robustness: a distance between bumpers [m], or the value that is
         limited.
         """
-        if self.bound is not None:
-            sign = -1 if self.bound.worst_is_largest else 1
-            return self.bound.limit + sign * robustness
-        return robustness + (self.keep if self.below is None else self.below)
+        sign = -1 if self.bound is not None and self.bound.worst_is_largest else 1
+        is_distance = self.bound is None and self.degree is None
+        return (self.distance if is_distance else self.limit) + sign * robustness
 
     def value_in_words(self, value: float) -> str:
         """What a safe vehicle has: `keeps 0.31 m of clearance`, `has drac 5.9`."""
-        return (
-            f"keeps {value:.2f} m of clearance"
-            if self.bound is None
-            else f"has {self.bound.measure} {value:.3g}"
-        )
+        if self.bound is not None:
+            return f"has {self.bound.measure} {value:.3g}"
+        if self.degree is not None:
+            return f"has a safety degree of {_degree_in_words(value)}"
+        return f"keeps {value:.2f} m of clearance"
 
     def breach_in_words(self, vehicle: Evaluations) -> str:
         """What a single unsafe vehicle does, with its value: `has drac 6.77 > 5.3`, `collides at
@@ -274,16 +290,16 @@ class Unsafe:
                 return (
                     f"has {measure} {_on_its_side(value, limit, 'g', 3)} {comparison} {limit:.12g}"
                 )
-        if self.below is not None and (degree >= 0 or self.below < 0):
+        if self.degree is not None and (degree >= 0 or self.degree < 0):
             unit = "m" if degree >= 0 else "m/s"
-            text = _on_its_side(degree, self.below, "g", 3)
-            return f"has a safety degree of {text} {unit}, below {self.below:.3g} {unit}"
+            text = _on_its_side(degree, self.degree, "g", 3)
+            return f"has a safety degree of {text} {unit}, below {self.degree:.3g} {unit}"
 
         # Otherwise a collision, or a distance that is too small.
         if vehicle.collided[0]:
             return f"collides at {abs(degree):.2f} m/s"
-        left = _on_its_side(degree - self.contact, self.keep, "f", 2)
-        return f"keeps {left} m of clearance, less than {self.keep:g} m"
+        left = _on_its_side(degree - self.contact, self.distance, "f", 2)
+        return f"keeps {left} m of clearance, less than {self.distance:g} m"
 
     @classmethod
     def parse(cls, criterion: CriterionLike) -> Unsafe:
@@ -316,7 +332,12 @@ class Unsafe:
 
         # A safety degree, or any metric of the study.
         if math.isfinite(limit):
-            if (quantity, comparison) in (("below", "="), (SAFETY_DEGREE, "<")):
+            if (quantity, comparison) == (SAFETY_DEGREE, "<"):
+                return cls(degree=limit)
+            if (quantity, comparison) == ("below", "="):
+                if limit < 0:
+                    legal = f'a clearance of at least 0 m, or "{cls(degree=limit)}"'
+                    raise InputError("unsafe", f"below={limit:g} is no clearance", legal)
                 return cls(below=limit)
             if comparison in COMPARISONS:
                 return cls(bound=MetricBound(quantity, comparison, limit))
@@ -339,7 +360,8 @@ class Unsafe:
         safety_degree = original.get(SAFETY_DEGREE) or 0.0
         if (outcomes == COLLISION).any() or not safety_degree > 0:
             return cls()
-        return cls(float(f"{DEGREE_SHARE * safety_degree:.{LIMIT_DIGITS}g}"), is_half=True)
+        half = float(f"{DEGREE_SHARE * safety_degree:.{LIMIT_DIGITS}g}")
+        return cls(degree=half, is_half=True)
 
     @classmethod
     def default_among(cls, evaluations: Evaluations, original: Evaluations) -> Unsafe:
@@ -384,6 +406,11 @@ def impact_in_words(speed: float, excess: float) -> str:
     return f"impact at {KMH_PER_MS * speed:.3g} km/h where {words} allowed"
 
 
+def _degree_in_words(degree: float) -> str:
+    """A safety degree with its unit, which is minus a speed on a collision."""
+    return f"{degree:.3g} {'m' if degree >= 0 else 'm/s'}"
+
+
 def _on_its_side(value: float, limit: float, kind: str, digits: int) -> str:
     """A value with so many digits, or as few more as keep it on its side of a limit."""
     texts = (f"{value:.{number}{kind}}" for number in range(digits, 17))
@@ -399,6 +426,6 @@ def margin_of(study: Study, margin: float | None) -> float:
 
 
 CriterionLike = Unsafe | float | str
-"""Values of an argument `unsafe`: `Unsafe`, a number X for a safety degree below X, "collision",
+"""Values of an argument `unsafe`: `Unsafe`, a number X for a clearance below X, "collision",
 "below=X" or a metric beyond a limit such as "drac > 6".
 """

@@ -57,9 +57,9 @@ QUESTIONS = {
 
 
 Criterion = Annotated[Unsafe | None, CRITERION]
-"""What is unsafe: a collision, a safety degree below X [m], or a metric of the study with <, <=, >
-or >= and a number; by default a collision if any evaluated setting collides, else half of the
-original's safety degree.
+"""What is unsafe: a collision, a clearance below X between bumpers [m], or a metric of the study
+with <, <=, > or >= and a number; by default a collision if any evaluated setting collides, else a
+safety degree below half of the original's.
 """
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""

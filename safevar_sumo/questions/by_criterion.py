@@ -75,19 +75,21 @@ def cases_by(
     progress: Progress,
     cluster: str | None = None,
 ) -> list[Case]:
-    """Results by a criterion; as they are without one.
+    """Results by a criterion; as they are without one, but for a clearance that their study states.
 
     Raises
     ------
     InputError
         If it is not one of a study.
     """
-    if unsafe is None:
-        return [*cases]
     found = []
     for case in cases:
+        own = unsafe or case.unsafe
+        if unsafe is None and own.below is None:
+            found.append(case)
+            continue
         with open_evaluator(case.study, None, jobs, progress, cluster) as evaluator:
-            found.append(case_by(case, evaluator.checked(unsafe), evaluator))
+            found.append(case_by(case, own, evaluator))
     return found
 
 
@@ -96,9 +98,9 @@ def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:
     of a matrix, all solutions are simulated again.
     """
     study = study_by(case.study, unsafe)
+    evaluator = evaluator.for_study(study, verified=0)
+    case = replace(case, stated=evaluator.checked(unsafe))
     if study == case.study:
-        return replace(case, stated=unsafe)
-    evaluations = evaluator.for_study(study, verified=0).evaluate(case.settings, STAGE)
-    return replace(
-        case.simulated_as(study, assemble(study).measuring.scoring, evaluations), stated=unsafe
-    )
+        return case
+    evaluations = evaluator.evaluate(case.settings, STAGE)
+    return case.simulated_as(study, evaluator.system.measuring.scoring, evaluations)

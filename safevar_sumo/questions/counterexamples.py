@@ -248,8 +248,8 @@ def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree
         impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
         impact = "" if impact_speed < 1 else f" at {float(f'{impact_speed:.2g}'):g} km/h"
         return f"the car hits {scenario.obstacle()}{impact}"
-    measured = FROM_CENTRES if unsafe.contact and unsafe.below else ""
+    measured = FROM_CENTRES if unsafe.contact and unsafe.degree else ""
     return (
-        f"the car keeps less than {unsafe.below or unsafe.keep:.3g} m{measured} from"
+        f"the car keeps less than {unsafe.degree or unsafe.distance:.3g} m{measured} from"
         f" {scenario.obstacle()}"
     )

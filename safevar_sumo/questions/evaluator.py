@@ -404,12 +404,12 @@ class Evaluator:
             self.check_measured(unsafe.bound.measure)
 
     def checked(self, unsafe: Unsafe) -> Unsafe:
-        """A criterion; raises an InputError if nobody is on the road, from whom it is a
-        distance.
+        """A criterion between the bodies of the study; raises an InputError if nobody is on the
+        road, from whom it is a distance.
         """
         if unsafe.measure == F_SAFE.name:
             self.check_measured()
-        return unsafe
+        return self.system.with_contact(unsafe)
 
     def check_measured(self, measure: str = F_SAFE.name) -> None:
         """Refuse what is measured in an encounter, as a distance, where nobody else is on the

@@ -98,7 +98,7 @@ def _lengths_of_step(model: Model, settings: FloatArray) -> FloatArray:
     [m], shape (M,); infinite where the limit is of no distance.
     """
     unsafe = model.unsafe
-    if not (unsafe.is_collision or (unsafe.below is not None and unsafe.below >= 0)):
+    if unsafe.bound is not None or unsafe.limit < 0:
         return np.full(len(settings), np.inf)
     system = model.evaluator.system
     values = system.characteristics.scenario.columns(system.split(settings)[1])

@@ -98,7 +98,7 @@ def risk(
     confidence
         Confidence of the intervals.
     unsafe
-        What is unsafe: a collision, or a safety degree below X.
+        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
     """
     # Vehicles as the study says that they vary.
     study = evaluator.study

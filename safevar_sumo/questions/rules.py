@@ -96,7 +96,7 @@ def rules(
         Number of vehicles, sampled as [variation] says, without it uniformly over the domain; one
         half yields the rules, the other half tests them.
     unsafe
-        What is unsafe: a collision, or a safety degree below X.
+        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
     """
     study = evaluator.study
     characteristics = evaluator.characteristics

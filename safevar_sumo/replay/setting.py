@@ -12,9 +12,8 @@ from safevar_sumo.questions.words import EXACT, change_texts, join_phrases, poin
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import SolutionId
 from safevar_sumo.scenarios import pre_crash_sentence
-from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE, Study
+from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE
 from safevar_sumo.sumo.matrix import PointResult, point_record, simulate_all_points, vehicle_remarks
-from safevar_sumo.sumo.measuring import own_criterion
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.without_effect import without_effect
 from safevar_sumo.vehicles import CharacteristicSet
@@ -78,14 +77,14 @@ def _meets(system: System, setting: FloatArray) -> list[str]:
     return sentences
 
 
-def _fails(study: Study, result: PointResult) -> bool:
+def _fails(system: System, result: PointResult) -> bool:
     """Whether the first setting fails at a point: by the study's own criterion, or by a contact
     that is faster than the point allows.
     """
-    criterion = own_criterion(study)
+    criterion = system.with_contact(system.criterion)
     bound = criterion.bound
     evaluations = result.evaluations
-    if bound is not None and bound.measure in evaluations.metrics:
+    if not criterion.is_collision and (bound is None or bound.measure in evaluations.metrics):
         return bool(criterion.of(evaluations)[0])
     is_allowed = result.runs.relative_speed[0] <= result.point.allowed_impact_speed
     return bool(evaluations.collided[0] and not is_allowed)
@@ -126,7 +125,7 @@ def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId
     # The verdict; of a matrix with the points at which it fails.
     verdict = [simulation.no_verdict, *_verdict(simulation, len(system.matrix))]
     if system.matrix:
-        tables["points"], failing = _points(study, system, setting)
+        tables["points"], failing = _points(system, setting)
         is_changed = simulation.setting != simulation.original.setting
         who = "changed" if is_changed else "original"
         verdict.append(points_in_words(f"The {who} vehicle", failing, len(system.matrix)))
@@ -147,7 +146,7 @@ def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId
     )
 
 
-def _points(study: Study, system: System, setting: FloatArray) -> tuple[pd.DataFrame, list[str]]:
+def _points(system: System, setting: FloatArray) -> tuple[pd.DataFrame, list[str]]:
     """The table of the points of a matrix, of which the worst ones lead, and the points at which a
     setting fails.
     """
@@ -156,7 +155,7 @@ def _points(study: Study, system: System, setting: FloatArray) -> tuple[pd.DataF
     points = [{**row, **row.get("contact", {})} for row in records]  # side and place are columns
     table = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
     table.attrs["lead_rows"] = np.argsort(table[SAFETY_DEGREE], kind="stable").tolist()
-    return table, [one.point.name for one in results if _fails(study, one)]
+    return table, [one.point.name for one in results if _fails(system, one)]
 
 
 def _without_repetition(frame: pd.DataFrame, simulation: Simulation) -> pd.DataFrame:

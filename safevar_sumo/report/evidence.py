@@ -104,8 +104,8 @@ def evidence(
         Ask this question instead of the usual ones, with its options, such as "risk --samples
         4000"; may be repeated.
     unsafe
-        What is unsafe, in all answers and on the page: a collision, a safety degree below X, or a
-        metric such as "drac > 6".
+        What is unsafe, in all answers and on the page: a collision, a clearance below X [m], or a
+        metric beyond a limit, such as "drac > 6".
     jobs
         Number of worker processes, by default one for each core.
     cluster

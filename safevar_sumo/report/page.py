@@ -87,8 +87,8 @@ def report(
         Ask this question instead of the usual ones, with its options, such as "risk --samples
         4000"; may be repeated. The verdict of the first question leads the page.
     unsafe
-        What is unsafe, on the whole page: a collision, a safety degree below X, or a metric such as
-        "drac > 6".
+        What is unsafe, on the whole page: a collision, a clearance below X [m], or a metric beyond
+        a limit, such as "drac > 6".
     point
         Only this point of the study's matrix.
     jobs

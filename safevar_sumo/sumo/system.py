@@ -141,6 +141,10 @@ class System:
             scene, _ = scenario.observe(world, world.step_length, world.begin(scenario))
             return (world.vehicle_length(VUT) + float(scene.obstacle_length)) / 2
 
+    def with_contact(self, unsafe: Unsafe) -> Unsafe:
+        """A criterion with the safety degree at which bodies touch, if it is a clearance."""
+        return unsafe if unsafe.below is None else replace(unsafe, contact=self.contact)
+
     def split(self, settings: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Of N settings, shape (N, n), the vehicles, shape (N, k), and the encounters that they
         meet: values of the n - k parameters that the study searches.

@@ -169,10 +169,13 @@ def test_who_collides_is_unsafe_by_every_measure_of_a_run() -> None:
         ("drac > 6", [False, True, True, True, False]),
         ("drac < 6", [True, False, True, True, False]),
         ("below=1.5", [True, False, True, True, True]),
+        ("below=0", [False, False, True, True, False]),
+        ("safety_degree < 1.5", [True, False, True, True, True]),
+        ("safety_degree < -2", [False, False, True, False, False]),
     ):
         criterion = Unsafe.parse(text)
         assert criterion.of(runs).tolist() == expected, text
-        assert "collision" in criterion.description or "drac" not in text
+        assert "collision" in criterion.description or "safety_degree" in text
         assert (criterion.robustness(runs) < 0).tolist() == expected, text
 
 
@@ -288,10 +291,17 @@ def test_each_vehicle_counts_for_itself_to_the_bit_and_says_if_on_a_collision(na
             2.2999,
             "keeps 0.2999 m of clearance, less than 0.3 m",
         ),
-        (Unsafe(below=1.4), Outcome.STOPPED, 0.8, "has a safety degree of 0.8 m, below 1.4 m"),
-        (Unsafe(below=1.4), Outcome.COLLISION, -2.0, "collides at 2.00 m/s"),
+        (Unsafe(degree=1.4), Outcome.STOPPED, 0.8, "has a safety degree of 0.8 m, below 1.4 m"),
+        (Unsafe(degree=1.4), Outcome.COLLISION, -2.0, "collides at 2.00 m/s"),
+        (Unsafe(below=1.4), Outcome.STOPPED, 0.8, "keeps 0.80 m of clearance, less than 1.4 m"),
         (
-            Unsafe(below=-1.4),
+            Unsafe(below=0.3, contact=2.0),
+            Outcome.PASSED,
+            2.2999,
+            "keeps 0.2999 m of clearance, less than 0.3 m",
+        ),
+        (
+            Unsafe(degree=-1.4),
             Outcome.COLLISION,
             -2.0,
             "has a safety degree of -2 m/s, below -1.4 m/s",

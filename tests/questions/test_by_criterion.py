@@ -9,6 +9,7 @@ import re
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import safevar_sumo as sv
@@ -17,7 +18,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.by_criterion import STAGE, study_by
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import Evaluations, FloatArray
-from tests.in_process import json_of, run, searched
+from tests.in_process import InlinePool, json_of, run, searched
 from tests.made_up import HARDEST_BRAKING
 
 SLOW = pytest.mark.slow
@@ -45,7 +46,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, coarse: None) -> Pat
 
 
 @pytest.mark.parametrize(
-    "text", ["collision", "below=0.3", "drac > 6", "ttc_min <= 1.25", "hardest >= 9"]
+    "text",
+    ["collision", "below=0.3", "safety_degree < 4.75", "safety_degree < -1.5", "hardest >= 9"],
 )
 def test_the_text_of_a_criterion_is_the_criterion(text: str) -> None:
     assert str(Unsafe.parse(text)) == text
@@ -156,3 +158,28 @@ def test_an_undefined_measure_is_counted(folder: Path) -> None:
     )
     undefined, simulated = (int(text.replace(",", "")) for text in counts)
     assert 0 < undefined < simulated, "some of all collide"
+
+
+def test_a_clearance_is_between_bumpers_where_the_degree_is_between_middles() -> None:
+    """A vehicle that brakes by 4.7 m/s^2 stops 4.75 m between middles before one as long as
+    itself: nothing of the results but the criterion is between bumpers.
+    """
+    evaluator = Evaluator(load_study("native"), InlinePool(), verified=0)
+    weak = evaluator.characteristics.setting({"decel": 4.7})
+    runs = evaluator.evaluate(weak[np.newaxis], "weak brakes")
+    below = evaluator.checked(Unsafe.parse("below=0.5"))
+    clearance = runs.gaps(evaluator.system.contact)[0]
+    assert 0 < clearance < 0.3 < 0.5 < runs.f_safe[0]
+    assert below.of(runs)[0]
+    assert below.robustness(runs)[0] == pytest.approx(clearance - 0.5)
+    assert below.value(below.robustness(runs)[0]) == pytest.approx(clearance)
+    assert evaluator.checked(Unsafe.parse("safety_degree < 0.5")).of(runs).tolist() == [False]
+
+
+@SLOW
+def test_a_stated_clearance_breaks_a_limit_as_the_margin_does() -> None:
+    asked = {"limits": ("decel >= 4.7",), "characteristics": ("decel",), "quick": True}
+    for criterion in ({"unsafe": "below=0.3"}, {"margin": 0.3}):
+        answer = sv.tolerance("native", **asked, **criterion)
+        assert answer.verdict.partition("Do not release: ")[2].startswith("decel 4.7 m/s^2: ")
+        assert "less than 0.3 m from a standing vehicle" in answer.verdict

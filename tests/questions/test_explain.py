@@ -411,7 +411,7 @@ def test_of_an_unsafe_original_no_change_is_a_cause(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(failures, "SAMPLED_SETTINGS", 4)
     study = load_study("smoke")
     answer = explain.compute(
-        study, Evaluator(study, InlinePool(), verified=0), unsafe=Unsafe(below=99), fits=0, top=1
+        study, Evaluator(study, InlinePool(), verified=0), unsafe=Unsafe(degree=99), fits=0, top=1
     )
     degree = f"{answer.numbers['original_degree']:.3g}"
     said = (

@@ -327,13 +327,14 @@ def test_the_margin_is_added_to_a_collision_alone() -> None:
     assert ends(unsafe="collision") == ("collision", 0, 9.0), "as it stands"
     assert ends(unsafe="collision", margin=5) == ("collision", 5, 8.0)
     assert ends(unsafe="below=4.5") == ("below=4.5", 0, 8.5)
+    assert ends(unsafe="safety_degree < 4.5") == ("safety_degree < 4.5", 0, 8.5)
     with pytest.raises(InputError, match=r"5 m beside 'below=4\.5'"):
         ends(unsafe="below=4.5", margin=5)
 
 
 def test_an_unsafe_original_keeps_no_limit_and_says_what_it_has() -> None:
     for limits in ((), ("a <= 6",)):
-        answer = answer_of(2, nowhere, unsafe="below=8.5", limits=limits)
+        answer = answer_of(2, nowhere, unsafe="safety_degree < 8.5", limits=limits)
         refusal = (
             "he original vehicle itself has a safety degree of 8 m, below 8.5 m: no limit can be"
             " kept"

@@ -110,7 +110,7 @@ def test_half_of_the_originals_is_said_by_every_question(
         ("tolerance", "results", "--quick", *FEW),
     ):
         answer = json_of(*typed)
-        assert answer["numbers"]["unsafe"].startswith("below="), typed
+        assert answer["numbers"]["unsafe"].startswith("safety_degree < "), typed
         assert "half of the original's" in answer["verdict"], typed
         assert "--unsafe collision counts collisions alone." in answer["verdict"], typed
 

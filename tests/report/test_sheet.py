@@ -189,13 +189,14 @@ def test_limits_that_do_not_hold_have_no_line_to_sign_and_say_so(
 
 def test_limits_by_a_criterion_relative_to_the_original_are_not_signed() -> None:
     """The default where nothing collides is a share of the original's safety degree."""
-    screening = answer_of(unsafe="below=1.4")
-    sheet = sheet_with(screening, unsafe="below=1.4")
+    half = "safety_degree < 1.4"
+    screening = answer_of(unsafe=half)
+    sheet = sheet_with(screening, unsafe=half)
     assert "Do not use this sheet: its limits are for screening." in sheet
     assert "with the option --unsafe collision" in sheet
     assert "signature" not in sheet
     # A user's own limit, for the whole page or this question, is a decision.
-    own = sheet_with(screening, unsafe="below=1.4", stated=Unsafe(below=1.4))
+    own = sheet_with(screening, unsafe=half, stated=Unsafe.parse(half))
     for signed in (own, sheet_with(screening)):
         assert "screening" not in signed
         assert "Name and signature" in signed

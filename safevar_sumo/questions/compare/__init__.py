@@ -125,7 +125,7 @@ def compare(
         Clearance that every vehicle must keep [m], as in `tolerance`; by default the larger one of
         the two studies.
     unsafe
-        What is unsafe: a collision, or a safety degree below X.
+        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
     at_tests
         Limits that hold at the points of the study's tests alone, as in `tolerance`.
     """

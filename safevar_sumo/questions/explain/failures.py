@@ -121,7 +121,9 @@ def gather_failures(
 
     # All are simulated here, and judged by one criterion.
     evaluations = evaluator.evaluate(settings, TO_EXPLAIN)
-    unsafe = criterion or Unsafe.default_among(evaluations, original)
+    unsafe = (
+        evaluator.checked(criterion) if criterion else Unsafe.default_among(evaluations, original)
+    )
     is_other = (evaluations.outcome != recorded) & (recorded != UNKNOWN)
 
     # Settings without a valid encounter do not count.

@@ -98,7 +98,7 @@ def permit(
         Clearance that every car must keep with the study's own parameter set [m], as in
         `tolerance`.
     unsafe
-        What is unsafe: a collision, a safety degree below X, or a metric beyond a limit.
+        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
     fits
         Number of parameter sets of the vehicle model, by default all; 0 for the study's own alone.
     quick

@@ -250,10 +250,11 @@ class PermitAnswer:
         """What a safe car does, with the study's own parameter set and with the others."""
         own = self.models.own.unsafe
         others = len(self.models.members) - 1
-        if not own.is_collision:
+        if own.below is None and not own.is_collision:
             return f"not {own.description}, in {number_of(others + 1, 'parameter set')}"
         if not own.keep:
-            return f"no contact, in {number_of(others + 1, 'parameter set')}"
+            clearance = f" and {own.below:g} m of clearance" if own.below else ""
+            return f"no contact{clearance}, in {number_of(others + 1, 'parameter set')}"
         rest = f", and no contact with {number_of(others, 'other')}" if others else ""
         return (
             f"no contact and {own.keep:g} m of clearance with the study's own parameter set{rest}"

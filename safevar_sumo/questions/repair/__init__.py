@@ -93,8 +93,8 @@ def repair(
         Clearance that every vehicle must keep [m], between bumpers; by default the model's error
         that the study states, else 0.3 m.
     unsafe
-        What is unsafe instead: a collision, a safety degree below X, or a metric such as "drac >
-        6".
+        What is unsafe instead: a collision, a clearance below X [m], or a metric beyond a limit,
+        such as "drac > 6".
     change
         Parameter of the driving system that may change; may be repeated. By default those under
         [repair], else those that come with a shipped driving system.
@@ -125,7 +125,9 @@ def repair(
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
     budget = budget_of(evaluator)
-    evaluator.begin({ROUNDS_STAGE: USUAL_ROUNDS * budget})
+    # Less than usual is no rough answer: a change that was not attacked is no repair.
+    usual = USUAL_ROUNDS * budget
+    evaluator.begin({ROUNDS_STAGE: usual}, least=usual)
     models = models_of(evaluator, unsafe_today, fits, with_unsafe_originals=True)
     problems = [
         RepairProblem(
@@ -172,7 +174,7 @@ def _first_vehicles(problem: RepairProblem, subject: Subject) -> FloatArray:
     rows = np.unique(np.concatenate(settings), axis=0)
     rows = rows[problem.holds(rows)]
     if not len(rows):
-        kept = "is safe" if problem.unsafe.bound else f"keeps {problem.unsafe.keep:g} m"
+        kept = f"keeps {problem.unsafe.keep:g} m" if problem.unsafe.keep else "is safe"
         study = problem.study
         text = f"{study.name!r}: the new vehicle {kept} in none of the tested encounters"
         raise InputError(study.source, text, "a smaller --margin, or narrower ranges of the axes")

@@ -75,7 +75,7 @@ def tolerance(
         bumpers; by default the model's error that the study states, else 0.3 m, and 0.1 m where
         encounters are ranges, whose originals keep more.
     unsafe
-        What is unsafe: a collision, or a safety degree below X.
+        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
     fits
         Number of parameter sets of the vehicle model (those of [spread]) in which the limits hold,
         by default all; 0 for the study's own alone.
