@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
+from safevar_sumo.ads.reaction import ANY_BRAKING
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.questions.preventability import ANY
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
 from safevar_sumo.sumo.matrix import drive_worst, simulate_all_points
@@ -155,7 +155,7 @@ def test_the_original_avoids_all_encounters_and_the_regulations_driver_all_but_t
     too_fast = {"cut_out, speed 60, wet", "cut_out, speed 80, wet"}
     for ads, failures in (
         ({"model": "aeb"}, set()),
-        ({"model": "competent_driver", "parameters": ANY}, too_fast),
+        ({"model": "competent_driver", "parameters": {"leader_braking": ANY_BRAKING}}, too_fast),
     ):
         system = assemble(load_study("alks", ads=ads))
         results = simulate_all_points(system, original_of(system))

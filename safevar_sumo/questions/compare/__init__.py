@@ -166,6 +166,7 @@ def compare(
         **of_originals,
     }
     summary = summary_of(numbers, tested.pairs, titles)
+    table = _table(common, settings)
     sentences = [
         *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
         why,
@@ -178,12 +179,7 @@ def compare(
         verdict=" ".join(sentences),
         tested=_test_in_words(tested, titles),
         numbers=numbers,
-        tables={
-            "summary": summary,
-            "limits": alone,
-            "pairs": tested.pairs,
-            "settings": _table(common, settings),
-        },
+        tables={"summary": summary, "limits": alone, "pairs": tested.pairs, "settings": table},
         folded=("settings",),
         failures=(why,) if why.startswith(DO_NOT_RELEASE) else (),
         draw=partial(draw_pairs, titles=titles),
