@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import inspect
 import math
-import operator
 import os
 import re
 import sys
@@ -22,6 +21,7 @@ from click.shell_completion import CompletionItem
 from rich.console import Console
 
 from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.metrics.unsafe import COMPARISONS
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.ask import COMMON_OPTIONS
@@ -57,7 +57,6 @@ ENDED_OPTIONS = {
     "study --shard": "sv.run(study, only=...), or --cluster",
 }
 """Options that commands had, and what stands in their place."""
-OPERATORS = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")
 
 
@@ -366,5 +365,5 @@ def _fulfilments(answer: Answer, key: str, sign: str, limit: float) -> Iterator[
     for value, row in zip(values, rows, strict=True):
         if isinstance(value, bool) or not isinstance(value, int | float | None):
             raise InputError("fail_if", f"{key} is no number", "the key of a number of the answer")
-        if value is not None and OPERATORS[sign](value, limit):
+        if value is not None and COMPARISONS[sign](value, limit):
             yield f"{key} = {value:g} {sign} {limit:g}{row}"

@@ -183,7 +183,8 @@ class SimulationRuns:
 
         Infinite while the distance does not shrink, outside the encounter, and once the vehicle has
         stopped after moving. The distance is that of the published data (method section 4): it also
-        shrinks by the speed of who crosses the path. `metrics.conflicts` is along the path alone.
+        shrinks by the speed of who crosses the path. `conflict` of `metrics/measures.py` is along
+        the path alone.
         """
         _, distance, closing_speed, _ = self.encounter
         is_counted = self.is_approach & (closing_speed > 0) & (distance >= 0)

@@ -71,17 +71,17 @@ def sumo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         yield libsumo
 
 
-def sumo_accelerations(sumo: Any, model: str, net_of: float) -> np.ndarray:
+def sumo_accelerations(sumo: Any, model: str) -> np.ndarray:
     """Acceleration by SUMO's model in every state [m/s^2]."""
     speeds = [
-        sumo.vehicle.getFollowSpeed(model, v, gap - net_of, u, 4.5)
+        sumo.vehicle.getFollowSpeed(model, v, gap - 2.5, u, 4.5)
         for gap, v, u in zip(GAPS, SPEEDS, LEADERS, strict=True)
     ]
     return (np.array(speeds) - SPEEDS) / STEP
 
 
 def test_idm_is_sumos(sumo: Any) -> None:
-    expected = sumo_accelerations(sumo, "IDM", 2.5)
+    expected = sumo_accelerations(sumo, "IDM")
     accelerations = Idm().acceleration_at(GAPS, SPEEDS, LEADERS)
     stops = SPEEDS + accelerations * STEP <= 0  # nobody drives backwards
     assert accelerations[~stops] == pytest.approx(expected[~stops], abs=1e-6)
@@ -90,7 +90,7 @@ def test_idm_is_sumos(sumo: Any) -> None:
 
 
 def test_acc_is_sumos(sumo: Any) -> None:
-    expected = sumo_accelerations(sumo, "ACC", 2.5)
+    expected = sumo_accelerations(sumo, "ACC")
     accelerations = Acc().acceleration_at(GAPS, SPEEDS, LEADERS)
     compared = (SPEEDS + accelerations * STEP > 0) & (np.abs(expected - accelerations) < 1e-6)
     braked = (

@@ -29,18 +29,16 @@ IMPACTS = "impact_speed", "impact_excess"
 STOPS = "stopping_distance", "stop_from_pedal", "mfdd"
 
 
-def braking_run(
-    speed: float, deceleration: float, gap: float, collision_speed: float = np.nan
-) -> SimulationRuns:
-    """One vehicle that brakes from `speed` at once and stands in the end."""
+def braking_run(collision_speed: float = np.nan) -> SimulationRuns:
+    """One vehicle that brakes at once from 10 m/s with 5 m/s^2, 12 m ahead of an obstacle."""
     time = np.arange(0, 10, STEP)[:, np.newaxis]
-    moving = np.minimum(time, speed / deceleration)
-    way = speed * moving - deceleration * moving**2 / 2
-    v = np.where(time < speed / deceleration, speed - deceleration * moving, 0.0)
-    return made_up_runs(STEP, v, gap - way, collision_speed, position=way, brake=np.ones_like(v))
+    moving = np.minimum(time, 2.0)
+    way = 10 * moving - 5 * moving**2 / 2
+    v = np.where(time < 2.0, 10 - 5 * moving, 0.0)
+    return made_up_runs(STEP, v, 12 - way, collision_speed, position=way, brake=np.ones_like(v))
 
 
-RUN = braking_run(10, 5, 12)
+RUN = braking_run()
 
 
 def meeting(**encounter: FloatArray) -> SimulationRuns:
@@ -53,7 +51,7 @@ def driving(**trace: FloatArray) -> SimulationRuns:
     return dataclasses.replace(RUN, trace=dataclasses.replace(RUN.trace, **trace))
 
 
-HIT = braking_run(10, 5, 12, collision_speed=3.5)
+HIT = braking_run(collision_speed=3.5)
 FIRST_SECOND = RUN.trace.time[:, np.newaxis] < 1.0
 COARSE = MetricsTable(ttc_threshold=2.0, sampling_interval=0.2)
 
@@ -262,12 +260,9 @@ def test_a_margin_is_the_safety_degree_above_the_limit() -> None:
 SAMPLED = 0.05
 
 
-def of_speeds(
-    name: str, speed: FloatArray, until: float = np.inf, collision_speed: float = np.nan
-) -> FloatArray:
+def of_speeds(name: str, speed: FloatArray, collision_speed: float = np.nan) -> FloatArray:
     v = speed.reshape(len(speed), -1)
-    active = np.broadcast_to((np.arange(len(v)) * SAMPLED <= until)[:, np.newaxis], v.shape)
-    runs = made_up_runs(SAMPLED, v, 0.0, collision_speed, active=active)
+    runs = made_up_runs(SAMPLED, v, 0.0, collision_speed, active=np.ones(v.shape, dtype=bool))
     return OPTIONAL_METRICS[name].function(runs, THRESHOLDS)
 
 

@@ -60,9 +60,9 @@ def driven(
     )
 
 
-def at_contact(run: SimulationRuns, values: FloatArray, vehicle: int = 0) -> float:
+def at_contact(run: SimulationRuns, values: FloatArray) -> float:
     """The value when the bumper reaches the obstacle, interpolated linearly between two samples."""
-    gap = run.trace.gap[:, vehicle]
+    gap = run.trace.gap[:, 0]
     after = int(np.argmax(gap <= 1e-9))
     share = gap[after - 1] / (gap[after - 1] - gap[after])
     return float(values[after - 1] + share * (values[after] - values[after - 1]))

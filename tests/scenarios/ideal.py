@@ -91,11 +91,10 @@ def point_mass(
     other: Callable[..., Any],
     rule: Callable[..., Any],
     beside: Any = 0.0,
-    reaction: float = 0.75,
     released: float = 0.0,
 ) -> Mass:
     """A driver's rule, integrated in fine steps. He keeps his speed until he sees a danger,
-    releases the accelerator for the reaction time, and then never speeds up again: his deceleration
+    releases the accelerator for 0.75 s, and then never speeds up again: his deceleration
     rises at 12.65 m/s^3 to that of the rule.
 
     `rule` says from time, both speeds, gap and own acceleration whether there is a danger, and how
@@ -111,7 +110,7 @@ def point_mass(
         danger = np.where(is_dangerous, np.minimum(danger, time), danger)
         before = np.where(time >= danger, np.minimum(np.maximum(braking, released), hardest), 0.0)
         rising = np.minimum(before + 12.65 * step, hardest)
-        braking = np.where(time >= danger + reaction, rising, before)
+        braking = np.where(time >= danger + 0.75, rising, before)
         acceleration = -(before + braking) / 2
         after = np.maximum(v + acceleration * step, 0.0)
         then = gap + (other(time) + other(time + step) - v - after) / 2 * step

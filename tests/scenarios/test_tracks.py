@@ -39,14 +39,12 @@ class Cast(TrackScenario):
         return [one(times) for one in self.cast]
 
 
-def standing(x: float, y: float = 0.0, name: str = "car") -> Any:
-    return lambda times: Track.of(name, "car", x, y)
+def standing(x: float) -> Any:
+    return lambda times: Track.of("standing", "car", x, 0.0)
 
 
-def moving(
-    name: str, x: float, y: float, vx: float, vy: float, kind: str = "car", size: Any = None
-) -> Any:
-    return lambda times: Track.of(name, kind, x + vx * times, y + vy * times, vx, vy, size)
+def moving(name: str, x: float, y: float, vx: float, vy: float, kind: str = "car") -> Any:
+    return lambda times: Track.of(name, kind, x + vx * times, y + vy * times, vx, vy)
 
 
 def held(*cast: Any, **parameters: Any) -> SimulationRuns:
@@ -94,7 +92,7 @@ def test_a_driver_watches_his_corridor_up_to_the_bodys_side(kind: str, middle: f
 
 def test_what_stands_before_another_body_hides_it_until_it_leaves() -> None:
     """A leader at 60 m moves aside and shows a standing car at 110 m."""
-    run = held(moving("leader", 60.0, 0.0, 0.01, 1.75), standing(110.0, name="standing"))
+    run = held(moving("leader", 60.0, 0.0, 0.01, 1.75), standing(110.0))
     gap = run.trace.gap[:, 0]
     shown = int(np.argmax(np.abs(np.diff(gap)) > 10)) + 1
     lateral = 1.75 * run.trace.time[shown]

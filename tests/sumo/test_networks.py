@@ -142,8 +142,8 @@ def rewritten(file: Path, old: str, new: str) -> None:
     file.write_text(text.replace(old, new))
 
 
-def on(study: str, network: Path) -> System:
-    return assemble(load_study(study, scenario={"parameters": {"network": str(network)}}))
+def on(network: Path) -> System:
+    return assemble(load_study("smoke", scenario={"parameters": {"network": str(network)}}))
 
 
 def roads(network: Path, n: int = 1) -> ElementTree.Element:
@@ -172,21 +172,22 @@ def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
 
 
 def test_a_built_network_without_sources_gives_the_same_results(mine: Path) -> None:
-    settings = np.vstack([original := load_original("smoke"), original * 1.01])
-    expected = drive_worst(on("smoke", mine), settings).trace.gap
+    settings = np.vstack(
+        [
+            original := assemble(load_study("smoke")).characteristics.original_settings,
+            original * 1.01,
+        ]
+    )
+    expected = drive_worst(on(mine), settings).trace.gap
     for name in ("network.nod.xml", "network.edg.xml", "network.con.xml", "network.netccfg"):
         (mine / name).unlink()
-    assert np.array_equal(drive_worst(on("smoke", mine), settings).trace.gap, expected)
+    assert np.array_equal(drive_worst(on(mine), settings).trace.gap, expected)
     (mine / "network.net.xml").rename(mine / "town.net.xml")
     for network in (mine, mine / "town.net.xml"):
-        assert np.array_equal(drive_worst(on("smoke", network), settings).trace.gap, expected)
+        assert np.array_equal(drive_worst(on(network), settings).trace.gap, expected)
     shutil.copy(mine / "town.net.xml", mine / "village.net.xml")
     with pytest.raises(InputError, match=r"has town\.net\.xml and village\.net\.xml"):
-        on("smoke", mine)
-
-
-def load_original(study: str) -> np.ndarray:
-    return assemble(load_study(study)).characteristics.original_settings
+        on(mine)
 
 
 def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:

@@ -93,13 +93,13 @@ anybody asks.
 NO_DELAYS = {"characteristics": NO_DELAY, "parameters": {"tyre_friction": 3.0}}
 
 
-def bare_sumo(traffic: Path, step: Callable[[Any, str], None], n: int = 161) -> np.ndarray:
-    """Speed and gap at n samples, where SUMO alone drives."""
+def bare_sumo(traffic: Path, step: Callable[[Any, str], None]) -> np.ndarray:
+    """Speed and gap at 161 samples, where SUMO alone drives."""
     rows = []
     with open_world(
         CopiedNetwork(NET / "network.net.xml", traffic, NET / "scenario.sumocfg"), 0
     ) as world:
-        for _ in range(n):
+        for _ in range(161):
             world.api.simulationStep()
             rows.append(
                 (world.api.vehicle.getSpeed("vut"), 80.3 - world.api.vehicle.getPosition("vut")[0])

@@ -100,13 +100,13 @@ def original(model: str, n: int = 1) -> FloatArray:
     return np.repeat(SYSTEMS[model].characteristics.original_settings, n, axis=0)
 
 
-def ends(model: str, name: str, points: int = 5) -> FloatArray:
-    """`points` settings of the original vehicle with one characteristic spread over its domain."""
+def ends(model: str, name: str) -> FloatArray:
+    """Five settings of the original vehicle with one characteristic spread over its domain."""
     characteristics = SYSTEMS[model].characteristics
-    settings = original(model, points)
+    settings = original(model, 5)
     column = characteristics.names.index(name)
     settings[:, column] = np.linspace(
-        characteristics.lower[column], characteristics.upper[column], points
+        characteristics.lower[column], characteristics.upper[column], 5
     )
     return settings
 
@@ -130,7 +130,5 @@ def coasting_after(start: float) -> Pedals:
     return lambda time: (1.0, 0.0) if time < start else (0.0, 0.0)
 
 
-def braking_after(start: float, coasting: float = 0.0) -> Pedals:
-    return lambda time: (
-        (1.0, 0.0) if time < start else (0.0, 1.0 if time >= start + coasting else 0.0)
-    )
+def braking_after(start: float) -> Pedals:
+    return lambda time: (1.0, 0.0) if time < start else (0.0, 1.0)

@@ -45,9 +45,9 @@ def prepared(model: str, **changes: float) -> Any:
     return SYSTEMS[model].vehicle.prepare(values, 1.0, STEP)
 
 
-def step(model: str, state: Any, throttle: float = 0.0, brake: float = 0.0) -> Any:
+def step(model: str, state: Any, throttle: float = 0.0) -> Any:
     return SYSTEMS[model].vehicle.advance(
-        prepared(model), state, Command(np.full(1, throttle), np.full(1, brake))
+        prepared(model), state, Command(np.full(1, throttle), np.zeros(1))
     )
 
 

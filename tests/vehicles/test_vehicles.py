@@ -108,10 +108,10 @@ def stopping_distance(
     ).distance[-1]
 
 
-def coasting_loss(start: float, duration: float) -> Callable[..., FloatArray]:
+def coasting_loss(duration: float) -> Callable[..., FloatArray]:
     def measured(model: str, population: FloatArray) -> FloatArray:
-        run = drive(model, population, coasting_after(start), start + duration + 0.5)
-        before = run.speed[run.at(start + 0.5)]
+        run = drive(model, population, coasting_after(3), duration + 3.5)
+        before = run.speed[run.at(3.5)]
         return (before - run.speed[-1]) / before
 
     return measured
@@ -125,14 +125,14 @@ ACTS = {
     "carla": {
         "max_rpm": (speed_at(30), +1),
         "dampRateFullT": (speed_at(1), -1),
-        "dampRateZeroT_CE": (coasting_loss(3, 2), +1),
+        "dampRateZeroT_CE": (coasting_loss(2), +1),
         "dampRateZeroT_CD": (speed_at(0.8, half_throttle), -1),
         "gearSwitchTime": (speed_at(0.8), -1),
         "clutchStrength": (speed_at(0.65), +1),
         "mass": (speed_at(3), -1),
         "dragCoeff": (speed_at(1.5), -1),
         "tireFric": (stopping_distance(1.0), -1),
-        "dampRate": (coasting_loss(3, 2), +1),
+        "dampRate": (coasting_loss(2), +1),
         "radius": (stopping_distance(1.0), +1),
         "maxBrakeTorque": (stopping_distance(1.0), -1),
     },
@@ -145,8 +145,8 @@ ACTS = {
         "maxBrakeTorque": (stopping_distance(0.2), -1),
         "maxMotorTorque": (speed_at(3), +1),
         "maxSteeringAngle": (lateral_error, -1),
-        "tireDragCoeff": (coasting_loss(3, 5), +1),
-        "wheelDamping": (coasting_loss(3, 5), +1),
+        "tireDragCoeff": (coasting_loss(5), +1),
+        "wheelDamping": (coasting_loss(5), +1),
         "shiftTime": (speed_at(5), +1),
         "tractionControlSlipLimit": (speed_at(6, road=0.1), -1),
     },
