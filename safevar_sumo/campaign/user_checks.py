@@ -74,7 +74,7 @@ def repeat_elsewhere(study: Study, pool: Pool) -> None:
         If a result differs.
     """
     system = system_of(study)
-    rows = np.concatenate([system.characteristics.original_settings, random_settings(study, 2)])
+    rows = np.concatenate([system.characteristics.original_settings, random_settings(study)])
     backwards = Selection(points=tuple(range(len(system.points)))[::-1])
     jobs = [(Task(study=study), rows), (Task(study=study, selection=backwards), rows)]
     if pool.workers > 1:  # the second one has simulated nothing yet
@@ -89,8 +89,8 @@ def repeat_elsewhere(study: Study, pool: Pool) -> None:
         raise UserCodeError(study.source, f"{problem}{REPRODUCED_BY}{command}", SAME_ELSEWHERE)
 
 
-def random_settings(study: Study, count: int) -> FloatArray:
-    """Feasible settings of a study, drawn uniformly, shape (count, n)."""
+def random_settings(study: Study) -> FloatArray:
+    """Two feasible settings of a study, drawn uniformly, shape (2, n)."""
     region = region_of(study)
     characteristics = region.characteristics
     rng = np.random.default_rng(study.search.seed)
@@ -100,7 +100,7 @@ def random_settings(study: Study, count: int) -> FloatArray:
             characteristics.lower, characteristics.upper, (count, len(characteristics))
         )
 
-    return np.resize(region.draw_feasible(draw, count), (count, len(characteristics)))
+    return np.resize(region.draw_feasible(draw, 2), (2, len(characteristics)))
 
 
 def find_in_new_process(study: Study) -> list[Finding]:

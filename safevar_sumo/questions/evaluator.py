@@ -313,7 +313,7 @@ class Evaluator:
             self.characteristics.with_original_vehicle(drawn), "encounters of the original"
         )
 
-    def feasible_settings(self, number: int, seed: int = 0) -> FloatArray:
+    def feasible_settings(self, number: int) -> FloatArray:
         """`number` settings that cover the feasible part of the domain evenly."""
         drawn = 0
 
@@ -321,7 +321,7 @@ class Evaluator:
             """The next `count` settings of the Sobol sequence."""
             nonlocal drawn
             drawn += count
-            return sobol_settings(self.characteristics, drawn, seed)[-count:]
+            return sobol_settings(self.characteristics, drawn)[-count:]
 
         return self.region.draw_feasible(draw_next, number)
 

@@ -53,11 +53,11 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     return points[:number]
 
 
-def sobol_settings(characteristics: CharacteristicSet, number: int, seed: int = 0) -> FloatArray:
+def sobol_settings(characteristics: CharacteristicSet, number: int) -> FloatArray:
     """`number` settings that cover the whole domain evenly, shape (number, n), feasible or not."""
     lower = characteristics.lower
     upper = characteristics.upper
-    return lower + sobol_points(number, len(characteristics), seed) * (upper - lower)
+    return lower + sobol_points(number, len(characteristics), 0) * (upper - lower)
 
 
 def clopper_pearson(count: float, total: float, confidence: float = CONFIDENCE) -> Interval:

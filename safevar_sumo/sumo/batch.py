@@ -23,8 +23,7 @@ from safevar_sumo.sumo.network import copied_network, networks_for
 from safevar_sumo.sumo.perception import Observer, SceneObserver
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
-from safevar_sumo.sumo.repeats import joined
-from safevar_sumo.sumo.simulators import simulate_each
+from safevar_sumo.sumo.simulators import joined, simulate_each
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traffic import OVERTIME, Traffic

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 import portalocker
 
 from safevar_sumo.errors import UserCodeError
-from safevar_sumo.metrics import OPTIONAL_METRICS, UNSAFE_SHARE
+from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, UNSAFE_SHARE, Unsafe
 from safevar_sumo.output import ALONE
 from safevar_sumo.plugins import UserCode, user_errors
 from safevar_sumo.plugins.process import (
@@ -32,6 +33,7 @@ from safevar_sumo.records import (
     NO_CONTACT,
     QUANTITIES,
     Encounter,
+    Evaluations,
     FloatArray,
     Outcome,
     SimulationRuns,
@@ -44,6 +46,16 @@ from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.kept import KEPT
 from safevar_sumo.sumo.system import System
 
+SEVERITY = [
+    Outcome.COLLISION,
+    Outcome.INVALID_TEST,
+    Outcome.TIMEOUT,
+    Outcome.NEVER_MOVED,
+    Outcome.PASSED,
+    Outcome.STOPPED,
+]
+"""Outcomes of the rounds of a setting, the worst first."""
+COLLISION = Unsafe()
 _steps = WeakKeyDictionary[type, dict[str, float]]()
 """The time step of each class, as this process has loaded it, at each point [s]."""
 
@@ -272,4 +284,47 @@ def _runs_of(
         allowed_impact_speed=np.array(allowed_impact_speed),
         lacks={name: np.array([name not in trace for trace in traces]) for name in QUANTITIES},
         stated=stated,
+    )
+
+
+def joined(evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION) -> Evaluations:
+    """Of N settings that were simulated in several rounds, in their order, the worst outcome, the
+    safety degree and the collision speed of the worst run, the share of runs that are unsafe by the
+    study's own criterion, and the mean of each other metric over the runs that define it. Metrics
+    by which a run is unsafe are kept of each round, too.
+    """
+    n = len(evaluations) // repeats
+    columns = np.arange(n)
+
+    def mean(values: FloatArray) -> FloatArray:
+        rounds = values.reshape(repeats, n)
+        number = np.count_nonzero(~np.isnan(rounds), axis=0)
+        total = np.add.reduce(np.nan_to_num(rounds, nan=0.0), axis=0)
+        return np.where(number, total / np.maximum(number, 1), np.nan)
+
+    # The worst run.
+    outcomes = evaluations.outcome.reshape(repeats, n)
+    rank = {str(name): number for number, name in enumerate(SEVERITY)}
+    severity = np.reshape([rank[name] for name in evaluations.outcome.tolist()], (repeats, n))
+    degrees = evaluations.f_safe.reshape(repeats, n)
+    worst = np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)
+    metrics = {name: mean(values) for name, values in evaluations.metrics.items()}
+    metrics[SAFETY_DEGREE] = degrees[worst, columns]
+
+    # The share of unsafe runs.
+    is_of_shares = criterion.measure == UNSAFE_SHARE.name
+    is_unsafe = (COLLISION if is_of_shares else criterion).of(evaluations)
+    metrics[UNSAFE_SHARE.name] = mean(is_unsafe.astype(float))
+    means_alone = {*METRICS, UNSAFE_SHARE.name} - {SAFETY_DEGREE}
+    rounds = {
+        f"{name}_{k + 1}": values
+        for name in evaluations.metrics
+        if name not in means_alone
+        for k, values in enumerate(evaluations.metrics[name].reshape(repeats, n))
+    }
+    return replace(
+        evaluations.take(columns),
+        outcome=outcomes[np.argmin(severity, axis=0), columns],
+        collision_speed=evaluations.collision_speed.reshape(repeats, n)[worst, columns],
+        metrics={**metrics, **rounds},
     )

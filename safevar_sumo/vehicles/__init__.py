@@ -12,6 +12,7 @@ from safevar_sumo.records import Command, FloatArray, Nominal, PedalTables
 from safevar_sumo.vehicles.base import (
     LEVEL as LEVEL,
     Sensors as Sensors,
+    SimulatedVehicle as SimulatedVehicle,
     Slope as Slope,
     SumoType as SumoType,
     Vehicle as Vehicle,
@@ -26,7 +27,6 @@ from safevar_sumo.vehicles.characteristics import (
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.region import FeasibleRegion as FeasibleRegion, region_of as region_of
 from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle
-from safevar_sumo.vehicles.simulated import SimulatedVehicle as SimulatedVehicle
 
 VEHICLES: Mapping[str, type[Any]] = {
     "carla": Carla,

@@ -253,6 +253,24 @@ class Vehicle:
         """The state one simulation step later."""
 
 
+class SimulatedVehicle(Vehicle):
+    """A vehicle that a simulator of the user's own moves and drives: here it has characteristics,
+    in their `units`; those that are `optional` may be missing, or be 0 in the original.
+    """
+
+    def __init__(self, units: Mapping[str, str], optional: tuple[str, ...]) -> None:
+        self.UNITS = units
+        self.OPTIONAL = optional  # type: ignore[misc]
+
+    def prepare(self, characteristics: Characteristics, *others: object) -> Characteristics:
+        return characteristics
+
+    def sumo_type(self, prepared: Characteristics) -> SumoType:
+        """Undefined: no vehicle of SUMO's stands for it."""
+        undefined = np.full(1, np.nan)
+        return SumoType(undefined, undefined, undefined, undefined, undefined)
+
+
 def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
     """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist
     of states, and a delayed signal, the only part with a method `where`, has a way of its own.

@@ -29,7 +29,7 @@ from safevar_sumo.records import Evaluations, differences
 from safevar_sumo.results import manifest_differences
 from safevar_sumo.sumo import kept, simulators
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
-from safevar_sumo.sumo.repeats import joined
+from safevar_sumo.sumo.simulators import joined
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.without_effect import without_effect
 from tests.in_process import InlinePool, json_of, refused, run
