@@ -140,7 +140,8 @@ def read_fleet(
         raise InputError(cells.place, "no car", "at least one car")
     # An answer beside the list that it is about, which may have had semicolons and decimal commas.
     written = {*answer_columns} - {CAR}
-    if is_answer := written <= {text.strip() for text in cells.header}:
+    is_answer = bool(written) and written <= {text.strip() for text in cells.header}
+    if is_answer:
         cells = cells._replace(separator=",;")
         ignore, answer_columns = [*ignore, *written], ()
 
