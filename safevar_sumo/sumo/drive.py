@@ -91,14 +91,15 @@ def drive(
             collisions = contacts.count(world, motion.hits, scene)
             if isinstance(observer, SceneObserver):  # bodies on tracks touch wherever they overlap
                 contacts.check(observer.world, scene, outcomes.is_open & ~scene.over, time)
-            ends = may_go_on & outcomes.is_open & (sample == last_sample)
-            if isinstance(observer, Traffic) and ends.any():
-                may_go_on &= ~_go_on(observer, motion, ends, last_sample)
+            if isinstance(observer, Traffic):  # a scene ends by its time
+                ends = may_go_on & outcomes.is_open & (sample == last_sample)
+                if ends.any():
+                    may_go_on &= ~_go_on(observer, motion, ends, last_sample)
             active = outcomes.note_sample(speed, scene.over, collisions, last=sample >= last_sample)
 
             # What the driving systems see, and what they command.
-            pedals = {"throttle": state.throttle, "brake": state.brake}
-            observation = perception.observe(time, speed, scene)._replace(**pedals)
+            observation = perception.observe(time, speed, scene)
+            observation = observation._replace(throttle=state.throttle, brake=state.brake)
             observation, state = vehicle.sense(prepared, state, observation)
             if listen is not None:
                 listen(observation)
