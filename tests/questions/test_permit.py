@@ -309,7 +309,8 @@ def test_one_car_is_told_which_assumed_value_lowers_its_speed_most(short: Study)
         if item.name not in stated
     }
     each = permit(short, cars=cars, **options)
-    up_to = each.table().set_index("car")["up_to"]
+    # A car that is unsafe at the lowest speed, 34 km/h, may drive up to none.
+    up_to = each.table().set_index("car")["up_to"].fillna(33)
     assert up_to[worst] == up_to.min() == float(failing) - 1
     assert "lowers" not in each.verdict
 
