@@ -18,7 +18,6 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-import cma
 import msgspec
 import numpy as np
 
@@ -272,6 +271,8 @@ def search(fit: Fit, log: Path, trials: int, seed: int, jobs: int, *, from_scrat
 
     It begins at the studies' values, which are the first trial; from scratch at a random place.
     """
+    import cma
+
     cube, keys = Cube.of(fit.plan.parameters), [parameter.key for parameter in fit.plan.parameters]
     own = fit.own_values()
     start = (

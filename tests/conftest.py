@@ -25,7 +25,7 @@ from safevar_sumo.questions.explain import explain
 from safevar_sumo.study import study_names
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import InlinePool, inline_worker, searched
-from tests.made_up import HAS_AD_RSS
+from tests.made_up import MISSING
 
 collect_ignore = (
     [] if os.name == "posix" else ["campaign/test_pool.py", "end_to_end/test_processes.py"]
@@ -136,7 +136,7 @@ SLOW_STUDIES = ("wear_idm", "wear_rss")
     params=[
         pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_STUDIES else [])
         for name in study_names()
-        if name != "wear_rss" or HAS_AD_RSS
+        if name not in MISSING
     ]
 )
 def any_system(request: pytest.FixtureRequest) -> System:

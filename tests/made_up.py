@@ -4,8 +4,7 @@ degrees.
 
 from __future__ import annotations
 
-import platform
-import sys
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -24,10 +23,9 @@ from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
-HAS_AD_RSS = (
-    sys.platform == "linux" and platform.machine() == "x86_64" and sys.version_info < (3, 14)
-)
-"""Whether there are wheels of ad-rss; setup.cfg says the same."""
+LIBRARIES = {"wear_rss": "ad_rss", "wear_idm": "highway_env"}
+MISSING = [study for study, library in LIBRARIES.items() if find_spec(library) is None]
+"""Shipped studies whose extra is not installed."""
 HARDEST_BRAKING = """
 import numpy as np
 from safevar_sumo.metrics import Measure

@@ -5,6 +5,8 @@ public name stands for one thing in the whole package.
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
@@ -20,6 +22,13 @@ DOUBLE = {
     *("columns_of", "parameters_of"),
 }
 """Names that may still have several meanings."""
+COLLECTION = """
+import sys
+libraries = ("ad_rss", "cma", "distributed", "fmpy", "highway_env", "pymoo", "sumo")
+sys.modules.update(dict.fromkeys(libraries))
+import pytest
+sys.exit(pytest.main(["--collect-only", "-n", "0", "-m", ""]))
+"""
 
 
 def test_every_folder_with_code_is_installed() -> None:
@@ -53,6 +62,11 @@ def test_a_public_name_is_defined_once() -> None:
             for name in public_names_in(source):
                 places[name].append(path)
     assert {name for name, paths in places.items() if len(paths) > 1} <= DOUBLE
+
+
+@pytest.mark.slow
+def test_tests_are_collected_without_the_extras() -> None:
+    subprocess.run([sys.executable, "-c", COLLECTION], cwd=ROOT, check=True, capture_output=True)
 
 
 def test_the_rules_find_what_breaks_them() -> None:

@@ -19,7 +19,6 @@ from safevar_sumo.ads import ADS, Ads, PerVehicleAds, ScalarAds
 from safevar_sumo.ads.aeb import Aeb, AutowareAeb
 from safevar_sumo.ads.car_following import Krauss
 from safevar_sumo.ads.published import Apollo, WorldOnRails
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.plugins.contract import checked_class
 from safevar_sumo.records import (
@@ -31,19 +30,21 @@ from safevar_sumo.records import (
     SimulationRuns,
 )
 from safevar_sumo.scenarios import Along, CarToCar
+from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import ModelTable, study_names
 from safevar_sumo.sumo.system import assemble
-from tests.made_up import HAS_AD_RSS, seen
+from tests.made_up import MISSING, seen
 from tests.scenarios.holding import CARLA, Hold, driven
 from tests.scenarios.test_crossing import WORN
 
 STEP = 0.05
-STUDIES = {load_study(name).ads.model: load_study(name) for name in study_names()}
-NATIVE = load_study("native")
+STUDIES = {study.ads.model: study for study in map(read_study, study_names())}
+NATIVE = read_study("native")
+UNAVAILABLE = {read_study(name).ads.model for name in MISSING}
 SYSTEMS = {
     name: assemble(STUDIES.get(name, msgspec.structs.replace(NATIVE, ads=ModelTable(model=name))))
     for name in ADS
-    if name != "ad_rss" or HAS_AD_RSS
+    if name not in UNAVAILABLE
 }
 TAKE_OVER = {
     "ad_rss",

@@ -16,7 +16,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.study import study_names
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, run
-from tests.made_up import HAS_AD_RSS
+from tests.made_up import MISSING
 from tests.manual import files_of
 from tests.scenarios.test_simulated import MODELS, STUDY
 
@@ -31,7 +31,7 @@ SMALL = {
     "report": '--ask "rules --samples 16" --out next.html',
 }
 """The options with which a command that comes next takes little time."""
-EVERY = [name for name in study_names() if name != "wear_rss" or HAS_AD_RSS]
+EVERY = [name for name in study_names() if name not in MISSING]
 """Studies that need no extra."""
 IN_RANGES = ("wear --ranges", "sun --ranges", "alks --ranges --point cut_in")
 WORN = {"worn": "brakeTorque=0.5", "carla": "tireFric=1", "lgsvl": "tire_friction=0.5"}
