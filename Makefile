@@ -32,6 +32,7 @@ docs: .venv/installed-docs
 
 docs-outputs: .venv/installed-test
 	$(RUN) -m tests.pages
+	$(RUN) docs/generate.py
 
 pictures: .venv/installed-test
 	$(RUN) docs/pictures.py

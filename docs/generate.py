@@ -1,22 +1,24 @@
-"""Tables made from the code: `python docs/generate.py NAME` prints one. As a hook of MkDocs, it
-puts what the command prints in place of a line of a page that is this command alone.
+"""Lists of pages that are made from the code: `python docs/generate.py` writes them anew between
+their marks. As a hook of MkDocs, this file draws formulas.
 """
 
 from __future__ import annotations
 
 import inspect
 import re
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from html import unescape
 from pathlib import Path
 from typing import Any, get_args
 
+import click
 import msgspec
 from msgspec.inspect import type_info
 
 from safevar_sumo import ads
 from safevar_sumo.ads import ADS
+from safevar_sumo.cli.command import COMMON_NAMES
+from safevar_sumo.cli.program import COMMANDS_BY_GROUP, commands
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, PUBLISHED_SCORING
 from safevar_sumo.results import FILES
 from safevar_sumo.scenarios.declared import read_study
@@ -24,6 +26,7 @@ from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, study_names
 from safevar_sumo.vehicles import VEHICLES
 
+DOCS = Path(__file__).parent
 PLAIN = {
     "StrType": "text",
     "IntType": "integer",
@@ -33,14 +36,15 @@ PLAIN = {
 }
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Called by MkDocs for every page."""
-    return re.sub(
-        r"^`python docs/generate.py (\w+)`$",
-        lambda match: TABLES[match[1]](),
-        markdown,
-        flags=re.MULTILINE,
-    )
+MARKED = re.compile(
+    r"(<!-- generated: (\w+) -->\n).*?(?=<!-- end of what is generated -->)", re.DOTALL
+)
+"""A list of a page, with the mark above it."""
+
+
+def filled(page: str) -> str:
+    """A page with its lists as the code has them now."""
+    return MARKED.sub(lambda match: f"{match[1]}\n{LISTS[match[2]]().strip()}\n\n", page)
 
 
 def on_page_content(html: str, **_: Any) -> str:
@@ -212,11 +216,52 @@ def results_files() -> str:
 
 
 def readme() -> str:
-    """The README of the repository, whose links go to this folder, without its badges, which are
-    loaded from elsewhere.
+    """The README of the repository, whose links go to this folder, without comments and without
+    its badges, which are loaded from elsewhere.
     """
-    text = (Path(__file__).parents[1] / "README.md").read_text().replace("](docs/", "](")
-    return re.sub(r"^\[!\[.*\n\n", "", text, flags=re.MULTILINE)
+    text = (DOCS.parent / "README.md").read_text().replace("](docs/", "](")
+    return re.sub(r"^\[!\[.*\n\n|^<!--(.|\n)*?-->\n+", "", text, flags=re.MULTILINE)
+
+
+def command_list() -> str:
+    """Every command with its own options, below the options of many commands."""
+    common = {f"--{name.replace('_', '-')}" for names in COMMON_NAMES.values() for name in names}
+    shared = {flag: text for flag, text in _options("risk").items() if flag.split()[0] in common}
+    parts = ["## Options of many commands", _option_table(shared)]
+    for title, group in COMMANDS_BY_GROUP.items():
+        parts.append(f"## {title}")
+        for name in group:
+            command = _command(name)
+            context = click.Context(command)
+            places = [one for one in command.params if isinstance(one, click.Argument)]
+            usage = " ".join([name, *(place.make_metavar(context) for place in places)])
+            own = {
+                flag: text for flag, text in _options(name).items() if text not in shared.values()
+            }
+            parts += [f"### {name}", f"`{usage}`", inspect.cleandoc(str(command.help))]
+            parts += [_option_table(own)] if own else []
+    return "\n\n".join(part.strip() for part in parts)
+
+
+def _command(name: str) -> click.Command:
+    command = commands.get_command(click.Context(commands), name)
+    assert command is not None
+    return command
+
+
+def _options(name: str) -> dict[str, str]:
+    """The options of a command as its help explains them; `--help-all` is the last one."""
+    context = click.Context(_command(name))
+    options = [one for one in context.command.params if isinstance(one, click.Option)]
+    records = [option.get_help_record(context) for option in options]
+    return dict(record for record in records[:-1] if record)
+
+
+def _option_table(options: dict[str, str]) -> str:
+    rows = [(f"`{flag}`", text) for flag, text in options.items()]
+    return _table(
+        ("option", "meaning"), [[cell.replace("|", "\\|") for cell in row] for row in rows]
+    )
 
 
 def characteristics() -> str:
@@ -248,8 +293,9 @@ def published_systems() -> str:
     )
 
 
-TABLES: dict[str, Callable[[], str]] = {
+LISTS: dict[str, Callable[[], str]] = {
     "readme": readme,
+    "commands": command_list,
     "published_systems": published_systems,
     "characteristics": characteristics,
     "study_keys": study_keys,
@@ -261,4 +307,5 @@ TABLES: dict[str, Callable[[], str]] = {
 }
 
 if __name__ == "__main__":
-    print(TABLES[sys.argv[1]]())
+    for path in sorted(DOCS.glob("*.md")):
+        path.write_text(filled(path.read_text(encoding="utf-8")), encoding="utf-8")

@@ -12,6 +12,7 @@ BLOCK = re.compile(
     r'(?:^<!-- ([^\n]*) -->\n+)?^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$',
     flags=re.DOTALL | re.MULTILINE,
 )
+GENERATED = re.compile("<!-- generated: .*?<!-- end of what is generated -->", re.DOTALL)
 
 
 class Block(NamedTuple):
@@ -26,12 +27,17 @@ class Block(NamedTuple):
     place: tuple[int, int]
 
 
+def written(page: str) -> str:
+    """A page of the manual, with empty lines in place of what docs/generate.py writes."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return GENERATED.sub(lambda match: "\n" * len(match[0]), text)
+
+
 def blocks(page: str) -> list[Block]:
     """The fenced blocks of a page of the manual."""
-    text = (ROOT / page).read_text(encoding="utf-8")
     return [
         Block(*(found or "" for found in match.groups()), match.span(4))
-        for match in BLOCK.finditer(text)
+        for match in BLOCK.finditer(written(page))
     ]
 
 

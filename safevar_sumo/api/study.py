@@ -115,42 +115,52 @@ def study(
     quiet: bool = False,
     status: bool = False,
 ) -> Answer:
-    """Search a study; run the same command again to continue where it stopped.
+    """Search for unsafe vehicles with few and small changes. You get a directory with every vehicle
+    that the search algorithms return, and the fewest changes that they found. The same command
+    continues a search that was interrupted.
+
+    Example: python -m safevar_sumo study rain
 
     Parameters
     ----------
     runs
-        Runs of each algorithm.
+        Number of runs of each search algorithm. Default: the number in the study.
     evaluations
-        Simulations of each run.
+        Largest number of simulated vehicles in each run. Default: the number in the study.
     algorithms
-        Algorithms, separated by commas.
+        Search algorithms, separated by commas, such as nsga2,rs. Default: the algorithms in the
+        study.
     seed
-        Seed of the whole study.
+        Seed of all random numbers of the study. Default: the seed in the study.
     ranges
-        Search the encounter, too, in the ranges of the study's axes.
+        Let the search also choose the encounter, within the ranges that the study states. Default:
+        only the listed test cases.
     point
-        Only this test, or this point, of the study's matrix.
+        Use only this test or test case of the study, such as CPNA. Default: all tests.
     up_to
-        Only encounters up to this value of an axis, such as speed=40.
+        Use only encounters in which this value is not exceeded, such as speed=40. The unit is that
+        of the study.
     unsafe
-        What the verdict calls unsafe: a collision, a clearance below X [m], or a metric beyond a
-        limit, such as "drac > 6".
+        Criterion for an unsafe vehicle in the answer, such as collision or "drac > 6". The search
+        itself stays the same.
     engine
-        What moves the vehicles. recorded: numpy, in a scene that SUMO has played once, if no actor
-        reacts to the vehicles; some results are verified in SUMO. sumo: always SUMO.
+        What moves the vehicles: recorded (fast, in a scene that SUMO played once) or sumo (SUMO in
+        every simulation).
     out
-        Directory of the results, by default results/STUDY.
+        Directory for the results. Default: results/STUDY.
     jobs
-        Number of worker processes, by default one for each core.
+        Number of worker processes. Default: one for each processor core.
     cluster
-        Compute on the workers of this Dask scheduler instead.
+        Simulate on the workers of this Dask scheduler, such as tcp://host:8786. Default: on this
+        machine.
     retry_failed
-        Simulate again the settings that could not be simulated before (simulator-error).
+        Simulate vehicles again that could not be simulated before. Default: such vehicles stay out
+        of the results.
     quiet
-        Print only errors, warnings, and what an output option such as --json asks for.
+        Print only errors, warnings, and an output that you ask for, such as JSON. Default: the
+        answer and the progress.
     status
-        Show the progress of the study in its directory, without disturbing it.
+        Print how far the search in the directory is, and simulate nothing.
     """
     as_written = part_of_study(read_study(study), ranges, point, up_to)
     directory = out or Path("results") / directory_name(as_written)

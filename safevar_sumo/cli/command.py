@@ -46,9 +46,9 @@ METAVARS = {
 }
 """How the help names positional parameters, unless by their names."""
 COMMON_NAMES = {
-    "Encounters": ("point", "ranges", "up_to"),
-    "Simulations": ("jobs", "cluster", "simulations", "as_it_is_now", "fresh"),
-    "Answer": ("format", "json", "details", "table", "plot", "fail_if"),
+    "Which encounters": ("point", "ranges", "up_to"),
+    "How to simulate": ("jobs", "cluster", "simulations", "as_it_is_now", "fresh"),
+    "How to print": ("format", "json", "details", "table", "plot", "fail_if"),
 }
 """Options that many commands have: with one meaning, help names them in a few lines."""
 ENDED_OPTIONS = {
@@ -88,11 +88,11 @@ class _Command(click.Command):
         }
         records = (option.get_help_record(ctx) for option in options.values())
         with formatter.section("Options"):
-            formatter.write_dl([record for record in records if record])
+            formatter.write_dl([record for record in records if record], col_max=16)
 
         # All others are named.
         if lines := [(title, ", ".join(flags)) for title, flags in common.items() if flags]:
-            with formatter.section("Options of many commands, which --help-all explains"):
+            with formatter.section("Options of many commands (--help-all explains them)"):
                 formatter.write_dl(lines)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -120,7 +120,7 @@ HELP_ALL = click.Option(
     is_eager=True,
     expose_value=False,
     callback=_explain_all,
-    help="Show all options with their meanings and exit.",
+    help="Explain all options and exit.",
 )
 
 
@@ -142,18 +142,18 @@ def _give_answer(
     Parameters
     ----------
     format
-        How to print.
+        Form in which the answer is printed.
     json
-        Short for --format json.
+        Print the answer as JSON, with all numbers and tables.
     details
-        Print all tables and numbers.
+        Print all sentences, tables and numbers. Default: one screen.
     table
-        Print this table only.
+        Print only this table of the answer. The line "More:" of an answer names the tables.
     plot
-        Draw the answer: png, pdf or svg.
+        Draw the answer into this file. The name ends in .png, .pdf or .svg.
     fail_if
-        End with exit code 3 if a number, or a table's column in any row, is so; may be
-        repeated.
+        End with exit code 3 if this condition holds, such as "probability > 0.01"; may be repeated.
+        The name is that of a number in --json.
     """
     # What the answer will not have is refused before it is computed.
     conditions = [_parse(text) for text in fail_if]
@@ -301,20 +301,19 @@ class _Path(click.Path):
 
 
 def _flag(option: Option) -> click.Option:
-    is_path = option.kind is Path
     return click.Option(
         [f"--{option.name.replace('_', '-')}", option.name],
         type=(
             click.Choice(option.choices)
             if option.choices
             else _Path(path_type=Path)
-            if is_path
+            if option.kind is Path
             else option.kind
         ),
         is_flag=option.kind is bool,
         multiple=option.is_repeated,
         show_default=option.default not in (None, (), False, "", inspect.Parameter.empty),
-        metavar=option.metavar or ("PATH" if is_path else None),
+        metavar=option.metavar,
         help=option.meaning + (f"  [{option.limits}]" if option.limits else ""),
         **(
             {"required": True}

@@ -29,7 +29,7 @@ from safevar_sumo.errors import (
 from safevar_sumo.shipped import PROGRAM, PROGRAM_COMMAND
 
 COMMANDS_BY_GROUP = {
-    "From a driving system to a decision": {
+    "Find, explain and limit failures": {
         "study": "api.study:study",
         "simulate": "replay.simulate:show_simulation",
         "explain": "questions.explain:explain",
@@ -43,12 +43,12 @@ COMMANDS_BY_GROUP = {
         "permit": "questions.permit:permit",
         "repair": "questions.repair:repair",
     },
-    "Hand over": {
+    "Hand results over": {
         "evidence": "report.evidence:evidence",
         "verify": "report.evidence:verify",
         "export": "replay.export:export",
     },
-    "Your own code": {
+    "Check your own code": {
         "check": "questions.catalogue:check",
         "list": "questions.catalogue:list_models",
     },
@@ -168,10 +168,12 @@ def _to_flag(flags: dict[str, str], argument: re.Match[str]) -> str:
 @click.group(cls=LazyCommands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="safevar_sumo")
 def commands() -> None:
-    """Search for the smallest variations of a vehicle that make its automated driving system
-    unsafe, on SUMO.
+    """Find the smallest changes of a vehicle, such as worn tyres or weak brakes, that make its
+    automated driving system unsafe. The vehicle drives in simulations with SUMO or with a simulator
+    of your own.
 
-    STUDY is the name of a study (see: list) or the path of a study file.
+    STUDY is the name of a study (`list studies` prints all names) or the path of a study file. DIR
+    is a directory with results of the command `study`.
     """
 
 

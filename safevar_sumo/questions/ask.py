@@ -142,28 +142,31 @@ class Question:
         Parameters
         ----------
         point
-            Only this test, or this point, of the study's matrix.
+            Use only this test or test case of the study, such as CPNA. Default: all tests.
         ranges
-            Any encounter in the ranges of the study's axes, not the tests alone.
+            Use every encounter within the ranges that the study states. Default: only the listed
+            test cases.
         up_to
-            Only encounters up to this value of an axis, such as speed=40.
+            Use only encounters in which this value is not exceeded, such as speed=40. The unit is
+            that of the study.
         jobs
-            Number of worker processes, by default one for each core.
+            Number of worker processes. Default: one for each processor core.
         cluster
-            Compute on the workers of this Dask scheduler instead.
+            Simulate on the workers of this Dask scheduler, such as tcp://host:8786. Default: on
+            this machine.
         simulations
-            At most so many simulations: a rough answer where more are usual. By default, as many
-            as take 15 minutes where a simulation takes long.
+            Largest number of simulations. Default: no limit, or in a slow simulator as many as take
+            15 minutes.
         pool
             Pool that simulates; by default new worker processes.
         progress
             True for a bar on the terminal, or a function of a phase, the number of simulations
             done, and their total.
         as_it_is_now
-            If results were computed with other files or versions, simulate with the present ones
-            and say so.
+            Use the present files and versions, although the results were computed with other files
+            or versions. Default: an error.
         fresh
-            Simulate everything anew, instead of reading what earlier commands have simulated.
+            Simulate everything again. Default: use simulations of earlier commands again.
         """
         # Where the question itself cuts encounters, it gets the whole of them.
         is_own = any(option.name == UP_TO for option in self.options)

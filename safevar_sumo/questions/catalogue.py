@@ -114,12 +114,12 @@ CACHE: Columns = {
     cache=CACHE,
 )
 def list_models(kind: str | None = None, study: str | None = None) -> Answer:
-    """List studies, vehicles, ADSs, scenarios, weathers, algorithms, metrics and objectives; with
-    KIND only these, or your own scenario, package.module:Name.
+    """List what the package contains: studies, vehicles, driving systems, scenarios, weathers,
+    algorithms, metrics and objectives. KIND lists only one of these kinds. `list characteristics
+    STUDY` lists the characteristics that a study changes, and how a workshop measures each one.
+    `list cache` prints the folder with earlier simulations.
 
-    KIND may also be characteristics, followed by a study: what it varies, how a workshop measures
-    it, and what to do with a vehicle beyond its limit. Or it may be cache: where simulations are
-    kept, how many, and how large they are.
+    Example: python -m safevar_sumo list studies
     """
     if kind == "characteristics":
         return _list_characteristics(study)
@@ -282,17 +282,17 @@ LONG = 10.0
 
 @contents("passed", "vehicles", "points", lead="block", block=BLOCK, findings=FINDINGS)
 def check(name: str, *, vehicles: Annotated[int | None, Range(1, 10_000)] = None) -> Answer:
-    """Check whether your driving system, vehicle, scenario, metrics, objectives and algorithms keep
-    the promises that results rest on.
+    """Check whether your own code (a driving system, vehicle, scenario, metric, objective or
+    algorithm) keeps the rules on which results rest. NAME is a study, or a driving system such as
+    my_ads:Careful. The exit code is 0 without findings, 1 with findings, and 2 if NAME cannot be
+    loaded.
 
-    NAME is the name or path of a study, all of whose code is checked, or a driving system, by its
-    name or package.module:Name, which then drives in the study smoke. The exit code is 0 if NAME
-    passes, 1 with findings, 2 if it cannot be loaded.
+    Example: python -m safevar_sumo check mine.toml
 
     Parameters
     ----------
     vehicles
-        Number of vehicles that are simulated; by default up to 100, as many as take at most 60 s.
+        Number of vehicles that are simulated. Default: up to 100, as many as take 60 s.
     """
     # What loads SUMO is imported where it is needed.
     from safevar_sumo.campaign import check_algorithms

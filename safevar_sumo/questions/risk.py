@@ -88,17 +88,23 @@ def risk(
     confidence: Fraction = 0.95,
     unsafe: Criterion = None,
 ) -> Answer:
-    """Estimate how likely an unsafe vehicle is if vehicles vary as the study specifies, and which
-    characteristics decide it.
+    """Estimate how likely an unsafe vehicle is, if vehicles vary as the study states under
+    [variation]. You also get the characteristics with the largest influence on the safety
+    degree. Without [variation] the answer is the share of unsafe vehicles in the domain (ranges
+    of values), and no probability in traffic.
+
+    Example: python -m safevar_sumo risk rain
 
     Parameters
     ----------
     samples
-        Number of vehicles, sampled as [variation] says, without it uniformly over the domain.
+        Number of sampled vehicles (drawn at random and simulated).
     confidence
-        Confidence of the intervals.
+        Confidence level of the intervals.
     unsafe
-        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
+        What counts as unsafe: a collision, less than X m of clearance, or a metric beyond a limit.
+        Default: the criterion of the study, else a collision (if nothing collides: half of the
+        original vehicle's safety degree).
     """
     # Vehicles as the study says that they vary.
     study = evaluator.study

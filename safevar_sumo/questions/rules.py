@@ -85,18 +85,21 @@ COLUMNS: Columns = {
 def rules(
     subject: Subject, evaluator: Evaluator, *, samples: Count = 16_384, unsafe: Criterion = None
 ) -> Answer:
-    """Find rules, in physical units, that say where in the domain a study is unsafe.
+    """Find regions of the domain (ranges of values) in which many vehicles are unsafe. Each region
+    is a rule in physical units, such as "tyre friction below 1.07", with the share of unsafe
+    vehicles in it. All characteristics vary at the same time.
 
-    All characteristics vary at the same time over the whole domain. `tolerance` says how far one
-    characteristic may change while all others stay as in the original.
+    Example: python -m safevar_sumo rules rain
 
     Parameters
     ----------
     samples
-        Number of vehicles, sampled as [variation] says, without it uniformly over the domain; one
-        half yields the rules, the other half tests them.
+        Number of sampled vehicles (drawn at random and simulated). One half finds the rules, the
+        other half tests these rules.
     unsafe
-        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
+        What counts as unsafe: a collision, less than X m of clearance, or a metric beyond a limit.
+        Default: the criterion of the study, else a collision (if nothing collides: half of the
+        original vehicle's safety degree).
     """
     study = evaluator.study
     characteristics = evaluator.characteristics

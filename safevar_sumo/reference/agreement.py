@@ -53,9 +53,11 @@ SIMULATION_KEYS = ("scenario", "vehicle", "ads", "weather", "metrics", "step_len
     "rows", *(f"collisions_{where}" for where in ("here", "reference", "both")), agreement=COLUMNS
 )
 def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
-    """Compare a study with settings and metrics in the published package's CSV format, row by row.
+    """Compare the simulation with published vehicles and metrics (a CSV file), row by row. You get
+    the rank correlation, the mean error and the bias of each metric. Rows that cannot be
+    simulated, or whose values are outside the domains, are left out.
 
-    Rows with values outside the domains, and rows that cannot be simulated, are left out.
+    Example: python -m safevar_sumo validate rain published.csv
 
     Parameters
     ----------

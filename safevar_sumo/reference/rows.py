@@ -208,19 +208,21 @@ def import_published(
     rs: str | Path | None = None,
     safe_fuzzer: str | Path | None = None,
 ) -> Results:
-    """Import published CSV solutions of a study as a results directory, in place of an earlier
-    import.
+    """Import published solutions (CSV files) of a study as a directory of results. An earlier
+    import in this directory is replaced.
+
+    Example: python -m safevar_sumo import rain --nsga2 nsga2.csv --out published
 
     Parameters
     ----------
     out
-        Directory of the results.
+        Directory for the results.
     nsga2
-        File with the solutions of NSGA-II.
+        CSV file with the solutions of NSGA-II.
     rs
-        File with the solutions of random search.
+        CSV file with the solutions of random search.
     safe_fuzzer
-        File with the solutions of SafeFuzzer.
+        CSV file with the solutions of SafeFuzzer.
 
     Raises
     ------

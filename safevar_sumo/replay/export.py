@@ -271,22 +271,25 @@ def export(
     point: PointName = None,
     as_it_is_now: bool = False,
 ) -> str:
-    """Write a solution's simulation for CARLA (a script and the vehicle's values), or as
-    OpenSCENARIO and OpenDRIVE.
+    """Write the simulation of one solution for another simulator. CARLA gets a script and the
+    values of the vehicle; OpenSCENARIO gets a scenario with an OpenDRIVE road.
+
+    Example: python -m safevar_sumo export results/rain --solution nsga2:0:0 --to carla --out
+    in_carla
 
     Parameters
     ----------
     solution
-        The solution to export; N counts from 0.
+        Solution to export, such as nsga2:3:0. Runs and solutions are counted from 0.
     to
-        What reads it.
+        Form of the files: for CARLA, or OpenSCENARIO with OpenDRIVE.
     out
-        A new directory.
+        New directory for the files.
     point
-        Only this point of the study's matrix.
+        Export this test case of the study.
     as_it_is_now
-        If results were computed with other files or versions, simulate with the present ones and
-        say so.
+        Use the present files and versions, although the results were computed with other files or
+        versions. Default: an error.
     """
     # The solution's vehicle, and its simulation.
     if out.exists() or out.is_symlink():

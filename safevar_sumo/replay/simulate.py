@@ -78,38 +78,43 @@ def show_simulation(
     fit: Annotated[int, Range(0, 1000)] = 0,
     as_it_is_now: bool = False,
 ) -> Answer:
-    """Simulate a study once, or a solution of results with the study as recorded there, beside the
-    original vehicle.
+    """Simulate one vehicle of a STUDY, or one solution in a directory of results (DIR), beside the
+    original vehicle. You get how both simulations end, with their safety metrics. Options write
+    the simulation step by step or as an animation.
+
+    Example: python -m safevar_sumo simulate rain --set tireFric=1.1
 
     Parameters
     ----------
     solution
-        Replay solution N of a run in a results directory; N counts from 0. Or the unsafe solution
-        with the smallest changes, or the most severe one: smallest, most-severe; fewest: that with
-        the fewest changes, of which as many are undone as it stays unsafe without.
+        Simulate this solution of the results, such as nsga2:3:0. The words smallest (changes),
+        fewest (changes) and most-severe (collision) choose an unsafe solution, too.
     set
-        The value of a characteristic, of an axis of the matrix or of the phase, in its unit, +10%
-        of the original; repeat it for others.
+        Change a value, such as "tireFric=1.1" or "mass=+8%"; may be repeated. "tireFric=1..2:6"
+        simulates a series of 6 values.
     beyond
-        Also accept values beyond the domains, and settings that violate a constraint.
+        Accept values outside the domains (allowed ranges), and vehicles that violate a constraint
+        of the study. Default: an error.
     trace
-        Write the simulation step by step to this csv file.
+        Write the simulation step by step to this CSV file.
     animate
-        Animate both simulations, seen from above, in this gif or html file.
+        Draw both vehicles from above as an animation. The name of the file ends in .gif or .html.
     gui
-        Show both simulations in sumo-gui, one upon the other: the original blue, the changed one
+        Show both simulations in SUMO's window. The original vehicle is blue, the changed vehicle
         orange.
     point
-        Only this test, or this point, of the study's matrix.
+        Use only this test or test case of the study, such as CPNA. Default: all tests.
     ranges
-        The encounter has values of its own, in the ranges of the study's axes.
+        Allow any encounter within the ranges that the study states. Default: only the listed test
+        cases.
     up_to
-        Only encounters up to this value of an axis, such as speed=40.
+        Use only encounters in which this value is not exceeded, such as speed=40. The unit is that
+        of the study.
     fit
-        With this parameter set of the vehicle model, by its number in [spread]; 0 is the study's.
+        Use this parameter set (calibration) of the vehicle model. 0 is the set of the study.
     as_it_is_now
-        If results were computed with other files or versions, simulate with the present ones and
-        say so.
+        Use the present files and versions, although the results were computed with other files or
+        versions. Default: an error.
     """
     # What is simulated: a study or a solution, with changes.
     target = load_target(source, solution, as_it_is_now, point, ranges=ranges, up_to=up_to)

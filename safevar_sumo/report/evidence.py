@@ -88,35 +88,34 @@ def evidence(
     fresh: bool = False,
     simulations: Simulations = None,
 ) -> str:
-    """Pack results with their study, page and answers, so that anybody can compute every number
-    again.
+    """Pack results with their study, page and answers into one file, so that anybody can compute
+    every number again. `verify` computes the numbers again and reports each difference. Names of
+    cars are left out.
 
-    A pack has lists of cars without names: they are "car 1", "car 2" and so on, and the columns
-    that a question ignores are empty.
+    Example: python -m safevar_sumo evidence results/rain --out pack.zip
 
     Parameters
     ----------
     results
         Results, or their directories.
     out
-        The pack to write.
+        File to write the pack to. The name ends in .zip.
     ask
-        Ask this question instead of the usual ones, with its options, such as "risk --samples
-        4000"; may be repeated.
+        Ask this question, such as "risk --samples 4000", not the usual ones; may be repeated.
     unsafe
-        What is unsafe, in all answers and on the page: a collision, a clearance below X [m], or a
-        metric beyond a limit, such as "drac > 6".
+        Criterion for an unsafe vehicle in all answers and on the page, such as collision or "drac >
+        6". Default: the criterion of the study, else a collision.
     jobs
-        Number of worker processes, by default one for each core.
+        Number of worker processes. Default: one for each processor core.
     cluster
-        Compute on the workers of this Dask scheduler instead.
+        Simulate on the workers of this Dask scheduler, such as tcp://host:8786. Default: on this
+        machine.
     progress
-        True for a bar on the terminal, or a function of a phase, the number of simulations done,
-        and their total.
+        True for a bar on the terminal, or a function of a phase, what is done, and the total.
     fresh
-        Simulate everything anew, instead of reading what earlier commands have simulated.
+        Simulate everything again. Default: use simulations of earlier commands again.
     simulations
-        At most so many simulations for all answers and replays, which share them.
+        Largest number of simulations of all questions and replays of the pack together.
 
     Returns
     -------
@@ -126,8 +125,7 @@ def evidence(
     Raises
     ------
     InputError
-        If a directory holds no results of a study, its inputs have changed since, or there is no
-        such question.
+        If a directory holds no results, its inputs have changed, or there is no such question.
     """
     out = Path(out)
     check_writable(out, "out", (".zip",))
@@ -256,23 +254,26 @@ def verify(
     jobs: Jobs = None,
     progress: bool | Progress = False,
 ) -> Answer:
-    """Compute what a pack of evidence claims again, and compare.
+    """Compute every claim of a pack of evidence again, and compare. The exit code is 0 if all
+    claims are the same, and 1 if a claim differs. Exit code 2 means a damaged pack or another
+    version.
 
-    The exit code is 0 if all is the same, 1 if not, 2 if the pack is damaged or of another version.
+    Example: python -m safevar_sumo verify pack.zip
 
     Parameters
     ----------
     pack
         The pack.
     search
-        Repeat the whole search, too.
+        Repeat the whole search, too. Default: repeat only the original vehicle, the solutions and
+        the answers.
     run_code
-        Let user code run that is in the pack, or that its studies and questions name.
+        Run user code that the pack contains or names. Default: such a pack is an error, and no code
+        is run.
     jobs
-        Number of worker processes, by default one for each core.
+        Number of worker processes. Default: one for each processor core.
     progress
-        True for a bar on the terminal, or a function of a phase, the number of simulations done,
-        and their total.
+        True for a bar on the terminal, or a function of a phase, what is done, and the total.
 
     Raises
     ------

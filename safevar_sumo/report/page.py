@@ -72,10 +72,11 @@ def report(
     quick: bool = False,
     simulations: Simulations = None,
 ) -> Path:
-    """Write one page about results that opens offline: what decides, replays, answers, trust, and
-    commands.
+    """Write one page (HTML) about results that opens without a network. The page has the answers,
+    animated replays of failures, a sheet for the workshop, and the commands that compute every
+    number again. The same results give the same page.
 
-    The same results give the same page.
+    Example: python -m safevar_sumo report results/rain
 
     Parameters
     ----------
@@ -84,30 +85,31 @@ def report(
     out
         File to write the page to.
     ask
-        Ask this question instead of the usual ones, with its options, such as "risk --samples
-        4000"; may be repeated. The verdict of the first question leads the page.
+        Ask this question, such as "risk --samples 4000", not the usual ones; may be repeated. The
+        answer to the first question leads the page.
     unsafe
-        What is unsafe, on the whole page: a collision, a clearance below X [m], or a metric beyond
-        a limit, such as "drac > 6".
+        Criterion for an unsafe vehicle on the whole page, such as collision or "drac > 6". Default:
+        the criterion of the study, else a collision.
     point
-        Only this point of the study's matrix.
+        Write the page about this test case only. Default: about all test cases.
     jobs
-        Number of worker processes, by default one for each core.
+        Number of worker processes. Default: one for each processor core.
     cluster
-        Compute on the workers of this Dask scheduler instead.
+        Simulate on the workers of this Dask scheduler, such as tcp://host:8786. Default: on this
+        machine.
     progress
         True for a bar on the terminal, or a function of a phase, the number of simulations done,
         and their total.
     as_it_is_now
-        If results were computed with other files or versions, simulate with the present ones and
-        say so.
+        Use the present files and versions, although the results were computed with other files or
+        versions. Default: an error.
     fresh
-        Simulate everything anew, instead of reading what earlier commands have simulated.
+        Simulate everything again. Default: use simulations of earlier commands again.
     quick
-        Rough answers: at most an eighth of the search, with the study's own parameter set alone. No
-        line to sign.
+        Give rough answers that prove nothing, with at most an eighth of the usual simulations. The
+        workshop sheet then has no line to sign.
     simulations
-        At most so many simulations for all answers and replays, which share them.
+        Largest number of simulations of all questions and replays of the page together.
 
     Returns
     -------

@@ -104,30 +104,30 @@ def compare(
     unsafe: Criterion = None,
     at_tests: bool = False,
 ) -> Answer:
-    """Compare two studies or results, A and B: what is better in B, and what is worse.
+    """Compare two versions A and B of a study, or of results, and decide whether B may be released.
+    You get RELEASE, DO NOT RELEASE (exit code 3) or DECIDE (exit code 4), with what is better
+    and what is worse in B. The same criterion counts for both versions.
 
-    A version B that is less safe must not be released, and the command ends with exit code 3: its
-    original vehicle collides where that of A does not, or something that concerns safety is worse,
-    and at most needless braking is better. Exit code 4 says that a person has to decide, as where
-    one side lacks tests, weathers, ranges or parameter sets of the other. The same criterion counts
-    for both. Where the original vehicles differ, the same changes of each original
-    are compared. Small changes are not filtered out.
+    Example: python -m safevar_sumo compare autoware_july autoware_december
 
     Parameters
     ----------
     samples
-        Number of settings that are sampled in the common domain beside the solutions, near to where
-        A and B begin to fail: their counts are no shares of the domain.
+        Number of sampled vehicles that are simulated in both versions. The sampled vehicles lie
+        near the boundary between safe and unsafe.
     limits
-        A limit in the characteristic's unit, such as "treadDepth >= 3"; only vehicles within it
-        are compared. May be repeated.
+        Compare only vehicles within this limit, such as "treadDepth >= 3"; may be repeated. The
+        unit is that of the study.
     margin
-        Clearance that every vehicle must keep [m], as in `tolerance`; by default the larger one of
-        the two studies.
+        Clearance that every vehicle must keep, in metres. Default: the larger value of the two
+        studies.
     unsafe
-        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
+        What counts as unsafe: a collision, less than X m of clearance, or a metric beyond a limit.
+        Default: the criterion of the study, else a collision (if nothing collides: half of the
+        original vehicle's safety degree).
     at_tests
-        Limits that hold at the points of the study's tests alone, as in `tolerance`.
+        Compare limits only at the listed test cases. Default: also at speeds and places between the
+        listed values.
     """
     # Both studies, in one common domain and by one criterion.
     study = evaluator.study

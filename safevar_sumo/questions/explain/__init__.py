@@ -113,30 +113,34 @@ def explain(
     fits: Annotated[int, Range(0, 1000)] = 20,
     quick: bool = False,
 ) -> Answer:
-    """Explain failures: which changes are necessary, how small they may be, and whether another
-    driver would have avoided the collision in the same vehicle.
+    """Ask a STUDY which smallest changes make the vehicle unsafe, or ask results (DIR) what caused
+    the failures in these results. For a study, the command simulates changes to the ends of the
+    domains (ranges of values): one by one, in pairs and in larger combinations. For results, the
+    command reduces each failure to the necessary changes, and lets other drivers drive the same
+    vehicle.
 
-    Of a study without results, all combinations of changes to an end of their domains are
-    simulated by their number, and then vehicles sampled over the whole domain.
+    Examples: python -m safevar_sumo explain rain and python -m safevar_sumo explain results/rain
 
     Parameters
     ----------
     solution
-        Handle of a solution, such as nsga2:3:0; may be repeated. By default those with
-        the fewest and the smallest changes, the most severe one, and one of each distinct cause.
+        Explain this solution of the results, such as nsga2:3:0; may be repeated. Default: some
+        failures with different causes.
     unsafe
-        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
+        What counts as unsafe: a collision, less than X m of clearance, or a metric beyond a limit.
+        Default: the criterion of the study, else a collision (if nothing collides: half of the
+        original vehicle's safety degree).
     of_study
-        Explain the study of results as if it had none: the smallest changes, and vehicles sampled
-        over the domain.
+        Ask which smallest changes make the vehicle unsafe, and ignore the failures in the results.
+        Default: explain these failures.
     top
-        Largest number of failures that are explained.
+        Largest number of failures that are examined one by one.
     fits
-        Number of parameter sets of the vehicle model (those of [spread]) with which each cause is
-        checked again; 0 leaves this out.
+        Number of parameter sets (calibrations) of the vehicle model in which each cause is checked
+        again. 0 checks none.
     quick
-        A rough answer: at most an eighth of the search, with the study's own parameter set alone.
-        It has causes of few failures.
+        Give a rough answer that proves nothing, with at most an eighth of the usual simulations.
+        The answer uses one parameter set of the vehicle model.
     """
     study, of_study = evaluator.study, of_study or isinstance(subject, Study)
     subject = study if of_study else subject

@@ -54,7 +54,7 @@ def permit(
     cars: Annotated[Any, CARS_FILE] = None,
     set: ValueTexts = (),
     limits: LimitTexts = (),
-    others: Literal["new"] | None = None,
+    others: Annotated[Literal["new"] | None, "new"] = None,
     ignore: Annotated[tuple[str, ...], "COLUMN"] = (),
     need: Annotated[str | None, '"50 km/h"'] = None,
     by: Annotated[str | None, "NAME"] = None,
@@ -65,48 +65,47 @@ def permit(
     quick: bool = False,
     out: Annotated[str | None, "FILE.csv"] = None,
 ) -> Answer:
-    """Find the greatest speed up to which each of several measured cars is safe.
+    """Find the highest speed up to which each of several measured cars is safe. You get a speed for
+    each car, what happens above this speed, and the part to renew first. The speed is safe in
+    every encounter of the study and in every parameter set (calibration) of the vehicle model.
 
-    Up to this speed a car is safe in every encounter of the study, in every parameter set of the
-    vehicle model, whether or not the original vehicle is safe there. Unless --unsafe says
-    otherwise, it keeps the margin with the study's own parameter set, and touches nobody with any
-    other.
+    Example: python -m safevar_sumo permit wear --set treadDepth=3 --set payload=300 --set
+    brakeTorque=0.9
 
     Parameters
     ----------
     cars
-        A list of measured cars, as CSV: the first column names the car, each other one is a
-        characteristic in the study's unit. The answer names the values of all others that it
-        assumes. A file that `--out` wrote is such a list, too. Of a value whose precision the
-        study states, all values of the interval count.
+        List of measured cars. The first column names the car, all others are characteristics.
     set
-        A value that was measured on a single car, in place of a list; may be repeated.
+        Ask about a single car with this measured value; may be repeated. The unit is that of the
+        study.
     limits
-        All cars within limits such as "treadDepth >= 3", in place of a list; may be repeated.
+        Ask about all cars within this limit, such as "treadDepth >= 3"; may be repeated.
     others
-        What a characteristic is that was not measured, and for which the study states no value
-        under [unmeasured]: as in a new car. Without this option it is an error.
+        Take the value of a new car for each characteristic without a measured or stated value.
+        Default: an error.
     ignore
-        A column of the list that is no characteristic; may be repeated.
+        Ignore this column of the list; may be repeated.
     need
-        A speed that the cars have to drive, with its unit; exit code 3 if one of them may not.
+        Speed that every car needs, else the exit code is 3.
     by
-        Another speed that the study varies, such as that of the target.
+        Find the highest safe value of this speed, such as target_speed. Default: the speed of the
+        vehicle.
     step
-        Distance of the speeds that are tried, to which the answer is rounded down.
+        Difference between two tested speeds, of which the answer is a multiple.
     margin
-        Clearance that every car must keep with the study's own parameter set [m], as in
-        `tolerance`.
+        Clearance to keep between bumpers, in metres. Default: the value of the study, else 0.3 m.
     unsafe
-        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
+        What counts as unsafe: a collision, less than X m of clearance, or a metric beyond a limit.
+        Default: a collision or too little clearance.
     fits
-        Number of parameter sets of the vehicle model, by default all; 0 for the study's own alone.
+        Number of parameter sets (calibrations) of the vehicle model in which a car must be safe.
+        Default: all; 0 uses only the set of the study.
     quick
-        A rough answer: at most an eighth of the search, with the study's own parameter set alone.
-        The grid alone is driven, no car may drive without a limit, and no repair is named.
+        Give a rough answer that proves nothing, from the tested speeds alone. Such an
+        answer never says "drive".
     out
-        A file for the list of cars, in the order of the input and with all its columns as they are
-        given, beside those of the answer; `assumed` names the values that were not measured.
+        Write the list with the highest safe speeds to this file.
     """
     if evaluator.study.states_ranges:
         evaluator = evaluator.for_study(with_ranges(evaluator.study))

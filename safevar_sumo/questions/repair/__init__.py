@@ -79,37 +79,38 @@ def repair(
     at_tests: bool = False,
     quick: bool = False,
 ) -> Answer:
-    """Find the smallest change of the driving system that keeps worn vehicles safe, and its price.
+    """Find the smallest change of the driving system's parameters that keeps worn vehicles safe.
+    You get the new values, their price (earlier and needless braking of the original vehicle),
+    and how the change was tested. Failures of results within the required wear must be safe,
+    too.
 
-    Failures of results that lie within the required range must be safe, too.
+    Example: python -m safevar_sumo repair autoware_july --promise "brakeTorque >= 0.9"
 
     Parameters
     ----------
     promise
-        Wear up to which vehicles have to be safe (the required range), such as "treadDepth >= 3";
-        may be repeated. Characteristics that are not named stay as in the original; "all" means the
-        whole domain. By default the study's [repair.promise], else its [limits].
+        Wear up to which vehicles must be safe, such as "treadDepth >= 3", or all; may be repeated.
+        Default: the wear under [repair.promise] of the study, else under [limits].
     margin
-        Clearance that every vehicle must keep [m], between bumpers; by default the model's error
-        that the study states, else 0.3 m.
+        Clearance that every vehicle must keep between bumpers, in metres. Default: the value of the
+        study, else 0.3 m.
     unsafe
-        What is unsafe instead: a collision, a clearance below X [m], or a metric beyond a limit,
-        such as "drac > 6".
+        What counts as unsafe: a collision, less than X m of clearance, or a metric beyond a limit.
+        Default: a collision or too little clearance.
     change
-        Parameter of the driving system that may change; may be repeated. By default those under
-        [repair], else those that come with a shipped driving system.
+        Parameter of the driving system that may change; may be repeated. Default: the parameters
+        under [repair] of the study, else those that a shipped driving system names.
     fits
-        Number of parameter sets of the vehicle model (those of [spread]) in which a repair holds:
-        the margin with the study's own, no collision with any other; by default all, 0 for the
-        study's own alone.
+        Number of parameter sets (calibrations) of the vehicle model in which the repair must hold.
+        Default: all; 0 uses only the set of the study.
     out
-        Study file to write with the first repair; it extends the study.
+        Write a study with the first repair to this file.
     at_tests
-        A repair for the points of the study's tests alone: nothing is simulated between the values
-        of a matrix.
+        Find a repair for the listed test cases only. Default: also for speeds and places between
+        the listed values.
     quick
-        A rough answer: at most an eighth of the search, with the study's own parameter set alone.
-        Not with `out`.
+        Give a rough answer that proves nothing, with at most an eighth of the usual simulations. A
+        rough repair is not written to a file.
     """
     study = evaluator.study
     evaluator.system.require("a driving system", "repair")

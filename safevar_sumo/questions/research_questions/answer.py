@@ -76,29 +76,27 @@ def tables(
     jobs: Jobs = None,
     table: str | None = None,
 ) -> Answer:
-    """Answer the research questions of the paper from results, one for each case, as tables and
-    figures.
+    """Answer the three research questions of the paper from results, as tables and figures. RQ1
+    compares the search with the original vehicle, RQ2 compares the algorithms, and RQ3 describes
+    the changes. One directory of results is one case.
 
-    RQ1 over runs leads; JSON has every table, `--details` all but those that pool the solutions of
-    runs, `rq1` and `rq2`, and `--table` prints any. One is computed only by `--table budget`: it
-    compares the algorithms after equal numbers of simulations.
+    Example: python -m safevar_sumo tables results/rain --table rq3.2
 
     Parameters
     ----------
     algorithm
-        The algorithm that RQ2 compares with all others; by default NSGA-II or, without it, the
-        study's first.
+        Algorithm that is compared with all other algorithms (RQ2). Default: NSGA-II, else the first
+        algorithm of the study.
     alpha
-        A p-value below it is significant, and intervals have the confidence 1 - alpha.
+        Significance level of the tests. Intervals have the confidence 1 - alpha.
     causes
-        Simulate the minimal causes of up to this many unsafe solutions of each run, and compare
-        their numbers.
+        Simulate the minimal causes of up to this many unsafe solutions of each run. Default: none.
     figures
-        Draw every figure into this directory, as png and pdf.
+        Directory for all figures, as png and pdf.
     jobs
-        Number of worker processes that simulate causes, by default one for each core.
+        Number of worker processes. Default: one for each processor core.
     table
-        `budget`: compute this table alone.
+        Print only this table of the answer. The line "More:" of an answer names the tables.
     """
     # The options, the cases, and the algorithm that is compared.
     {option.name: option for option in options_of(tables)}["alpha"].check(alpha)

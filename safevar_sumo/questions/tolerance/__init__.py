@@ -55,39 +55,39 @@ def tolerance(
     at_tests: bool = False,
     quick: bool = False,
 ) -> Answer:
-    """Find how far each characteristic may change: alone, and all at the same time.
+    """Find how far each characteristic may change before the vehicle becomes unsafe. You get the
+    limit of each characteristic alone, and joint limits that hold at the same time. The answer
+    states the tests, speeds and roads for which the limits hold.
 
-    The limits hold in every parameter set of the vehicle model, within a scope that is stated. No
-    unsafe solution of results lies within the joint limits. Where encounters are ranges
-    they hold in all encounters in which the original vehicle is safe.
+    Example: python -m safevar_sumo tolerance autoware_july --characteristics
+    brakeTorque,brakeResponse
 
     Parameters
     ----------
     limits
-        A limit in the characteristic's unit, such as "treadDepth >= 3", beside those of [limits] in
-        the study; may be repeated. All others get the largest operating range that is safe then;
-        exit code 3 if a limit does not hold or the original itself is unsafe.
+        Check this limit, such as "treadDepth >= 3"; may be repeated. The exit code is 3 if a limit
+        does not hold.
     characteristics
-        Only these characteristics, separated by commas; all others keep their values. By default
-        all.
+        Change only these characteristics, separated by commas. Default: all characteristics of the
+        study.
     margin
-        Clearance that every vehicle must keep with the study's own parameter set [m], between
-        bumpers; by default the model's error that the study states, else 0.3 m, and 0.1 m where
-        encounters are ranges, whose originals keep more.
+        Clearance that every vehicle must keep between bumpers, in metres. Default: the value of the
+        study, else 0.3 m.
     unsafe
-        What is unsafe: a collision, a clearance below X [m], or a metric beyond a limit.
+        What counts as unsafe: a collision, less than X m of clearance, or a metric beyond a limit.
+        Default: the criterion of the study, else a collision or too little clearance.
     fits
-        Number of parameter sets of the vehicle model (those of [spread]) in which the limits hold,
-        by default all; 0 for the study's own alone.
+        Number of parameter sets (calibrations) of the vehicle model in which the limits must hold.
+        Default: all; 0 uses only the set of the study.
     up_to
-        Limits that hold up to a value of an axis, such as speed=40: encounters with a larger value
-        do not count.
+        Use only encounters in which this value is not exceeded, such as speed=40. The unit is that
+        of the study.
     at_tests
-        Limits that hold at the points of the study's tests alone: nothing is simulated between the
-        values of a matrix.
+        Test the limits only at the listed test cases. Default: also at speeds and places between
+        the listed values.
     quick
-        A rough answer: at most an eighth of the search, with the study's own parameter set alone.
-        No limit is called kept, and with limits the exit code is 3.
+        Give a rough answer that confirms no limit, with at most an eighth of the usual simulations.
+        The exit code is always 3 if you state limits, because no limit is confirmed.
     """
     whole = evaluator
     if up_to is not None:
