@@ -8,6 +8,7 @@ import io
 import json
 import os
 import re
+import shlex
 import signal
 import sys
 from collections.abc import Callable
@@ -109,6 +110,11 @@ def run(*arguments: str, expect: int | None = 0) -> CommandOutput:
 def json_of(*arguments: str, expect: int = 0) -> Any:
     """The JSON that a command prints."""
     return json.loads(run(*arguments, "--json", expect=expect).stdout)
+
+
+def numbers_of(command: str) -> Any:
+    """The numbers of a printed command."""
+    return json_of(*shlex.split(command)[3:])["numbers"]
 
 
 def refused(*arguments: str, message: tuple[str, ...]) -> None:

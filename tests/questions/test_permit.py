@@ -24,12 +24,11 @@ from safevar_sumo.questions.permit.encounters import EncounterRange, encounters_
 from safevar_sumo.questions.permit.rows import verdict_of
 from safevar_sumo.questions.permit.search import PermitSearch
 from safevar_sumo.questions.permit.speeds import Cars
-from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import json_of, refused, run
+from tests.in_process import json_of, numbers_of, refused, run
 from tests.questions.conftest import model_of
 
 SHORT = """
@@ -50,8 +49,8 @@ sensorRange = { value = 80, source = "assumption" }
 PLACES = np.linspace(25, 75, 21)  # impact locations [%]
 FLEET = """car;note;treadDepth [mm];brakeTorque;payload;brakeResponse;sensorLatency
 new;bought "today";8;1;75;0,1;0,05
-007;;3;0,7;525;0,1;0,05
-slow;;1,6;0,5;525;0,4;0,4
+007;;3;0,8;525;0,1;0,05
+slow;;1,6;0,55;525;0,4;0,4
 """
 
 
@@ -63,13 +62,7 @@ def short(in_tmp: Path) -> Study:
 
 
 def are_unsafe(
-    study: Study,
-    fit: int,
-    cars: FloatArray,
-    values: FloatArray,
-    places: FloatArray,
-    keep: float,
-    phase: float = 0,
+    study: Study, fit: int, cars: FloatArray, values: FloatArray, places: FloatArray, keep: float
 ) -> BoolArray:
     """Second computation: which cars are unsafe at each speed, shape (cars, speeds), at any of the
     impact locations `places` in any test alone, whether or not the original is safe there.
@@ -80,11 +73,8 @@ def are_unsafe(
     for test in own.matrix.tests:
         single = replace(own, matrix=replace(own.matrix, tests=[test]))
         system = assemble(single)
-        if phase:
-            system = assemble(in_phases(single, system))
         grid = np.stack(np.meshgrid(values, places, indexing="ij"), axis=-1).reshape(-1, 2)
         rows = np.hstack([np.repeat(cars, len(grid), axis=0), np.tile(grid, (len(cars), 1))])
-        rows = np.pad(rows, ((0, 0), (0, int(phase > 0))), constant_values=phase)
         runs = drive_and_score(system, rows, with_originals=False)
         fails = runs.collided | (runs.f_safe < (keep if fit == 0 else 0.0))
         found |= fails.reshape(len(cars), len(values), -1).any(axis=2)
@@ -96,9 +86,8 @@ def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None
     study = load_study("wear", encounters="ranges")
     members = assemble(study).characteristics.vehicle
     rng = default_rng(5)
-    settings = np.vstack(
-        [members.original, members.lower + rng.random((3, 7)) * (members.upper - members.lower)]
-    )
+    lower = members.lower + [item.error for item in members]
+    settings = np.vstack([members.original, lower + rng.random((3, 7)) * (members.upper - lower)])
     frame = pd.DataFrame(settings, columns=[*members.names])
     frame.insert(0, "car", ["new", "a", "b", "c"])
     answer = permit("wear", cars=frame, fits=6)
@@ -113,13 +102,10 @@ def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None
             reached = up_to.loc[name, fit]
             assert np.isnan(reached) or not fails[car, speeds <= reached].any(), (name, fit)
             # The encounter that is named for what lies above fails as printed.
-            encounter = sets.encounter[name, fit]
-            numbers = re.findall(r"(\S+) (?:km/h|%)", encounter)
-            speed, place = np.array(numbers, dtype=float).reshape(2, 1)
-            assert speed <= (10.0 if np.isnan(reached) else reached + 1), (name, fit)
-            phase = sets.phase[name, fit] or 0
-            fails_there = are_unsafe(study, fit, settings[[car]], speed, place, 0.1, phase)
-            assert fails_there.all(), (name, fit, encounter)
+            (speed,) = re.findall(r"speed (\S+) km/h", sets.encounter[name, fit])
+            assert float(speed) <= (10.0 if np.isnan(reached) else reached + 1), (name, fit)
+            command = sets.simulate[name, fit]
+            assert numbers_of(command)["f_safe"] < (0.1 if fit == 0 else 0), command
     rows = answer.table().set_index("car")
     for name in frame["car"]:
         least = up_to.loc[name].min(skipna=False)
