@@ -37,7 +37,7 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
     is_invalid = runs.outcome == Outcome.INVALID_TEST
     settings = np.tile(settings, (system.repeats, 1))
 
-    # Metrics of runs are undefined in an invalid test.
+    # In an invalid test the speed is not that of the test: metrics of its run say nothing.
     metrics = dict[str, FloatArray]()
     with user_errors(system.source):
         for name, measure in system.measuring.measures.items():
@@ -46,14 +46,18 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
             else:
                 values = measure.of_runs(runs, system.metrics_table)
                 metrics[name] = np.where(is_invalid, np.nan, values)
-    found = Evaluations(
+    evaluations = Evaluations(
         settings=settings,
         outcome=runs.outcome,
         collision_speed=runs.collision_speed,
         metrics=metrics,
         **system.characteristics.change_objectives(settings),
     )
-    return found if system.repeats == 1 else joined(found, system.repeats, system.criterion)
+    return (
+        evaluations
+        if system.repeats == 1
+        else joined(evaluations, system.repeats, system.criterion)
+    )
 
 
 def reason_against_scenes(system: System) -> str:
@@ -97,19 +101,22 @@ def drive_all(
     vehicles, encounters = system.split(settings)
     on_road = system.at_encounters(encounters)
     scenario = on_road.points[0].scenario
-    system.vehicle.compile()  # outside the time limit
+    # Outside the time limit, which is one of user code.
+    system.vehicle.compile()
     with user_errors(system.source), end_if_longer(system.time_limit):
         reason = reason_against_scenes(system)
         traffic = traffic_of(system, encounters, OVERTIME if reason else 0.0)
-        if reason:  # in SUMO, among the other actors that it moves
+        # SUMO is slow: it simulates only where neither bodies on tracks, at all points at once, nor
+        # a scene that it has played once can stand in for it.
+        if reason:
             with open_points_world(system, encounters, traffic) as sumo_world:
                 observer = observer_of(scenario, sumo_world, traffic)
                 runs = drive(on_road, vehicles, sumo_world, observer, listen)
-        elif traffic is not None:  # on a lane, among bodies on tracks, at all points at once
+        elif traffic is not None:
             lane = LaneWorld(traffic, _start_speeds(on_road.points, len(settings)), traffic.step)
             vehicles = np.tile(vehicles, (len(system.points), 1))
             runs = drive(on_road, vehicles, lane, traffic, listen)
-        else:  # in a scene that SUMO has played once
+        else:
             world = _recorded_world(system, encounters, scenario)
             runs = drive(on_road, vehicles, world, observer_of(scenario, world, None), listen)
     return runs
@@ -153,13 +160,13 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
     group = np.repeat(np.arange(len(points)), len(encounters))
     n_encounters = 1
 
-    # An encounter that several vehicles meet is there once.
+    # An encounter that several vehicles meet is there once: its bodies are computed once.
     if encounters.shape[1]:
-        _, first, group = np.unique(encounters, axis=0, return_index=True, return_inverse=True)
-        if len(first) == len(encounters):
-            first = group = np.arange(len(encounters))
-        points = system.at_encounters(encounters[first]).points
-        n_encounters = len(first)
+        _, distinct, group = np.unique(encounters, axis=0, return_index=True, return_inverse=True)
+        if len(distinct) == len(encounters):
+            distinct = group = np.arange(len(encounters))
+        points = system.at_encounters(encounters[distinct]).points
+        n_encounters = len(distinct)
         starts = n_encounters * np.arange(len(points))
         group = (starts[:, np.newaxis] + np.ravel(group)).ravel()
     step = system.scenes.step_of(points[0].scenario)
@@ -191,13 +198,10 @@ def open_points_world(
     step = system.scenes.step
     n, n_searched = encounters.shape
 
-    # The scenario in each encounter, and a network for it.
     scenarios = [point.scenario]
     if n_searched:
-        scenarios = [
-            encounter(point, system.characteristics.scenario.named(values)).scenario
-            for values in encounters
-        ]
+        searched = map(system.characteristics.scenario.named, encounters)
+        scenarios = [encounter(point, values).scenario for values in searched]
     networks = networks_for(scenarios)
 
     # Bodies on tracks are moved to their places.

@@ -5,6 +5,7 @@ first.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -66,29 +67,27 @@ class Body(NamedTuple):
     @property
     def velocity(self) -> FloatArray:
         """Velocities of M bodies in columns, shape (M, 2) [m/s]."""
-        left = np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
-        return np.asarray(
-            self.along * self.speed[:, np.newaxis] + left * np.asarray(self.drift)[..., np.newaxis]
-        )
+        along, across = _axes_of(self)
+        drift = np.asarray(self.drift)[..., np.newaxis]
+        return np.asarray(along * self.speed[:, np.newaxis] + across * drift)
 
     @classmethod
     def columns(cls, bodies: Sequence[Body]) -> Body:
         """M bodies in columns: `middle` and `along` of shape (M, 2), the other columns of shape
         (M,).
         """
-        return cls._make(
-            np.array([body[column] for body in bodies]) for column in range(len(cls._fields))
-        )
+        columns = map(itemgetter, range(len(cls._fields)))
+        return cls._make(np.array([*map(column, bodies)]) for column in columns)
 
 
 class BodyPairs(NamedTuple):
-    """M pairs of bodies: numbers of the vehicles under test, shape (M,), their bodies and the
-    others, in columns.
+    """M pairs of bodies, in columns: the numbers of the vehicles under test, shape (M,), their
+    bodies, and those of the others.
     """
 
     vehicles: IntArray
-    own: Body
-    other: Body
+    body: Body
+    obstacle: Body
 
 
 def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) -> FloatArray:
@@ -200,10 +199,10 @@ class FirstContacts:
         """Process the hits of one sample; returns those that are collisions: speeds [m/s] by
         vehicle number.
         """
-        new_copies = [copy for copy in hits if not self.first.side[copy]]
+        side = self.first.side
+        new_copies = [copy for copy in hits if not side[copy]]
         if new_copies:
             self._locate(world.bodies(new_copies), scene)
-        side = self.first.side
         return {
             copy: speed
             for copy, speed in hits.items()
@@ -233,8 +232,10 @@ class FirstContacts:
         around = world.bodies_around(np.flatnonzero(enters).tolist())
         if not len(around.vehicles):
             return
-        depth = find_overlaps(around.own, around.other)
-        is_missed = (depth > TOUCH_OVERLAP) & (find_touches(around.own, around.other).side == FRONT)
+        depth = find_overlaps(around.body, around.obstacle)
+        is_missed = (depth > TOUCH_OVERLAP) & (
+            find_touches(around.body, around.obstacle).side == FRONT
+        )
         if is_missed.any():
             inside = (
                 f"the front of the vehicle under test is {depth[is_missed].max():.2f} m inside a"
@@ -247,15 +248,15 @@ class FirstContacts:
             )
 
     def _locate(self, pairs: BodyPairs, scene: Scene) -> None:
-        copies, own, other = pairs
-        touches = find_touches(own, other)
+        copies, body, obstacle = pairs
+        touches = find_touches(body, obstacle)
         lateral_speed = np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[copies]
         lateral = scene.lateral[copies] - lateral_speed * touches.age
         is_at_end = (touches.side == FRONT) | (touches.side == REAR)
-        share = np.where(is_at_end, lateral / own.width + 0.5, touches.behind_front / own.length)
+        share = np.where(is_at_end, lateral / body.width + 0.5, touches.behind_front / body.length)
         self.first.side[copies] = touches.side
-        self.first.speed[copies] = other.speed * np.round(
-            (own.along * other.along).sum(axis=1), COSINE_DECIMALS
+        self.first.speed[copies] = obstacle.speed * np.round(
+            (body.along * obstacle.along).sum(axis=1), COSINE_DECIMALS
         )
         self.first.place[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
 
@@ -276,9 +277,9 @@ def distance_between(body: Track, middle: FloatArray, length: float, width: floa
         (-length / 2, width / 2),
         (-length / 2, -width / 2),
     ):
-        ahead = end * body.along + side * body.left
-        left = side * body.along - end * body.left
-        squares.append(_square_outside(lengthwise + ahead, across + left, body.length, body.width))
+        dx = end * body.along + side * body.left
+        dy = side * body.along - end * body.left
+        squares.append(_square_outside(lengthwise + dx, across + dy, body.length, body.width))
     cosine = np.abs(body.along)
     sine = np.abs(body.left)
     # Bodies that cross each other have no corner in the other one.
@@ -311,7 +312,7 @@ class Touches(NamedTuple):
     behind_front: FloatArray
 
 
-def find_touches(own: Body, other: Body) -> Touches:
+def find_touches(body: Body, obstacle: Body) -> Touches:
     """The first touches of M overlapping pairs, a vehicle's own body and another, if their
     velocities were constant.
 
@@ -322,10 +323,10 @@ def find_touches(own: Body, other: Body) -> Touches:
     or, if they approach each other in neither direction, in the one with the smaller overlap.
     """
     # Distance, speed and overlap along both axes of the vehicle.
-    axes = _axes_of(own)
-    distance = _dot(other.middle - own.middle, axes)
-    speed = _dot(own.velocity - other.velocity, axes)
-    overlap = _joint_extent(own, other, axes) - np.abs(distance)
+    axes = _axes_of(body)
+    distance = _dot(obstacle.middle - body.middle, axes)
+    speed = _dot(body.velocity - obstacle.velocity, axes)
+    overlap = _joint_extent(body, obstacle, axes) - np.abs(distance)
     closing_speed = np.copysign(1.0, distance) * speed
     is_closing = closing_speed > 0
 
@@ -338,24 +339,26 @@ def find_touches(own: Body, other: Body) -> Touches:
     age = np.where(approaches, np.min(ages, axis=0), 0.0)
 
     # The side that touched last, and the place on it.
-    ahead, left = distance > 0
-    side = np.where(is_lengthwise, np.where(ahead, FRONT, REAR), np.where(left, LEFT, RIGHT))
-    return Touches(side, age, own.length / 2 - (distance[0] + age * speed[0]))
+    is_ahead, is_left = distance > 0
+    side = np.where(is_lengthwise, np.where(is_ahead, FRONT, REAR), np.where(is_left, LEFT, RIGHT))
+    return Touches(side, age, body.length / 2 - (distance[0] + age * speed[0]))
 
 
-def find_overlaps(own: Body, other: Body) -> FloatArray:
+def find_overlaps(body: Body, obstacle: Body) -> FloatArray:
     """How deeply M pairs of bodies overlap [m], shape (M,), in the direction in which they overlap
     least; negative for bodies that do not touch.
     """
-    overlaps = _overlaps_along(own, other)
-    return np.minimum(overlaps, _overlaps_along(other, own)) if (overlaps > 0).any() else overlaps
+    overlaps = _overlaps_along(body, obstacle)
+    return (
+        np.minimum(overlaps, _overlaps_along(obstacle, body)) if (overlaps > 0).any() else overlaps
+    )
 
 
-def _overlaps_along(own: Body, other: Body) -> FloatArray:
+def _overlaps_along(body: Body, obstacle: Body) -> FloatArray:
     """The overlaps in that direction of the own bodies in which they are less deep [m]."""
-    axes = _axes_of(own)
-    distance = _dot(other.middle - own.middle, axes)
-    return np.asarray(np.minimum(*(_joint_extent(own, other, axes) - np.abs(distance))))
+    axes = _axes_of(body)
+    distance = _dot(obstacle.middle - body.middle, axes)
+    return np.asarray(np.minimum(*(_joint_extent(body, obstacle, axes) - np.abs(distance))))
 
 
 def _axes_of(body: Body) -> FloatArray:
@@ -363,13 +366,13 @@ def _axes_of(body: Body) -> FloatArray:
     return np.stack([body.along, np.stack([-body.along[:, 1], body.along[:, 0]], axis=1)])
 
 
-def _joint_extent(own: Body, other: Body, axes: FloatArray) -> FloatArray:
+def _joint_extent(body: Body, obstacle: Body, axes: FloatArray) -> FloatArray:
     """Half the extents of M pairs of bodies along the axes of the own ones, added up, shape (2, M)
     [m].
     """
-    cosine, sine = np.abs(_dot(other.along, axes))
-    along = (own.length + other.length * cosine + other.width * sine) / 2
-    across = (own.width + other.length * sine + other.width * cosine) / 2
+    cosine, sine = np.abs(_dot(obstacle.along, axes))
+    along = (body.length + obstacle.length * cosine + obstacle.width * sine) / 2
+    across = (body.width + obstacle.length * sine + obstacle.width * cosine) / 2
     return np.stack([along, across])
 
 

@@ -114,28 +114,24 @@ def write_demand(roots: Sequence[ElementTree.Element], n: int, file: Path) -> No
     InputError
         If an element cannot be copied.
     """
-    texts = [
-        [(time, _marked_xml(child, DEMAND_IDS)) for child, time in _departures(root)]
-        for root in roots
-    ]
-    copies = sorted(
-        ((time, copy, text) for copy in range(n) for time, text in texts[copy % len(texts)]),
-        key=itemgetter(0),
-    )
-    _write(roots[0], [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies], file)
+    traffics = [[*_departures(root)] for root in roots]
+    copies = [(time, copy, text) for copy in range(n) for time, text in traffics[copy % len(roots)]]
+    copies.sort(key=itemgetter(0))
+    blocks = [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies]
+    _write(roots[0], blocks, file)
 
 
-def _departures(root: ElementTree.Element) -> Iterable[tuple[ElementTree.Element, float]]:
-    """Yield children with their departure times [s]; types and routes get -1, so that they come
-    first.
+def _departures(root: ElementTree.Element) -> Iterable[tuple[float, str]]:
+    """Yield the departure times [s] of children, and their XML with a placeholder in every id;
+    types and routes get -1, so that they come first.
     """
     time = 0.0
     for child in root:
         if child.tag in ("vType", "route"):
-            yield child, -1.0
+            yield -1.0, _marked_xml(child, DEMAND_IDS)
         else:
             time = parse_seconds(child.get("depart", child.get("begin", ""))) or time
-            yield child, time
+            yield time, _marked_xml(child, DEMAND_IDS)
 
 
 def parse_seconds(text: str) -> float | None:
@@ -145,9 +141,9 @@ def parse_seconds(text: str) -> float | None:
     try:
         total = 0.0
         fields = text.split(":")
-        for seconds, field in zip(
-            (86400, 3600, 60, 1)[-len(fields) :], fields, strict=True
-        ):  # seconds are last
+        # The last field is that of seconds, however many stand before it.
+        units = (86400, 3600, 60, 1)[-len(fields) :]
+        for seconds, field in zip(units, fields, strict=True):
             total += seconds * float(field)
     except ValueError:
         return None
@@ -162,10 +158,8 @@ def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:
                 "", f"has a {part.tag!r}, which cannot be copied for every vehicle", ", ".join(ids)
             )
         for name in set(ids[part.tag]) & part.attrib.keys():
-            part.set(
-                name,
-                " ".join(copied_id(_COPY_PLACEHOLDER, id_) for id_ in part.attrib[name].split()),
-            )
+            ids_in_copy = (copied_id(_COPY_PLACEHOLDER, id_) for id_ in part.attrib[name].split())
+            part.set(name, " ".join(ids_in_copy))
     return ElementTree.tostring(element, encoding="unicode")
 
 
@@ -202,20 +196,20 @@ def ensure_cached(folder: str, name: str, build: Callable[[Path], None]) -> Path
     if (target / name).is_file():
         return target / name
 
-    # Built in a folder of its own, and moved to its place as a whole.
+    # Another process must never see a part of it: it is moved to its place as a whole.
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(target.parent) as temporary:
             new = Path(temporary, "new")
             new.mkdir()
             build(new)
+            # Not even a power failure may leave a part of it at its place.
             with (new / name).open("rb+") as file:
-                os.fsync(
-                    file.fileno()
-                )  # so that not even a power failure leaves a part of it at its place
+                os.fsync(file.fileno())
             new.rename(target)
     except OSError as error:
-        if not (target / name).is_file():  # no other process was faster
+        # Another process may have been faster.
+        if not (target / name).is_file():
             raise EnvironmentFault(
                 f"{target}: cannot write the cache of networks: {error.strerror or error}"
             ) from None

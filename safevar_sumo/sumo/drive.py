@@ -66,7 +66,6 @@ def drive(
     n = len(settings)
     size = n // len(points)
 
-    # Vehicles, driving systems and what is noted of the runs, at the start.
     prepared, ads, motion = enter(system, settings, world)
     state = vehicle.at_start(prepared, motion.speeds)
     length, width = float(world.vehicle_length(VUT)), float(world.vehicle_width)
@@ -82,22 +81,24 @@ def drive(
     log = _Log(world, int(last_sample.max()) + 1 + round(may_go_on.any() * OVERTIME / step))
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.capacity):
-            # What is around the vehicles now, and which runs end by it.
             time = sample * step
             speed = motion.speeds
             scene = observer.observe(motion, outcomes.is_open)
-            if system.sees_nobody:  # the run ends at the place of the encounter
+            # Who sees nobody drives through everybody: its run ends at the place of the encounter.
+            if system.sees_nobody:
                 scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
             collisions = contacts.count(world, motion.hits, scene)
-            if isinstance(observer, SceneObserver):  # bodies on tracks touch wherever they overlap
+            # SUMO misses contacts in some places; bodies on tracks touch wherever they overlap.
+            if isinstance(observer, SceneObserver):
                 contacts.check(observer.world, scene, outcomes.is_open & ~scene.over, time)
-            if isinstance(observer, Traffic):  # a scene ends by its time
+            # Recorded scenes end by their time: nobody knows how their actors go on.
+            if isinstance(observer, Traffic):
                 ends = may_go_on & outcomes.is_open & (sample == last_sample)
                 if ends.any():
                     may_go_on &= ~_go_on(observer, motion, ends, last_sample)
-            active = outcomes.note_sample(speed, scene.over, collisions, last=sample >= last_sample)
+            is_last = sample >= last_sample
+            active = outcomes.note_sample(speed, scene.over, collisions, is_last=is_last)
 
-            # What the driving systems see, and what they command.
             observation = perception.observe(time, speed, scene)
             observation = observation._replace(throttle=state.throttle, brake=state.brake)
             observation, state = vehicle.sense(prepared, state, observation)
@@ -111,7 +112,6 @@ def drive(
             if not np.count_nonzero(outcomes.is_open):
                 break
 
-            # The vehicles advance by a time step.
             np.copyto(outcomes.is_checked, outcomes.is_open)
             state = vehicle.advance(prepared, state, command)
             _check_finite(state.speed, settings, system.characteristics)
@@ -177,19 +177,17 @@ def enter(system: System, settings: FloatArray, world: VehicleWorld) -> RoadVehi
     vehicle = system.vehicle
     n = len(settings)
 
-    # Constants of the vehicles on these roads.
     characteristics = system.characteristics.columns(settings)
     prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
     types = vehicle.sumo_type(prepared)
 
-    # Who drives: full braking, the driving system, or a controller that SUMO calls.
+    # A controller that was written for SUMO drives in it, beside SUMO's own driver.
     ads = FullBrake() if system.points[0].scenario.brakes_fully else with_tau(system.ads, types.tau)
     if not isinstance(ads, TraciController):
         return RoadVehicles(prepared, ads, world.enter(types))
     motion = world.enter(ads.known_types(system.nominal, types), keeps_drivers=True)
-    return RoadVehicles(
-        prepared, ads.in_world(world, _sensors_in_weather(system, prepared, n)), motion
-    )
+    sensors = _sensors_in_weather(system, prepared, n)
+    return RoadVehicles(prepared, ads.in_world(world, sensors), motion)
 
 
 def _check_finite(
@@ -236,7 +234,7 @@ def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
     """The vehicles' sensors: the weather adds its recognition delay and scales the range by its
     visibility.
     """
-    (point,) = system.points  # SUMO simulates one point at once
+    (point,) = system.points
     latency, reach, scale = system.vehicle.sensors(prepared) or Sensors.perfect(n)
     # Nobody is within a negative range.
     reach_in_weather = np.full(n, -1.0) if system.sees_nobody else reach * point.weather.visibility
@@ -257,19 +255,21 @@ class _Log:
         self._frame = world.frame
         self._positions = np.zeros((capacity, world.n, 2))
 
-        # A column for each quantity of a sample.
+        # Truths keep one byte instead of eight.
         names = (field.name for field in fields(Trace) if field.name not in OF_ALL_RUNS)
-        kinds = {name: bool if name in TRUTHS else float for name in names}
-        self._columns = {
-            name: np.zeros((capacity, world.n), dtype=kind) for name, kind in kinds.items()
-        }
+        self._columns = {name: np.zeros((capacity, world.n)) for name in names}
+        self._columns |= {name: np.zeros((capacity, world.n), dtype=bool) for name in TRUTHS}
 
     def write(
-        self, position: FloatArray, scene: Scene, command: Command, **others: FloatArray | BoolArray
+        self,
+        position: FloatArray,
+        scene: Scene,
+        command: Command,
+        **quantities: FloatArray | BoolArray,
     ) -> None:
         """Write the next sample."""
         self._positions[self._samples] = position
-        values = {**scene._asdict(), **command._asdict(), **others}
+        values = {**scene._asdict(), **command._asdict(), **quantities}
         for name, column in self._columns.items():
             column[self._samples] = values[name]
         self._samples += 1
@@ -314,24 +314,23 @@ class _Outcomes:
         over: BoolArray,
         collisions: dict[int, float],
         *,
-        last: BoolArray | bool,
+        is_last: BoolArray | bool,
     ) -> BoolArray:
         """Process one sample; returns for which vehicles the sample is part of the run."""
         active = self.is_open & ~over
 
-        # A collision ends a run, and the sample counts.
+        # A collision ends a run, and its sample counts, also where the encounter is over by then.
         for copy, collision_speed in collisions.items():
             if self.is_open[copy]:
                 self.collision_speed[copy] = collision_speed
                 active[copy] = True
                 self.is_open[copy] = False
 
-        # Who has moved, stopped, and passed.
         is_standing = speed <= STANDSTILL
         self._has_stopped |= self.is_open & self._has_moved & is_standing
         self._has_moved |= self.is_open & ~is_standing
         self._is_over |= self.is_open & over
-        self.is_open &= ~over & ~np.asarray(last)
+        self.is_open &= ~over & ~np.asarray(is_last)
         return active
 
     def note_warnings(self, warns: BoolArray | None, speed: FloatArray, scene: Scene) -> None:

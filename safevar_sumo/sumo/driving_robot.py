@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from safevar_sumo.records import BoolArray, Command, FloatArray
+from safevar_sumo.records import BoolArray, Command
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.vehicles import Vehicle, VehicleState
@@ -59,19 +59,16 @@ class DrivingRobot:
         state: VehicleState,
         step: float,
     ) -> None:
-        # The test speed of each vehicle; NaN without a test.
         n = len(state.speed)
-        speeds = (point.scenario.test_speed for point in points)
-        known = [np.nan if speed is None else speed for speed in speeds]
-        self._test_speed: FloatArray = np.concatenate(
-            [np.broadcast_to(speed, n // len(points)) for speed in known]
-        )
+        size = n // len(points)
+        # Without a test the speed is None, which becomes NaN.
+        speeds = (np.asarray(point.scenario.test_speed, dtype=float) for point in points)
+        self._test_speed = np.concatenate([np.broadcast_to(speed, size) for speed in speeds])
         self.has_test_speed: BoolArray = ~np.isnan(self._test_speed)
         """Which vehicles are in a scenario with a `test_speed`."""
         self._is_driving = self.has_test_speed.copy()
         self._is_needed = bool(self.has_test_speed.any())
 
-        # The robot controls the speed with the pedals of the start.
         self._prepared = prepared
         self._vehicle = vehicle
         self._start_pedal = state.throttle - state.brake
@@ -84,7 +81,8 @@ class DrivingRobot:
         """Deviation from the test speed [m/s] that was largest relative to the tolerance while the
         robot drove; NaN without a test.
         """
-        self._error_share = np.zeros(n)  # the error divided by the tolerance in its direction [-]
+        # The error divided by the tolerance in its direction, which differs from the other's [-].
+        self._error_share = np.zeros(n)
 
     def drive(self, command: Command, state: State, is_open: BoolArray) -> tuple[Command, State]:
         """The command of the robot while it drives, otherwise of the system; and the state, with
@@ -95,16 +93,16 @@ class DrivingRobot:
         """
         if not self._is_needed:
             return command, state
-        self._is_needed = not self._has_braked.all()  # this is the last call that it is needed for
+        # Where all have braked, only the error up to now remains to be noted.
+        self._is_needed = not self._has_braked.all()
 
-        # How far the speed has strayed from the test speed, relative to the tolerance.
         error = np.where(self._is_driving, state.speed - self._test_speed, 0.0)
         error_share = np.where(error > 0, error / MAX_ERROR, error / MIN_ERROR)
         is_larger = is_open & (error_share > self._error_share)
         np.copyto(self.error, error, where=is_larger)
         np.copyto(self._error_share, error_share, where=is_larger)
 
-        # The robot drives until the system brakes or lets go of the accelerator.
+        # Some systems ease off before they brake: that, too, is their action.
         self._has_braked |= command.brake > self._brake_threshold
         system_pedal = command.throttle - command.brake
         self._max_system_pedal = np.maximum(self._max_system_pedal, system_pedal)
@@ -112,7 +110,6 @@ class DrivingRobot:
             system_pedal >= np.minimum(self._max_system_pedal, self._start_pedal) - ACTION_THRESHOLD
         )
 
-        # A controller with a proportional and an integral part holds the speed.
         error = np.where(self._is_driving, error, 0.0)
         self._integral = np.minimum(
             np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN), 1 / INTEGRAL_GAIN

@@ -55,17 +55,19 @@ def find_problems(system: System) -> dict[str, EmptyRoadFault]:
     it does not reach the place of the encounter before the encounter is over, or brakes on its way,
     the obstacle is not what keeps it from a collision.
     """
-    if not system.mover.has("a driving system"):  # that sees nobody
+    # A simulator of the user's own may not be able to show nobody.
+    if not system.mover.has("a driving system"):
         return {}
     original = system.characteristics.original_settings
     try:
         results = simulate_all_points(replace(system, sees_nobody=True), original)
-    except SimulationError:  # the study's own simulations decide, and report their errors
+    # The study's own simulations decide, and report their errors.
+    except SimulationError:
         return {}
     # A searched scenario is the one of the original encounter.
     members = system.characteristics
     values = members.scenario.columns(members.scenario.original_settings)
-    points = [encounter(point, values) if values else point for point in system.points]
+    points = [encounter(point, values) for point in system.points]
     return {
         point.name: problem
         for point, result in zip(points, results, strict=True)
@@ -81,7 +83,7 @@ def sentence_on(problems: dict[str, EmptyRoadFault], n_points: int) -> str:
     if not problems:
         return ""
     point, problem = next(iter(problems.items()))
-    count = sum(other.reason is problem.reason for other in problems.values())
+    count = sum(fault.reason is problem.reason for fault in problems.values())
     where = f" at {count} of {n_points} points, such as {point}" if n_points > 1 else ""
     return (
         f"On a first drive, with nobody in sight, the original vehicle {problem.words}{where}. So"
@@ -95,11 +97,9 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     Who still has its test speed at the end, and comes closer to nobody, has driven as it should.
     Who still has the speed that it began with when the others have left is late.
     """
-    # The run up to its end.
+    # The sample after the last active one ended the run.
     trace = runs.trace
-    end = (
-        int(np.count_nonzero(trace.active)) + 1
-    )  # the sample after the last active one ended the run
+    end = int(np.count_nonzero(trace.active)) + 1
     gap, speed, brake, position = (
         values[:end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position)
     )
@@ -108,18 +108,17 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
         for values in (trace.obstacle_speed, trace.obstacle_width)
     )
 
-    # Does it brake for nothing?
+    # Some cruise controls brake for nothing, but take no speed off by it.
     if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
         return EmptyRoadFault(Reason.BRAKES, "brakes without an obstacle")
 
-    # Does it get to the encounter at its speed?
     approach = speed[-1] - obstacle_speed[-1]
     is_alone = not np.isfinite(gap[-1]) or approach < SLOW_APPROACH
     keeps_speed = test_speed is not None and speed[-1] > test_speed - MIN_SLOWDOWN
     if runs.outcome[0] == Outcome.COLLISION:
         return None
 
-    # Does nobody come into its way, or nearer to it at the end?
+    # Who drives past somebody beside its way has met nobody.
     beside = np.abs(trace.lateral[:end, 0]) - (trace.vehicle_width + obstacle_width) / 2
     stays_beside = (beside > 0).all() and beside[-1] >= beside[-2:][0]
     if gap[-1] <= 0 and stays_beside:
@@ -128,7 +127,6 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     if gap[-1] <= 0 or (keeps_speed and is_alone):
         return None
 
-    # It came too late, or stands.
     distance = position[-1] - position[0]
     of_needed = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
     if (

@@ -42,11 +42,10 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
     differ, a range that is wider than the scenario's, and ranges in which an encounter is
     impossible.
     """
-    # What the scenarios at all points let vary, in their units and ranges.
     for point in points:
         legal = searchable_in(point.scenario)
-        own = study.ranges if point.ranges is None else point.ranges
-        for name, domain in own.items():
+        ranges = study.ranges if point.ranges is None else point.ranges
+        for name, domain in ranges.items():
             key = f"over.{name}"
             where = f"{key}: {point.name} of [matrix]: " if point.name else f"{key}: "
             problem = f"{where}{type(point.scenario).__name__} has no such parameter to search"
@@ -58,22 +57,24 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
                 problem = f"{key}: lower = {domain.lower:g} and upper = {domain.upper:g}"
                 part = f"[{widest.lower:g}, {widest.upper:g}]{unit_text(widest.unit)}"
                 raise InputError("", problem, f"a part of {part}")
-            first = points[0].weather
-            other = point.weather
-            if name in WEATHER_PARAMETERS and getattr(first, name) != getattr(other, name):
-                problem = (
-                    f"{key}: weathers {first.name} and {other.name} of the matrix set {name}, too"
-                )
+            first_weather = points[0].weather
+            weather = point.weather
+            if name in WEATHER_PARAMETERS and getattr(first_weather, name) != getattr(
+                weather, name
+            ):
+                weathers = f"{first_weather.name} and {weather.name}"
+                problem = f"{key}: weathers {weathers} of the matrix set {name}, too"
                 raise InputError("", problem, "a range, or values in the weathers")
-        _check_corners(study, point, own)
+        _check_corners(study, point, ranges)
 
 
-def _check_corners(study: Study, point: Point, own: Mapping[str, Domain]) -> None:
+def _check_corners(study: Study, point: Point, ranges: Mapping[str, Domain]) -> None:
     """Refuse ranges of a point in which the encounter at a corner is impossible."""
-    ends = [(domain.lower, domain.upper) for domain in own.values()]
-    corners = [dict(zip(own, corner, strict=True)) for corner in product(*ends)]
+    ends = [(domain.lower, domain.upper) for domain in ranges.values()]
+    corners = [dict(zip(ranges, corner, strict=True)) for corner in product(*ends)]
     constraints = (*study.shared_constraints, *point.constraints)
-    corners = [corner for corner in corners if all(one.allows(corner) for one in constraints)]
+    for constraint in constraints:
+        corners = [*filter(constraint.allows, corners)]
     try:
         scenarios = [encounter(point, corner).scenario for corner in corners]
         if scenarios and scenarios[0].mover.has("roads"):
@@ -100,18 +101,16 @@ def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
 
 def original_encounter(point: Point, ranges: Mapping[str, Domain]) -> Point:
     """A point at the original values of its own ranges, or of all."""
-    own = ranges if point.ranges is None else point.ranges
-    return encounter(point, {name: domain.original for name, domain in own.items()})
+    point_ranges = ranges if point.ranges is None else point.ranges
+    return encounter(point, {name: domain.original for name, domain in point_ranges.items()})
 
 
 def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) -> Recording:
     """The scenes of N vehicles whose scenario has arrays as parameters, from a recorded scene."""
-    # The scene up to the longest encounter.
     samples = 1 + int(np.max(np.round(np.asarray(scenario.duration) / recording.step_length)))
     layout = scenario.layout(recording, recording.step_length, samples)
     tracks = {name: _extended(track, samples) for name, track in recording.tracks.items()}
 
-    # A pedestrian walks as in each encounter.
     if layout.pedestrian:
         track = recording.tracks[layout.pedestrian]
         frame = Frame.of(recording.lane(recording.first_lanes[VUT]))
@@ -133,8 +132,8 @@ def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) 
 
 def _extended(track: Film, samples: int) -> Film:
     """The track of an actor who stands, for at least this number of samples."""
-    missing = max(samples - len(track.motion), 0)
-    return track._replace(motion=np.pad(track.motion, ((0, missing), (0, 0)), mode="edge"))
+    shortage = max(samples - len(track.motion), 0)
+    return track._replace(motion=np.pad(track.motion, ((0, shortage), (0, 0)), mode="edge"))
 
 
 def where_met(system: System, setting: FloatArray) -> System:
@@ -161,18 +160,18 @@ def met_at(point: Point, system: System, settings: FloatArray) -> BoolArray:
     """
     members = system.characteristics.scenario
     encounters = np.clip(system.split(settings)[1], members.lower, members.upper)
-    met = point.meets(members.columns(encounters)) if len(members) else True
-    return np.broadcast_to(met, len(settings))
+    is_met = point.meets(members.columns(encounters)) if len(members) else True
+    return np.broadcast_to(is_met, len(settings))
 
 
 def in_place_of_unmet(
-    point: Point, system: System, settings: FloatArray, met: BoolArray
+    point: Point, system: System, settings: FloatArray, is_met: BoolArray
 ) -> FloatArray:
     """Settings, of which those that have no encounter of a point stand in its original one."""
     members = system.characteristics
-    own = {name: domain.original for name, domain in (point.ranges or {}).items()}
-    original = np.array([own.get(item.name, item.original) for item in members])
-    return np.where(met[:, np.newaxis] | members.of_vehicle, settings, original)
+    originals = {name: domain.original for name, domain in (point.ranges or {}).items()}
+    original = np.array([originals.get(item.name, item.original) for item in members])
+    return np.where(is_met[:, np.newaxis] | members.of_vehicle, settings, original)
 
 
 def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
@@ -193,14 +192,15 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
     has_collided = np.stack([evaluations.collided for evaluations in in_order]).any(axis=0)
     values = safety_degrees
 
-    # By another measure, collisions first.
     if system.aggregate != WORST:
-        name, direction = system.aggregate.split()  # such as "drac >"
+        # Such as "drac >".
+        name, direction = system.aggregate.split()
         measures = np.stack([evaluations.column(name) for evaluations in in_order])
-        measures = np.where(np.isnan(measures), np.inf, -measures if direction == ">" else measures)
+        if direction == ">":
+            measures = -measures
+        measures = np.where(np.isnan(measures), np.inf, measures)
         # An impact may be allowed: then the measure says how bad a collision is.
         values = np.where(~has_collided | (name == IMPACT_EXCESS.name), measures, safety_degrees)
 
-    # An invalid test counts as worst, unless something collides.
     values[is_invalid & ~has_collided] = -np.inf
     return np.asarray(order[np.argmin(values, axis=0)])

@@ -71,7 +71,8 @@ def open_in_process(options: Sequence[str]) -> Iterator[Api]:
     SimulationError
         With SUMO's message, if SUMO cannot simulate a step.
     """
-    with redirect_stdout(sys.stderr):  # libsumo warns of a pyarrow of another version
+    # libsumo warns of a pyarrow of another version.
+    with redirect_stdout(sys.stderr):
         import libsumo
     with _open(libsumo, "SUMO"):
         try:
@@ -103,10 +104,8 @@ def open_window(options: Sequence[str]) -> Iterator[Api]:
     # The window opens with the first step.
     api = traci_api()
     with _open(api, "sumo-gui"):
-        with (
-            redirect_stdout(StringIO()),
-            warnings.catch_warnings(),
-        ):  # traci prints that it waits for SUMO
+        # traci prints that it waits for SUMO.
+        with redirect_stdout(StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             api.start([program, *options], numRetries=CONNECTION_ATTEMPTS)
         yield api
@@ -187,8 +186,12 @@ def sumo_options(files: CopiedNetwork, step: float | None = None) -> list[str]:
 
     # What the simulation needs overrules what the user's options say.
     stated = options_in(files.options)
-    own = own_options(stated) | {"step-length": repr(step_of(stated) if step is None else step)}
-    return [*as_arguments(own), *(str(text) for option in options.items() for text in option)]
+    step = step_of(stated) if step is None else step
+    fixed_options = own_options(stated) | {"step-length": repr(step)}
+    return [
+        *as_arguments(fixed_options),
+        *(str(text) for option in options.items() for text in option),
+    ]
 
 
 def own_options(stated: Mapping[str, str]) -> dict[str, str]:

@@ -54,18 +54,14 @@ class Kept:
         is_struct = isinstance(scenario, msgspec.Struct)
         set_field: Any = msgspec.structs.force_setattr if is_struct else object.__setattr__
         simulator = copy(scenario)
-        fields = (
-            msgspec.structs.asdict(scenario)
-            if isinstance(scenario, msgspec.Struct)
-            else _attributes(scenario)
-        )
-        for field, value in fields.items():
+        for field, value in _attributes(scenario).items():
             if has_worker or is_struct or isinstance(value, PLAIN):
                 set_field(simulator, field, _deep_copy(value))
         if has_worker:
             try:
                 set_field(simulator, "worker", handle)
-            except AttributeError:  # a Struct has its fields alone
+            # A Struct has its fields alone.
+            except AttributeError:
                 kind.worker = property(lambda self: handle)
         elif not is_struct:
             for field, value in _attributes(self._last.get(name, simulator)).items():
@@ -80,15 +76,17 @@ class Kept:
             self._close(name)
 
     def _close(self, name: str) -> None:
-        last = self._last.pop(name, None)
+        simulator = self._last.pop(name, None)
         _, kind, handle = self._handles.pop(name)
-        if last is not None:
-            last.close()
+        if simulator is not None:
+            simulator.close()
         kind.close_worker(handle)
 
 
 def _attributes(simulator: Simulator) -> dict[str, Any]:
-    """The attributes of a simulator; none where its class has slots."""
+    """The attributes of a simulator, or the fields of a Struct; none where its class has slots."""
+    if isinstance(simulator, msgspec.Struct):
+        return msgspec.structs.asdict(simulator)
     return dict(getattr(simulator, "__dict__", {}))
 
 

@@ -61,7 +61,6 @@ def point_record(result: PointResult) -> JsonObject:
     deviation from the test speed before the ADS acted [km/h]; the time to collision at the first
     warning [s]; the side of the contact, and the position along that side [%].
     """
-    # What the first setting did.
     evaluations = result.evaluations
     runs = result.runs
     test_speed_error, warning_ttc, side, place = (
@@ -80,19 +79,18 @@ def point_record(result: PointResult) -> JsonObject:
         "gap": evaluations.gaps(runs.middles_apart)[0],
         "test_speed_error": test_speed_error / KMH,
         "warning_ttc": warning_ttc,
-        **{
-            name: values[0]
-            for name, values in evaluations.metrics.items()
-            if name == STOPPING_DISTANCE.name
-        },
     }
-    return {
+    if STOPPING_DISTANCE.name in evaluations.metrics:
+        values[STOPPING_DISTANCE.name] = evaluations.metrics[STOPPING_DISTANCE.name][0]
+    record = {
         "point": result.point.name,
         **dict(result.point.parameters),
         "outcome": str(evaluations.outcome[0]),
         **{name: finite_or_none(value) for name, value in values.items()},
-        **({"contact": {"side": str(side), "place": float(place)}} if side else {}),
     }
+    if side:
+        record["contact"] = {"side": str(side), "place": float(place)}
+    return record
 
 
 def vehicle_remarks(system: System) -> list[str]:
@@ -104,7 +102,7 @@ def vehicle_remarks(system: System) -> list[str]:
     if max(speeds) <= fitted_speed:
         return []
 
-    # What the model does beyond the speeds of its fit.
+    # The drag shows how far the model is off there.
     tables = system.nominal.tables()
     speed = min(max(speeds), float(tables.speeds[-1]))
     drag = np.interp(speed, tables.speeds, tables.coasting)
@@ -125,7 +123,7 @@ def drive_and_score(
     what the original vehicle does in it, row i also holds the safety degree of that, unless
     `with_originals` is false.
     """
-    # Large batches are cut; beside each setting drives the original in its encounter.
+    # Beside each setting drives the original in its encounter, so that half as many fit.
     takes_pairs = with_originals and system.measuring.scoring.safe_original is not None
     size = max(1, batch_size(system) // (system.repeats * (1 + takes_pairs)))
     if len(settings) > size:
@@ -134,18 +132,16 @@ def drive_and_score(
             [drive_and_score(system, batch, with_originals=with_originals) for batch in batches]
         )
 
-    # The original meets the encounter of each variant, too.
     vehicles = settings
     if takes_pairs:
         originals = system.characteristics.with_original_vehicle(settings)
         vehicles, variants, original_of = _beside(system, settings, originals)
 
-    # At all points, or at the only one.
     try:
         if system.matrix:
-            found = evaluate_matrix(system, vehicles)
+            evaluations = evaluate_matrix(system, vehicles)
         else:
-            found = score(system, vehicles, drive_all(system, vehicles))
+            evaluations = score(system, vehicles, drive_all(system, vehicles))
     except UserCodeError as error:
         if not system.skips_failed:
             raise
@@ -153,17 +149,15 @@ def drive_and_score(
         metrics = system.measuring.measures
         changes = system.characteristics.change_objectives(vehicles)
         reasons = {row.tobytes(): reason for row in vehicles}
-        found = Evaluations.undefined(
+        evaluations = Evaluations.undefined(
             vehicles, Outcome.SIMULATOR_ERROR, metrics, reasons=reasons, **changes
         )
     if not takes_pairs:
-        return found
+        return evaluations
 
-    # The original's safety degree stands beside the variant's.
-    of_variants = found.take(variants)
-    return replace(
-        of_variants, metrics={**of_variants.metrics, ORIGINAL_DEGREE: found.f_safe[original_of]}
-    )
+    of_variants = evaluations.take(variants)
+    metrics = {**of_variants.metrics, ORIGINAL_DEGREE: evaluations.f_safe[original_of]}
+    return replace(of_variants, metrics=metrics)
 
 
 def _beside(
@@ -186,13 +180,10 @@ def evaluate_matrix(system: System, settings: FloatArray) -> Evaluations:
     """Evaluate settings, shape (N, n), at their worst points. Traces are dropped, as they would
     take gigabytes.
     """
-    # Every point once, in groups.
     results = {
         result.point.name: result.evaluations for result in simulate_points(system, settings)
     }
     at_points = [results[point.name] for point in system.points]
-
-    # The worst point of each setting.
     numbers = worst_points(system, at_points)
     rows = numbers * len(settings) + np.arange(len(settings))
     evaluations = Evaluations.concatenate(at_points).take(rows)
@@ -201,13 +192,13 @@ def evaluate_matrix(system: System, settings: FloatArray) -> Evaluations:
 
 def settings_per_batch(system: System) -> int:
     """Number of settings in an efficient batch."""
-    if system.mover.takes_long:  # the results of a batch are journaled immediately
+    # The results of a batch are journaled at its end: a long simulation is not to be lost.
+    if system.mover.takes_long:
         return 1
     if reason_against_scenes(system):
         return MAX_COPIES
-    if len(
-        system.characteristics.scenario
-    ):  # the original vehicle drives beside each; the points one after another
+    # The original vehicle drives beside each; the points one after another.
+    if len(system.characteristics.scenario):
         return largest_batch(system) // 2
     # Vehicles of a batch take each step together: fewer would cost as much.
     return max(largest_batch(system) // len(system.points), MAX_COPIES)
@@ -230,10 +221,8 @@ def batch_size(system: System) -> int:
         return 1
     if not reason_against_scenes(system):
         return largest_batch(system)
-    lanes = max(
-        number_of_lanes(open_network(network))
-        for network in {point.scenario.network for point in system.points}
-    )
+    networks = {point.scenario.network for point in system.points}
+    lanes = max(map(number_of_lanes, map(open_network, networks)))
     return min(max(MAX_LANES // max(lanes, 1), 1), MAX_COPIES, largest_batch(system))
 
 
@@ -260,20 +249,20 @@ def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResul
     """
     n = len(settings)
 
-    # Points with tracks drive together.
     groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     searched = system.characteristics.scenario.names
     if not reason_against_scenes(system) and (not searched or [*searched] == [PHASE]):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
     for points in groups:
-        here = replace(system, points=points)
         # Settings that have no encounter of these points keep their rows, for the others' sake.
-        met = met_at(points[0], system, settings)
-        vehicles = settings if met.all() else in_place_of_unmet(points[0], system, settings, met)
-        runs = drive_all(here, vehicles)
+        is_met = met_at(points[0], system, settings)
+        vehicles = (
+            settings if is_met.all() else in_place_of_unmet(points[0], system, settings, is_met)
+        )
+        runs = drive_all(replace(system, points=points), vehicles)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
-        if not met.all():
-            evaluations = evaluations.where(met, Outcome.INFEASIBLE)
+        if not is_met.all():
+            evaluations = evaluations.where(is_met, Outcome.INFEASIBLE)
         for point, start in zip(points, range(0, len(points) * n, n), strict=True):
             rows = slice(start, start + n)
             yield PointResult(point, evaluations.take(np.arange(start, start + n)), runs.of(rows))
@@ -298,9 +287,9 @@ def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
         scenario = point.scenario
         key: Hashable = point.name
         if isinstance(scenario, TrackScenario):
-            n_bodies = (
-                0 if len(system.points) <= size else len(scenario.tracks(np.zeros((1, 1))))
-            )  # at time 0
+            # The bodies at time 0 are those of all times.
+            one_batch = len(system.points) <= size
+            n_bodies = 0 if one_batch else len(scenario.tracks(np.zeros((1, 1))))
             key = (
                 scenario.vut_length,
                 scenario.vut_width,

@@ -63,16 +63,14 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
     InputError
         If a measure does not exist, is invalid, or has a name that is taken.
     """
-    # Metrics that the study has anyway.
-    further = ((STOPPING_DISTANCE, has_stops), (UNSAFE_SHARE, study.scenario.repeats > 1))
-    computed = {
-        **METRICS,
-        **{metric.name: metric for metric, is_computed in further if is_computed},
-    }
+    computed = {**METRICS}
+    if has_stops:
+        computed[STOPPING_DISTANCE.name] = STOPPING_DISTANCE
+    if study.scenario.repeats > 1:
+        computed[UNSAFE_SHARE.name] = UNSAFE_SHARE
     metrics = {**computed, **OPTIONAL_METRICS}
     named = _Named(lookup, {*RESULT_COLUMNS, *metrics, *study.domains}, computed)
 
-    # Those that it names.
     for name in study.metrics.also:
         if name in METRICS:
             problem = f"metrics.also = {study.metrics.also}: every study has {name!r}"
@@ -80,26 +78,25 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         if named.look_up(name, "metrics.also", metrics).of == "settings":
             raise InputError("", f"metrics.also = {name!r} measures settings", "a measure of runs")
 
-    # The one of its own criterion.
     if (bound := own_criterion(study).bound) is not None:
-        known = OPTIONAL_METRICS | named.computed
+        measures = OPTIONAL_METRICS | named.computed
         problem = f"{study.unsafe.criterion!r}: there is no metric {bound.measure!r}"
-        check_name("", f"{CRITERION_KEY} = {problem}", bound.measure, known)
-        named.computed.setdefault(bound.measure, known[bound.measure])
+        check_name("", f"{CRITERION_KEY} = {problem}", bound.measure, measures)
+        named.computed.setdefault(bound.measure, measures[bound.measure])
 
-    # Objectives, each once.
     shipped = {**metrics, **OBJECTIVES}
     objectives = [
         named.look_up(name, OBJECTIVES_KEY, shipped).facts for name in study.search.objectives
     ]
     if IMPACT_EXCESS.name in named.computed:
-        named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)  # sentences have both
+        # Sentences state both.
+        named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)
     texts = dict[str, list[str]]()
     for objective, text in zip(objectives, study.search.objectives, strict=True):
         texts.setdefault(objective.name, []).append(repr(text))
-    for same in texts.values():
-        if len(same) > 1:
-            problem = f"{OBJECTIVES_KEY}: {' and '.join(same)} are the same objective"
+    for names in texts.values():
+        if len(names) > 1:
+            problem = f"{OBJECTIVES_KEY}: {' and '.join(names)} are the same objective"
             raise InputError("", problem, "each objective once")
     of_runs = tuple(measure.facts for measure in named.computed.values() if measure.of == "runs")
     return Measuring(named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives)))
@@ -128,27 +125,28 @@ class _Named:
         Those that are computed, by column.
     """
 
-    def __init__(self, lookup: Lookup, taken: set[str], computed: dict[str, Measure]) -> None:
+    def __init__(
+        self, lookup: Lookup, reserved_names: set[str], computed: dict[str, Measure]
+    ) -> None:
         self.computed = computed
         self._lookup = lookup
-        self._taken = taken
+        self._reserved_names = reserved_names
         self._own = dict[str, Measure]()
 
     def look_up(self, name: str, key: str, shipped: Mapping[str, Measure]) -> Measure:
         """A measure by the name of a shipped one, of a user's class, or of one that was looked up
         before.
         """
-        # A measure of the package, or of the user.
         member = self._lookup.find({**shipped, **self._own}, name, key)
         measure: Measure = member.target
         if member.code is not None:
             measure = checked_measure(member.code)
-            if measure.name in self._taken:
+            if measure.name in self._reserved_names:
                 raise InputError(
                     "", f"{key} = {name!r}: the name {measure.name!r} is taken", "a unique name"
                 )
             self._own |= {name: measure, measure.name: measure}
-            self._taken.add(measure.name)
+            self._reserved_names.add(measure.name)
         if measure.function is not None:
             self.computed.setdefault(measure.name, measure)
         return measure

@@ -74,7 +74,6 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
     """
     name = f"ads.model = {table.model!r}"
     with substitute_traci():
-        # A function, or a class with a method.
         member = lookup.find({}, table.model, "ads.model")
         controller = member.target
         parameters = lookup.with_paths(member, table.parameters, "ads.parameters")
@@ -94,23 +93,22 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
         create: Callable[[], Controller]
         if is_class:
             create = partial(instance_of, member, parameters, name, "ads.parameters")
-            create()  # so that wrong parameters raise errors here
+            # Wrong parameters raise their errors here.
+            create()
         else:
-            create = partial(partial, controller, **parameters)  # the function with its parameters
+            create = partial(partial, controller, **parameters)
     return TraciController(create)
 
 
 def matrix_points(study: Study, lookup: Lookup) -> tuple[Point, ...]:
     """The points of a study's matrix; raises an error if several points share a name."""
-    # The points of each test.
     points: list[Point] = []
     shared = study.shared_constraints
-    constraints = [one for one in study.constraints if one not in shared]
+    constraints = [constraint for constraint in study.constraints if constraint not in shared]
     for test in study.tests:
         with about(f"{subject()}: test {test.name!r}"):
             points += _points_of(test, study, constraints, lookup)
 
-    # Each with a name of its own.
     for name, count in Counter(point.name for point in points).items():
         if count > 1:
             legal = "unique names of tests, and each value once"
@@ -127,10 +125,13 @@ def _points_of(
     model = test.model or study.scenario.model
     shared = study.scenario.parameters if model == study.scenario.model else {}
     lists, ranges = study.lists_of(test), study.ranges_of(test)
-    constraints = tuple(one for one in of_tests if test.name in (one.tests or [test.name]))
+    constraints = tuple(
+        constraint for constraint in of_tests if test.name in (constraint.tests or [test.name])
+    )
     for number, alone in enumerate(study.points_of(test)):
         over = {name: alone.axes[name].at[0] for name in lists}
-        if number % max(len(test.weathers), 1) == 0:  # the same scenario in all weathers
+        # All weathers of an encounter share a scenario.
+        if number % max(len(test.weathers), 1) == 0:
             table = ModelTable(model=model, parameters={**shared, **test.parameters, **over})
             scenario = create_scenario(table, lookup)
             if not ranges:
@@ -153,10 +154,10 @@ def _points_of(
 
 def _check_listed(values: Mapping[str, Any], constraints: Sequence[Constraint]) -> None:
     """Refuse a listed encounter that violates a constraint."""
-    known = {name: value for name, value in values.items() if isinstance(value, int | float)}
+    numbers = {name: value for name, value in values.items() if isinstance(value, int | float)}
     for constraint in constraints:
-        if not constraint.allows(known):
-            where = ", ".join(f"{name} = {known[name]:g}" for name in constraint.sum)
+        if not constraint.allows(numbers):
+            where = ", ".join(f"{name} = {numbers[name]:g}" for name in constraint.sum)
             problem = f"{where} violates the constraint of {constraint.quantity}"
             raise InputError("", problem, "encounters that the constraints allow")
 
@@ -222,7 +223,6 @@ def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
     if table.kind == "traci":
         return _create_traci_controller(table, lookup)
 
-    # An FMU drives one vehicle.
     if table.kind == "fmu":
         path = file_beside(table.model, lookup.folders)
         if not path:
@@ -234,9 +234,9 @@ def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
         fleet.max_vehicles = MAX_INSTANCES
         return fleet
 
-    # A class drives one vehicle or all.
+    # A ScalarAds, too, is created once, so that wrong parameters raise their errors here.
     member, create = _class_and_creator("ads", ADS, table, lookup, ScalarAds, Ads)
-    ads: Ads = create()  # also for a ScalarAds, so that wrong parameters raise errors here
+    ads: Ads = create()
     if not isinstance(ads, ScalarAds):
         return ads
     return PerVehicleAds(create, member.code or UserCode(f"ads.model = {table.model!r}"))

@@ -39,7 +39,7 @@ class Moving(NamedTuple):
     ----------
     track
         The body's track with such columns.
-    edge, far, half_length, half_width
+    edge, far_end, half_length, half_width
         Position along the lane of the body's rear (of who faces along the lane, of its first point
         in the vehicle's path) and of its far end; half its extent along and across the lane [m].
     vx, vy, least_vx, most_vx
@@ -60,7 +60,7 @@ class Moving(NamedTuple):
 
     track: Track
     edge: FloatArray
-    far: FloatArray
+    far_end: FloatArray
     half_length: FloatArray
     half_width: FloatArray
     vx: FloatArray
@@ -82,20 +82,18 @@ class Moving(NamedTuple):
         """What follows from a track with columns; `vehicle_width` is that of the vehicle under test
         [m].
         """
-        # Half sizes of the box around a rotated body.
         cosine = np.abs(track.along)
         sine = np.abs(track.left)
         half_length = (track.length * cosine + track.width * sine) / 2
         half_width = (track.length * sine + track.width * cosine) / 2
 
-        # Where the vehicle first touches it from behind.
+        # A vehicle touches a rotated body first at a side, which may be ahead of its rear corner.
         rear = track.x - half_length
         edge = rear
         is_lengthwise = _rotated(track) & (cosine > sine)
         if is_lengthwise.any():
             edge = np.where(is_lengthwise, first_in_strip(track, vehicle_width / 2), rear)
 
-        # How it moves, and when it is in the vehicle's path.
         vx = slim(track.speed * track.along)
         vy = slim(np.diff(track.y, axis=0, prepend=track.y[:1]) / step)
         is_there: BoolArray = slim((track.length > 0) | (track.width > 0))
@@ -113,7 +111,7 @@ class Moving(NamedTuple):
         return cls(
             track=track,
             edge=edge,
-            far=track.x + half_length,
+            far_end=track.x + half_length,
             half_length=slim(half_length),
             half_width=half_width,
             vx=vx,
@@ -131,19 +129,23 @@ class Moving(NamedTuple):
             faces_along=bool((cosine == 1).all()),
         )
 
-    def covers(self, other: Moving) -> bool:
+    def covers(self, body: Moving) -> bool:
         """Whether another body that stands is always inside this one, which then hides all that the
         other one does.
         """
-        mine = self.track
-        its = other.track
+        cover = self.track
+        track = body.track
         return (
             self.faces_along
-            and other.faces_along
-            and len(its.x) == len(its.y) == 1
-            and bool((np.abs(its.x - mine.x) <= (mine.length - its.length) / 2 + TIE).all())
-            and bool((np.abs(its.y - mine.y) <= (mine.width - its.width) / 2 + TIE).all())
+            and body.faces_along
+            and len(track.x) == len(track.y) == 1
+            and bool((np.abs(track.x - cover.x) <= (cover.length - track.length) / 2 + TIE).all())
+            and bool((np.abs(track.y - cover.y) <= (cover.width - track.width) / 2 + TIE).all())
         )
+
+    def is_covered_by(self, bodies: Sequence[Moving]) -> bool:
+        """Whether one of other bodies covers this one."""
+        return any(body.covers(self) for body in bodies if body is not self)
 
 
 def _rotated(track: Track) -> BoolArray:
@@ -173,10 +175,10 @@ def row(column: Sampled, sample: int, group: IntArray | None) -> Sampled:
 
 
 def tracks_of(
-    points: Sequence[Point], times: FloatArray, n_encounters: int, step: float, own: Body
+    points: Sequence[Point], times: FloatArray, n_encounters: int, step: float, vehicle: Body
 ) -> list[Track]:
     """The bodies at K points, each in N encounters, with columns; body b is that of all scenarios'
-    bodies b. `own` is the vehicle under test at the start.
+    bodies b. `vehicle` is the vehicle under test at the start.
 
     Raises
     ------
@@ -191,10 +193,11 @@ def tracks_of(
     for tracks in tracks_of_scenarios:
         check_shapes(tracks, len(times), n_encounters, step)
     of_bodies = zip_longest(*tracks_of_scenarios, fillvalue=NOBODY)
-    joined = [_joined(tracks, n_encounters if len(points) > 1 else 1) for tracks in of_bodies]
+    width = n_encounters if len(points) > 1 else 1
+    joined = [_joined(tracks, width) for tracks in of_bodies]
     for track in joined:
         check_motion(track, step)
-    check_start(joined, own)
+    check_start(joined, vehicle)
     return joined
 
 
@@ -206,5 +209,5 @@ def _joined(tracks: Sequence[Track], width: int) -> Track:
         length = max(len(part) for part in parts)
         widened = [np.broadcast_to(part, (length, max(width, part.shape[1]))) for part in parts]
         columns.append(slim(np.concatenate(widened, axis=1)))
-    first = next(track for track in tracks if track is not NOBODY)
-    return Track(first.name, first.kind, *columns)
+    body = next(track for track in tracks if track is not NOBODY)
+    return Track(body.name, body.kind, *columns)

@@ -94,7 +94,6 @@ def open_network(network: str) -> NetworkFiles:
     InputError
         If the network does not exist, a file is missing, or it is unclear which files to use.
     """
-    # A shipped network, or a folder or file of the user.
     path = NETWORKS / network if is_shipped(network) else Path(network)
     if not is_network(path):
         names = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
@@ -105,7 +104,6 @@ def open_network(network: str) -> NetworkFiles:
         )
     folder, roads_file = (path, _roads_in(path)) if path.is_dir() else (path.parent, path.name)
 
-    # All files on which it depends.
     names = [roads_file, *_sources_of(folder / roads_file), TRAFFIC_FILE, OPTIONS_FILE]
     if (folder / OPTIONS_FILE).is_file():
         names += _sources_of(folder / OPTIONS_FILE)
@@ -129,7 +127,8 @@ def is_network(path: Path) -> bool:
     """Whether a path is a folder or a built network."""
     try:
         return path.is_dir() or (path.name.endswith(NETWORK_ENDING) and path.is_file())
-    except OSError:  # for example, a name is too long
+    # For example, a name is too long.
+    except OSError:
         return False
 
 
@@ -146,16 +145,10 @@ def _roads_in(folder: Path) -> str:
     """The recipe in a folder or, without a recipe, its built network; of several the one that
     SUMO's options name.
     """
-    # A recipe comes before a built network; options tell which of several.
-    recipes, built = (
-        sorted(file.name for file in folder.glob(f"*{end}"))
-        for end in (RECIPE_ENDING, NETWORK_ENDING)
-    )
-    names = recipes or built
+    names = _names_in(folder, RECIPE_ENDING) or _names_in(folder, NETWORK_ENDING)
     if len(names) > 1 and (folder / OPTIONS_FILE).is_file():
-        names = [
-            name for name in names if name == options_in(folder / OPTIONS_FILE).get("net-file")
-        ] or names
+        stated = options_in(folder / OPTIONS_FILE).get("net-file")
+        names = [name for name in names if name == stated] or names
     if len(names) != 1:
         raise InputError(
             folder,
@@ -163,6 +156,10 @@ def _roads_in(folder: Path) -> str:
             f"{LEGAL_FOLDERS}; of several networks, net-file in {OPTIONS_FILE} names one",
         )
     return names[0]
+
+
+def _names_in(folder: Path, ending: str) -> list[str]:
+    return sorted(file.name for file in folder.glob(f"*{ending}"))
 
 
 def _sources_of(file: Path) -> list[str]:
@@ -238,10 +235,9 @@ def built_network(network: NetworkFiles) -> Path:
     """The file of the network, which netconvert builds unless it is there, with its changes; raises
     the errors of `copied_network`.
     """
-    # A built network without changed lanes is used as it is.
-    original = network._replace(lane_changes=(), traffic_changes=())
     if not network.lane_changes and network.is_built:
         return network.path(network.roads_file)
+    original = network._replace(lane_changes=(), traffic_changes=())
 
     def build(into: Path) -> None:
         if network.lane_changes:
@@ -268,8 +264,10 @@ def cache_folder_name(network: NetworkFiles, n: int, digests: Sequence[str]) -> 
     """Name of the folder in the cache for `n` copies of a network whose files have these
     digests.
     """
-    name = re.sub(r"[^a-zA-Z0-9_.-]", "_", network.folder.name)  # SUMO splits file names at commas
-    return f"{name}-{n}-{_digest(' '.join([*digests, sumo_version(), _code_digest()]).encode())}"
+    # SUMO splits file names at commas.
+    name = re.sub(r"[^a-zA-Z0-9_.-]", "_", network.folder.name)
+    content = " ".join([*digests, sumo_version(), _code_digest()])
+    return f"{name}-{n}-{_digest(content.encode())}"
 
 
 def program_of_sumo(name: str, source: object) -> str:
@@ -320,9 +318,7 @@ def _digest(content: bytes) -> str:
 
 @cache
 def _code_digest() -> str:
-    return _digest(
-        b"".join(Path(str(module)).read_bytes() for module in (__file__, copies.__file__))
-    )
+    return _digest(Path(__file__).read_bytes() + Path(str(copies.__file__)).read_bytes())
 
 
 def road_digests(network: NetworkFiles) -> list[str]:
@@ -369,7 +365,8 @@ def networks_for(scenarios: Sequence[Scenario]) -> list[NetworkFiles]:
     """The networks of several scenarios, whose files are read once per network; raises the errors
     of `network_for`.
     """
-    networks = {name: open_network(name) for name in {scenario.network for scenario in scenarios}}
+    names = {scenario.network for scenario in scenarios}
+    networks = {name: open_network(name) for name in names}
     return [_network_for(scenario, networks[scenario.network]) for scenario in scenarios]
 
 
@@ -379,10 +376,13 @@ def _network_for(scenario: Scenario, network: NetworkFiles) -> NetworkFiles:
 
 
 def _frozen(changes: XmlChanges) -> Changes:
-    return tuple(
-        (path, None if attributes is None else tuple(attributes.items()))
+    """The changes with the attributes of elements as pairs, where they are not removed."""
+    items = {
+        path: tuple(attributes.items())
         for path, attributes in changes.items()
-    )
+        if attributes is not None
+    }
+    return tuple((path, items.get(path)) for path in changes)
 
 
 class _BuiltRoads:
@@ -395,8 +395,8 @@ class _BuiltRoads:
         shapes = _lane_shapes(self._network)
         if lane not in shapes:
             raise InputError(self._network.folder, f"there is no lane {lane!r}")
-        x_and_y = (map(float, point.split(",")[:2]) for point in shapes[lane].split())
-        return lane_through(lane, [(x, y) for x, y in x_and_y])
+        points = (point.split(",") for point in shapes[lane].split())
+        return lane_through(lane, [(float(x), float(y)) for x, y, *_ in points])
 
 
 @lru_cache(maxsize=100)

@@ -125,7 +125,6 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
     if is_shipped(name):
         return []
 
-    # Attributes of the vehicle under test that have no effect.
     network = open_network(name)
     file = network.path(TRAFFIC_FILE)
     unused_attributes = [
@@ -143,20 +142,14 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
         )
         remarks.append(f"{unused}; the study's vehicle and ADS determine how it drives")
 
-    # SUMO's driver, who drives beside a controller.
-    model = next(
-        (
-            vtype.get("carFollowModel", "")
-            for vtype in parse_xml(file).findall(f"vType[@id='{VUT}']")
-        ),
-        "",
-    )
+    # SUMO's driver drives beside a controller.
+    vtype = parse_xml(file).find(f"vType[@id='{VUT}']")
+    model = "" if vtype is None else vtype.get("carFollowModel", "")
     if acting and model not in ("", *EXACT_MODELS):
         remarks.append(
             f"{file}: carFollowModel = {model}: SUMO's driver uses its speed behind a leader alone"
         )
 
-    # Options that are missing or overruled.
     options_file = network.path(OPTIONS_FILE)
     stated = DEFAULT_OPTIONS | options_in(options_file)
     if "step-length" not in stated:
@@ -179,25 +172,24 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
             " study"
         )
 
-    # What SUMO says.
     if warnings := _warnings_file(network).read_text(encoding="utf-8"):
         remarks.append(f"{network.folder}: {warnings}")
     return remarks
 
 
-def _is_same(stated: str, own: str) -> bool:
+def _is_same(stated: str, value: str) -> bool:
     """Whether two values of an option of SUMO mean the same."""
     number = parse_seconds(stated)
-    if own in ("true", "false"):
-        return (stated.lower() in TRUE_VALUES) == (own == "true")
+    if value in ("true", "false"):
+        return (stated.lower() in TRUE_VALUES) == (value == "true")
     if number is None:
-        return stated == own
-    return number <= 0 if own == SWITCHED_OFF else number == parse_seconds(own)
+        return stated == value
+    return number <= 0 if value == SWITCHED_OFF else number == parse_seconds(value)
 
 
 @lru_cache(maxsize=100)
 def _check_files(network: NetworkFiles) -> None:
-    # Options that this program can use.
+    # Of these options SUMO would wait for a client at the remote port.
     options = {
         "step-length": str(STEP_LENGTH),
         "route-files": TRAFFIC_FILE,
@@ -205,15 +197,11 @@ def _check_files(network: NetworkFiles) -> None:
     }
     is_legal_step = SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP
     if "remote-port" in options or not is_legal_step or options["route-files"] != TRAFFIC_FILE:
-        names = (
-            "remote-port",
-            "step-length",
-            "route-files",
-        )  # SUMO would wait for a client at the port
+        names = ("remote-port", "step-length", "route-files")
         stated = ", ".join(f"{name} = {options[name]!r}" for name in names if name in options)
         raise InputError(network.path(OPTIONS_FILE), stated, LEGAL_OPTIONS)
 
-    # The vehicle under test departs at once, alone of its type, without a stop.
+    # The vehicle under test departs at once, alone of its type, as each setting changes its type.
     file = network.path(TRAFFIC_FILE)
     traffic = parse_xml(file)
     vut = next(
@@ -227,10 +215,12 @@ def _check_files(network: NetworkFiles) -> None:
     routes = (vut, *vut.findall("route"), *traffic.findall(f"route[@id='{vut.get('route')}']"))
     type_name = vut.get("type")
     depart = vut.get("depart", "")
-    others = sum(actor is not vut and actor.get("type") == VUT for actor in traffic)
+    n_others = sum(actor is not vut and actor.get("type") == VUT for actor in traffic)
     has_stop = any(route.find("stop") is not None for route in routes)
-    if type_name != VUT or others or parse_seconds(depart) != 0 or has_stop:
-        problem = f"vehicle {VUT!r}: type = {type_name!r} (of {others} others), depart = {depart!r}"
+    if type_name != VUT or n_others or parse_seconds(depart) != 0 or has_stop:
+        problem = (
+            f"vehicle {VUT!r}: type = {type_name!r} (of {n_others} others), depart = {depart!r}"
+        )
         raise InputError(file, f"{problem}, has {'a stop' if has_stop else 'no stop'}", LEGAL_VUT)
     _check_lanes(file, routes, parse_xml(built_network(network)))
     _refuse_random_types(file, traffic)
@@ -244,13 +234,11 @@ def _check_lanes(
     names = " ".join(
         route.get(name, "") for route in routes for name in ("edges", "from", "via", "to")
     ).split()
-    for lane in (
-        lane for edge in roads.iter("edge") if edge.get("id") in names for lane in edge.iter("lane")
-    ):
-        coordinates = [
-            (*point.split(","), "0") for point in lane.get("shape", "").split()
-        ]  # x,y or x,y,z
-        heights = [float(z) for _, _, z, *_ in coordinates]
+    edges = (edge for edge in roads.iter("edge") if edge.get("id") in names)
+    for lane in (lane for edge in edges for lane in edge.iter("lane")):
+        # A point is x,y or x,y,z.
+        points = (f"{point},0".split(",") for point in lane.get("shape", "").split())
+        heights = [float(z) for _, _, z, *_ in points]
         climb = max(heights, default=0.0) - min(heights, default=0.0)
         friction = float(lane.get("friction", 1))
         problem = (
@@ -265,10 +253,11 @@ def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
     """Refuse types whose drivers are random: two copies of traffic that reacts to the vehicle may
     not show it yet.
     """
-    names = {actor.get("type") for actor in traffic if actor.tag in ("vehicle", "trip", "flow")} - {
-        VUT
-    }
-    for vtype in (vtype for vtype in traffic.findall("vType") if vtype.get("id") in names):
+    actors = [actor for actor in traffic if actor.tag in ("vehicle", "trip", "flow")]
+    names = {actor.get("type") for actor in actors} - {VUT}
+    for vtype in traffic.findall("vType"):
+        if vtype.get("id") not in names:
+            continue
         model = vtype.get("carFollowModel", "Krauss")
         speed_dev = vtype.get("speedDev", "0.1")
         sigma = vtype.get("sigma", "0.5") if model in SIGMA_MODELS else "0"
@@ -293,12 +282,13 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
     """Load a network in a SUMO process of its own, as some crash SUMO; then compare the traffic of
     two copies.
     """
-    # SUMO loads the network.
     legal = "options and traffic that SUMO loads without an error"
     files = ("-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE)
-    own = own_options(options_in(network.path(OPTIONS_FILE)))
+    fixed_options = own_options(options_in(network.path(OPTIONS_FILE)))
     only_load = ("--begin", "0", "--no-step-log", "true")
-    exit_code, messages = load_in_sumo(network.folder, *files, *only_load, *as_arguments(own))
+    exit_code, messages = load_in_sumo(
+        network.folder, *files, *only_load, *as_arguments(fixed_options)
+    )
     if exit_code != 0:
         problem = (
             f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}:"
@@ -306,7 +296,7 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
         )
         raise InputError(network.folder, problem, legal)
 
-    # Two copies of its traffic move alike.
+    # Traffic that is random moves otherwise in each copy.
     try:
         actor, time = _first_difference(network)
     except (SimulationError, EnvironmentFault) as error:

@@ -52,13 +52,11 @@ class Perception:
     def __init__(self, weathers: Sequence[Weather], step: float, size: int) -> None:
         self._visibility = per_vehicle([weather.visibility for weather in weathers], size)
 
-        # A delay line for each number of whole steps.
         delays = per_vehicle([weather.recognition_delay for weather in weathers], size)
         self._lines: list[tuple[IntArray | slice, DelayLine]] = []
+        # One delay line for all, without indices, is faster than one for each number of steps.
         if np.ndim(delays) == 0:
-            self._lines.append(
-                (slice(None), DelayLine.by(float(delays), step))
-            )  # faster than indices
+            self._lines.append((slice(None), DelayLine.by(float(delays), step)))
             return
         steps, fractions = DelayLine.parts(delays, step)
         groups = [np.flatnonzero(steps == count) for count in np.unique(steps)]
@@ -71,21 +69,20 @@ class Perception:
 
         An occluded obstacle appears at rest, infinitely far away.
         """
-        # What the ADS may see, hidden where nobody is visible.
+        # The speed is delayed, too: the closing speed is that of then.
         values = np.empty((len(OCCLUDED) + 1, len(speed)))
-        values[-1] = speed  # for the closing speed of then
+        values[-1] = speed
         for row, quantity in enumerate(OCCLUDED):
             values[row] = getattr(scene, quantity)
         if scene.visible is not ALL_TRUE:
             values[:-1] = np.where(scene.visible, values[:-1], _UNSEEN)
 
-        # As it was when it was sensed.
-        seen = np.empty_like(values)
+        delayed = np.empty_like(values)
         for k, (vehicles, line) in enumerate(self._lines):
-            seen[:, vehicles], next_line = line.delayed(values[:, vehicles])
+            delayed[:, vehicles], next_line = line.delayed(values[:, vehicles])
             self._lines[k] = vehicles, next_line
-        obstacle = dict(zip(OCCLUDED, seen[:-1], strict=True))
-        closing_speed = seen[-1] - obstacle["obstacle_speed"]
+        obstacle = dict(zip(OCCLUDED, delayed[:-1], strict=True))
+        closing_speed = delayed[-1] - obstacle["obstacle_speed"]
         return Observation(
             time=time,
             speed=speed,

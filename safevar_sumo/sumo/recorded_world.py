@@ -48,7 +48,6 @@ class RecordedWorld:
     """
 
     def __init__(self, recording: Recording, size: int) -> None:
-        # The recorded actors, at every sample and in every scene.
         films = [*recording.tracks.values()]
         n_samples = max((len(film.motion) for film in films), default=1)
         n_scenes = np.size(recording.speed)
@@ -62,7 +61,6 @@ class RecordedWorld:
                 len(film.motion), -1, 5
             )
 
-        # From where on a vehicle may touch somebody.
         self._middles = self._motion[..., :2] - self._motion[..., 2:4] * (self._sizes[:, :1] / 2)
         self._reach = (
             np.add.outer((recording.length, recording.width), np.hypot(*self._sizes.T)) / 2
@@ -75,7 +73,6 @@ class RecordedWorld:
         """The first position along the way, at every sample, of a front that may touch somebody
         [m].
         """
-        # The vehicles at the start.
         self.n = size * n_scenes
         self.step_length = recording.step_length
         self.sample = 0
@@ -100,7 +97,6 @@ class RecordedWorld:
         SimulationError
             If a vehicle leaves its last lane.
         """
-        # Ballistic update, as SUMO's.
         self._before = self._now
         distances = distance_covered(self._before.speeds, speeds, self.step_length)
         if np.count_nonzero(is_open) < self.n:
@@ -109,7 +105,7 @@ class RecordedWorld:
         self._lane_position = self._lane_position + distances
         self.sample += 1
 
-        # On to the next lane of the route.
+        # A fast vehicle may pass several lanes in a step.
         while np.count_nonzero(is_beyond := self._lane_position > self._lanes.end):
             if (self._lane_number[is_beyond] == len(self._scene.way.end) - 1).any():
                 raise SimulationError(
@@ -183,7 +179,7 @@ class RecordedWorld:
         who cross a junction are checked against vehicles whose front is on it
         (`MSLane::detectCollisions`).
         """
-        # Who is near enough to touch somebody?
+        # In most steps nobody is near: then no overlaps are computed.
         self._struck = {}
         if (self._now.fronts @ self._scene.along).max() < self._at_sample(self._begins):
             return {}
@@ -200,19 +196,20 @@ class RecordedWorld:
             self._now, vehicles, actors, ~persons | self._now.meets_persons[vehicles]
         )
 
-        # The first actor of each vehicle.
         pairs = np.flatnonzero(early | late)
-        struck, first = np.unique(vehicles[pairs], return_index=True)
-        pairs = pairs[first]
+        struck, rows = np.unique(vehicles[pairs], return_index=True)
+        pairs = pairs[rows]
         speeds = np.where(early[pairs], self._before.speeds[struck], self._now.speeds[struck])
         self._struck = dict(zip(struck.tolist(), actors[pairs].tolist(), strict=True))
         return dict(zip(struck.tolist(), speeds.tolist(), strict=True))
 
     def _is_near(self) -> BoolArray:
         """Which of the A actors each vehicle may have touched since the last step, shape (N, A)."""
-        own = self._now.fronts - self._scene.along * (self._scene.length / 2)
-        apart = own.reshape(-1, self._size, 1, 2) - self._at_sample(self._middles)[:, np.newaxis]
-        dx, dy = apart.reshape(self.n, -1, 2).transpose(2, 0, 1)
+        middles = self._now.fronts - self._scene.along * (self._scene.length / 2)
+        offsets = (
+            middles.reshape(-1, self._size, 1, 2) - self._at_sample(self._middles)[:, np.newaxis]
+        )
+        dx, dy = offsets.reshape(self.n, -1, 2).transpose(2, 0, 1)
         east, north = self._scene.along
         along = np.abs(dx * east + dy * north)
         across = np.abs(dy * east - dx * north)
@@ -230,21 +227,27 @@ class RecordedWorld:
         overlaps = np.zeros(len(vehicles), dtype=bool)
         (pairs,) = np.nonzero(is_checked)
         if len(pairs):
-            other = self._actors(vehicles[pairs], actors[pairs])
-            is_parallel = np.abs(other.along @ self._scene.along) >= PARALLEL_COSINE
-            least = np.where(is_parallel & ~self._is_person[actors[pairs]], NUMERICAL_EPS, 0.0)
-            overlaps[pairs] = find_overlaps(self._own(moment, vehicles[pairs]), other) > least
+            obstacles = self._actors(vehicles[pairs], actors[pairs])
+            is_parallel = np.abs(obstacles.along @ self._scene.along) >= PARALLEL_COSINE
+            tolerance = np.where(is_parallel & ~self._is_person[actors[pairs]], NUMERICAL_EPS, 0.0)
+            overlaps[pairs] = (
+                find_overlaps(self._vehicle_body(moment, vehicles[pairs]), obstacles) > tolerance
+            )
         return overlaps
 
     def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
         numbers = np.asarray(vehicles)
         struck = np.array([self._struck[vehicle] for vehicle in vehicles])
-        return BodyPairs(numbers, self._own(self._now, numbers), self._actors(numbers, struck))
+        return BodyPairs(
+            numbers, self._vehicle_body(self._now, numbers), self._actors(numbers, struck)
+        )
 
     def bodies_around(self, vehicles: Sequence[int]) -> BodyPairs:
         numbers = np.repeat(vehicles, len(self._sizes))
         actors = np.tile(np.arange(len(self._sizes)), len(vehicles))
-        return BodyPairs(numbers, self._own(self._now, numbers), self._actors(numbers, actors))
+        return BodyPairs(
+            numbers, self._vehicle_body(self._now, numbers), self._actors(numbers, actors)
+        )
 
     def _at_sample(self, motion: FloatArray) -> FloatArray:
         """The row of this sample; without actors there is only one."""
@@ -257,7 +260,7 @@ class RecordedWorld:
         length, width = self._sizes[actors].T
         return Body.behind(motion[:, :2], motion[:, 2:4], length, width, motion[:, 4])
 
-    def _own(self, moment: _Moment, vehicles: IntArray) -> Body:
+    def _vehicle_body(self, moment: _Moment, vehicles: IntArray) -> Body:
         scene = self._scene
         along = np.tile(scene.along, (len(vehicles), 1))
         length = np.full(len(vehicles), scene.length)

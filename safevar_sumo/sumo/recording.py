@@ -59,13 +59,13 @@ class LaneSequence(NamedTuple):
     """The L lanes of a straight line that the vehicle under test follows, in order; shape (L,) or
     (L, 2) [m].
 
-    A lane's shape leads from `first` along `vector`, over `shape_length`. SUMO counts positions on
+    A lane's shape leads from `origin` along `vector`, over `shape_length`. SUMO counts positions on
     the lane from 0 to `end`; `stretch` is `shape_length` / `end`. `meets_persons` is 1 where SUMO
     looks for collisions with persons: on the lanes of junctions, which persons cross, or everywhere
     if there is no junction; else 0.
     """
 
-    first: FloatArray
+    origin: FloatArray
     vector: FloatArray
     end: FloatArray
     stretch: FloatArray
@@ -81,7 +81,7 @@ class LaneSequence(NamedTuple):
         lanes, shape (N,) [m].
         """
         share = lane_position * self.stretch / self.shape_length
-        return self.first + self.vector * share[:, np.newaxis]
+        return self.origin + self.vector * share[:, np.newaxis]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,10 +181,8 @@ def _code_bytes() -> bytes:
     """SUMO's version and the code that plays scenes: a scene depends on them and on its
     scenario.
     """
-    files = sorted(
-        file for folder in ("sumo", "scenarios") for file in (PACKAGE / folder).glob("*.*")
-    )
-    return b"".join([sumo_version().encode(), *(file.read_bytes() for file in files)])
+    files = sorted([*(PACKAGE / "sumo").glob("*.*"), *(PACKAGE / "scenarios").glob("*.*")])
+    return sumo_version().encode() + b"".join(file.read_bytes() for file in files)
 
 
 def _packed_array(array: FloatArray) -> tuple[tuple[int, ...], bytes]:
@@ -198,11 +196,10 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
 
 def _play(scenario: WorldScenario, network: NetworkFiles, step: float | None) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
-    # The scene as SUMO starts it.
     with open_world(copied_network(network, 1), 1, step) as world:
         world.enter(None)
         api = world.api
-        vehicle = world.api.vehicle
+        vehicle = api.vehicle
         vut = copied_id(0, VUT)
         way = _way_of(api, vut)
         if way is None:
@@ -212,7 +209,7 @@ def _play(scenario: WorldScenario, network: NetworkFiles, step: float | None) ->
             for id_ in vehicle.getIDList()
         }
 
-        # All that vehicles meet in it.
+        # The tracks are last: they advance the world.
         return Recording(
             step_length=world.step_length,
             start=float(vehicle.getLanePosition(vut)),
@@ -225,7 +222,7 @@ def _play(scenario: WorldScenario, network: NetworkFiles, step: float | None) ->
                 copy_and_name(id_)[1]: tuple(api.lane.getShape(id_)) for id_ in api.lane.getIDList()
             },
             first_lanes=lane_of,
-            tracks=_tracks(scenario, world),  # last: it advances the world
+            tracks=_tracks(scenario, world),
         )
 
 
@@ -233,7 +230,6 @@ def _tracks(scenario: WorldScenario, world: SumoWorld) -> dict[str, Film]:
     """How all actors except the vehicle under test move."""
     length = round(scenario.duration / world.step_length) + 1
 
-    # The actors at every sample, without the vehicle under test.
     tracks = dict[str, Film]()
     memory = world.begin(scenario)
     for sample in range(length):
@@ -252,7 +248,7 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
     """The lanes of a vehicle's route; None if the vehicle does not depart in the middle of a lane,
     or the lanes do not form a straight line.
     """
-    # The only way along the route, with the lanes of junctions.
+    # The way has the lanes of junctions, too, which a route leaves out.
     lanes = [api.vehicle.getLaneID(vut)]
     for edge in api.vehicle.getRoute(vut)[api.vehicle.getRouteIndex(vut) + 1 :]:
         links = [
@@ -268,7 +264,6 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
             links = api.lane.getLinks(lanes[-1])
         lanes.append(next_lane)
 
-    # Straight lanes without a gap between them.
     shapes = [api.lane.getShape(lane) for lane in lanes]
     if api.vehicle.getLateralLanePosition(vut) or any(len(shape) != 2 for shape in shapes):
         return None
@@ -282,7 +277,6 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
     if largest_turn > STRAIGHTNESS or largest_gap > STRAIGHTNESS:
         return None
 
-    # Where persons walk, and how shapes and lengths relate.
     is_junction = np.array([float(copy_and_name(lane)[1].startswith(":")) for lane in lanes])
     meets_persons = is_junction if is_junction.any() else np.ones(len(lanes))
     stretch = np.maximum(shape_length, POSITION_EPS) / lengths

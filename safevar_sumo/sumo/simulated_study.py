@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ from safevar_sumo.scenarios.base import Mover
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
-NOISE = ("noise", "noisy", "dropout", "jitter")
+NOISE = re.compile("noise|noisy|dropout|jitter")
 """Words of characteristics that are noise."""
 SEED = "seed"
 """The parameter of a simulator that its noise is drawn from."""
@@ -28,7 +29,7 @@ def check_tables(study: Study, mover: Mover) -> None:
         With the first such key.
     """
     tests = study.tests
-    given: dict[str, Any] = {
+    entries: dict[str, Any] = {
         "vehicle.model": study.vehicle.model,
         "vehicle.parameters": study.vehicle.parameters,
         "ads.model": study.ads.model,
@@ -42,25 +43,23 @@ def check_tables(study: Study, mover: Mover) -> None:
             problem = f"search.failed = {study.search.failed!r} without a simulator of one's own"
             raise InputError("", problem, "'stop': settings on which SUMO fails are skipped anyway")
         for key in ("vehicle.model", "ads.model", "weather"):
-            if not given[key]:
+            if not entries[key]:
                 table = key.removesuffix(".model") if key.startswith("ads") else key
                 legal = "this key, or a scenario.model with simulate(setting), a simulator"
                 raise InputError("", f"{table} is missing", legal)
         return
 
-    # What a simulator has of its own.
-    given |= {
+    entries |= {
         "step_length": study.step_length,
         "spread": study.spread,
         "repair": study.repair.parameters,
         "matrix.tests.weathers": next((test.weathers for test in tests if test.weathers), []),
     }
-    for key, value in given.items():
+    for key, value in entries.items():
         if value:
             text = value if isinstance(value, str | float) else str(value)
-            raise InputError(
-                "", f"{key} = {text!r} beside the simulator of scenario.model", IN_SIMULATOR
-            )
+            problem = f"{key} = {text!r} beside the simulator of scenario.model"
+            raise InputError("", problem, IN_SIMULATOR)
 
 
 def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
@@ -72,9 +71,9 @@ def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
         With the first such test.
     """
     for point in matrix:
-        there, here = point.scenario.mover.kind, scenario.mover.kind
-        if there != here:
-            problem = f"matrix.tests: {point.name!r} is {there}, and scenario.model is {here}"
+        kind, study_kind = point.scenario.mover.kind, scenario.mover.kind
+        if kind != study_kind:
+            problem = f"matrix.tests: {point.name!r} is {kind}, and scenario.model is {study_kind}"
             raise InputError("", problem, "tests of the kind of scenario.model")
 
 
@@ -83,15 +82,13 @@ def noise_remarks(characteristics: CharacteristicSet, points: Sequence[Point]) -
     seed.
     """
     noisy = [
-        item.name
-        for item in characteristics
-        if any(word in f"{item.name} {item.meaning}".lower() for word in NOISE)
+        item.name for item in characteristics if NOISE.search(f"{item.name} {item.meaning}".lower())
     ]
     seeds = {getattr(point.scenario, SEED, None) for point in points}
     if not noisy or len(seeds) > 1:
         return []
-    which = f"{SEED} = {seeds.pop()}" if None not in seeds else "one seed"
+    source = f"{SEED} = {seeds.pop()}" if None not in seeds else "one seed"
     return [
-        f"{' and '.join(noisy)}: noise of {which}, and a limit may be that of this seed alone;"
+        f"{' and '.join(noisy)}: noise of {source}, and a limit may be that of this seed alone;"
         f" several seeds are an axis of the matrix, such as over = {{ {SEED} = [1, 2, 3] }}"
     ]

@@ -32,6 +32,7 @@ from safevar_sumo.records import (
     LEAST_CLOSING_SPEED,
     NO_CONTACT,
     QUANTITIES,
+    BoolArray,
     Encounter,
     Evaluations,
     FloatArray,
@@ -105,7 +106,8 @@ class _Setting(dict[str, float]):
         self.unread.discard(name)
         return super().get(name, default)
 
-    def __iter__(self) -> Iterator[str]:  # copies read all
+    # Whoever copies a setting, by any of these, reads all of it.
+    def __iter__(self) -> Iterator[str]:
         self.unread.clear()
         return super().__iter__()
 
@@ -146,7 +148,7 @@ def simulations_of_setting(system: System) -> int:
 
 
 @contextmanager
-def _attempt(what: str, system: System) -> Iterator[None]:
+def _attempt(command: str, system: System) -> Iterator[None]:
     """Note that a setting is simulated, for a study that skips those that fail.
 
     Raises
@@ -158,14 +160,13 @@ def _attempt(what: str, system: System) -> Iterator[None]:
         yield
         return
     # An attempt is a file that its process has locked, from the moment it is there.
-    others = this_process.attempts / sha256(what.encode()).hexdigest()
-    others.mkdir(parents=True, exist_ok=True)
-    if sum(map(_has_died, others.iterdir())) > MAX_DEATHS:
+    attempts = this_process.attempts / sha256(command.encode()).hexdigest()
+    attempts.mkdir(parents=True, exist_ok=True)
+    if sum(map(_has_died, attempts.iterdir())) > MAX_DEATHS:
         problem = "two workers died, or exceeded the time limit, in simulate"
-        raise UserCodeError(system.source, f"{problem}{REPRODUCED_BY}{what}")
-    name = uuid4().hex
-    attempt = others / name
-    with this_process.attempts.with_name(name).open("x") as file:
+        raise UserCodeError(system.source, f"{problem}{REPRODUCED_BY}{command}")
+    attempt = attempts / uuid4().hex
+    with this_process.attempts.with_name(attempt.name).open("x") as file:
         portalocker.lock(file, ALONE)
         os.replace(file.name, attempt)
         try:
@@ -199,9 +200,9 @@ def _check_step(simulator: Simulator, time: FloatArray, point: str) -> None:
     """Refuse another time step than that of earlier runs of this process at a point."""
     kind = type(simulator)
     step = round(float(time[1] - time[0]), 6)
-    first = _steps.setdefault(kind, {}).setdefault(point, step)
-    if step != first:
-        steps = f"{min(step, first):g} and {max(step, first):g} s"
+    earlier_step = _steps.setdefault(kind, {}).setdefault(point, step)
+    if step != earlier_step:
+        steps = f"{min(step, earlier_step):g} and {max(step, earlier_step):g} s"
         code = UserCode(f"scenario.model = {kind.__name__}: runs have time steps of {steps}", kind)
         raise code.wrong("simulate", f"{step:g} s", "one time step in all runs")
 
@@ -212,10 +213,10 @@ def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System)
     """
     code = UserCode(f"scenario.model = {type(scenario).__name__}", type(scenario))
     measures = system.measuring.measures
-    known = {*OPTIONAL_METRICS, *measures, OUTCOME, IMPACT_SPEED, STRUCK_SPEED}
+    names = {*OPTIONAL_METRICS, *measures, OUTCOME, IMPACT_SPEED, STRUCK_SPEED}
     for name in result:
-        if name not in known:
-            legal = f"names of metrics: {', '.join(sorted(known))}"
+        if name not in names:
+            legal = f"names of metrics: {', '.join(sorted(names))}"
             raise code.wrong("simulate", f"a result without a trace, with {name!r}", legal)
     for objective in system.measuring.scoring.objectives:
         measure = measures.get(objective.name)
@@ -230,8 +231,14 @@ def _runs_of(
     results: Sequence[Mapping[str, Any]], system: System, allowed_impact_speed: float
 ) -> SimulationRuns:
     """The runs of N results, each with its own number of samples; 0 without a trace."""
-    traces = [result if TIME in result else {} for result in results]
-    step = next((float(np.diff(trace[TIME][:2])[0]) for trace in traces if trace), 0.0)
+    # A result with a trace states no metrics: they follow from the trace.
+    traces, rigs = list[Mapping[str, Any]](), list[Mapping[str, Any]]()
+    for result in results:
+        has_trace = TIME in result
+        traces.append(result if has_trace else {})
+        rigs.append({} if has_trace else result)
+    times = next((trace[TIME] for trace in traces if trace), np.zeros(2))
+    step = float(times[1] - times[0])
     lengths = np.array([len(trace.get(TIME, ())) for trace in traces])
     samples = np.arange(lengths.max())
 
@@ -249,19 +256,19 @@ def _runs_of(
         """What results state, shape (N,), NaN where they do not."""
         return np.array([result.get(name, np.nan) for result in of], dtype=float)
 
-    # How hard the collisions were, and other metrics that a run without a trace states.
+    def is_missing(name: str) -> BoolArray:
+        return np.array([name not in trace for trace in traces])
+
     outcome = np.array([result[OUTCOME] for result in results], dtype="U16")
     collided = outcome == Outcome.COLLISION
     struck = np.nan_to_num(number(STRUCK_SPEED))
     impact = np.where(np.isnan(number(IMPACT_SPEED)), -number(SAFETY_DEGREE), number(IMPACT_SPEED))
     closing_speed = np.maximum(impact - struck, LEAST_CLOSING_SPEED)
-    rigs = [{} if TIME in result else result for result in results]
     stated = {name: number(name, rigs) for name in system.measuring.measures}
     stated["impact_speed"] = np.where(collided, closing_speed, np.nan)
     excess = closing_speed - allowed_impact_speed
     stated["impact_excess"] = np.where(collided, excess, number("impact_excess", rigs))
 
-    # One batch, as of SUMO.
     columns: dict[str, Any] = {name: column(name) for name in ("speed", *ALSO_SAMPLED)}
     closing = columns["speed"] - columns["obstacle_speed"]
     separation = column("separation")
@@ -282,7 +289,7 @@ def _runs_of(
         collision_speed=np.where(collided, impact, np.nan),
         contact=NO_CONTACT._replace(speed=struck),
         allowed_impact_speed=np.array(allowed_impact_speed),
-        lacks={name: np.array([name not in trace for trace in traces]) for name in QUANTITIES},
+        lacks={name: is_missing(name) for name in QUANTITIES},
         stated=stated,
     )
 
@@ -302,7 +309,6 @@ def joined(evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION
         total = np.add.reduce(np.nan_to_num(rounds, nan=0.0), axis=0)
         return np.where(number, total / np.maximum(number, 1), np.nan)
 
-    # The worst run.
     outcomes = evaluations.outcome.reshape(repeats, n)
     rank = {str(name): number for number, name in enumerate(SEVERITY)}
     severity = np.reshape([rank[name] for name in evaluations.outcome.tolist()], (repeats, n))
@@ -311,7 +317,7 @@ def joined(evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION
     metrics = {name: mean(values) for name, values in evaluations.metrics.items()}
     metrics[SAFETY_DEGREE] = degrees[worst, columns]
 
-    # The share of unsafe runs.
+    # The share of unsafe runs is no criterion for one run.
     is_of_shares = criterion.measure == UNSAFE_SHARE.name
     is_unsafe = (COLLISION if is_of_shares else criterion).of(evaluations)
     metrics[UNSAFE_SHARE.name] = mean(is_unsafe.astype(float))

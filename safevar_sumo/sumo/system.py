@@ -188,18 +188,19 @@ def assemble(study: Study) -> System:
         return _assemble(study)
 
 
-def _original_points(study: Study, lookup: Lookup, only: Point) -> tuple[Point, ...]:
-    """The points in the original encounter, where encounters are ranges; `only` is the one without
+def _original_points(study: Study, lookup: Lookup, single: Point) -> tuple[Point, ...]:
+    """The points in the original encounter, where encounters are ranges; `single` is that without
     a matrix. Ranges have to be possible, also where listed encounters alone are met.
     """
     in_ranges = with_ranges(study) if study.states_ranges else study
-    points = matrix_points(in_ranges, lookup) or (only,) if in_ranges.ranges else ()
+    points = matrix_points(in_ranges, lookup) or (single,) if in_ranges.ranges else ()
     check_domains(in_ranges, points)
     if not study.ranges:
         return ()
-    for name in (name for name in study.scenario.over if name not in study.axes):
-        problem = f"over.{name}: the weathers of each test set {name}, too"
-        raise InputError("", problem, "a range, or values in the weathers")
+    for name in study.scenario.over:
+        if name not in study.axes:
+            problem = f"over.{name}: the weathers of each test set {name}, too"
+            raise InputError("", problem, "a range, or values in the weathers")
     return tuple(original_encounter(point, study.ranges) for point in points)
 
 
@@ -214,7 +215,6 @@ def _assemble(study: Study) -> System:
     check_plausible(study, vehicle)
     _check_sensors(study, vehicle, ads)
 
-    # The points at which settings are simulated, and what is measured there.
     matrix = matrix_points(study, lookup)
     check_matrix(scenario, matrix)
     scenarios = (scenario, *(point.scenario for point in matrix))
@@ -227,16 +227,16 @@ def _assemble(study: Study) -> System:
     if not (matrix or study.ranges):
         scenario.check()
 
-    only = Point(scenario, weather)
-    points = _original_points(study, lookup, only) or matrix or (only,)
+    single = Point(scenario, weather)
+    points = _original_points(study, lookup, single) or matrix or (single,)
     if not matrix:
         points = (Point(points[0].scenario, points[0].weather),)
 
-    # What the driving system knows of the original vehicle.
     region = region_of(study)
     nominal = calibration_drive(vehicle, region.characteristics.vehicle)
     if study.vehicle.model not in {*VEHICLES, ""}:
-        nominal.tables()  # so that errors of a user's vehicle do not depend on the ADS
+        # Errors of a user's vehicle must not depend on whether the ADS reads the tables.
+        nominal.tables()
     system = System(
         characteristics=region.characteristics,
         vehicle=vehicle,

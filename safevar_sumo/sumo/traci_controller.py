@@ -89,24 +89,23 @@ class TraciController(Ads):
         )
         return SumoType(mass, accel, decel, max_speed, lag, types.tau)
 
-    def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
-        # The first call is that of `start`.
+    def drive(self, observation: Observation, memory: _Memory) -> tuple[Command, _Memory]:
+        # `start` recorded the traffic of the first step.
         initial_trim = memory.initial_trim
         accelerations = np.zeros(len(memory.drivers))
-        if initial_trim is None:  # `start` recorded the first step
-            initial_trim = trim_at(memory.nominal, seen)
+        if initial_trim is None:
+            initial_trim = trim_at(memory.nominal, observation)
         else:
             memory.traffic.record_step()
 
-        # Each controller steps, if its vehicle is on the road.
         with substitute_traci():
             for i, (view, step) in enumerate(memory.drivers):
                 if memory.traffic.is_on_road(i):
-                    view.time = seen.time
-                    speed = float(seen.speed[i])
+                    view.time = observation.time
+                    speed = float(observation.speed[i])
                     self._call(view, step)
                     accelerations[i] = view.commanded_acceleration(speed)
-        command = pedals_for(memory.nominal, seen.speed, accelerations, initial_trim)
+        command = pedals_for(memory.nominal, observation.speed, accelerations, initial_trim)
         return command, memory._replace(initial_trim=initial_trim)
 
     def _call(self, view: TraciView, function: Callable[..., None]) -> None:
@@ -117,7 +116,8 @@ class TraciController(Ads):
                 function(traci_module(), VUT)
         finally:
             _active_view = None
-        if view.last_error is not None:  # the controller caught the error and continued
+        # The controller may have caught the error and continued.
+        if view.last_error is not None:
             raise user_error_of(view.last_error) or view.last_error
 
 
@@ -180,11 +180,9 @@ class _Substitute(ModuleType):
         real = getattr(self._real, name)
         if hasattr(real, "getIDList") or name in ("simulation", "gui"):
             return _Substitute(real, name)
-        return (
-            partial(_call, self._domain, name)
-            if callable(real) and not isinstance(real, type)
-            else real
-        )
+        if callable(real) and not isinstance(real, type):
+            return partial(_call, self._domain, name)
+        return real
 
 
 def _call(domain: str, name: str, /, *arguments: Value, **named: Value) -> Value:

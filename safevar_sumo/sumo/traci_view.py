@@ -75,11 +75,11 @@ def refused(domain: str, name: str, problem: str) -> InputError:
 class Snapshot(NamedTuple):
     """The traffic at one time.
 
-    `own` are the values of the vehicle under test, empty once it has left the road; `actors` those
-    of other actors, by domain and name; `leader` is the leader with its gap [m].
+    `vehicle` are the values of the vehicle under test, empty once it has left the road; `actors`
+    those of other actors, by domain and name; `leader` is the leader with its gap [m].
     """
 
-    own: ActorValues
+    vehicle: ActorValues
     actors: Mapping[str, dict[str, ActorValues]]
     leader: tuple[str, float] | None
 
@@ -116,10 +116,9 @@ class SensedTraffic:
 
     def is_on_road(self, copy: int) -> bool:
         """Whether a vehicle has not left the road."""
-        return bool(self._past[copy][-1].own)
+        return bool(self._past[copy][-1].vehicle)
 
     def _snapshot(self, copy: int, names: Mapping[tuple[int, str], list[str]]) -> Snapshot:
-        # The actors of this copy, and what is measured of them.
         api = self._world.api
         vut = copied_id(copy, VUT)
         if vut not in self._world.driving:
@@ -134,23 +133,21 @@ class SensedTraffic:
                 id_ = copied_id(copy, actor)
                 actors[domain][actor] = {name: get(id_) for name, get in getters.items()}
 
-        # The vehicle itself, and who leads it.
-        own = actors["vehicle"].pop(VUT)
+        vehicle = actors["vehicle"].pop(VUT)
         leader = api.vehicle.getLeader(vut, LEADER_RANGE)
-        if (
-            not leader or not leader[0]
-        ):  # without a leader, libsumo and traci return None or ("", -1)
-            return Snapshot(own, actors, None)
+        # Without a leader, libsumo and traci return None or ("", -1).
+        if not leader or not leader[0]:
+            return Snapshot(vehicle, actors, None)
         leader_id, gap = leader
-        return Snapshot(own, actors, (copy_and_name(leader_id)[1], float(gap)))
+        return Snapshot(vehicle, actors, (copy_and_name(leader_id)[1], float(gap)))
 
 
 def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
     """The snapshot without actors beyond the sensors' range, and with distances multiplied by the
     sensors' scale.
     """
-    own = snapshot.own
-    if not own or (reach == math.inf and scale == 1):
+    vehicle = snapshot.vehicle
+    if not vehicle or (reach == math.inf and scale == 1):
         return snapshot
     actors: dict[str, dict[str, ActorValues]] = {}
     for domain, members in snapshot.actors.items():
@@ -160,18 +157,18 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
             length = values["getLength"] if domain == "vehicle" else 0.0
             heading = math.radians(values["getAngle"])
             front = values["getPosition"]
-            position = own["getPosition"]
+            position = vehicle["getPosition"]
             rear = front[0] - length * math.sin(heading), front[1] - length * math.cos(heading)
             if min(math.dist(position, front), math.dist(position, rear)) <= reach:
-                actors[domain][name] = values | _positions_in_scale(own, values, scale)
+                actors[domain][name] = values | _positions_in_scale(vehicle, values, scale)
     leader = snapshot.leader
     if leader is None or leader[0] not in actors["vehicle"]:
-        return Snapshot(own, actors, None)
+        return Snapshot(vehicle, actors, None)
     name, gap = leader
-    return Snapshot(own, actors, (name, gap * scale))
+    return Snapshot(vehicle, actors, (name, gap * scale))
 
 
-def _positions_in_scale(own: ActorValues, values: ActorValues, scale: float) -> ActorValues:
+def _positions_in_scale(vehicle: ActorValues, values: ActorValues, scale: float) -> ActorValues:
     """The positions of an actor, with distances from the vehicle itself multiplied by the sensors'
     scale.
     """
@@ -179,8 +176,8 @@ def _positions_in_scale(own: ActorValues, values: ActorValues, scale: float) -> 
         return {}
     positions = {}
     for name in POSITIONS:
-        pairs = zip(own[name], values[name], strict=True)
-        positions[name] = tuple(here + scale * (there - here) for here, there in pairs)
+        pairs = zip(vehicle[name], values[name], strict=True)
+        positions[name] = tuple(start + scale * (end - start) for start, end in pairs)
     return positions
 
 
@@ -221,7 +218,6 @@ class TraciView:
         """Speed that SUMO's driver would choose next for the limits of road and vehicle and for the
         leader [m/s].
         """
-        # What SUMO's driver would drive: up to the limit, and behind the leader.
         vehicle = self._api.vehicle
         vut = self._vut
         _, actors, leader = self._traffic.seen[self._copy]
@@ -268,17 +264,16 @@ class TraciView:
             self.last_error = error
             raise
         except (self._api.TraCIException, self._api.FatalTraCIError) as error:
-            message = re.sub(r"'([:!]?)\d+\.", r"'\1", str(error))  # ids of the traffic file
+            # The controller knows the ids of the traffic file.
+            message = re.sub(r"'([:!]?)\d+\.", r"'\1", str(error))
             raise real_traci().exceptions.TraCIException(message) from None
 
     def _command(self, domain: str, name: str, vehicle: str, *values: Value) -> Value:
         if vehicle != VUT:
-            raise refused(
-                domain, name, f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}"
-            )
-        self._commands.command(
-            name, self.time, float(self._api.vehicle.getSpeed(self._vut)), values
-        )
+            problem = f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}"
+            raise refused(domain, name, problem)
+        speed = float(self._api.vehicle.getSpeed(self._vut))
+        self._commands.command(name, self.time, speed, values)
         if name in DRIVER_COMMANDS:
             self._sumo_value(domain, name, VUT, *values)
 
@@ -298,7 +293,7 @@ class TraciView:
             return self._commands.mode
         return self._sumo_value(domain, name, *arguments)
 
-    def _sensed_value(self, domain: str, name: str, actor: str, *others: Value) -> Value:
+    def _sensed_value(self, domain: str, name: str, actor: str, *arguments: Value) -> Value:
         """Another actor's value as the sensors report it; of an actor that they do not see, as SUMO
         reports one that is not on the road.
         """
@@ -307,16 +302,16 @@ class TraciView:
                 domain, name, f"returns a value of {actor!r} that no sensor of the vehicle measures"
             )
 
-        # An actor that the sensors see has its value, another one an invalid one.
         actors = self._traffic.seen[self._copy].actors[domain]
         if actor in actors:
             return _original_ids(actors[actor][name])
-        value = self._sumo_value(domain, name, actor, *others)
+        value = self._sumo_value(domain, name, actor, *arguments)
         if isinstance(value, str):
             return ""
         if isinstance(value, tuple):
             return (float(INVALID_NUMBER),) * len(value)
-        return type(value)(INVALID_NUMBER)  # an int or a float, as SUMO has it
+        # An int or a float, as SUMO has it.
+        return type(value)(INVALID_NUMBER)
 
     def _ids(self, domain: str) -> tuple[str, ...]:
         """The ids of the actors that the sensors see, the vehicle under test first, or of the
@@ -324,8 +319,8 @@ class TraciView:
         """
         if domain not in SENSED:
             return tuple(dict.fromkeys(map(_original_ids, getattr(self._api, domain).getIDList())))
-        own = [VUT] if domain == "vehicle" else []
-        return (*own, *self._traffic.seen[self._copy].actors[domain])
+        ids = [VUT] if domain == "vehicle" else []
+        return (*ids, *self._traffic.seen[self._copy].actors[domain])
 
     def _leader(self, dist: float = 100.0) -> tuple[str, float] | None:
         """The leader and the gap to it minus minGap, if at most `dist` [m]; 0 means the stopping
@@ -351,12 +346,10 @@ class TraciView:
             if functions.get(number) not in CALLS[domain]:
                 problem = f"variable {number!r} is none of {', '.join(VARIABLES)}"
                 raise refused(domain, "subscribe", problem)
-            more = (parameters or {}).get(number, ())
             # TraCI's tuples begin with the type of what follows.
-            variables[number] = (
-                functions[number],
-                more[1:] if isinstance(more, tuple) else (more,),
-            )
+            extras = (parameters or {}).get(number, ())
+            extras = extras[1:] if isinstance(extras, tuple) else (extras,)
+            variables[number] = functions[number], extras
         self._subscriptions[domain, actor] = variables
 
     def _subscribed_values(self, domain: str, actor: str | None = None) -> Value:
@@ -369,7 +362,8 @@ class TraciView:
             if of_domain == domain and id_ in ids:
                 items = variables.items()
                 values[id_] = {
-                    number: self._query(domain, name, id_, *more) for number, (name, more) in items
+                    number: self._query(domain, name, id_, *extras)
+                    for number, (name, extras) in items
                 }
         return values if actor is None else values.get(actor, {})
 
@@ -389,7 +383,8 @@ def _original_ids(value: Value) -> Value:
     """A result with the ids of the traffic file."""
     if isinstance(value, str):
         return re.sub(r"^([:!]?)\d+\.", r"\1", value)
-    if type(value) in (list, tuple):  # not TraCI's own classes, which derive from tuple
+    # TraCI's own classes derive from tuple.
+    if type(value) in (list, tuple):
         return type(value)(map(_original_ids, value))
     return value
 

@@ -33,7 +33,7 @@ def check_shapes(tracks: Sequence[Track], n_samples: int, n_encounters: int, ste
     InputError
         With the actor, the time [s] and what is expected.
     """
-    # A name for each actor; the vehicle under test has one, too.
+    # The vehicle under test has a name, too.
     for name, count in Counter([VUT, *(track.name for track in tracks)]).items():
         if count > 1:
             raise InputError(
@@ -42,10 +42,10 @@ def check_shapes(tracks: Sequence[Track], n_samples: int, n_encounters: int, ste
                 "another name for each actor",
             )
 
-    # A number, or a value for each sample and encounter.
     for track in tracks:
         for name, value in zip(Track._fields[2:], track[2:], strict=True):
-            shape = (1, *np.shape(value))[-2:]  # a number, or one row for all samples
+            # A number, and a row, are the same at all samples.
+            shape = (1, *np.shape(value))[-2:]
             if (
                 np.ndim(value) > 2
                 or shape[0] not in (1, n_samples)
@@ -72,7 +72,6 @@ def check_motion(track: Track, step: float) -> None:
     InputError
         With the actor, the time [s] and what is expected.
     """
-    # Finite numbers, a size, a speed, a direction of length 1.
     for name, column in zip(Track._fields[2:], track[2:], strict=True):
         _refuse(
             track,
@@ -105,7 +104,6 @@ def check_motion(track: Track, step: float) -> None:
         "a unit vector (along, left)",
     )
 
-    # Nobody jumps.
     for column in (track.x, track.y):
         jumps = np.diff(column, axis=0, prepend=column[:1]) / step
         expected = f"at most {MOST_SPEED:g} m/s between two samples"
@@ -116,11 +114,11 @@ def check_motion(track: Track, step: float) -> None:
     velocity = speed * track.along * (track.length > 0)
     velocity, way = np.broadcast_arrays(velocity, track.x - track.x[:1])
     driven = travelled(velocity, np.arange(len(way), dtype=float)[:, np.newaxis] * step)
-    most = np.maximum(np.abs(way), np.abs(driven))
+    tolerance = np.maximum(APART, np.maximum(np.abs(way), np.abs(driven)) / 3)
     _refuse(
         track,
         step,
-        np.abs(way - driven) > np.maximum(APART, most / 3),
+        np.abs(way - driven) > tolerance,
         way - driven,
         "is {:.3g} m in x from where its speed takes it",
         "an x that changes by vx, the speed along the road, times the time",
@@ -139,9 +137,9 @@ def _refuse(
         )
 
 
-def check_start(tracks: Sequence[Track], own: Body) -> None:
-    """Refuse bodies, whose quantities are columns, that are inside each other or inside the
-    vehicle, `own`, at the start.
+def check_start(tracks: Sequence[Track], vehicle: Body) -> None:
+    """Refuse bodies, whose quantities are columns, that are inside each other or inside the vehicle
+    under test at the start.
 
     Raises
     ------
@@ -149,16 +147,15 @@ def check_start(tracks: Sequence[Track], own: Body) -> None:
         With the actors, the time [s] and what is expected.
     """
     bodies = {f"actor {track.name!r}": _first(track) for track in tracks if track.kind != SCREEN}
-    for (name, body), (other_name, other) in combinations(
-        {**bodies, "the vehicle under test": own}.items(), 2
-    ):
-        n = max(len(body.speed), len(other.speed))
+    bodies["the vehicle under test"] = vehicle
+    for (name, body), (obstacle_name, obstacle) in combinations(bodies.items(), 2):
+        n = max(len(body.speed), len(obstacle.speed))
         # Without a size nobody is there.
-        pair = _repeated(body, n), _repeated(other, n)
-        are_there = np.all([one.length + one.width > 0 for one in pair], axis=0)
+        pair = _repeated(body, n), _repeated(obstacle, n)
+        are_there = np.all([part.length + part.width > 0 for part in pair], axis=0)
         depth = np.where(are_there, find_overlaps(*pair), 0.0).max()
         if depth > TOUCH:
-            problem = f"at 0 s {name} is {depth:.2f} m inside {other_name}"
+            problem = f"at 0 s {name} is {depth:.2f} m inside {obstacle_name}"
             raise InputError(
                 "", f"{TRACKS_KEY}: {problem}", "bodies that do not overlap at the start"
             )
@@ -171,18 +168,8 @@ def _repeated(body: Body, n: int) -> Body:
 
 def _first(track: Track) -> Body:
     """A body at the start, of M encounters."""
-    x, y, along, left, length, width, speed = np.broadcast_arrays(
-        *(
-            column[0]
-            for column in (
-                track.x,
-                track.y,
-                track.along,
-                track.left,
-                track.length,
-                track.width,
-                track.speed,
-            )
-        )
+    length, width, x, y, cosine, sine, speed = np.broadcast_arrays(
+        *(column[0] for column in track[2:])
     )
-    return Body(np.stack([x, y], axis=1), np.stack([along, left], axis=1), length, width, speed)
+    along = np.stack([cosine, sine], axis=1)
+    return Body(np.stack([x, y], axis=1), along, length, width, speed)

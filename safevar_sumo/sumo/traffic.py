@@ -70,15 +70,15 @@ class Traffic:
         n_samples: int,
         step: float,
     ) -> None:
-        first = points[0].scenario
-        assert isinstance(first, TrackScenario)
-        self.length = first.vut_length
-        self.width = first.vut_width
-        self.setback = first.sensor_setback
+        scenario = points[0].scenario
+        assert isinstance(scenario, TrackScenario)
+        self.length = scenario.vut_length
+        self.width = scenario.vut_width
+        self.setback = scenario.sensor_setback
         n_groups = int(group.max()) + 1
         self.n = len(group)
         self.step = step
-        # None: all vehicles share a column, or each has its own.
+        # None: all vehicles share a column, or each has its own, so that no index is needed.
         self.group: IntArray | None = group if 1 < n_groups < self.n else None
         self._points = points
         self._n_encounters = n_encounters
@@ -92,8 +92,8 @@ class Traffic:
     def _place(self, n_samples: int) -> None:
         """Place all bodies at this number of samples."""
         times = (np.arange(n_samples) * self.step).astype(float)[:, np.newaxis]
-        own = self._own(np.zeros(1), np.zeros(1))
-        self.tracks = tracks_of(self._points, times, self._n_encounters, self.step, own)
+        vehicle = self._vehicle_body(np.zeros(1), np.zeros(1))
+        self.tracks = tracks_of(self._points, times, self._n_encounters, self.step, vehicle)
         bodies = [Moving.of(track, self.step, self.width) for track in self.tracks]
         highest_level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
         self._counts = [np.atleast_2d(body.level == highest_level) for body in bodies]
@@ -103,11 +103,7 @@ class Traffic:
         ]
         self._bodies = bodies
         screens = [body for body in bodies if body.track.kind == SCREEN]
-        self._hides = [
-            k
-            for k, body in enumerate(bodies)
-            if not any(screen.covers(body) for screen in screens if screen is not body)
-        ]
+        self._hides = [k for k, body in enumerate(bodies) if not body.is_covered_by(screens)]
         self._is_avoidable = [bool(body.is_avoidable.any()) for body in bodies]
 
     def are_closing(self, motion: VehicleStates) -> BoolArray:
@@ -119,16 +115,16 @@ class Traffic:
         samples = slice(self._sample, self._sample + 1)
         closes = np.zeros(self.n, dtype=bool)
         for k in self._encountered:
-            apart, rate, counts = self._apart(k, samples, front, speed)
-            closes |= (counts & (rate > STEADY) & (apart < OVERTIME * rate))[0]
+            distance, rate, counts = self._approach(k, samples, front, speed)
+            closes |= (counts & (rate > STEADY) & (distance < OVERTIME * rate))[0]
         return closes
 
     def place_until(self, n_samples: int) -> None:
         """Move all bodies up to this number of samples, if they do not yet."""
-        known = self._ended.shape[1]
-        if n_samples > known:
+        n_placed = self._ended.shape[1]
+        if n_samples > n_placed:
             self._place(n_samples)
-            self._ended = np.pad(self._ended, ((0, 0), (0, n_samples - known), (0, 0)))
+            self._ended = np.pad(self._ended, ((0, 0), (0, n_samples - n_placed), (0, 0)))
 
     def _row(self, column: Sampled, sample: int | None = None) -> Sampled:
         return row(column, self._sample if sample is None else sample, self.group)
@@ -137,17 +133,15 @@ class Traffic:
         """The scene at the sample of the last `hits`; to be called at every sample. Whoever touches
         a body sees it.
         """
-        # The front of each vehicle, and who is met at all.
         front = motion.fronts[:, 0]
         speed = motion.speeds
         over = ALL_TRUE
-        seen = []
+        views = []
         for k in self._encountered:
-            # How near a body is, and whether the encounter with it is over.
             body = self._bodies[k]
             gap = self._row(body.edge) - front
             closing = speed - self._row(body.vx)
-            is_passed = (self._row(body.far) < front - self.length) & (
+            is_passed = (self._row(body.far_end) < front - self.length) & (
                 speed >= self._row(body.most_vx)
             )
             ended = np.asarray(is_passed | self._row(body.is_cleared))
@@ -160,10 +154,9 @@ class Traffic:
             self._ended[k, self._sample] = ended
             counts: BoolArray = self._row(self._counts[k])
             over = over & (ended | ~counts)
-            seen.append(_Seen(k, gap, closing, is_passed, self._is_visible(k, front)))
+            views.append(_View(k, gap, closing, is_passed, self._is_visible(k, front)))
 
-        # The only body, or the nearest of several.
-        return self._scene_of(seen[0], over) if len(seen) == 1 else self._nearest(seen, over)
+        return self._scene_of(views[0], over) if len(views) == 1 else self._nearest(views, over)
 
     def _is_visible(self, number: int, front: FloatArray) -> BoolArray:
         """Whether a body is there, and nobody on the line from the sensors to its middle."""
@@ -176,86 +169,84 @@ class Traffic:
         return visible
 
     def _blocks(
-        self, other: Moving, x: Quantity, y: Quantity, to_x: Quantity, to_y: Quantity
+        self, body: Moving, x: Quantity, y: Quantity, to_x: Quantity, to_y: Quantity
     ) -> BoolArray:
         """Whether a body is on the line between two points: the slab test in the body's own
         axes.
         """
-        # The line of sight in the body's own coordinates.
         dx = to_x - x
         dy = to_y - y
-        rx = x - self._row(other.track.x)
-        ry = y - self._row(other.track.y)
-        if not other.faces_along:
-            along = self._row(other.track.along)
-            left = self._row(other.track.left)
-            dx, dy = dx * along + dy * left, dy * along - dx * left
-            rx, ry = rx * along + ry * left, ry * along - rx * left
+        rx = x - self._row(body.track.x)
+        ry = y - self._row(body.track.y)
+        if not body.faces_along:
+            cosine = self._row(body.track.along)
+            sine = self._row(body.track.left)
+            dx, dy = dx * cosine + dy * sine, dy * cosine - dx * sine
+            rx, ry = rx * cosine + ry * sine, ry * cosine - rx * sine
 
-        # Where it enters and leaves the body, along and across.
+        # In shares of the line: 0 at the sensors, 1 at the other point.
         enter: Quantity = -np.inf
         leave: Quantity = np.inf
-        for position, change, size in ((rx, dx, other.track.length), (ry, dy, other.track.width)):
+        for position, change, size in ((rx, dx, body.track.length), (ry, dy, body.track.width)):
             half = self._row(size) / 2 + TIE
-            first = (-half - position) / change  # infinite along the body
-            second = (half - position) / change
-            enter = np.maximum(enter, np.minimum(first, second))
-            leave = np.minimum(leave, np.maximum(first, second))
+            # Infinite for a line along the body.
+            to_rear = (-half - position) / change
+            to_front = (half - position) / change
+            enter = np.maximum(enter, np.minimum(to_rear, to_front))
+            leave = np.minimum(leave, np.maximum(to_rear, to_front))
         blocks = (enter < leave) & (leave > 0) & (enter < 1)
-        return np.asarray(blocks & self._row(other.is_there))
+        return np.asarray(blocks & self._row(body.is_there))
 
-    def _scene_of(self, seen: _Seen, over: BoolArray) -> Scene:
-        body = self._bodies[seen.body]
+    def _scene_of(self, view: _View, over: BoolArray) -> Scene:
+        body = self._bodies[view.body]
         zeros = np.zeros(self.n)
         return Scene(
-            gap=np.where(self._row(body.is_there), seen.gap, np.inf),
+            gap=np.where(self._row(body.is_there), view.gap, np.inf),
             lateral=zeros + self._row(body.lateral),
             lateral_speed=zeros + self._row(body.lateral_speed),
             over=np.broadcast_to(over, self.n),
             obstacle_speed=zeros + self._row(body.vx),
-            visible=seen.visible,
+            visible=view.visible,
             obstacle_length=zeros + 2 * self._row(body.half_length),
             obstacle_width=zeros + 2 * self._row(body.half_width),
-            obstacle=zeros + seen.body,
+            obstacle=zeros + view.body,
         )
 
-    def _nearest(self, seen: Sequence[_Seen], over: BoolArray) -> Scene:
+    def _nearest(self, views: Sequence[_View], over: BoolArray) -> Scene:
         """The scene of the nearest visible body that is or comes into the way; without one, of the
         nearest other.
         """
         ranks = []
 
-        # Who is nearest of those that are or come into the way?
-        for found in seen:
-            body = self._bodies[found.body]
-            counts: BoolArray = self._row(self._counts[found.body])
-            time_to_arrival = np.maximum(found.gap, 0.0) / np.maximum(
-                found.closing, LEAST_CLOSING_SPEED
-            )
+        for view in views:
+            body = self._bodies[view.body]
+            counts: BoolArray = self._row(self._counts[view.body])
+            closing = np.maximum(view.closing, LEAST_CLOSING_SPEED)
+            time_to_arrival = np.maximum(view.gap, 0.0) / closing
             lateral = self._row(body.track.y)
             drift = self._row(body.vy)
-            lateral_at_arrival = lateral + drift * np.where(found.closing > 0, time_to_arrival, 0.0)
-            comes = (found.closing > 0) & (
+            lateral_at_arrival = lateral + drift * np.where(view.closing > 0, time_to_arrival, 0.0)
+            comes = (view.closing > 0) & (
                 np.abs(lateral_at_arrival) < self.width / 2 + self._row(body.half_width)
             )
             # A leader at the vehicle's speed who makes way is nobody to brake for.
-            leaves = (np.sign(lateral) * drift > 0) & (found.closing <= APPROACH_SPEED)
+            leaves = (np.sign(lateral) * drift > 0) & (view.closing <= APPROACH_SPEED)
             is_in_way = (self._row(body.is_in_path) & ~leaves) | comes
             rank = (
-                found.gap
+                view.gap
                 + OFF_THE_WAY * ~is_in_way
-                + HIDDEN * ~found.visible
-                + PASSED * found.is_passed
+                + HIDDEN * ~view.visible
+                + PASSED * view.is_passed
                 + NOT_MET * ~counts
             )
-            ranks.append(np.where(self._struck == found.body, -np.inf, rank))
+            ranks.append(np.where(self._struck == view.body, -np.inf, rank))
 
-        # A scene of which each vehicle sees its own body.
+        # Most bodies are nobody's nearest: their scenes are not computed.
         chosen = np.argmin(np.stack(ranks), axis=0)
-        first, *others = [number for number in range(len(seen)) if (chosen == number).any()]
-        scene = self._scene_of(seen[first], over)
-        for number in others:
-            columns = zip(scene, self._scene_of(seen[number], over), strict=True)
+        numbers = [number for number in range(len(views)) if (chosen == number).any()]
+        scene = self._scene_of(views[numbers[0]], over)
+        for number in numbers[1:]:
+            columns = zip(scene, self._scene_of(views[number], over), strict=True)
             scene = Scene(*(np.where(chosen == number, new, old) for old, new in columns))
         return scene
 
@@ -265,7 +256,6 @@ class Traffic:
         """Speeds [m/s] of the vehicles of open runs that touch a body, by number; the sample is
         that of `observe`.
         """
-        # Bodies that a front has reached.
         self._sample = sample
         self._struck = np.full(self.n, NOBODY)
         foremost = front.max()
@@ -276,32 +266,33 @@ class Traffic:
                 continue
             is_beside = (
                 (front > self._row(body.edge))
-                & (rear < self._row(body.far))
+                & (rear < self._row(body.far_end))
                 & self._row(body.is_in_path)
             )
             vehicles = np.flatnonzero(is_beside & is_open & (self._struck == NOBODY))
             if vehicles.size:
                 overlaps = find_overlaps(
-                    self._own(front[vehicles], speed[vehicles]), self._body(k, vehicles)
+                    self._vehicle_body(front[vehicles], speed[vehicles]), self._body(k, vehicles)
                 )
                 self._struck[vehicles[overlaps > TOUCH]] = k
 
-        # Who was touched, with the speed.
         touched = np.flatnonzero(self._struck != NOBODY)
         return dict(zip(touched.tolist(), speed[touched].tolist(), strict=True))
 
     def bodies(self, vehicles: Sequence[int], front: FloatArray, speed: FloatArray) -> BodyPairs:
         """Vehicles that touch somebody and those whom they touch, in lane coordinates."""
         numbers = np.asarray(vehicles)
-        others = [self._body(k, numbers) for k in range(len(self._bodies))]
+        bodies = [self._body(k, numbers) for k in range(len(self._bodies))]
         struck = self._struck[numbers]
         columns = (
             np.stack(column)[struck, np.arange(len(numbers))]
-            for column in zip(*others, strict=True)
+            for column in zip(*bodies, strict=True)
         )
-        return BodyPairs(numbers, self._own(front[numbers], speed[numbers]), Body(*columns))
+        return BodyPairs(
+            numbers, self._vehicle_body(front[numbers], speed[numbers]), Body(*columns)
+        )
 
-    def _own(self, front: FloatArray, speed: FloatArray) -> Body:
+    def _vehicle_body(self, front: FloatArray, speed: FloatArray) -> Body:
         return Body.behind(
             np.stack([front, np.zeros_like(front)], axis=1),
             np.tile([1.0, 0.0], (len(front), 1)),
@@ -314,20 +305,19 @@ class Traffic:
         """A body at this sample, as the given vehicles meet it."""
         body = self._bodies[number]
         group = vehicles if self.group is None else self.group[vehicles]
-        columns = (row(column, self._sample, None) for column in (*body.track[2:], body.vy))
-        length, width, x, y, along, left, speed, vy = (
-            values[group] if len(values) > 1 else values.repeat(len(vehicles)) for values in columns
+        # A column may have one value for all encounters: then "clip" takes it for each.
+        length, width, x, y, cosine, sine, speed, vy = (
+            row(column, self._sample, None).take(group, mode="clip")
+            for column in (*body.track[2:], body.vy)
         )
         drift = vy if body.faces_along else np.zeros_like(vy)
-        return Body(
-            np.stack([x, y], axis=1), np.stack([along, left], axis=1), length, width, speed, drift
-        )
+        along = np.stack([cosine, sine], axis=1)
+        return Body(np.stack([x, y], axis=1), along, length, width, speed, drift)
 
     def encounter(self, trace: Trace) -> Encounter:
         """The distance to the nearest body that still counts, and how fast it shrinks, at all
         samples of a trace whose positions are those of the vehicles' fronts.
         """
-        # In blocks of samples, the distance to the nearest body that is met.
         shape = trace.speed.shape
         n_rows = max(BLOCK // trace.speed.shape[1], 1)
         distance = np.full(shape, np.inf)
@@ -336,45 +326,46 @@ class Traffic:
         for start in range(0, shape[0], n_rows):
             samples = slice(start, min(start + n_rows, shape[0]))
             for k in self._encountered:
-                apart, rate, counts = self._apart(
+                separation, rate, counts = self._approach(
                     k, samples, trace.position[samples], trace.speed[samples]
                 )
                 is_nearer = (
-                    counts & (apart < distance[samples]) if len(self._encountered) > 1 else counts
+                    counts & (separation < distance[samples])
+                    if len(self._encountered) > 1
+                    else counts
                 )
-                np.copyto(distance[samples], apart, where=is_nearer)
+                np.copyto(distance[samples], separation, where=is_nearer)
                 np.copyto(closing[samples], rate, where=is_nearer)
                 in_conflict[samples] |= counts
         return Encounter(
             separation=distance, distance=distance, closing_speed=closing, in_conflict=in_conflict
         )
 
-    def _apart(
+    def _approach(
         self, number: int, samples: slice, front: FloatArray, speed: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """The distances of vehicles to a body at some samples, how fast they shrink, and whether
         they count.
         """
         body = self._bodies[number]
-        edge, far, vx, vy, y, half_width = (
+        edge, far_end, vx, vy, y, half_width = (
             self._table(column, samples)
-            for column in (body.edge, body.far, body.vx, body.vy, body.track.y, body.half_width)
+            for column in (body.edge, body.far_end, body.vx, body.vy, body.track.y, body.half_width)
         )
-        ahead = edge - front
-        behind = front - self.length - far
-        dx = np.maximum(np.maximum(ahead, behind), 0.0)
+        gap_ahead = edge - front
+        gap_behind = front - self.length - far_end
+        dx = np.maximum(np.maximum(gap_ahead, gap_behind), 0.0)
         dy = np.maximum(np.abs(y) - self.width / 2 - half_width, 0.0)
-        apart = np.sqrt(dx * dx + dy * dy) if dy.any() else dx
-        approach = (speed - vx) * np.where(ahead > behind, dx, -dx) - np.sign(y) * vy * dy
-        rate = approach / np.maximum(apart, LEAST_DISTANCE)
+        separation = np.sqrt(dx * dx + dy * dy) if dy.any() else dx
+        approach = (speed - vx) * np.where(gap_ahead > gap_behind, dx, -dx) - np.sign(y) * vy * dy
+        rate = approach / np.maximum(separation, LEAST_DISTANCE)
         if body.is_rotated:
-            track = Track(
-                *body.track[:2], *(self._table(column, samples) for column in body.track[2:])
-            )
-            apart = distance_between(track, front - self.length / 2, self.length, self.width)
+            columns = (self._table(column, samples) for column in body.track[2:])
+            track = Track(*body.track[:2], *columns)
+            separation = distance_between(track, front - self.length / 2, self.length, self.width)
         counts = self._table(body.is_there & self._counts[number], samples)
         counts = counts & ~self._ended[number, samples]
-        return apart, rate, counts
+        return separation, rate, counts
 
     def _table(self, column: Sampled, samples: slice) -> Sampled:
         """A column at some samples, for each vehicle or for all of them."""
@@ -382,7 +373,7 @@ class Traffic:
         return values if self.group is None or values.shape[1] == 1 else values[:, self.group]
 
 
-class _Seen(NamedTuple):
+class _View(NamedTuple):
     """A body as N vehicles meet it at a sample: its number, gap [m] and closing speed [m/s], and
     whether it is passed and visible.
     """

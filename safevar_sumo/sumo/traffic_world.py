@@ -75,8 +75,8 @@ class Placed(NamedTuple):
     @classmethod
     def of(cls, track: Track, ids: list[str], start: Frame) -> Placed:
         is_person = track.kind in PERSONS
-        ahead = 0.0 if is_person else track.length.max(axis=0) / 2
-        x, y = start.point(track.x + track.along * ahead, track.y + track.left * ahead)
+        offset = 0.0 if is_person else track.length.max(axis=0) / 2
+        x, y = start.point(track.x + track.along * offset, track.y + track.left * offset)
         east, north = start._replace(origin=(0.0, 0.0)).point(track.along, track.left)
         angle = np.degrees(np.arctan2(east, north)) % 360
         return cls(track, ids, is_person, np.asarray(x), np.asarray(y), angle)
@@ -96,7 +96,6 @@ class TrafficWorld(SumoWorld):
         self._traffic = traffic
         self._start = start
 
-        # Vehicles on a lane, and actors that are placed on their tracks.
         self._sample = 0
         self._lane = LaneWorld(traffic, start_speeds, self.step_length)
         self._actors = [
@@ -105,7 +104,7 @@ class TrafficWorld(SumoWorld):
             if track.kind != SCREEN
         ]
 
-        # Functions of SUMO that place them.
+        # At every sample of every copy: their wrappers would take as long as they do.
         self._move_person, self._move_vehicle, self._set_previous_speed = (
             function_of(api, *name)
             for name in (
@@ -158,8 +157,9 @@ class TrafficWorld(SumoWorld):
         # Who is not there yet has the size that it will have.
         sizes = (column.max(axis=0, keepdims=True) for column in (track.length, track.width))
         lengths, widths = map(self._of_copies, sizes)
+        default_type = "DEFAULT_PEDTYPE" if actor.is_person else "DEFAULT_VEHTYPE"
         for id_, route, length, width in zip(actor.ids, self._routes, lengths, widths, strict=True):
-            types.copy("DEFAULT_PEDTYPE" if actor.is_person else "DEFAULT_VEHTYPE", id_)
+            types.copy(default_type, id_)
             types.setLength(id_, length)
             types.setWidth(id_, width)
             types.setMinGap(id_, 0)
@@ -202,14 +202,17 @@ class TrafficWorld(SumoWorld):
         """
         front = np.stack(self._start.point(motion.fronts[:, 0], 0.0), axis=1)
         driving = [*self.driving.values()]
-        wanted = {"vehicle under test": (front[driving], self._fronts[driving])}
+        places = {"vehicle under test": (front[driving], self._fronts[driving])}
         for actor in self._actors:
             get_position = self._get_person_position if actor.is_person else self._get_position
-            here = np.stack([self._at_copies(actor.x), self._at_copies(actor.y)], axis=1)
-            wanted[f"actor {actor.track.name!r}"] = here, np.array([*map(get_position, actor.ids)])
-        for name, (here, there) in wanted.items():
-            if not (np.abs(there - here) <= PLACE_TOLERANCE).all():
-                off = np.abs(there - here).max()
+            expected = np.stack([self._at_copies(actor.x), self._at_copies(actor.y)], axis=1)
+            places[f"actor {actor.track.name!r}"] = (
+                expected,
+                np.array([*map(get_position, actor.ids)]),
+            )
+        for name, (expected, actual) in places.items():
+            if not (np.abs(actual - expected) <= PLACE_TOLERANCE).all():
+                off = np.abs(actual - expected).max()
                 time = self._sample * self.step_length
                 raise SimulationError(
                     f"SUMO has the {name} {off:.2g} m beside its track at {time:g} s"

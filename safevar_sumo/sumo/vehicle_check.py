@@ -57,8 +57,8 @@ def check_units(study: Study, vehicle: Vehicle) -> None:
             raise InputError("", f"{key}.unit = {entry.unit!r}", repr(units[name]))
     for name in units:
         if name not in table and name not in vehicle.OPTIONAL:
-            needed = ", ".join(name for name in units if name not in vehicle.OPTIONAL)
-            raise InputError("", f"vehicle.characteristics.{name} is missing", f"all of {needed}")
+            names = ", ".join(name for name in units if name not in vehicle.OPTIONAL)
+            raise InputError("", f"vehicle.characteristics.{name} is missing", f"all of {names}")
 
 
 def check_plausible(study: Study, vehicle: Vehicle) -> None:

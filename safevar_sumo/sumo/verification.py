@@ -90,16 +90,15 @@ def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str
     for number, point in enumerate(points):
         of_tests.setdefault(dict(point.parameters).get("test"), []).append(number)
     digest = zlib.crc32(settings.tobytes())
-    others = [numbers[digest % len(numbers)] for numbers in of_tests.values()]
-    other = np.resize(others, len(settings))
-    other = np.where(other == worst, (worst + 1) % len(points), other)
+    candidates = [numbers[digest % len(numbers)] for numbers in of_tests.values()]
+    second_points = np.resize(candidates, len(settings))
+    second_points = np.where(second_points == worst, (worst + 1) % len(points), second_points)
 
-    # Those of a point drive together.
     remark = ""
     size = batch_size(system)
-    for number in np.union1d(worst, other):
+    for number in np.union1d(worst, second_points):
         at_point = system.at(points[number])
-        is_here = (worst == number) | (other == number)
+        is_here = (worst == number) | (second_points == number)
         of_point = settings[is_here & met_at(points[number], system, settings)]
         for start in range(0, len(of_point), size):
             batch = of_point[start : start + size]
@@ -137,7 +136,8 @@ def _compare(
         differs = trace.active & ~np.isclose(
             in_sumo[name], values, rtol=0, atol=ROUNDING, equal_nan=True
         )
-        if name == "collision":  # an invalid test has none
+        # An invalid test has no collision.
+        if name == "collision":
             differs &= runs.outcome != Outcome.INVALID_TEST
         if differs.any():
             sample, row = np.argwhere(differs)[0]

@@ -10,6 +10,7 @@ from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, network_remarks
 from safevar_sumo.sumo.simulated_study import noise_remarks
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
+from safevar_sumo.vehicles import STEP
 from safevar_sumo.vehicles.base import Prepared
 
 UNKNOWN_TO_DRIVER = (
@@ -30,18 +31,14 @@ def without_effect(system: System) -> list[str]:
     """
     if not system.mover.has("a driving system"):
         return noise_remarks(system.characteristics, system.points)
-    # On networks, vehicles and drivers.
     uses_traci = isinstance(system.ads, TraciController)
-    remarks = [
-        remark
-        for network in dict.fromkeys(point.scenario.network for point in system.points)
-        for remark in network_remarks(network, _acting_attributes(system) if uses_traci else ())
-    ]
+    acting = _acting_attributes(system) if uses_traci else ()
+    remarks = []
+    for network in dict.fromkeys(point.scenario.network for point in system.points):
+        remarks += network_remarks(network, acting)
     remarks += system.vehicle.remarks
     remarks += _remarks_on_driver(system)
     remarks += _remarks_on_grip(system)
-
-    # On weathers without effect.
     for weather in {point.weather.name: point.weather for point in system.points}.values():
         if weather.visibility != 1 and uses_traci and not _has_limited_range(system):
             remarks.append(
@@ -61,7 +58,7 @@ def _acting_attributes(system: System) -> set[str]:
     """Attributes of the traffic file with which SUMO's driver drives under a controller written
     for TraCI.
     """
-    return {*ACTING_ATTRIBUTES} - ({"tau"} if _has_tau(system) else set())
+    return {name for name in ACTING_ATTRIBUTES if name != "tau" or not _has_tau(system)}
 
 
 def _has_tau(system: System) -> bool:
@@ -74,19 +71,15 @@ def _remarks_on_driver(system: System) -> list[str]:
         return [UNKNOWN_TO_DRIVER]
     if not _has_tau(system):
         return []
-    name = system.ads.tau_parameter
-
     # A driver with a headway of its own takes the vehicle's tau.
+    name = system.ads.tau_parameter
     if not name:
         return [
             "tau has no effect: it is the headway of SUMO's driver, and the study has another ADS"
         ]
-    is_default = getattr(system.ads, name) == getattr(type(system.ads)(), name)
-    return (
-        []
-        if is_default
-        else [f"ads.parameters.{name} has no effect: the vehicle's tau takes its place"]
-    )
+    if getattr(system.ads, name) == getattr(type(system.ads)(), name):
+        return []
+    return [f"ads.parameters.{name} has no effect: the vehicle's tau takes its place"]
 
 
 def _remarks_on_grip(system: System) -> list[str]:
@@ -95,7 +88,7 @@ def _remarks_on_grip(system: System) -> list[str]:
     if DECEL not in members.names:
         return []
 
-    # Does the largest deceleration still rise at the end of the domain?
+    # Where it still rises at the end of the domain, the brakes limit it and not the tyres.
     upper = members.upper[members.names.index(DECEL)]
     friction = max(point.weather.road_friction for point in system.points)
     nearly, highest = (
@@ -121,4 +114,4 @@ def _prepared(system: System, friction: float = 1.0, **changes: FloatArray) -> P
     """
     members = system.characteristics.vehicle
     original = members.columns(members.original_settings)
-    return system.vehicle.prepare(original | changes, friction, 0.1)  # time step 0.1 s
+    return system.vehicle.prepare(original | changes, friction, STEP)

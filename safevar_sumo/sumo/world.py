@@ -92,8 +92,8 @@ class SumoWorld:
         """
         vehicletype = self.api.vehicletype
         ids = self.ids(VUT)
-        least = np.full(self.n, INSERTION_DECELERATION)
-        decelerations = (least if types is None else types.decel,) * 2
+        insertion_decel = np.full(self.n, INSERTION_DECELERATION)
+        decelerations = (insertion_decel if types is None else types.decel,) * 2
         if keeps_drivers:
             planned = [
                 (vehicletype.getDecel(id_), vehicletype.getEmergencyDecel(id_)) for id_ in ids
@@ -107,11 +107,12 @@ class SumoWorld:
             self._set(vehicletype.setMaxSpeed, types.max_speed)
             if types.tau is not None:
                 self._set(vehicletype.setTau, types.tau)
-        self._set_decelerations(*(np.maximum(values, least) for values in decelerations))
+        self._set_decelerations(*(np.maximum(values, insertion_decel) for values in decelerations))
         self._depart()
         self._set_decelerations(*decelerations)
         if keeps_drivers:
-            for id_ in ids:  # SUMO drew a factor for each vehicle
+            # SUMO drew a factor for each vehicle.
+            for id_ in ids:
                 self.api.vehicle.setSpeedFactor(id_, vehicletype.getSpeedFactor(id_))
         return self._motion(np.ones(self.n, dtype=bool))
 
@@ -197,12 +198,11 @@ class SumoWorld:
 
     def _pairs(self, pairs: Sequence[tuple[int, str]]) -> BodyPairs:
         """Vehicles under test by their copy, each with an actor by its id."""
-        own = Body.columns([self._body_of(self.ids(VUT)[copy]) for copy, _ in pairs])
-        return BodyPairs(
-            np.array([copy for copy, _ in pairs]),
-            own,
-            Body.columns([self._body_of(id_) for _, id_ in pairs]),
-        )
+        ids = self.ids(VUT)
+        copies = [copy for copy, _ in pairs]
+        vehicles = Body.columns([self._body_of(ids[copy]) for copy in copies])
+        obstacles = Body.columns([self._body_of(id_) for _, id_ in pairs])
+        return BodyPairs(np.array(copies), vehicles, obstacles)
 
     def _body_of(self, id_: str) -> Body:
         domain = self._domain_of(id_)
@@ -229,7 +229,8 @@ class SumoWorld:
         copies = [*self.driving.values()]
         try:
             positions = np.array([*map(self._get_person_position, ids)])
-        except self.api.TraCIException:  # one has left the road
+        # One of them has left the road.
+        except self.api.TraCIException:
             positions = self._persons.get(actor, np.zeros((self.n, 2))).copy()
             positions[copies] = [self._get_person_position(ids[copy]) for copy in copies]
         self._persons[actor] = positions
@@ -279,15 +280,15 @@ class SumoWorld:
         return float(self.api.person.getWidth(self.ids(actor)[0]))
 
     def walk(self, person: str, speed: FloatOrArray) -> None:
-        for id_, value in zip(
-            self.ids(person), np.broadcast_to(speed, self.n).tolist(), strict=True
-        ):
+        speeds = np.broadcast_to(speed, self.n).tolist()
+        for id_, value in zip(self.ids(person), speeds, strict=True):
             self.api.person.setSpeed(id_, value)
 
     def turn_back(self, person: str, copies: Sequence[int] | None = None) -> None:
         api = self.api.person
         ids = self.ids(person)
-        for id_ in ids if copies is None else (ids[copy] for copy in copies):
+        for copy in range(self.n) if copies is None else copies:
+            id_ = ids[copy]
             back = [api.getRoadID(id_), api.getEdges(id_)[0]]
             api.appendWalkingStage(id_, back, 0.0, speed=api.getSpeed(id_))
             api.removeStage(id_, 0)
