@@ -122,16 +122,18 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             warns=nobody,
         )
 
-    def drive(self, seen: Observation, memory: _Memory) -> tuple[Command, _Memory]:
+    def drive(self, observation: Observation, memory: _Memory) -> tuple[Command, _Memory]:
         nominal = memory.nominal
 
         # Without a threat it holds its speed; once it has intervened, it no longer accelerates.
-        cruise_speed, cruise_trim = memory.cruise or cruise_at(nominal, seen, self.cruise_speed)
-        is_threatened = is_in_the_way(seen, self.corridor, self.reach) & (seen.closing_speed > 0)
-        stage = self._stage(seen, memory, is_threatened)
+        cruise = memory.cruise or cruise_at(nominal, observation, self.cruise_speed)
+        cruise_speed, cruise_trim = cruise
+        blocks = is_in_the_way(observation, self.corridor, self.reach)
+        is_threatened = blocks & (observation.closing_speed > 0)
+        stage = self._stage(observation, memory, is_threatened)
         has_intervened = memory.intervened | (stage > NO_BRAKING)
-        cruising = self.cruise_gain * (cruise_speed - seen.speed)
-        pedals = self.pedals(cruising, seen.speed, nominal, cruise_trim)
+        cruising = self.cruise_gain * (cruise_speed - observation.speed)
+        pedals = self.pedals(cruising, observation.speed, nominal, cruise_trim)
         throttle, cruise_brake = (np.where(has_intervened, 0.0, pedal) for pedal in pedals)
 
         # A braking stage presses the brake, partly or fully.
@@ -139,31 +141,33 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         command = Command(throttle, np.where(stage > NO_BRAKING, stage_brake, cruise_brake))
 
         # It warns before it brakes.
-        warns = (is_threatened & (time_to_reach(seen) < self.warning_time)) | (stage > NO_BRAKING)
+        warns = is_threatened & (time_to_reach(observation) < self.warning_time)
         return command, memory._replace(
-            cruise=(cruise_speed, cruise_trim),
+            cruise=cruise,
             stage=stage,
             intervened=has_intervened,
-            obstacle=seen.obstacle,
-            obstacle_speed=seen.obstacle_speed,
-            warns=warns,
+            obstacle=observation.obstacle,
+            obstacle_speed=observation.obstacle_speed,
+            warns=warns | (stage > NO_BRAKING),
         )
 
     def warns(self, memory: _Memory) -> BoolArray:
         """Whether each driver is warned now."""
         return memory.warns
 
-    def _stage(self, seen: Observation, memory: _Memory, is_threatened: BoolArray) -> FloatArray:
+    def _stage(
+        self, observation: Observation, memory: _Memory, is_threatened: BoolArray
+    ) -> FloatArray:
         """The braking stage; it does not fall while the obstacle blocks the way, nor at
         standstill.
         """
-        speed = seen.speed
-        obstacle_speed = seen.obstacle_speed
+        speed = observation.speed
+        obstacle_speed = observation.obstacle_speed
 
         # How hard the obstacle has braked since the last step.
         deceleration = self.braking_share * memory.nominal.decel
         lost_speed = np.where(
-            seen.obstacle == memory.obstacle, memory.obstacle_speed - obstacle_speed, 0.0
+            observation.obstacle == memory.obstacle, memory.obstacle_speed - obstacle_speed, 0.0
         )
         obstacle_deceleration = lost_speed / memory.step
 
@@ -174,7 +178,7 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             / (2 * np.maximum(obstacle_deceleration, LEAST_DECELERATION))
         )
         stop_difference = speed * speed / (2 * deceleration) - obstacle_stop
-        closing_speed = np.maximum(seen.closing_speed, 0.0)
+        closing_speed = np.maximum(observation.closing_speed, 0.0)
         braking_distance = np.maximum(
             closing_speed * closing_speed / (2 * deceleration),
             np.where(obstacle_deceleration > LEAST_DECELERATION, stop_difference, 0.0),
@@ -184,14 +188,16 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         full_gap = speed * self.response_time + braking_distance + self.margin
         partial_gap = full_gap + speed * self.partial_time
         stage_at_gap = np.where(
-            seen.gap < full_gap,
+            observation.gap < full_gap,
             FULL_BRAKING,
-            np.where(seen.gap < partial_gap, PARTIAL_BRAKING, NO_BRAKING),
+            np.where(observation.gap < partial_gap, PARTIAL_BRAKING, NO_BRAKING),
         )
         stage = np.where(is_threatened, stage_at_gap, NO_BRAKING)
 
         # It ends when nobody approaches any more who blocks the way.
-        still_blocks = is_ahead(seen) & (closing_speed > 0) & blocks_the_way(seen, self.corridor)
+        still_blocks = (
+            is_ahead(observation) & (closing_speed > 0) & blocks_the_way(observation, self.corridor)
+        )
         is_standing = speed <= 0
         return np.where(still_blocks | is_standing, np.maximum(stage, memory.stage), stage)
 
@@ -260,13 +266,14 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def start(self, n: int, nominal: Nominal, step: float) -> _AutowareMemory:
         return _AutowareMemory(nominal, step, cruise=None, decision_time=np.full(n, -1.0))
 
-    def drive(self, seen: Observation, memory: _AutowareMemory) -> tuple[Command, _AutowareMemory]:
+    def drive(
+        self, observation: Observation, memory: _AutowareMemory
+    ) -> tuple[Command, _AutowareMemory]:
         nominal, step, cruise, decision_time = memory
-        cruise = cruise or cruise_at(nominal, seen, self.cruise_speed)
+        cruise = cruise or cruise_at(nominal, observation, self.cruise_speed)
         cruise_speed, cruise_trim = cruise
-        is_near = is_in_the_way(seen, self.corridor) & (
-            seen.gap < self.distance(seen.speed, seen.obstacle_speed)
-        )
+        distance = self.distance(observation.speed, observation.obstacle_speed)
+        is_near = is_in_the_way(observation, self.corridor) & (observation.gap < distance)
         decision_time = np.where(
             decision_time >= 0, decision_time + step, np.where(is_near, 0.0, -1.0)
         )
@@ -276,9 +283,9 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         acceleration = np.where(
             is_braking,
             -np.minimum(ramp, self.target_acceleration),
-            self.cruise_gain * (cruise_speed - seen.speed),
+            self.cruise_gain * (cruise_speed - observation.speed),
         )
-        pedals = self.pedals(acceleration, seen.speed, nominal, cruise_trim)
+        pedals = self.pedals(acceleration, observation.speed, nominal, cruise_trim)
         return pedals, _AutowareMemory(nominal, step, cruise, decision_time)
 
     def distance(self, speed: FloatArray, obstacle_speed: FloatArray) -> FloatArray:

@@ -8,7 +8,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from importlib import import_module
-from itertools import repeat
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -76,7 +75,7 @@ class Ads:
         """
 
     @abstractmethod
-    def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
+    def drive(self, observation: Observation, memory: Memory) -> tuple[Command, Memory]:
         """Command the pedals for the coming step; returns the memory for the next call."""
 
     def warns(self, memory: Memory) -> BoolArray | None:
@@ -105,7 +104,7 @@ class FullBrake(Ads):
     def start(self, n: int, nominal: Nominal, step: float) -> Command:
         return Command(np.zeros(n), np.ones(n))
 
-    def drive(self, seen: Observation, memory: Command) -> tuple[Command, Command]:
+    def drive(self, observation: Observation, memory: Command) -> tuple[Command, Command]:
         return memory, memory
 
 
@@ -129,7 +128,7 @@ class ScalarAds(ABC):
         self.step = step
 
     @abstractmethod
-    def drive(self, seen: Observation) -> tuple[float, float]:
+    def drive(self, observation: Observation) -> tuple[float, float]:
         """Command throttle and brake, each in [0, 1], from an observation whose fields are
         numbers.
         """
@@ -170,13 +169,15 @@ class PerVehicleAds(Ads):
                 self._code.call("start", driver.start, nominal, step)
         return drivers
 
-    def drive(self, seen: Observation, memory: list[ScalarAds]) -> tuple[Command, list[ScalarAds]]:
-        observations = list(_scalar_observations(seen))
+    def drive(
+        self, observation: Observation, memory: list[ScalarAds]
+    ) -> tuple[Command, list[ScalarAds]]:
+        observations = list(_scalar_observations(observation, len(memory)))
         pedals = [(0.0, 0.0)] * len(memory)
+        # A vehicle whose run has ended may have left what its driver expects.
+        rows = open_rows(np.ones(len(memory), dtype=bool)).tolist()
         with np.errstate():
-            for i in open_rows(
-                np.ones(len(memory), dtype=bool)
-            ).tolist():  # vehicles whose run has not ended
+            for i in rows:
                 command = self._code.call("drive", memory[i].drive, observations[i])
                 pedals[i] = self._checked_pedals(command)
         return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
@@ -187,8 +188,9 @@ class PerVehicleAds(Ads):
     def _checked_pedals(self, command: Any) -> tuple[float, float]:
         if type(command) is tuple and len(command) == 2:
             throttle, brake = command
+            # The fast path: this runs for every vehicle in every step.
             if type(throttle) is type(brake) is float and 0 <= throttle <= 1 and 0 <= brake <= 1:
-                return throttle, brake  # the fast path: this runs for every vehicle in every step
+                return throttle, brake
         if not isinstance(command, tuple | list) or len(command) != 2:
             raise self._code.wrong("drive", quoted(command), "(throttle, brake), each in [0, 1]")
         pedals = zip(Command._fields, command, strict=True)
@@ -198,23 +200,18 @@ class PerVehicleAds(Ads):
         return float(throttle), float(brake)
 
 
-def _scalar_observations(seen: Observation) -> Iterator[Observation]:
-    """The observation of each vehicle, as plain numbers."""
-    columns = [
-        value.tolist() if isinstance(value, np.ndarray) and value.ndim else repeat(float(value))
-        for value in seen
-    ]
-    return map(Observation._make, zip(*columns, strict=False))  # a repeated number is endless
+def _scalar_observations(observation: Observation, n: int) -> Iterator[Observation]:
+    """The observation of each of N vehicles, as plain numbers."""
+    columns = (np.broadcast_to(value, n).astype(float).tolist() for value in observation)
+    return map(Observation._make, zip(*columns, strict=True))
 
 
 def interpolate_tables(
     table_speeds: FloatArray, speed: Quantity, *tables: FloatArray
 ) -> list[FloatArray]:
     """Tables over equally spaced speeds, interpolated linearly at `speed`."""
-    spacing = table_speeds[1]
-    position = np.minimum(
-        speed / spacing, len(table_speeds) - 1.001
-    )  # just before the last row: there is a next one
+    # Just before the last row at most, so that there is a next one.
+    position = np.minimum(speed / table_speeds[1], len(table_speeds) - 1.001)
     row = position.astype(np.intp)
     share = position - row
     next_row = row + 1
@@ -257,12 +254,12 @@ class DelayLine(NamedTuple):
         older = past[0]
         newer = past[1]
         if np.ndim(self.fraction) or self.fraction:
-            with np.errstate(invalid="ignore"):  # the difference of two infinities
+            # The difference of two infinities is not defined.
+            with np.errstate(invalid="ignore"):
                 mixture = newer + (older - newer) * self.fraction
             if not (is_defined := np.isfinite(mixture)).all():
-                mixture = np.where(
-                    is_defined, mixture, np.where(np.equal(self.fraction, 0), newer, older)
-                )
+                earlier = np.where(np.equal(self.fraction, 0), newer, older)
+                mixture = np.where(is_defined, mixture, earlier)
             newer = mixture
         return newer, DelayLine(self.steps, self.fraction, past)
 
@@ -280,21 +277,28 @@ NO_TRIM = Trim(np.zeros(()), np.zeros(()))
 """The trim on a level road."""
 
 
-def trim_at(nominal: Nominal, seen: Observation) -> Trim:
+def trim_at(nominal: Nominal, observation: Observation) -> Trim:
     """The trim of a driver who already holds the speed of a rolling vehicle; 0 at standstill."""
-    is_rolling = seen.speed > 0
+    is_rolling = observation.speed > 0
     coasting, full_throttle = interpolate_tables(
-        nominal.speeds, seen.speed, nominal.coasting, nominal.full_throttle
+        nominal.speeds, observation.speed, nominal.coasting, nominal.full_throttle
     )
     holding_throttle = coasting / (full_throttle + coasting)
-    holding_brake = -coasting / nominal.braking  # negative: it would have to push the vehicle
-    throttle = np.where(is_rolling, seen.throttle - holding_throttle, 0.0)
-    return Trim(throttle, np.where(is_rolling & (seen.brake > 0), seen.brake - holding_brake, 0.0))
+    # Negative: it would have to push the vehicle.
+    holding_brake = -coasting / nominal.braking
+    throttle = np.where(is_rolling, observation.throttle - holding_throttle, 0.0)
+    return Trim(
+        throttle,
+        np.where(is_rolling & (observation.brake > 0), observation.brake - holding_brake, 0.0),
+    )
 
 
-def cruise_at(nominal: Nominal, seen: Observation, speed: float | None) -> tuple[FloatArray, Trim]:
+def cruise_at(
+    nominal: Nominal, observation: Observation, speed: float | None
+) -> tuple[FloatArray, Trim]:
     """The speed that a cruise control holds [m/s], by default that of now, and its trim."""
-    return seen.speed if speed is None else np.full_like(seen.speed, speed), trim_at(nominal, seen)
+    speeds = observation.speed if speed is None else np.full_like(observation.speed, speed)
+    return speeds, trim_at(nominal, observation)
 
 
 def pedals_for(
@@ -324,51 +328,55 @@ them finite.
 """
 
 
-def time_to_reach(seen: Observation) -> FloatArray:
+def time_to_reach(observation: Observation) -> FloatArray:
     """Time to collision, gap over closing speed [s], shape (N,); `LARGEST_GAP` while the gap does
     not shrink.
     """
-    gap = np.minimum(np.maximum(seen.gap, 0.0), LARGEST_GAP)
+    gap = np.minimum(np.maximum(observation.gap, 0.0), LARGEST_GAP)
     return np.where(
-        seen.closing_speed > 0,
-        gap / np.maximum(seen.closing_speed, LEAST_CLOSING_SPEED),
+        observation.closing_speed > 0,
+        gap / np.maximum(observation.closing_speed, LEAST_CLOSING_SPEED),
         LARGEST_GAP,
     )
 
 
-def is_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
+def is_in_the_way(observation: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
     """Whether a side of a detected obstacle ahead is within `corridor` of the lane's middle [m], or
     will be when the vehicle reaches it.
 
     `reach` is the sensors' range in clear weather [m].
     """
-    return depth_in_the_way(seen, corridor, reach) >= 0
+    return depth_in_the_way(observation, corridor, reach) >= 0
 
 
-def depth_in_the_way(seen: Observation, corridor: float, reach: float = np.inf) -> FloatArray:
+def depth_in_the_way(
+    observation: Observation, corridor: float, reach: float = np.inf
+) -> FloatArray:
     """How far within `corridor` a side of a detected obstacle ahead is, or will be when the vehicle
     reaches it [m]; below 0 outside, and `-LARGEST_GAP` without an obstacle.
     """
-    is_detected = is_ahead(seen) & (seen.gap <= reach * seen.visibility)
-    lateral = np.where(is_detected, seen.lateral, LARGEST_GAP)
-    lateral_at_arrival = lateral + seen.lateral_speed * time_to_reach(seen)
-    watched = corridor + seen.obstacle_width / 2
-    least = np.minimum(np.abs(lateral), np.abs(lateral_at_arrival))
-    return np.where(is_detected, watched - least, -LARGEST_GAP)
+    is_detected = is_ahead(observation) & (observation.gap <= reach * observation.visibility)
+    lateral = np.where(is_detected, observation.lateral, LARGEST_GAP)
+    lateral_at_arrival = lateral + observation.lateral_speed * time_to_reach(observation)
+    watched = corridor + observation.obstacle_width / 2
+    nearest = np.minimum(np.abs(lateral), np.abs(lateral_at_arrival))
+    return np.where(is_detected, watched - nearest, -LARGEST_GAP)
 
 
-def is_ahead(seen: Observation) -> BoolArray:
+def is_ahead(observation: Observation) -> BoolArray:
     """Whether there is an obstacle, and it has not been passed."""
-    return np.isfinite(seen.gap) & (seen.gap > 0)
+    return np.isfinite(observation.gap) & (observation.gap > 0)
 
 
-def moves_inwards(seen: Observation) -> BoolArray:
+def moves_inwards(observation: Observation) -> BoolArray:
     """Whether an obstacle moves towards the middle of the lane."""
-    return np.sign(seen.lateral) * seen.lateral_speed < 0
+    return np.sign(observation.lateral) * observation.lateral_speed < 0
 
 
-def blocks_the_way(seen: Observation, corridor: float) -> BoolArray:
+def blocks_the_way(observation: Observation, corridor: float) -> BoolArray:
     """Whether a side of an obstacle is within `corridor` of the lane's middle [m], or moves towards
     the middle.
     """
-    return (np.abs(seen.lateral) <= corridor + seen.obstacle_width / 2) | moves_inwards(seen)
+    return (
+        np.abs(observation.lateral) <= corridor + observation.obstacle_width / 2
+    ) | moves_inwards(observation)

@@ -31,9 +31,8 @@ AVOIDING_GAINS = 0.23, 0.8
 FOLLOWING_GAP = 100.0  # m, largest gap at which it follows
 GAP_TOLERANCE, SPEED_TOLERANCE = 0.2, 0.1  # m, m/s: errors below which it keeps the gap
 LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
-LAST_DECELERATION = (
-    0.5  # m/s^2, assumption: at v_safe alone Krauss would creep to its gap, and never stop
-)
+# m/s^2, assumption: at v_safe alone Krauss would creep to its gap, and never stop.
+LAST_DECELERATION = 0.5
 
 
 class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -50,13 +49,14 @@ class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         return nominal, None
 
     def drive(
-        self, seen: Observation, memory: tuple[Nominal, Trim | None]
+        self, observation: Observation, memory: tuple[Nominal, Trim | None]
     ) -> tuple[Command, tuple[Nominal, Trim | None]]:
         nominal, trim = memory
-        initial_trim = trim_at(nominal, seen) if trim is None else trim
-        gap = np.where(is_in_the_way(seen, self.corridor), seen.gap, LARGEST_GAP)
-        acceleration = self.acceleration_at(gap, seen.speed, seen.obstacle_speed)
-        return self.pedals(acceleration, seen.speed, nominal, initial_trim), (nominal, initial_trim)
+        initial_trim = trim_at(nominal, observation) if trim is None else trim
+        gap = np.where(is_in_the_way(observation, self.corridor), observation.gap, LARGEST_GAP)
+        acceleration = self.acceleration_at(gap, observation.speed, observation.obstacle_speed)
+        command = self.pedals(acceleration, observation.speed, nominal, initial_trim)
+        return command, (nominal, initial_trim)
 
     @abstractmethod
     def acceleration_at(
@@ -169,7 +169,7 @@ class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return nominal, step
 
     def drive(
-        self, seen: Observation, memory: tuple[Nominal, float]
+        self, observation: Observation, memory: tuple[Nominal, float]
     ) -> tuple[Command, tuple[Nominal, float]]:
         """Aim at v_safe = -b t + sqrt((b t)^2 + 2 b gap), with the planned deceleration b and the
         reaction time t.
@@ -180,14 +180,13 @@ class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         nominal, step = memory
         deceleration = self.braking_share * nominal.decel
         reaction_speed = deceleration * self.reaction_time
-        gap = np.minimum(np.maximum(seen.gap - self.standing_gap, 0.0), LARGEST_GAP)
+        gap = np.minimum(np.maximum(observation.gap - self.standing_gap, 0.0), LARGEST_GAP)
         safe_speed = (
             np.sqrt(reaction_speed * reaction_speed + 2 * deceleration * gap) - reaction_speed
         )
         safe_speed = np.maximum(safe_speed, np.sqrt(2 * LAST_DECELERATION * gap))
-        acceleration = (np.minimum(safe_speed, self.cruise_speed) - seen.speed) / (
-            step + nominal.actuator_lag
-        )
+        speed_change = np.minimum(safe_speed, self.cruise_speed) - observation.speed
+        acceleration = speed_change / (step + nominal.actuator_lag)
         throttle = np.minimum(np.maximum(acceleration / nominal.accel, 0.0), 1.0)
         brake = np.minimum(np.maximum(-acceleration / nominal.decel, 0.0), 1.0)
         return Command(throttle, brake), memory

@@ -101,26 +101,27 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     def start(self, n: int, nominal: Nominal, step: float) -> _Perceiving:
         reaction = ReferenceDriver.start(self, n, nominal, step)
         never = np.full(n, -1.0)
-        no = np.zeros(n, dtype=bool)
-        return _Perceiving(reaction, np.full(n, np.inf), no, never, never, no)
+        nobody = np.zeros(n, dtype=bool)
+        return _Perceiving(reaction, np.full(n, np.inf), nobody, never, never, nobody)
 
-    def drive(self, seen: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
+    def drive(self, observation: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
         step = memory.reaction.step
-        is_same = seen.obstacle == memory.reaction.leader
-        is_perceived, memory = self._perceive(seen, memory, is_same)
-        is_in_way = is_perceived & (is_in_the_way(seen, self.corridor) | _cuts_in(seen))
-        reaction = self.watch_leader(seen, memory.reaction, is_in_way)
+        is_same = observation.obstacle == memory.reaction.leader
+        is_perceived, memory = self._perceive(observation, memory, is_same)
+        enters = is_in_the_way(observation, self.corridor) | _cuts_in(observation)
+        is_in_way = is_perceived & enters
+        reaction = self.watch_leader(observation, memory.reaction, is_in_way)
 
         # Since when has a leader braked so hard that it is a danger? It is seen a step later.
         brakes_now = reaction.leader_deceleration > self.leader_braking + DECELERATION_ROUNDING
-        begun = np.where(brakes_now, step, -1.0)
+        new_braking_time = np.where(brakes_now, step, -1.0)
         has_begun = is_same & (memory.braking_time >= 0)
-        braking_time = np.where(has_begun, memory.braking_time + step, begun)
+        braking_time = np.where(has_begun, memory.braking_time + step, new_braking_time)
         is_noticed = braking_time >= self.perception_time - TIME_ROUNDING
-        brakes = is_noticed & ((seen.closing_speed > 0) | reaction.leader_brakes)
+        brakes = is_noticed & ((observation.closing_speed > 0) | reaction.leader_brakes)
 
         # Towards somebody who does not brake, the time to collision decides.
-        nearness = self.critical_ttc - time_to_reach(seen)
+        nearness = self.critical_ttc - time_to_reach(observation)
         is_danger = is_in_way & (brakes | ((nearness > 0) & ~reaction.leader_brakes))
 
         # A new danger has lasted since its condition held, and not longer than it is perceived.
@@ -134,44 +135,44 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
             nearness=np.where(brakes, np.inf, nearness),
             longest=np.where(brakes, braking_time - self.perception_time, perceived_time),
         )
-        command, reaction = self.react(seen, reaction, danger, self.start_throttle)
+        command, reaction = self.react(observation, reaction, danger, self.start_throttle)
         braking_time = np.where(is_in_way, braking_time, -1.0)
         return command, memory._replace(
             reaction=reaction, braking_time=braking_time, was_in_way=is_in_way
         )
 
     def _perceive(
-        self, seen: Observation, memory: _Perceiving, is_same: BoolArray
+        self, observation: Observation, memory: _Perceiving, is_same: BoolArray
     ) -> tuple[BoolArray, _Perceiving]:
         """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from
         its first position `perception_time` ago or earlier.
         """
         # Where the obstacle was at first sight, and whether it was in the way then.
-        is_sighted = np.isfinite(seen.gap) & np.isfinite(seen.lateral)
-        lateral = np.where(is_sighted, seen.lateral, 0.0)
+        is_sighted = np.isfinite(observation.gap) & np.isfinite(observation.lateral)
+        lateral = np.where(is_sighted, observation.lateral, 0.0)
         is_first_sight = is_sighted & ~(is_same & np.isfinite(memory.first_lateral))
         first_lateral = np.where(is_first_sight, lateral, memory.first_lateral)
-        is_in_corridor = np.abs(lateral) <= self.corridor + seen.obstacle_width / 2
+        is_in_corridor = np.abs(lateral) <= self.corridor + observation.obstacle_width / 2
         appears_in_way = is_in_corridor & (memory.stray_time < 0)
         appeared_in_way = np.where(is_first_sight, appears_in_way, memory.appeared_in_way)
 
         # Since when it has strayed from there.
         deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
         strays_now = is_sighted & (deviation >= self.stray)
-        strayed = (deviation - self.stray) / np.maximum(np.abs(seen.lateral_speed), LEAST_DIVISOR)
+        drift = np.maximum(np.abs(observation.lateral_speed), LEAST_DIVISOR)
+        strayed = (deviation - self.stray) / drift
         new_stray_time = np.where(strays_now, np.minimum(strayed, memory.reaction.step), -1.0)
-        stray_time = np.where(
-            memory.stray_time >= 0, memory.stray_time + memory.reaction.step, new_stray_time
-        )
+        old_time = memory.stray_time
+        stray_time = np.where(old_time >= 0, old_time + memory.reaction.step, new_stray_time)
         is_perceived = appeared_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
         return is_perceived, memory._replace(
             first_lateral=first_lateral, appeared_in_way=appeared_in_way, stray_time=stray_time
         )
 
 
-def _cuts_in(seen: Observation) -> BoolArray:
+def _cuts_in(observation: Observation) -> BoolArray:
     """Whether somebody ahead moves towards the middle of the lane, and drives along it rather than
     across it.
     """
-    along = seen.obstacle_speed >= np.abs(seen.lateral_speed)
-    return is_ahead(seen) & moves_inwards(seen) & along
+    along = observation.obstacle_speed >= np.abs(observation.lateral_speed)
+    return is_ahead(observation) & moves_inwards(observation) & along

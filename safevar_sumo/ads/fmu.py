@@ -63,12 +63,11 @@ class Fmu:
         self.code = code
         self._folder = TemporaryDirectory(prefix="fmu", ignore_cleanup_errors=True)
 
-        # The model description, read from the unpacked FMU.
         expected = (
             "an FMU of FMI 2.0 or 3.0 for co-simulation, of which a process may have many instances"
         )
         try:
-            from fmpy import extract, read_model_description  # an extra
+            from fmpy import extract, read_model_description
 
             with ZipFile(BytesIO(read_file(Path(path)))) as archive:
                 size = sum(entry.file_size for entry in archive.infolist())
@@ -78,12 +77,12 @@ class Fmu:
             self._model: Any = read_model_description(self._folder.name, validate=False)
         except ImportError:
             raise missing_extra("", f"{path} needs FMPy", "fmu") from None
-        except Exception as error:  # any error of FMPy about a user's file
+        # FMPy may raise anything about a user's file.
+        except Exception as error:
             raise InputError(
                 "", f"{table.model}: {type(error).__name__}: {error}", expected
             ) from None
 
-        # What this package cannot simulate is refused.
         kind = self._model.coSimulation
         if kind is None or self._model.fmiVersion < "2" or kind.canBeInstantiatedOnlyOncePerProcess:
             raise InputError("", f"{table.model} is another FMU", expected)
@@ -91,7 +90,6 @@ class Fmu:
             expected = "throttle, brake or both; alternatively acceleration"
             raise InputError("", f"ads.outputs = {sorted(table.outputs)}", expected)
 
-        # Its variables by the quantities that they take or hold.
         observed = [
             name
             for name in UNITS
@@ -116,7 +114,6 @@ class Fmu:
         key = f"ads.{causality}s.{quantity}"
         check_name("", f"{key}: there is no such quantity", quantity, quantities)
 
-        # The variable by its name.
         variables = {
             variable.name: variable
             for variable in self._model.modelVariables
@@ -128,7 +125,6 @@ class Fmu:
             )
         variable = variables[name]
 
-        # Its unit is the quantity's SI unit, if it states one.
         unit = (
             (variable.unit or getattr(variable.declaredType, "unit", None) or "")
             .replace("^", "")
@@ -147,20 +143,18 @@ class Fmu:
         # An FMU with a step of its own takes the study's.
         kind = self._model.coSimulation
         experiment = self._model.defaultExperiment
-        own = getattr(kind, "fixedInternalStepSize", None)
+        fixed_step = getattr(kind, "fixedInternalStepSize", None)
         if not kind.canHandleVariableCommunicationStepSize and experiment:
-            own = own or experiment.stepSize
-        if own and float(own) != step:
+            fixed_step = fixed_step or experiment.stepSize
+        if fixed_step and float(fixed_step) != step:
             raise InputError(
-                "", f"ads.model: the FMU takes steps of {own} s", f"the study's step, {step:g} s"
+                "",
+                f"ads.model: the FMU takes steps of {fixed_step} s",
+                f"the study's step, {step:g} s",
             )
         # An FMU in Python imports its own modules, not namesakes.
         for file in Path(self._folder.name, "resources").glob("*.py"):
-            sys.modules.pop(
-                file.stem, None
-            )  # an FMU in Python imports its own modules, not namesakes
-
-        # Initialised with the parameters of the study.
+            sys.modules.pop(file.stem, None)
         slave = instantiate_fmu(
             self._folder.name, self._model, "CoSimulation", logger=lambda *_: None
         )
@@ -183,24 +177,25 @@ class FmuAds(ScalarAds):
 
     def start(self, nominal: Nominal, step: float) -> None:
         super().start(nominal, step)
-        values = nominal._asdict()
-        self._known = {f"{NOMINAL}{name}": values[name] for name in NOMINAL_UNITS} | {"step": step}
+        self._known = {f"{NOMINAL}{name}": nominal._asdict()[name] for name in NOMINAL_UNITS} | {
+            "step": step
+        }
         self._slave = self._fmu.code.call("initialisation", self._fmu.new_instance, step)
         self._end = weakref.finalize(self, _free, self._slave)
         self._end.atexit = False
 
-    def drive(self, seen: Observation) -> tuple[float, float]:
+    def drive(self, observation: Observation) -> tuple[float, float]:
         outputs = self._fmu.code.call(
             "doStep",
             self._step,
-            {**seen._asdict(), "detected": np.isfinite(seen.gap), **self._known},
+            {**observation._asdict(), "detected": np.isfinite(observation.gap), **self._known},
         )
         self._calls += 1
         self.warns = outputs.get("warns", 0.0) > 0.5
         if "acceleration" not in outputs:
             return outputs.get("throttle", 0.0), outputs.get("brake", 0.0)
-        self._trim = self._trim or trim_at(self.nominal, seen)
-        return self.pedals(outputs["acceleration"], seen.speed, self._trim)
+        self._trim = self._trim or trim_at(self.nominal, observation)
+        return self.pedals(outputs["acceleration"], observation.speed, self._trim)
 
     def _step(self, values: Mapping[str, float]) -> NamedValues:
         """Advance the instance with observed values; returns its outputs."""
@@ -210,14 +205,16 @@ class FmuAds(ScalarAds):
             for name, variable in self._fmu.inputs.items():
                 write(slave, variable, float(values[name]))
             result = slave.doStep(time, self.step)
-            if result and any(result[1:3]):  # FMI 3.0
+            # FMI 3.0.
+            if result and any(result[1:3]):
                 raise RuntimeError("it ends the simulation or returns early")
             return {
                 name: getattr(slave, f"get{variable.type}")([variable.valueReference])[0]
                 for name, variable in self._fmu.outputs.items()
             }
-        except Exception as error:  # any error of FMPy about an FMU
-            self._end.detach()  # any further call of an instance that failed is undefined
+        # FMPy may raise anything, and any further call of an instance that failed is undefined.
+        except Exception as error:
+            self._end.detach()
             raise RuntimeError(f"{str(error).splitlines()[0]} at {time:g} s") from None
 
 

@@ -35,16 +35,17 @@ class HighwayIdm(ScalarAds):
         road = roads.Road(network, record_history=False)
         self._me, self._front = (vehicles.IDMVehicle(road, [0.0, 0.0]) for _ in range(2))
 
-    def drive(self, seen: Observation) -> tuple[float, float]:
+    def drive(self, observation: Observation) -> tuple[float, float]:
         me = self._me
         front = self._front
-        me.speed = float(seen.speed)
+        me.speed = float(observation.speed)
         if self.target_speed is None:
             self.target_speed = me.speed
         me.target_speed = self.target_speed
-        is_led = bool(is_in_the_way(seen, self.corridor))
-        if is_led:  # distances of the library are between the middles of its own vehicles
-            front.position[0] = seen.gap + (me.LENGTH + front.LENGTH) / 2
-            front.speed = float(seen.obstacle_speed)
+        is_led = bool(is_in_the_way(observation, self.corridor))
+        # Distances of the library are between the middles of its own vehicles.
+        if is_led:
+            front.position[0] = observation.gap + (me.LENGTH + front.LENGTH) / 2
+            front.speed = float(observation.obstacle_speed)
         wish = me.acceleration(me, front if is_led else None)
-        return self.pedals(min(max(float(wish), -me.ACC_MAX), me.ACC_MAX), seen.speed)
+        return self.pedals(min(max(float(wish), -me.ACC_MAX), me.ACC_MAX), observation.speed)

@@ -65,10 +65,13 @@ class AdRss(ScalarAds):
             "brake_max": brake_max,
         }
         for name, value in sizes.items():
-            most = brake_max if name == "brake_min" else MOST
-            if not 0 <= value <= most or (value == 0 and name != "accel_max"):
-                legal = f"a number above 0, up to {most:g}"
-                raise InputError("", f"ads.parameters.{name} = {value:g}", legal)
+            upper_limit = brake_max if name == "brake_min" else MOST
+            if not 0 <= value <= upper_limit or (value == 0 and name != "accel_max"):
+                raise InputError(
+                    "",
+                    f"ads.parameters.{name} = {value:g}",
+                    f"a number above 0, up to {upper_limit:g}",
+                )
         self.response_time = response_time
         self.accel_max = accel_max
         self.brake_min = brake_min
@@ -77,25 +80,26 @@ class AdRss(ScalarAds):
         self.cruise_speed = cruise_speed
         self.corridor = corridor
         self.has_braked = False
-        with warnings.catch_warnings():  # about converters that both modules register
+        # They warn of converters that both modules register; the first has types of the second.
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            library("ad_rss", "ad-rss", "ad_physics")  # the types of the next one
+            library("ad_rss", "ad-rss", "ad_physics")
             self._library = library("ad_rss", "ad-rss", "ad_rss")
         self._rule: _Rule | None = None
 
-    def drive(self, seen: Observation) -> tuple[float, float]:
+    def drive(self, observation: Observation) -> tuple[float, float]:
         if self.cruise_speed is None:
-            self.cruise_speed = float(seen.speed)
+            self.cruise_speed = float(observation.speed)
         self._rule = self._rule or _Rule(self._library, self)
-        is_blocked = bool(is_in_the_way(seen, self.corridor))
+        is_blocked = bool(is_in_the_way(observation, self.corridor))
         if is_blocked and self._rule.demands_braking(
-            float(seen.speed), float(seen.gap), float(seen.obstacle_speed)
+            float(observation.speed), float(observation.gap), float(observation.obstacle_speed)
         ):
             self.has_braked = True
             return 0.0, 1.0
         if self.has_braked:
-            return self.pedals(-ROLLING_OUT, seen.speed) if is_blocked else (0.0, 0.0)
-        return self.pedals(self.cruise_speed - seen.speed, seen.speed)
+            return self.pedals(-ROLLING_OUT, observation.speed) if is_blocked else (0.0, 0.0)
+        return self.pedals(self.cruise_speed - observation.speed, observation.speed)
 
 
 class _Rule:
@@ -104,7 +108,8 @@ class _Rule:
     def __init__(self, library: Any, driver: AdRss) -> None:
         self._rss = library.rss
         self._physics = library.physics
-        self._rss.core.setLogLevel("off")  # what it refuses is an error here
+        # What it refuses is an error here.
+        self._rss.core.setLogLevel("off")
         tables = shipped_table("ads/ad_rss.toml")
         self._check = self._rss.core.RssSituationChecking()
         self._resolve = self._rss.core.RssResponseResolving()
@@ -145,7 +150,6 @@ class _Rule:
         del self._situation.constellations[:]
         self._situation.constellations.append(self._pair)
 
-        # Let the library judge it, and respond.
         states = self._rss.state.RssStateSnapshot()
         response = self._rss.state.ProperResponse()
         is_legal = self._check.checkSituation(self._situation, states)

@@ -18,7 +18,8 @@ HOLDING_DECELERATION = 2.0  # m/s^2, commanded to hold at standstill
 TAPER_TIME = 0.3  # s, over which the deceleration fades into the creep
 CREEP_MARGIN = 0.1  # m/s, above the creep speed, where the creep begins
 LEAST_DISTANCE = 0.05  # m, smallest distance over which a deceleration is planned
-LEAST_RISE = 1e-9  # m/s^2, lower bound of a rise of the needed deceleration, which is a divisor
+# m/s^2, lower bound of a rise of the needed deceleration, which is a divisor.
+LEAST_RISE = 1e-9
 FIRST_COMMAND_ROUNDING = 1e-9  # s
 
 
@@ -100,12 +101,14 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             creeping_time=zeros,
         )
 
-    def drive(self, seen: Observation, memory: _ApolloMemory) -> tuple[Command, _ApolloMemory]:
-        plan = self._plan(seen, memory)
-        command = self._pedals(seen, plan)
-        if seen.time >= self.first_command - FIRST_COMMAND_ROUNDING:
+    def drive(
+        self, observation: Observation, memory: _ApolloMemory
+    ) -> tuple[Command, _ApolloMemory]:
+        plan = self._plan(observation, memory)
+        command = self._pedals(observation, plan)
+        if observation.time >= self.first_command - FIRST_COMMAND_ROUNDING:
             return command, plan
-        is_waiting = seen.speed == 0
+        is_waiting = observation.speed == 0
         nominal, step, *old_arrays = memory
         _, _, *new_arrays = plan
         arrays = (
@@ -114,14 +117,14 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         pedals = (np.where(is_waiting, 0.0, pedal) for pedal in command)
         return Command(*pedals), _ApolloMemory(nominal, step, *arrays)
 
-    def _plan(self, seen: Observation, memory: _ApolloMemory) -> _ApolloMemory:
+    def _plan(self, observation: Observation, memory: _ApolloMemory) -> _ApolloMemory:
         """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d;
         then creep and hold.
         """
-        speed = seen.speed
-        is_detected = seen.gap <= self.perception_range * seen.visibility
+        speed = observation.speed
+        is_detected = observation.gap <= self.perception_range * observation.visibility
         distance = np.where(
-            is_detected, np.minimum(seen.gap, self.perception_range) - self.stop_gap, np.inf
+            is_detected, np.minimum(observation.gap, self.perception_range) - self.stop_gap, np.inf
         )
         needed_deceleration = speed * speed / (2 * np.maximum(distance, LEAST_DISTANCE))
         # The onset allows for the distance lost by the lag of the pedals and while the deceleration
@@ -170,11 +173,11 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             creeping_time=creeping_time,
         )
 
-    def _pedals(self, seen: Observation, memory: _ApolloMemory) -> Command:
+    def _pedals(self, observation: Observation, memory: _ApolloMemory) -> Command:
         """Pedals for the commanded acceleration, from the calibration table of the original
         vehicle.
         """
-        pedals = self.pedals(memory.commanded_acceleration, seen.speed, memory.nominal)
+        pedals = self.pedals(memory.commanded_acceleration, observation.speed, memory.nominal)
         stops = memory.has_begun_to_stop
         return Command(np.where(stops, 0.0, pedals.throttle), np.where(stops, pedals.brake, 0.0))
 
@@ -273,17 +276,17 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
             DelayLine.by(self.hesitation, step),
         )
 
-    def drive(self, seen: Observation, memory: _RailsMemory) -> tuple[Command, _RailsMemory]:
+    def drive(self, observation: Observation, memory: _RailsMemory) -> tuple[Command, _RailsMemory]:
         (gap, lateral), recognition_line = memory.recognition_line.delayed(
-            np.array([seen.gap, seen.lateral])
+            np.array([observation.gap, observation.lateral])
         )
-        is_braking = self._decide_to_brake(seen, gap, lateral, memory.is_braking)
-        is_waiting = (seen.speed == 0) & (seen.time < self.first_command)
+        is_braking = self._decide_to_brake(observation, gap, lateral, memory.is_braking)
+        is_waiting = (observation.speed == 0) & (observation.time < self.first_command)
         low, middle, high = self.throttle
-        level = seen.speed / SPEED_LEVEL
+        level = observation.speed / SPEED_LEVEL
         above_first_level = middle + (high - middle) * np.minimum(np.maximum(level - 1, 0.0), 1.0)
         throttle = np.where(
-            is_braking | is_waiting | (seen.speed > SPEED_LIMIT),
+            is_braking | is_waiting | (observation.speed > SPEED_LIMIT),
             0.0,
             np.where(level < 1, low + (middle - low) * level, above_first_level),
         )
@@ -298,19 +301,17 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
 
     def _decide_to_brake(
-        self, seen: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray
+        self, observation: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray
     ) -> BoolArray:
         """Whether the policy brakes for the recognised obstacle, which is in the corridor and was
         near.
         """
-        past = lateral - self.brake_place  # negative before that place
-        reduction = self.brake_gap_past * np.maximum(
-            past, 0.0
-        ) + self.brake_gap_before * np.maximum(-past, 0.0)
-        braking_gap = seen.visibility * (
-            self.brake_gap + self.brake_gap_per_speed * seen.speed - reduction
-        )
+        # Negative before that place.
+        past = lateral - self.brake_place
+        reduction_past = self.brake_gap_past * np.maximum(past, 0.0)
+        reduction = reduction_past + self.brake_gap_before * np.maximum(-past, 0.0)
+        largest_gap = self.brake_gap + self.brake_gap_per_speed * observation.speed
+        braking_gap = observation.visibility * (largest_gap - reduction)
         is_seen = (np.abs(lateral) <= self.corridor) & (gap > self.release_gap)
         starts_braking = (gap <= braking_gap) & (gap > PASSED_GAP)
-        is_braking = is_seen & (starts_braking | was_braking)
-        return is_braking
+        return is_seen & (starts_braking | was_braking)

@@ -92,9 +92,9 @@ class Reaction(NamedTuple):
     is_undercut: BoolArray
     nearness: FloatArray
 
-    def acceleration(self, seen: Observation) -> FloatArray:
+    def acceleration(self, observation: Observation) -> FloatArray:
         """Mean acceleration since the last call [m/s^2]; 0 at the first call."""
-        change = seen.speed - self.speed
+        change = observation.speed - self.speed
         return change / self.step if self.cruise else np.zeros_like(change)
 
     @property
@@ -164,10 +164,12 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
             nearness=np.full(n, -LARGEST_GAP),
         )
 
-    def watch_leader(self, seen: Observation, memory: Reaction, is_in_way: BoolArray) -> Reaction:
+    def watch_leader(
+        self, observation: Observation, memory: Reaction, is_in_way: BoolArray
+    ) -> Reaction:
         """The memory with the leader as it is now; `is_in_way` says where the obstacle is one."""
-        speed = np.where(is_in_way, seen.obstacle_speed, 0.0)
-        is_same = seen.obstacle == memory.leader
+        speed = np.where(is_in_way, observation.obstacle_speed, 0.0)
+        is_same = observation.obstacle == memory.leader
         is_led = is_in_way & is_same & (memory.leader_speed > 0)
         deceleration = np.where(is_led, (memory.leader_speed - speed) / memory.step, 0.0)
         memory = memory._replace(leader_speed=speed, leader_deceleration=deceleration)
@@ -175,7 +177,7 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return memory._replace(leader_has_braked=has_braked)
 
     def react(
-        self, seen: Observation, memory: Reaction, danger: Danger, start: StartThrottle = ()
+        self, observation: Observation, memory: Reaction, danger: Danger, start: StartThrottle = ()
     ) -> tuple[Command, Reaction]:
         """Hold the cruise speed, or answer a danger.
 
@@ -191,60 +193,67 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         start
             Throttle in the first steps without a danger.
         """
-        # At the first call it finds out what speed to hold, and with which pedals.
-        cruise = memory.cruise or (*cruise_at(memory.nominal, seen, self.cruise_speed), seen.brake)
+        cruise = memory.cruise or (
+            *cruise_at(memory.nominal, observation, self.cruise_speed),
+            observation.brake,
+        )
         speed_to_hold, trim, brake_at_start = cruise
 
         # Is there a danger? A known one is there while its cause approaches or brakes.
-        is_same = seen.obstacle == memory.leader
+        is_same = observation.obstacle == memory.leader
         is_known = (memory.aware_time >= 0) & (is_same | memory.is_endangered)
-        blocks = is_ahead(seen) & blocks_the_way(seen, self.corridor)
-        approaches = (seen.closing_speed >= 0) | memory.leader_brakes
+        blocks = is_ahead(observation) & blocks_the_way(observation, self.corridor)
+        approaches = (observation.closing_speed >= 0) | memory.leader_brakes
         is_endangered = danger.is_present | (is_known & blocks & approaches)
 
         # Since when is the driver aware of it? It forgets a cause that no longer blocks the way.
         is_aware = is_endangered | (is_known & is_same & blocks)
         # The time for which a new danger has lasted [s]: that since `nearness` was 0 in this step.
-        before = np.where(seen.obstacle == memory.leader, memory.nearness, 0.0)
-        now = np.maximum(_nearness(seen, danger), LEAST_DIVISOR)
-        part_of_step = 1 / (1 - np.minimum(before, 0.0) / now)
+        old_nearness = np.where(is_same, memory.nearness, 0.0)
+        nearness = _nearness(observation, danger)
+        rise = np.maximum(nearness, LEAST_DIVISOR)
+        part_of_step = 1 / (1 - np.minimum(old_nearness, 0.0) / rise)
         new_time = np.maximum(np.minimum(danger.longest, memory.step * part_of_step), 0.0)
         known_time = np.where(is_known, memory.aware_time + memory.step, new_time)
         aware_time = np.where(is_aware, known_time, -1.0)
 
         # Without a danger it holds its speed; aware of a cause it only ever becomes slower.
-        if (step_index := round(seen.time / memory.step)) < len(start):
-            calm = Command(np.full_like(seen.speed, start[step_index]), np.zeros_like(seen.speed))
+        if (step_index := round(observation.time / memory.step)) < len(start):
+            calm = Command(
+                np.full_like(observation.speed, start[step_index]), np.zeros_like(observation.speed)
+            )
         else:
-            acceleration = CRUISE_GAIN * (speed_to_hold - seen.speed)
+            acceleration = CRUISE_GAIN * (speed_to_hold - observation.speed)
             acceleration = np.where(is_aware, np.minimum(acceleration, 0.0), acceleration)
-            calm = self.pedals(acceleration, seen.speed, memory.nominal, trim)
+            calm = self.pedals(acceleration, observation.speed, memory.nominal, trim)
 
         # In a danger it brakes by what the vehicle's own deceleration lacks.
-        mean, felt, intended = _decelerations(seen, memory, danger, is_endangered, aware_time)
+        mean, felt, intended = _decelerations(
+            observation, memory, danger, is_endangered, aware_time
+        )
         lacking = np.maximum(mean - felt, 0.0) / memory.nominal.braking
         brake = np.minimum(brake_at_start + lacking, 1.0)
         throttle = np.where(is_aware, 0.0, calm.throttle)
         command = Command(throttle, np.where(is_endangered, brake, calm.brake))
         return command, memory._replace(
             cruise=cruise,
-            speed=seen.speed,
+            speed=observation.speed,
             is_endangered=is_endangered,
             aware_time=aware_time,
             felt_deceleration=felt,
             intended_deceleration=intended,
-            leader=seen.obstacle,
-            nearness=_nearness(seen, danger),
+            leader=observation.obstacle,
+            nearness=nearness,
         )
 
 
-def _nearness(seen: Observation, danger: Danger) -> FloatArray:
+def _nearness(observation: Observation, danger: Danger) -> FloatArray:
     """The nearness of a danger for each vehicle, shape (N,), bounded below."""
-    return np.maximum(danger.nearness, np.full_like(seen.gap, -LARGEST_GAP))
+    return np.maximum(danger.nearness, np.full_like(observation.gap, -LARGEST_GAP))
 
 
 def _decelerations(
-    seen: Observation,
+    observation: Observation,
     memory: Reaction,
     danger: Danger,
     is_endangered: BoolArray,
@@ -258,7 +267,7 @@ def _decelerations(
     # How the vehicle decelerates by itself: as before it braked, or as it does now.
     was_braking = memory.aware_time + step - danger.reaction_time > TIME_ROUNDING
     braked = np.maximum(memory.intended_deceleration - memory.felt_deceleration, 0.0)
-    felt_now = np.maximum(-memory.acceleration(seen) - braked, 0.0)
+    felt_now = np.maximum(-memory.acceleration(observation) - braked, 0.0)
     felt = np.where(was_braking, memory.felt_deceleration, felt_now)
 
     # In the step in which it sees the danger it feels how the vehicle coasts, and does not brake.

@@ -48,12 +48,12 @@ class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
 
     start_throttle: StartThrottle = ()
 
-    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        is_in_way = is_in_the_way(seen, self.corridor)
-        memory = self.watch_leader(seen, memory, is_in_way)
-        is_present = is_in_way & (seen.closing_speed > 0)
+    def drive(self, observation: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        is_in_way = is_in_the_way(observation, self.corridor)
+        memory = self.watch_leader(observation, memory, is_in_way)
+        is_present = is_in_way & (observation.closing_speed > 0)
         danger = Danger(is_present, UNLIMITED_BRAKING, reaction_time=0.0, jerk=np.inf)
-        return self.react(seen, memory, danger, self.start_throttle)
+        return self.react(observation, memory, danger, self.start_throttle)
 
 
 class R157(ReferenceDriver, frozen=True, kw_only=True):
@@ -81,21 +81,21 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
     reaction_time: NonNegativeParameter = 0.35
     margin: NonNegativeParameter = 0.1
 
-    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        depth = depth_in_the_way(seen, self.corridor)
+    def drive(self, observation: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        depth = depth_in_the_way(observation, self.corridor)
 
         # Towards somebody who does not brake, the time to collision decides.
         critical_ttc = (
-            seen.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
+            observation.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
         )
-        when_steady = np.minimum(depth, critical_ttc - time_to_reach(seen))
+        when_steady = np.minimum(depth, critical_ttc - time_to_reach(observation))
 
         # Was the leader too near before he braked, as far as the driver has seen him?
-        is_same = seen.obstacle == memory.leader
+        is_same = observation.obstacle == memory.leader
         was_seen = is_same & (memory.leader_speed > 0) | (memory.cruise is None)
-        memory = self.watch_leader(seen, memory, depth >= 0)
-        least_gap = seen.speed * (1 + seen.speed * KMH_PER_MS / 100)
-        is_near = seen.gap < least_gap - GAP_ROUNDING
+        memory = self.watch_leader(observation, memory, depth >= 0)
+        least_gap = observation.speed * (1 + observation.speed * KMH_PER_MS / 100)
+        is_near = observation.gap < least_gap - GAP_ROUNDING
         is_steady = was_seen & ~memory.leader_has_braked
         is_undercut = np.where(is_steady, is_near, memory.is_undercut & is_same)
 
@@ -105,7 +105,7 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
         danger = Danger(
             nearness > 0, self.deceleration, self.reaction_time, np.inf, nearness=nearness
         )
-        return self.react(seen, memory._replace(is_undercut=is_undercut), danger)
+        return self.react(observation, memory._replace(is_undercut=is_undercut), danger)
 
 
 class Rss(ReferenceDriver, frozen=True, kw_only=True):
@@ -136,13 +136,15 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
     braking: PositiveParameter = HARDEST_BRAKING
     leader_deceleration: PositiveParameter = HARDEST_BRAKING
 
-    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        depth = depth_in_the_way(seen, self.corridor)
-        memory = self.watch_leader(seen, memory, depth >= 0)
-        lacking = self.safe_distance(seen.speed, seen.obstacle_speed) - seen.gap
+    def drive(self, observation: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        depth = depth_in_the_way(observation, self.corridor)
+        memory = self.watch_leader(observation, memory, depth >= 0)
+        lacking = (
+            self.safe_distance(observation.speed, observation.obstacle_speed) - observation.gap
+        )
         nearness = np.minimum(depth, lacking)
         danger = Danger(nearness > 0, self.braking, self.reaction_time, nearness=nearness)
-        return self.react(seen, memory, danger)
+        return self.react(observation, memory, danger)
 
     def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
         """Smallest safe gap [m], at speeds [m/s] of shape (N,)."""
@@ -184,20 +186,22 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     leader_deceleration: PositiveParameter = 7.0
     margin: NonNegativeParameter = 2.0
 
-    def drive(self, seen: Observation, memory: Reaction) -> tuple[Command, Reaction]:
-        depth = depth_in_the_way(seen, self.corridor)
-        memory = self.watch_leader(seen, memory, depth >= 0)
-        gap = np.where(depth >= 0, seen.gap, np.inf)
-        pfs = self.proactive_metric(gap, seen.speed, seen.obstacle_speed)
-        cfs = self.critical_metric(gap, seen.speed, seen.obstacle_speed, memory.acceleration(seen))
+    def drive(self, observation: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+        depth = depth_in_the_way(observation, self.corridor)
+        memory = self.watch_leader(observation, memory, depth >= 0)
+        gap = np.where(depth >= 0, observation.gap, np.inf)
+        pfs = self.proactive_metric(gap, observation.speed, observation.obstacle_speed)
+        cfs = self.critical_metric(
+            gap, observation.speed, observation.obstacle_speed, memory.acceleration(observation)
+        )
         critical_deceleration = cfs * (self.hardest - self.comfortable) + self.comfortable
         deceleration = np.minimum(
             np.where(cfs > 0, critical_deceleration, pfs * self.comfortable), HARDEST_BRAKING
         )
-        _, safe_distance = self.proactive_distances(seen.speed, seen.obstacle_speed)
-        nearness = np.minimum(depth, safe_distance + self.margin - seen.gap)
+        _, safe_distance = self.proactive_distances(observation.speed, observation.obstacle_speed)
+        nearness = np.minimum(depth, safe_distance + self.margin - observation.gap)
         danger = Danger((pfs > 0) | (cfs > 0), deceleration, self.reaction_time, nearness=nearness)
-        return self.react(seen, memory, danger)
+        return self.react(observation, memory, danger)
 
     def proactive_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
         """PFS at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe

@@ -58,16 +58,15 @@ class VariedAds(Ads):
                 for driver, value in zip(drivers, column.tolist(), strict=True):
                     setattr(driver, name, value)
             return varied, drivers
-        set_field = (
-            force_setattr if isinstance(varied, msgspec.Struct) else object.__setattr__
-        )  # frozen ones, too
+        # Frozen ones get the values, too.
+        set_field = force_setattr if isinstance(varied, msgspec.Struct) else object.__setattr__
         for name, column in zip(self._names, columns, strict=True):
             set_field(varied, name, column)
         return varied, varied.start(n, nominal, step)
 
-    def drive(self, seen: Observation, memory: Memory) -> tuple[Command, Memory]:
+    def drive(self, observation: Observation, memory: Memory) -> tuple[Command, Memory]:
         varied, memory_of_varied = memory
-        command, memory_of_varied = varied.drive(seen, memory_of_varied)
+        command, memory_of_varied = varied.drive(observation, memory_of_varied)
         return command, (varied, memory_of_varied)
 
     def warns(self, memory: Memory) -> BoolArray | None:

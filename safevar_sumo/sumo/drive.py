@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -117,9 +117,10 @@ def drive(
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace()
-    encounter = observer.encounter(trace)
     outcomes.ended = outcomes.classify()
-    return _runs(points, outcomes, robot, contacts, trace=trace, encounter=encounter)
+    return _runs(
+        points, outcomes, robot, contacts, trace=trace, encounter=observer.encounter(trace)
+    )
 
 
 def _go_on(
@@ -257,7 +258,7 @@ class _Log:
 
         # Truths keep one byte instead of eight.
         names = (field.name for field in fields(Trace) if field.name not in OF_ALL_RUNS)
-        self._columns = {name: np.zeros((capacity, world.n)) for name in names}
+        self._columns: dict[str, Any] = {name: np.zeros((capacity, world.n)) for name in names}
         self._columns |= {name: np.zeros((capacity, world.n), dtype=bool) for name in TRUTHS}
 
     def write(

@@ -149,8 +149,11 @@ def where_met(system: System, setting: FloatArray) -> System:
         point for point in system.points if not point.name or met_at(point, system, settings).all()
     )
     if not points:
-        problem = f"no test has the encounter of {system.characteristics.options(setting)}"
-        raise InputError(system.source, problem, "values in the ranges of one test")
+        raise InputError(
+            system.source,
+            f"no test has the encounter of {system.characteristics.options(setting)}",
+            "values in the ranges of one test",
+        )
     return replace(system, points=points)
 
 

@@ -40,8 +40,9 @@ class Kept:
         kind = type(scenario)
         name = f"{kind.__module__}:{kind.__qualname__}"
         has_worker = getattr_static(kind, "open_worker") is not Simulator.__dict__["open_worker"]
-        file = inspect.getfile(kind.open_worker)
-        edited = Path(file).stat().st_mtime_ns if has_worker else id(kind)
+        edited = (
+            Path(inspect.getfile(kind.open_worker)).stat().st_mtime_ns if has_worker else id(kind)
+        )
         if name in self._handles and self._handles[name][0] != edited:
             self._close(name)
         if name not in self._handles:

@@ -146,11 +146,10 @@ def drive_and_score(
         if not system.skips_failed:
             raise
         reason = " ".join(f"{error.source}: {error.problem}".split())
-        metrics = system.measuring.measures
         changes = system.characteristics.change_objectives(vehicles)
         reasons = {row.tobytes(): reason for row in vehicles}
         evaluations = Evaluations.undefined(
-            vehicles, Outcome.SIMULATOR_ERROR, metrics, reasons=reasons, **changes
+            vehicles, Outcome.SIMULATOR_ERROR, system.measuring.measures, reasons=reasons, **changes
         )
     if not takes_pairs:
         return evaluations
@@ -264,8 +263,11 @@ def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResul
         if not is_met.all():
             evaluations = evaluations.where(is_met, Outcome.INFEASIBLE)
         for point, start in zip(points, range(0, len(points) * n, n), strict=True):
-            rows = slice(start, start + n)
-            yield PointResult(point, evaluations.take(np.arange(start, start + n)), runs.of(rows))
+            yield PointResult(
+                point,
+                evaluations.take(np.arange(start, start + n)),
+                runs.of(slice(start, start + n)),
+            )
 
 
 def worst_point(system: System, setting: FloatArray) -> Point:

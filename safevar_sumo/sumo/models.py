@@ -84,10 +84,11 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
                 *[None] * (2 + is_class), **({} if is_class else parameters)
             )
         except (TypeError, ValueError) as error:
-            problem = (
-                f"{name} cannot be called as step(traci, vehicle_id) with {parameters}: {error}"
-            )
-            raise InputError("", problem, CONTROLLER_FORMS) from None
+            raise InputError(
+                "",
+                f"{name} cannot be called as step(traci, vehicle_id) with {parameters}: {error}",
+                CONTROLLER_FORMS,
+            ) from None
 
         # Each vehicle gets a controller of its own.
         create: Callable[[], Controller]
@@ -111,8 +112,11 @@ def matrix_points(study: Study, lookup: Lookup) -> tuple[Point, ...]:
 
     for name, count in Counter(point.name for point in points).items():
         if count > 1:
-            legal = "unique names of tests, and each value once"
-            raise InputError("", f"matrix.tests: {count} points are {name!r}", legal)
+            raise InputError(
+                "",
+                f"matrix.tests: {count} points are {name!r}",
+                "unique names of tests, and each value once",
+            )
     return tuple(points)
 
 
@@ -158,8 +162,11 @@ def _check_listed(values: Mapping[str, Any], constraints: Sequence[Constraint]) 
     for constraint in constraints:
         if not constraint.allows(numbers):
             where = ", ".join(f"{name} = {numbers[name]:g}" for name in constraint.sum)
-            problem = f"{where} violates the constraint of {constraint.quantity}"
-            raise InputError("", problem, "encounters that the constraints allow")
+            raise InputError(
+                "",
+                f"{where} violates the constraint of {constraint.quantity}",
+                "encounters that the constraints allow",
+            )
 
 
 def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
@@ -253,7 +260,10 @@ def create_driven(study: Study, lookup: Lookup, scenario: Scenario) -> tuple[Veh
     units = getattr(scenario, "UNITS", None)
     if not isinstance(units, Mapping):
         code = UserCode(f"scenario.model = {study.scenario.model!r}", type(scenario))
-        legal = "UNITS: units of the vehicle's characteristics by name"
-        raise code.wrong("__init__", "an object without UNITS", legal)
+        raise code.wrong(
+            "__init__",
+            "an object without UNITS",
+            "UNITS: units of the vehicle's characteristics by name",
+        )
     # Neither moves nor drives anything.
     return SimulatedVehicle(units, tuple(getattr(scenario, "OPTIONAL", ()))), Ads()  # type: ignore[abstract]

@@ -197,8 +197,11 @@ def _check_files(network: NetworkFiles) -> None:
     }
     is_legal_step = SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP
     if "remote-port" in options or not is_legal_step or options["route-files"] != TRAFFIC_FILE:
-        names = ("remote-port", "step-length", "route-files")
-        stated = ", ".join(f"{name} = {options[name]!r}" for name in names if name in options)
+        stated = ", ".join(
+            f"{name} = {options[name]!r}"
+            for name in ("remote-port", "step-length", "route-files")
+            if name in options
+        )
         raise InputError(network.path(OPTIONS_FILE), stated, LEGAL_OPTIONS)
 
     # The vehicle under test departs at once, alone of its type, as each setting changes its type.
@@ -266,8 +269,11 @@ def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
             f" {model}"
         )
         if float(speed_dev) or float(sigma) or model not in (*SIGMA_MODELS, *DETERMINISTIC_MODELS):
-            legal = f'speedDev="0"; sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}'
-            raise InputError(file, problem, legal)
+            raise InputError(
+                file,
+                problem,
+                f'speedDev="0"; sigma="0" or carFollowModel {", ".join(DETERMINISTIC_MODELS)}',
+            )
 
 
 def _warnings_file(network: NetworkFiles) -> Path:
@@ -285,9 +291,14 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
     legal = "options and traffic that SUMO loads without an error"
     files = ("-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE)
     fixed_options = own_options(options_in(network.path(OPTIONS_FILE)))
-    only_load = ("--begin", "0", "--no-step-log", "true")
     exit_code, messages = load_in_sumo(
-        network.folder, *files, *only_load, *as_arguments(fixed_options)
+        network.folder,
+        *files,
+        "--begin",
+        "0",
+        "--no-step-log",
+        "true",
+        *as_arguments(fixed_options),
     )
     if exit_code != 0:
         problem = (

@@ -82,11 +82,10 @@ class Perception:
             delayed[:, vehicles], next_line = line.delayed(values[:, vehicles])
             self._lines[k] = vehicles, next_line
         obstacle = dict(zip(OCCLUDED, delayed[:-1], strict=True))
-        closing_speed = delayed[-1] - obstacle["obstacle_speed"]
         return Observation(
             time=time,
             speed=speed,
-            closing_speed=closing_speed,
+            closing_speed=delayed[-1] - obstacle["obstacle_speed"],
             visibility=self._visibility,
             **obstacle,
         )

@@ -163,8 +163,12 @@ def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
     network = network_for(scenario)
     if scenario.is_user_code:
         return _play(scenario, network, step)
-    files = (network.digests, road_digests(network))
-    inputs = (type(scenario).__name__, to_builtins(scenario), files, step)
+    inputs = (
+        type(scenario).__name__,
+        to_builtins(scenario),
+        (network.digests, road_digests(network)),
+        step,
+    )
     digest = sha256(_code_bytes() + repr(inputs).encode())
 
     def build(folder: Path) -> None:

@@ -28,7 +28,6 @@ def check_tables(study: Study, mover: Mover) -> None:
     InputError
         With the first such key.
     """
-    tests = study.tests
     entries: dict[str, Any] = {
         "vehicle.model": study.vehicle.model,
         "vehicle.parameters": study.vehicle.parameters,
@@ -45,15 +44,18 @@ def check_tables(study: Study, mover: Mover) -> None:
         for key in ("vehicle.model", "ads.model", "weather"):
             if not entries[key]:
                 table = key.removesuffix(".model") if key.startswith("ads") else key
-                legal = "this key, or a scenario.model with simulate(setting), a simulator"
-                raise InputError("", f"{table} is missing", legal)
+                raise InputError(
+                    "",
+                    f"{table} is missing",
+                    "this key, or a scenario.model with simulate(setting), a simulator",
+                )
         return
 
     entries |= {
         "step_length": study.step_length,
         "spread": study.spread,
         "repair": study.repair.parameters,
-        "matrix.tests.weathers": next((test.weathers for test in tests if test.weathers), []),
+        "matrix.tests.weathers": next((test.weathers for test in study.tests if test.weathers), []),
     }
     for key, value in entries.items():
         if value:

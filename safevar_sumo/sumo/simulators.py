@@ -126,12 +126,11 @@ def unread_characteristics(system: System, settings: FloatArray) -> set[str]:
     """
     if system.mover.is_exact:
         return set()
-    point = system.points[0]
     names = system.characteristics.vehicle.names
     unread = {*names}
     for vehicle, values in zip(*system.split(settings), strict=True):
         searched = dict(zip(system.characteristics.scenario.names, values.tolist(), strict=True))
-        scenario: Any = encounter(point, searched).scenario
+        scenario: Any = encounter(system.points[0], searched).scenario
         setting = _Setting(dict(zip(names, vehicle.tolist(), strict=True)))
         with user_errors(system.source):
             KEPT.at(scenario).simulate(setting)
@@ -216,15 +215,21 @@ def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System)
     names = {*OPTIONAL_METRICS, *measures, OUTCOME, IMPACT_SPEED, STRUCK_SPEED}
     for name in result:
         if name not in names:
-            legal = f"names of metrics: {', '.join(sorted(names))}"
-            raise code.wrong("simulate", f"a result without a trace, with {name!r}", legal)
+            raise code.wrong(
+                "simulate",
+                f"a result without a trace, with {name!r}",
+                f"names of metrics: {', '.join(sorted(names))}",
+            )
     for objective in system.measuring.scoring.objectives:
         measure = measures.get(objective.name)
         if objective.name == UNSAFE_SHARE.name:
             continue
         if measure is not None and measure.of == "runs" and objective.name not in result:
-            problem = f"a result without a trace and without {objective.name}"
-            raise code.wrong("simulate", problem, "each metric that is an objective of the study")
+            raise code.wrong(
+                "simulate",
+                f"a result without a trace and without {objective.name}",
+                "each metric that is an objective of the study",
+            )
 
 
 def _runs_of(
@@ -266,8 +271,9 @@ def _runs_of(
     closing_speed = np.maximum(impact - struck, LEAST_CLOSING_SPEED)
     stated = {name: number(name, rigs) for name in system.measuring.measures}
     stated["impact_speed"] = np.where(collided, closing_speed, np.nan)
-    excess = closing_speed - allowed_impact_speed
-    stated["impact_excess"] = np.where(collided, excess, number("impact_excess", rigs))
+    stated["impact_excess"] = np.where(
+        collided, closing_speed - allowed_impact_speed, number("impact_excess", rigs)
+    )
 
     columns: dict[str, Any] = {name: column(name) for name in ("speed", *ALSO_SAMPLED)}
     closing = columns["speed"] - columns["obstacle_speed"]

@@ -165,8 +165,7 @@ class System:
 
     def at(self, point: Point) -> System:
         """The system reduced to one point."""
-        alone = point._replace(name="", parameters=(), constraints=())
-        return replace(self, points=(alone,))
+        return replace(self, points=(point._replace(name="", parameters=(), constraints=()),))
 
 
 def simulate_command(study: Study) -> str:
@@ -199,8 +198,11 @@ def _original_points(study: Study, lookup: Lookup, single: Point) -> tuple[Point
         return ()
     for name in study.scenario.over:
         if name not in study.axes:
-            problem = f"over.{name}: the weathers of each test set {name}, too"
-            raise InputError("", problem, "a range, or values in the weathers")
+            raise InputError(
+                "",
+                f"over.{name}: the weathers of each test set {name}, too",
+                "a range, or values in the weathers",
+            )
     return tuple(original_encounter(point, study.ranges) for point in points)
 
 
@@ -210,7 +212,6 @@ def _assemble(study: Study) -> System:
     lookup = Lookup.of(study)
     scenario = create_scenario(study.scenario, lookup)
     vehicle, ads = create_driven(study, lookup, scenario)
-    weather = weather_of(study.weather)
     check_units(study, vehicle)
     check_plausible(study, vehicle)
     _check_sensors(study, vehicle, ads)
@@ -227,7 +228,7 @@ def _assemble(study: Study) -> System:
     if not (matrix or study.ranges):
         scenario.check()
 
-    single = Point(scenario, weather)
+    single = Point(scenario, weather_of(study.weather))
     points = _original_points(study, lookup, single) or matrix or (single,)
     if not matrix:
         points = (Point(points[0].scenario, points[0].weather),)
@@ -270,15 +271,13 @@ def _check_sensors(study: Study, vehicle: Vehicle, ads: Ads) -> None:
     """
     has_none = study.vehicle.model not in VEHICLES and type(vehicle).sensors is Vehicle.sensors
     if isinstance(ads, TraciController) and has_none:
-        problem = (
+        raise InputError(
+            "",
             f"vehicle.model = {study.vehicle.model!r} has no method sensors, and a controller of"
-            " TraCI bypasses sense"
-        )
-        expected = (
+            " TraCI bypasses sense",
             "a method sensors(prepared) that returns safevar_sumo.vehicles.Sensors(latency, reach,"
-            " scale), or None"
+            " scale), or None",
         )
-        raise InputError("", problem, expected)
 
 
 def _check_metrics(study: Study, measuring: Measuring) -> None:

@@ -196,9 +196,10 @@ class CommandedSpeed:
                 "0",
             )
         if name == "setLaneChangeMode" and int(value) & OWN_LANE_CHANGES:
-            problem = f"mode = {value:g}: the vehicle keeps its lane"
             raise InputError(
-                "traci.vehicle.setLaneChangeMode", problem, "0, 256 or 512, without changes of lane"
+                "traci.vehicle.setLaneChangeMode",
+                f"mode = {value:g}: the vehicle keeps its lane",
+                "0, 256 or 512, without changes of lane",
             )
 
         # What the vehicle does from now on.

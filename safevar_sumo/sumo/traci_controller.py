@@ -102,9 +102,8 @@ class TraciController(Ads):
             for i, (view, step) in enumerate(memory.drivers):
                 if memory.traffic.is_on_road(i):
                     view.time = observation.time
-                    speed = float(observation.speed[i])
                     self._call(view, step)
-                    accelerations[i] = view.commanded_acceleration(speed)
+                    accelerations[i] = view.commanded_acceleration(float(observation.speed[i]))
         command = pedals_for(memory.nominal, observation.speed, accelerations, initial_trim)
         return command, memory._replace(initial_trim=initial_trim)
 

@@ -270,8 +270,9 @@ class TraciView:
 
     def _command(self, domain: str, name: str, vehicle: str, *values: Value) -> Value:
         if vehicle != VUT:
-            problem = f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}"
-            raise refused(domain, name, problem)
+            raise refused(
+                domain, name, f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}"
+            )
         speed = float(self._api.vehicle.getSpeed(self._vut))
         self._commands.command(name, self.time, speed, values)
         if name in DRIVER_COMMANDS:
@@ -344,8 +345,9 @@ class TraciView:
         variables: Variables = {}
         for number in map(_constant, DEFAULT_VARIABLES) if requested is None else requested:
             if functions.get(number) not in CALLS[domain]:
-                problem = f"variable {number!r} is none of {', '.join(VARIABLES)}"
-                raise refused(domain, "subscribe", problem)
+                raise refused(
+                    domain, "subscribe", f"variable {number!r} is none of {', '.join(VARIABLES)}"
+                )
             # TraCI's tuples begin with the type of what follows.
             extras = (parameters or {}).get(number, ())
             extras = extras[1:] if isinstance(extras, tuple) else (extras,)
@@ -360,10 +362,9 @@ class TraciView:
         ids = self._ids(domain)
         for (of_domain, id_), variables in self._subscriptions.items():
             if of_domain == domain and id_ in ids:
-                items = variables.items()
                 values[id_] = {
                     number: self._query(domain, name, id_, *extras)
-                    for number, (name, extras) in items
+                    for number, (name, extras) in variables.items()
                 }
         return values if actor is None else values.get(actor, {})
 

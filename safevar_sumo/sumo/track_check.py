@@ -84,21 +84,19 @@ def check_motion(track: Track, step: float) -> None:
     for name, column in (("length", track.length), ("width", track.width)):
         _refuse(track, step, column < 0, column, f"has {name} = {{:g}} m", "a size of 0 m or more")
     speed = np.broadcast_to(track.speed, np.broadcast_shapes(track.speed.shape, track.x.shape))
-    outside = (speed < 0) | (speed > MOST_SPEED)
     _refuse(
         track,
         step,
-        outside,
+        (speed < 0) | (speed > MOST_SPEED),
         speed,
         "has a speed of {:g} m/s",
         f"a speed from 0 to {MOST_SPEED:g} m/s",
     )
     norm = np.square(track.along) + np.square(track.left)
-    is_unit = np.abs(norm - 1) <= UNIT_TOLERANCE
     _refuse(
         track,
         step,
-        ~is_unit,
+        ~(np.abs(norm - 1) <= UNIT_TOLERANCE),
         np.sqrt(norm),
         "has a direction of length {:g}",
         "a unit vector (along, left)",
@@ -106,8 +104,14 @@ def check_motion(track: Track, step: float) -> None:
 
     for column in (track.x, track.y):
         jumps = np.diff(column, axis=0, prepend=column[:1]) / step
-        expected = f"at most {MOST_SPEED:g} m/s between two samples"
-        _refuse(track, step, np.abs(jumps) > MOST_SPEED, jumps, "jumps, at {:g} m/s", expected)
+        _refuse(
+            track,
+            step,
+            np.abs(jumps) > MOST_SPEED,
+            jumps,
+            "jumps, at {:g} m/s",
+            f"at most {MOST_SPEED:g} m/s between two samples",
+        )
 
     # It goes along the road where its speed takes it, while it is there. (Who changes lane may face
     # along it.)

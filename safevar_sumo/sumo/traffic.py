@@ -283,9 +283,8 @@ class Traffic:
         """Vehicles that touch somebody and those whom they touch, in lane coordinates."""
         numbers = np.asarray(vehicles)
         bodies = [self._body(k, numbers) for k in range(len(self._bodies))]
-        struck = self._struck[numbers]
         columns = (
-            np.stack(column)[struck, np.arange(len(numbers))]
+            np.stack(column)[self._struck[numbers], np.arange(len(numbers))]
             for column in zip(*bodies, strict=True)
         )
         return BodyPairs(

@@ -30,15 +30,13 @@ def check_units(study: Study, vehicle: Vehicle) -> None:
         and "tau" in table
         and ("actuatorLag" not in table or table["tau"].original < MIN_HEADWAY)
     ):
-        problem = (
+        raise InputError(
+            "",
             f"vehicle.characteristics.tau.original = {table['tau'].original:g}: tau is the headway"
-            " of SUMO's driver"
-        )
-        legal = (
+            " of SUMO's driver",
             f"at least {MIN_HEADWAY:g} s; the lag from pedal to wheel force is"
-            " vehicle.characteristics.actuatorLag"
+            " vehicle.characteristics.actuatorLag",
         )
-        raise InputError("", problem, legal)
     for name, entry in table.items():
         key = f"vehicle.characteristics.{name}"
         if name in RESULT_COLUMNS:
@@ -81,8 +79,10 @@ def check_plausible(study: Study, vehicle: Vehicle) -> None:
             raise InputError("", problem, "names of characteristics and of parameters")
         values: list[tuple[str, Any]] = [(f"parameters.{name}", getattr(vehicle, name, None))]
         if entry is not None:
-            ends = ("original", "lower", "upper")
-            values = [(f"characteristics.{name}.{end}", getattr(entry, end)) for end in ends]
+            values = [
+                (f"characteristics.{name}.{end}", getattr(entry, end))
+                for end in ("original", "lower", "upper")
+            ]
         unit = unit_text(own_unit if entry is None else entry.unit)
         for key, value in values:
             is_number = isinstance(value, int | float)

@@ -113,5 +113,6 @@ def _prepared(system: System, friction: float = 1.0, **changes: FloatArray) -> P
     friction.
     """
     members = system.characteristics.vehicle
-    original = members.columns(members.original_settings)
-    return system.vehicle.prepare(original | changes, friction, STEP)
+    return system.vehicle.prepare(
+        members.columns(members.original_settings) | changes, friction, STEP
+    )

@@ -240,10 +240,9 @@ class SumoWorld:
         """All actors on the road, by id: the place of the front, or of a person [m], and the
         heading clockwise from north [degrees].
         """
-        domains = (self.api.vehicle, self.api.person)
         return {
             id_: (domain.getPosition(id_), domain.getAngle(id_))
-            for domain in domains
+            for domain in (self.api.vehicle, self.api.person)
             for id_ in domain.getIDList()
         }
 

@@ -11,6 +11,7 @@ import numpy as np
 from safevar_sumo.records import Command, FloatArray, Nominal, PedalTables
 from safevar_sumo.vehicles.base import (
     LEVEL as LEVEL,
+    Prepared as Prepared,
     Sensors as Sensors,
     SimulatedVehicle as SimulatedVehicle,
     Slope as Slope,
@@ -43,11 +44,7 @@ LIGHT_BRAKE = 0.1  # pedal position while braking, far from the limit of the tyr
 
 def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
     """The original vehicle on a dry road; the drive is simulated when its tables are first used."""
-    # Values of the SUMO type; tables of the pedals only if somebody reads them.
-    types = vehicle.sumo_type(
-        vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP)
-    )
-    simulate_tables = cache(partial(_simulated_tables, vehicle, characteristics))
+    types = vehicle.sumo_type(_prepared_original(vehicle, characteristics))
     mass, accel, decel, max_speed, lag = (float(values[0]) for values in types[:5])
     return Nominal(
         mass=mass,
@@ -55,15 +52,13 @@ def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> N
         decel=decel,
         max_speed=max_speed,
         actuator_lag=lag,
-        tables=simulate_tables,
+        tables=cache(partial(_simulated_tables, vehicle, characteristics)),
     )
 
 
-def _original_values(characteristics: CharacteristicSet) -> dict[str, FloatArray]:
-    return {
-        characteristic.name: np.full(1, float(characteristic.original))
-        for characteristic in characteristics
-    }
+def _prepared_original(vehicle: Vehicle, characteristics: CharacteristicSet) -> Prepared:
+    values = {member.name: np.full(1, float(member.original)) for member in characteristics}
+    return vehicle.prepare(values, DRY_ROAD_FRICTION, STEP)
 
 
 @lru_cache(maxsize=4)
@@ -71,9 +66,7 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
     """Accelerate at full throttle to the highest speed of the tables; from there, coast in one
     drive and brake lightly in another.
     """
-    # At rest with the original's values, on a dry road.
-    prepared = vehicle.prepare(_original_values(characteristics), DRY_ROAD_FRICTION, STEP)
-    rest = vehicle.at_rest(prepared)
+    prepared = _prepared_original(vehicle, characteristics)
 
     def drive(
         state: VehicleState, throttle: float, brake: float
@@ -91,8 +84,7 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
                 break
         return speeds, state
 
-    # The drives, which give accelerations at each speed.
-    launch, fast_state = drive(rest, throttle=1.0, brake=0.0)
+    launch, fast_state = drive(vehicle.at_rest(prepared), throttle=1.0, brake=0.0)
     coasting_speeds, _ = drive(fast_state, throttle=0.0, brake=0.0)
     braking_speeds, _ = drive(fast_state, throttle=0.0, brake=LIGHT_BRAKE)
     # With time reversed, decelerations are accelerations:
@@ -104,8 +96,9 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
         coasting=coasting,
         braking=float(np.median(braking - coasting)) / LIGHT_BRAKE,
     )
+    # Many ADSs read them.
     for table in (tables.speeds, tables.full_throttle, tables.coasting):
-        table.flags.writeable = False  # many ADSs read them
+        table.flags.writeable = False
     return tables
 
 

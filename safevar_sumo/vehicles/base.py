@@ -111,7 +111,8 @@ LEGAL_STATE = {
 LEGAL_SENSORS = {"latency": Legal(0.0), "reach": Legal(0.0, infinite=True), "scale": POSITIVE}
 LEGAL_OBSERVATION = {
     **dict.fromkeys(Observation._fields, Legal(scalar=True)),
-    **dict.fromkeys(("gap", "lateral"), Legal(infinite=True)),  # while no obstacle is detected
+    # While no obstacle is detected.
+    **dict.fromkeys(("gap", "lateral"), Legal(infinite=True)),
 }
 
 
@@ -159,7 +160,8 @@ class Vehicle:
     __slots__ = ()
     RETURNS: ClassVar[Mapping[str, Returned]] = {
         "prepare": Returned(like=0),
-        "sumo_type": Returned((dict.fromkeys(SumoType._fields[:-1], POSITIVE),)),  # tau may be None
+        # The last field, tau, may be None.
+        "sumo_type": Returned((dict.fromkeys(SumoType._fields[:-1], POSITIVE),)),
         "at_rest": Returned(({**LEGAL_STATE, "speed": Legal(0.0, 0.0)},)),
         "at_speed": Returned((LEGAL_STATE,), like=1),
         "hold_gear": Returned((LEGAL_STATE,), like=2),
@@ -215,14 +217,13 @@ class Vehicle:
         """The initial state at a speed [m/s], shape (N,): at rest if the speed is 0, else the
         steady state.
         """
-        rest = self.at_rest(prepared)
+        standing = self.at_rest(prepared)
         is_rolling = speed > 0
         if not is_rolling.any():
-            return rest
-        steady = self.at_speed(
-            prepared, np.where(is_rolling, speed, 1.0)
-        )  # any speed for those that stand
-        return steady if is_rolling.all() else _select_state(is_rolling, steady, rest)
+            return standing
+        # Those that stand get any speed above 0, and their state is not used.
+        steady = self.at_speed(prepared, np.where(is_rolling, speed, 1.0))
+        return steady if is_rolling.all() else _select_state(is_rolling, steady, standing)
 
     def hold_gear(self, prepared: Prepared, state: State, holds: BoolArray) -> State:
         """The state in which vehicles do not change gear where `holds`, shape (N,), is true; for
@@ -244,7 +245,7 @@ class Vehicle:
 
     @abstractmethod
     def sense(
-        self, prepared: Prepared, state: State, seen: Observation
+        self, prepared: Prepared, state: State, observation: Observation
     ) -> tuple[Observation, State]:
         """What the vehicles' sensors report of an observation, and the state after it."""
 
@@ -262,7 +263,7 @@ class SimulatedVehicle(Vehicle):
         self.UNITS = units
         self.OPTIONAL = optional  # type: ignore[misc]
 
-    def prepare(self, characteristics: Characteristics, *others: object) -> Characteristics:
+    def prepare(self, characteristics: Characteristics, *conditions: object) -> Characteristics:
         return characteristics
 
     def sumo_type(self, prepared: Characteristics) -> SumoType:
@@ -271,14 +272,16 @@ class SimulatedVehicle(Vehicle):
         return SumoType(undefined, undefined, undefined, undefined, undefined)
 
 
-def _select_state(is_rolling: BoolArray, steady: State, rest: State) -> State:
-    """The state `steady` of the vehicles that roll, and `rest` of the others; a state may consist
-    of states, and a delayed signal, the only part with a method `where`, has a way of its own.
+def _select_state(is_rolling: BoolArray, steady: State, standing: State) -> State:
+    """The state `steady` of the vehicles that roll, and `standing` of the others; a state may
+    consist of states, and a delayed signal, the only part with a method `where`, has a way of its
+    own.
     """
-    if hasattr(rest, "where"):
-        return steady.where(is_rolling, rest)
+    if hasattr(standing, "where"):
+        return steady.where(is_rolling, standing)
     if isinstance(steady, tuple):
-        pairs = zip(steady, rest, strict=True)
-        columns = [_select_state(is_rolling, *pair) for pair in pairs]
+        columns = [_select_state(is_rolling, *pair) for pair in zip(steady, standing, strict=True)]
         return type(steady)(*columns) if hasattr(steady, "_fields") else tuple(columns)
-    return rest if steady is None or rest is None else np.where(is_rolling, steady, rest)
+    return (
+        standing if steady is None or standing is None else np.where(is_rolling, steady, standing)
+    )

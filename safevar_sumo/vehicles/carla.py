@@ -50,14 +50,16 @@ TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = 400.0, 500.0, 400.0  # N m
 PEAK_SPEED, END_SPEED = 1890 / 5800, 5730 / 5800
 TORQUE_RISE = (TORQUE_PEAK - TORQUE_IDLE) / PEAK_SPEED
 TORQUE_FALL = (TORQUE_PEAK - TORQUE_END) / (END_SPEED - PEAK_SPEED)
-GEAR_RATIOS = 0.0, 2.85, 2.02, 1.35, 1.0  # neutral first; blueprint of the LincolnMkz2017
+# Neutral first; blueprint of the LincolnMkz2017.
+GEAR_RATIOS = 0.0, 2.85, 2.02, 1.35, 1.0
 FINAL_RATIO = 4.0
 OVERALL_RATIOS = tuple(ratio * FINAL_RATIO for ratio in GEAR_RATIOS)
 WHEELS = 4
 WHEEL_MASS = 20.0  # kg each; PxVehicleWheelData.mMass
 AIR_DENSITY = 1.2  # kg/m^3
 FRONTAL_AREA = 2.2  # m^2, of the LincolnMkz2017
-HOLD_SPEED = 0.03  # m/s; below this speed the tyres hold a braked vehicle (PxVehicle sticky tires)
+# m/s; below this speed the tyres hold a braked vehicle (PxVehicle sticky tires).
+HOLD_SPEED = 0.03
 SUBSTEP = 1 / 60  # s, the longest substep; CARLA 0.9.10 (MaxSubstepDeltaTime)
 NEWTON_STEPS = 8  # from 1 to a cube root near 1; the last steps change nothing
 
@@ -135,9 +137,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         "maxBrakeTorque": Plausible(20, 50_000),
         "shift_latency": SECONDS,
     }
-    FITTED_UP_TO: ClassVar[float] = (
-        6.5  # m/s; highest speed in simulations of the published settings of sun and rain
-    )
+    # m/s; highest speed in simulations of the published settings of sun and rain.
+    FITTED_UP_TO: ClassVar[float] = 6.5
 
     tyre_friction: Positive
     longitudinal_stiffness: Positive
@@ -161,12 +162,9 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         slope: Slope = LEVEL,
         water: FloatOrArray = 0.0,
     ) -> _Prepared:
-        from safevar_sumo.vehicles.carla_step import (
-            TYRE_STEPS,
-            Car,
-        )  # Numba takes longer to load than a simulation
+        # Numba takes longer to load than a simulation: studies of other vehicles do without.
+        from safevar_sumo.vehicles.carla_step import TYRE_STEPS, Car
 
-        # Radius, grip and steps of time.
         c = characteristics
         radius = c["radius"] / 100
         grip = c["tireFric"] * (self.tyre_friction * road_friction) * c["mass"] * slope.down
@@ -174,7 +172,6 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         substep = step / substeps
         tyre_step = substep / TYRE_STEPS
 
-        # Constants of the equations of motion.
         constants = Car(
             radius=radius,
             wheel_inertia=WHEELS * 0.5 * WHEEL_MASS * radius * radius / tyre_step,
@@ -194,12 +191,12 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             standstill=np.zeros_like(radius),
         )
 
-        # The speed at which a slope moves the wheels counts as standstill.
+        # The speed at which a slope moves the wheels counts as standstill; `car` has it, too.
         rows = np.array(constants)
         car = Car(*rows)
         pull = c["mass"] * slope.back
         creep_speed, _ = self._rim_at(car, np.abs(pull), np.zeros_like(radius))
-        rows[Car._fields.index("standstill")] = HOLD_SPEED + creep_speed  # `car` has it, too
+        rows[Car._fields.index("standstill")] = HOLD_SPEED + creep_speed
         return _Prepared(
             substeps=substeps,
             law=self._law(substep, tyre_step),
@@ -264,7 +261,6 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         from safevar_sumo.vehicles.carla_step import CarlaState, full_torque
 
         p = prepared.car
-        law = prepared.law
         rim, force = self._rim_at(p, prepared.pull, speed)
         wheel_speed = rim / p.radius
         resistance = p.wheel_damping * wheel_speed + p.radius * force
@@ -288,16 +284,15 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         for ratio in OVERALL_RATIOS[1:-1]:
             _, _, engine_speed = engine_in(ratio)
             gear += engine_speed > self.shift_up * p.engine_limit
-        clutch_torque, brake_torque, engine_speed = engine_in(
-            np.take(OVERALL_RATIOS, gear.astype(np.intp))
-        )
+        ratios = np.take(OVERALL_RATIOS, gear.astype(np.intp))
+        clutch_torque, brake_torque, engine_speed = engine_in(ratios)
         brake = np.minimum(np.maximum(brake_torque / p.brake_torque, 0.0), 1.0)
         throttle_torque = (
-            full_torque(p, law, engine_speed) - (p.damping_full - p.damping_engaged) * engine_speed
+            full_torque(p, prepared.law, engine_speed)
+            - (p.damping_full - p.damping_engaged) * engine_speed
         )
-        throttle = (p.damping_engaged * engine_speed + clutch_torque) / np.maximum(
-            throttle_torque, 1.0
-        )
+        torque = p.damping_engaged * engine_speed + clutch_torque
+        throttle = torque / np.maximum(throttle_torque, 1.0)
         throttle = np.where(brake > 0, 0.0, np.minimum(throttle, 1.0))
         shifts_down = (gear > 1) & (engine_speed < self.shift_down * p.engine_limit)
         since_shift = np.where(shifts_down, prepared.shift_time, self.shift_latency)
@@ -319,7 +314,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         force = np.minimum(np.maximum(p.air_drag * speed * speed + pull, -p.grip), p.grip)
         grip_share = np.abs(force) / p.grip
         root = np.ones_like(speed)
-        for _ in range(NEWTON_STEPS):  # root^3 = 1 - force / grip; see `tyre_force`
+        # root^3 = 1 - force / grip; see `tyre_force`.
+        for _ in range(NEWTON_STEPS):
             root = root - (root * root * root - 1 + grip_share) / (3 * root * root)
         driving_rim = (p.slip_stiffness * speed + self.slip_offset * (1 - root)) / (
             p.slip_stiffness - 1 + root
@@ -331,10 +327,10 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return Sensors.perfect(len(prepared.mass))._replace(scale=prepared.assumed_height)
 
     def sense(
-        self, prepared: _Prepared, state: CarlaState, seen: Observation
+        self, prepared: _Prepared, state: CarlaState, observation: Observation
     ) -> tuple[Observation, CarlaState]:
         """The gap as the camera measures it: the wheel radius sets the height of the camera."""
-        return seen._replace(gap=seen.gap * prepared.assumed_height), state
+        return observation._replace(gap=observation.gap * prepared.assumed_height), state
 
     @defer_interrupts()
     def compile(self, *, only_load: bool = False) -> bool:

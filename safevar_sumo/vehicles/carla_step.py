@@ -134,9 +134,9 @@ def pedal_position(
 @equation
 def ratio_of(law: Law, gear: FloatOrArray) -> FloatOrArray:
     """Overall ratio of a gear; 0 in neutral."""
-    neutral, first, second, third, fourth = law.ratios
-    low = first if gear == 1.0 else second
-    high = third if gear == 3.0 else fourth
+    neutral, first_ratio, second_ratio, third_ratio, fourth_ratio = law.ratios
+    low = first_ratio if gear == 1.0 else second_ratio
+    high = third_ratio if gear == 3.0 else fourth_ratio
     engaged = low if gear < 3.0 else high
     return engaged if gear > NEUTRAL else neutral
 
@@ -167,10 +167,9 @@ def tyre_force(car: Car, law: Law, speed: FloatOrArray, rim: FloatOrArray) -> Fl
     """
     slip_speed = rim - speed
     denominator = np.maximum(rim, speed) + law.slip_offset
-    rest = (
-        np.maximum(denominator - car.slip_stiffness * np.abs(slip_speed), 0.0) / denominator
-    )  # 1 - K / 3
-    return np.copysign(car.grip - car.grip * rest * rest * rest, slip_speed)
+    # 1 - K / 3 in the equation: 1 without slip, 0 where the tyre slides.
+    adhesion = np.maximum(denominator - car.slip_stiffness * np.abs(slip_speed), 0.0) / denominator
+    return np.copysign(car.grip - car.grip * adhesion * adhesion * adhesion, slip_speed)
 
 
 @equation
@@ -221,9 +220,9 @@ def roll(
         free_engine_speed = engine_share * engine_speed + engine_gain
         free_rim = rim_share * rim + rim_by_engine * free_engine_speed - rim_loss
         slip_end_force = (free_rim - speed) / slip_by_force
-        least = np.minimum(slip_end_force, 0.0)
-        most = np.maximum(slip_end_force, 0.0)
-        force = np.minimum(np.maximum(tyre_force(car, law, speed, rim), least), most)
+        lower_limit = np.minimum(slip_end_force, 0.0)
+        upper_limit = np.maximum(slip_end_force, 0.0)
+        force = np.minimum(np.maximum(tyre_force(car, law, speed, rim), lower_limit), upper_limit)
         rim = np.maximum(free_rim - rim_by_force * force, 0.0)
         engine_speed = np.minimum(free_engine_speed + engine_by_rim * rim, car.engine_limit)
         speed = np.maximum(speed + car.speed_by_force * force - speed_loss, 0.0)
@@ -270,18 +269,16 @@ def advance(
     changes, those of `CarlaState`, shape (8, N), of `commands` throttle and brake, shape (2, N).
     """
     n = states.shape[1]
-    t = np.ones(
-        (26, BLOCK)
-    )  # 16 rows of `Car`, 8 of `CarlaState`, 2 of commands; idle columns divide by 1
-
-    # Vehicles in blocks, each in columns of a table.
+    # 16 rows of `Car`, 8 of `CarlaState`, 2 of commands; idle columns divide by 1.
+    t = np.ones((26, BLOCK))
     for start in range(0, n, BLOCK):
         count = min(BLOCK, n - start)
         t[:16, :count] = cars[:, start : start + count]
         t[16:24, :count] = states[:, start : start + count]
         t[24:, :count] = commands[:, start : start + count]
         for _ in range(substeps):
-            for i in range(BLOCK):  # the whole block, whose last columns may hold no vehicle
+            # The whole block, whose last columns may hold no vehicle: a fixed number is faster.
+            for i in range(BLOCK):
                 s = move(car_in(t, i), law, state_in(t, i), t[24, i], t[25, i])
                 t[16, i] = s.speed
                 t[17, i] = s.wheel_speed
@@ -294,7 +291,7 @@ def advance(
 
         # A braked vehicle that is slower than a slope could move it stands.
         for i in range(count):
-            if t[23, i] > 0.0 and t[16, i] < t[15, i]:  # a standstill
+            if t[23, i] > 0.0 and t[16, i] < t[15, i]:
                 t[16, i] = 0.0
                 t[17, i] = 0.0
         states[:, start : start + count] = t[16:24, :count]

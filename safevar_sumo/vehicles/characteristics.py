@@ -103,10 +103,8 @@ class Characteristic:
     def resolution(self) -> float:
         """A change that matters little: beta (u - l) (method section 2)."""
         width = self.upper - self.lower
-        return (
-            next(share for smallest_width, share in FILTER_SHARES if width >= smallest_width)
-            * width
-        )
+        shares = (share for smallest_width, share in FILTER_SHARES if width >= smallest_width)
+        return next(shares) * width
 
     @property
     def largest_plausible(self) -> float:
@@ -141,10 +139,11 @@ class Characteristic:
     def rounded_inwards(self, interval: tuple[float, float]) -> tuple[float, float]:
         """An interval around the original, rounded inwards; ends of the domain stay."""
         low, high = interval
-        return (
-            low if low <= self.lower else self.rounded(low, upwards=True),
-            high if high >= self.upper else self.rounded(high, upwards=False),
-        )
+        if low > self.lower:
+            low = self.rounded(low, upwards=True)
+        if high < self.upper:
+            high = self.rounded(high, upwards=False)
+        return low, high
 
     @property
     def suffix(self) -> str:
@@ -169,24 +168,22 @@ class Characteristic:
         InputError
             Naming the value and what is expected.
         """
-        if not isinstance(value, Real) or not self.is_legal(value, beyond=beyond):
-            sign = " above 0" if self.lower > 0 else " from 0" if self.is_scenario else ""
-            expected = (
-                f"a finite number{sign}, up to {self.largest_plausible:g}"
-                if beyond
-                else f"a number in [{self.lower:g}, {self.upper:g}]"
-            )
-
-            # A legal value outside the domain has a way to be accepted.
-            is_outside_domain = (
-                not beyond and isinstance(value, Real) and self.is_legal(value, beyond=True)
-            )
-            hint = f", or any with {switch}" if is_outside_domain and switch else ""
-            raise InputError(
-                "",
-                f"{self.name} = {value!r}{' is outside its domain' if is_outside_domain else ''}",
-                f"{expected}{self.suffix}{otherwise}{hint}",
-            )
+        is_number = isinstance(value, Real)
+        if is_number and self.is_legal(value, beyond=beyond):
+            return
+        problem = f"{self.name} = {value!r}"
+        expected = f"a number in [{self.lower:g}, {self.upper:g}]"
+        hint = ""
+        if beyond:
+            sign = " from 0" if self.is_scenario else ""
+            if self.lower > 0:
+                sign = " above 0"
+            expected = f"a finite number{sign}, up to {self.largest_plausible:g}"
+        # A legal value outside the domain has a way to be accepted.
+        elif is_number and self.is_legal(value, beyond=True):
+            problem += " is outside its domain"
+            hint = f", or any with {switch}" if switch else ""
+        raise InputError("", problem, f"{expected}{self.suffix}{otherwise}{hint}")
 
     def is_legal(self, values: Quantity, *, beyond: bool) -> Quantity:
         """Whether values, a number or an array, are in the domain; with `beyond`, whether they are
@@ -233,8 +230,9 @@ class CharacteristicSet:
             for item, value in zip(self.members, setting.tolist(), strict=True)
             if value != item.original
         ]
-        is_beyond = ((setting < self.lower) | (setting > self.upper)).any()
-        return " ".join([*words, *(["--beyond"] if is_beyond else [])])
+        if ((setting < self.lower) | (setting > self.upper)).any():
+            words.append("--beyond")
+        return " ".join(words)
 
     def __iter__(self) -> Iterator[Characteristic]:
         return iter(self.members)
@@ -258,11 +256,11 @@ class CharacteristicSet:
         """Which members are the vehicle's, shape (n,)."""
         return np.array([not member.is_scenario for member in self.members], dtype=bool)
 
-    def of_others(self, others: CharacteristicSet, settings: FloatArray) -> FloatArray:
+    def of_others(self, characteristics: CharacteristicSet, settings: FloatArray) -> FloatArray:
         """Settings of other characteristics, shape (N, m), with those of this set alone, shape
         (N, n).
         """
-        return np.asarray(settings[:, [others.names.index(name) for name in self.names]])
+        return np.asarray(settings[:, [characteristics.names.index(name) for name in self.names]])
 
     def with_original_vehicle(self, settings: FloatArray) -> FloatArray:
         """The original vehicle in the encounters of settings, shape (N, n)."""
@@ -369,7 +367,6 @@ class CharacteristicSet:
                 "values by characteristic, such as {'mass': 2500}",
             )
 
-        # Legal values in place of the original's.
         setting = self.original.copy()
         for name, value in values.items():
             check_name("", f"there is no characteristic {name!r}", name, self.names)

@@ -38,11 +38,12 @@ def compiled(function: Function) -> Function:
     """Compile a function when it is first called with arguments of new types, unless the cache has
     it.
     """
+    # Where no folder for a cache can be written, Numba refuses to use one.
     try:
-        made: Any = numba.njit(error_model="numpy", cache=True)(function)
-    except RuntimeError:  # no folder for a cache can be written
-        made = numba.njit(error_model="numpy")(function)
-    return made  # type: ignore[no-any-return]
+        compiled_function: Any = numba.njit(error_model="numpy", cache=True)(function)
+    except RuntimeError:
+        compiled_function = numba.njit(error_model="numpy")(function)
+    return compiled_function  # type: ignore[no-any-return]
 
 
 def is_compiled(call: Callable[[], object]) -> bool:

@@ -36,21 +36,23 @@ FIRST_GEAR, LAST_GEAR = map(np.array, (1.0, len(GEAR_RATIOS)))
 FINAL_RATIO = np.array(2.56)  # VehicleSMI
 SHIFT_DELAY = np.array(0.7)  # s, minimum time between two shifts; VehicleSMI
 SHIFT_UP, SHIFT_DOWN = map(np.array, (0.33, 0.13))  # of maxRpm (assumption)
-RPM_RATE = 20.0  # 1/s, the engine speed follows the wheels with a lag of 1/20 s; VehicleSMI
-TRACTION_START = (
-    1 - 0.675
-)  # share of maxMotorTorque that the traction control allows at the start; VehicleSMI
-TRACTION_RATE = (
-    6.75 / 0.02
-)  # N m/s, rate at which the allowed torque rises and falls; VehicleSMI, at 50 Hz
+# 1/s, the engine speed follows the wheels with a lag of 1/20 s; VehicleSMI.
+RPM_RATE = 20.0
+# Share of maxMotorTorque that the traction control allows at the start; VehicleSMI.
+TRACTION_START = 1 - 0.675
+# N m/s, rate at which the allowed torque rises and falls; VehicleSMI, at 50 Hz.
+TRACTION_RATE = 6.75 / 0.02
 AIR_DRAG, DOWNFORCE = map(np.array, (1.0, 2.0))  # N s^2/m^2; VehicleSMI
 # Unity's WheelCollider: forward friction rises to its extremum and falls to its asymptote.
 PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = map(np.array, (0.4, 0.8, 0.5))
 SLIDING_RANGE, FRICTION_LOSS = map(np.array, (SLIDING_SLIP - PEAK_SLIP, 1 - SLIDING_FRICTION))
 FRICTION = 1.0  # at the extremum
-SLIP_FLOOR = np.array(4.0)  # m/s, smallest denominator of a slip (assumption, as in PhysX)
-LEAST_RIM_SPEED = np.array(1e-3)  # m/s, smallest rim speed that a slip limit is relative to
-HOLD_SPEED = np.array(0.05)  # m/s, below which locked wheels hold the vehicle (assumption)
+# m/s, smallest denominator of a slip (assumption, as in PhysX).
+SLIP_FLOOR = np.array(4.0)
+# m/s, smallest rim speed that a slip limit is relative to.
+LEAST_RIM_SPEED = np.array(1e-3)
+# m/s, below which locked wheels hold the vehicle (assumption).
+HOLD_SPEED = np.array(0.05)
 WHEELBASE = np.array(2.85)  # m
 # Initial errors for the lane keeping to correct (assumption), so that the steering angle has an
 # effect.
@@ -166,13 +168,11 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         slope: Slope = LEVEL,
         water: FloatOrArray = 0.0,
     ) -> _Prepared:
-        # Inertia of the wheels, and constants of the equations of motion.
         c = characteristics
-        substep = step / SUBSTEPS
         inertia = WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"]
         prepared = _Prepared(
             step=np.array(step),
-            substep=np.array(substep),
+            substep=np.array(step / SUBSTEPS),
             mass=c["mass"],
             weight=c["mass"] * slope.down,
             body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"],
@@ -240,21 +240,16 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         p = prepared
         zeros = np.zeros_like(prepared.mass)
 
-        # The force that holds the speed, and the slip that it needs.
         force = (AIR_DRAG * speed + p.rolling_drag) * speed + p.body * p.slope_deceleration
-        rim = _rim_at(p, speed, force)
-        wheel_speed = rim / p.radius
+        wheel_speed = _rim_at(p, speed, force) / p.radius
 
-        # The gear in which the engine is not too fast.
         gear = zeros + 1
         for lower_ratio in GEAR_RATIOS[:-1]:
             rpm = p.least_rpm + wheel_speed * (lower_ratio * FINAL_RATIO * RPM_PER_RAD_S)
-            is_too_fast = rpm > SHIFT_UP * p.largest_rpm
-            gear += is_too_fast
+            gear += rpm > SHIFT_UP * p.largest_rpm
         ratio = GEAR_RATIOS[gear.astype(np.intp) - 1]
         gearing = ratio * FINAL_RATIO
 
-        # The pedal that gives the torque.
         engine_rpm = p.least_rpm + wheel_speed * gearing * RPM_PER_RAD_S
         full_torque = _torque_share(engine_rpm / p.largest_rpm) * gearing * p.motor_torque
         needed_torque = p.damping * wheel_speed + p.radius * force
@@ -275,18 +270,15 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         )
 
     def sense(
-        self, prepared: _Prepared, state: LgsvlState, seen: Observation
+        self, prepared: _Prepared, state: LgsvlState, observation: Observation
     ) -> tuple[Observation, LgsvlState]:
-        return seen, state
+        return observation, state
 
     def advance(self, prepared: _Prepared, state: LgsvlState, command: Command) -> LgsvlState:
         p = prepared
-
-        # Steering, pedals and gear once a step.
         lateral, heading, cornering_drag = self._steer(p, state)
-        pedal_share = p.step / (
-            p.step + self.pedal_lag
-        )  # of its error that a pedal makes up in a step
+        # Of its error a pedal makes up this share in a step.
+        pedal_share = p.step / (p.step + self.pedal_lag)
         state = _shift(p, state)._replace(
             throttle=state.throttle + (command.throttle - state.throttle) * pedal_share,
             brake=state.brake + (command.brake - state.brake) * pedal_share,
@@ -294,7 +286,6 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             heading=heading,
         )
 
-        # Engine, wheels and body in substeps.
         gearing = _ratio(p, state) * FINAL_RATIO
         for _ in range(SUBSTEPS):
             state = _roll(p, state, gearing, cornering_drag)
@@ -322,7 +313,6 @@ def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
     """Automatic gearbox by engine speed. For shiftTime after a shift, the ratio moves linearly from
     the old one to the new one.
     """
-    # Who shifts up or down?
     rpm_share = s.engine_rpm / p.largest_rpm
     is_ready = s.since_shift >= SHIFT_DELAY
     up = is_ready & (rpm_share > SHIFT_UP) & (s.gear < LAST_GEAR)
@@ -361,21 +351,17 @@ def _roll(
     w' (I + h d + p r - p^2 / M) = I w + h (T_drive - T_brake) + p m u / M    (`wheel_momentum`)
     v' = (m u + p w') / M
     """
-    # Engine speed and torque.
     h = p.substep
     steady_rpm = p.least_rpm + s.wheel_speed * gearing * RPM_PER_RAD_S
     engine_rpm = s.engine_rpm + (steady_rpm - s.engine_rpm) * (RPM_RATE * h / (1 + RPM_RATE * h))
     drive = _torque_share(engine_rpm / p.largest_rpm) * gearing * s.traction_torque * s.throttle
 
-    # Slip of the driven wheels, which traction control limits.
     rim = p.radius * s.wheel_speed
     slip_speed = rim - s.speed
     is_spinning = slip_speed > p.slip_limit * np.maximum(rim, LEAST_RIM_SPEED)
-    traction_torque = s.traction_torque + np.where(
-        is_spinning, -TRACTION_RATE * h, TRACTION_RATE * h
-    )
+    torque_change = TRACTION_RATE * h
+    traction_torque = s.traction_torque + np.where(is_spinning, -torque_change, torque_change)
 
-    # Wheel and body, with the stiffness of the tyres.
     stiffness = _tyre_stiffness(p, s.speed, rim, slip_speed)
     pull = h * p.radius * stiffness
     damped_mass = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
@@ -420,9 +406,8 @@ def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
     grip_share = np.minimum(
         np.abs(force) / (p.friction * (p.weight + DOWNFORCE * speed * speed)), 1.0
     )
-    slip = (
-        PEAK_SLIP * grip_share / (1 + np.sqrt(1 - grip_share))
-    )  # grip_share = x (2 - x), x = slip / PEAK_SLIP
+    # From grip_share = x (2 - x) with x = slip / PEAK_SLIP.
+    slip = PEAK_SLIP * grip_share / (1 + np.sqrt(1 - grip_share))
     slow_rim = speed + SLIP_FLOOR * slip
     driving_rim = np.where(slow_rim <= SLIP_FLOOR, slow_rim, speed / (1 - slip))
     return np.asarray(

@@ -48,18 +48,20 @@ class _Bounds(NamedTuple):
         cls, constraint: Constraint, study: Study, characteristics: CharacteristicSet
     ) -> _Bounds:
         """The computation of a study's constraint."""
-        # Weights by column, and how far the sum may vary.
         table = study.domains
         widths = characteristics.upper - characteristics.lower
         weights = tuple(
             (characteristics.names.index(name), weight) for name, weight in constraint.sum.items()
         )
+        width = float(sum(abs(weight) * widths[column] for column, weight in weights))
+        minimum = -np.inf if constraint.at_least is None else constraint.at_least
+        maximum = np.inf if constraint.at_most is None else constraint.at_most
         return cls(
             constraint,
             weights,
-            float(sum(abs(weight) * widths[column] for column, weight in weights)),
-            -np.inf if constraint.at_least is None else constraint.at_least,
-            np.inf if constraint.at_most is None else constraint.at_most,
+            width,
+            minimum,
+            maximum,
             constraint.bounds_in_words(table),
             unit_text(constraint.unit_of(table)),
         )
@@ -119,7 +121,8 @@ class FeasibleRegion:
             Naming the constraint that the first infeasible setting violates, and the values of that
             setting.
         """
-        for setting in settings[~self.feasible(settings)][:1]:  # the first one, if any
+        # The first one, if any, stands for all.
+        for setting in settings[~self.feasible(settings)][:1]:
             row = setting[np.newaxis]
             bound = next(
                 bound for bound in self.bounds if bound.excess(row)[0] > SLACK / len(self.bounds)
@@ -130,8 +133,9 @@ class FeasibleRegion:
                 if characteristic.name in bound.constraint.sum
             )
             quantity = f"{bound.constraint.quantity} = {bound.quantity(row)[0]:g}{bound.suffix}"
-            problem = f"violates a constraint: {quantity} ({values})"
-            raise InputError("", problem, bound.condition + otherwise)
+            raise InputError(
+                "", f"violates a constraint: {quantity} ({values})", bound.condition + otherwise
+            )
 
     def repaired(self, settings: FloatArray) -> FloatArray:
         """Settings moved towards the original until they are feasible after the filter, shape (N,
@@ -156,7 +160,8 @@ class FeasibleRegion:
         batches = [np.zeros((0, len(self.characteristics)))]
         draws = 0
         while (shortage := number - sum(map(len, batches))) and draws < REJECTIONS * number:
-            settings = draw(max(shortage, min(draws, LARGEST_DRAW)))  # as many as all draws before
+            # As many as all draws before, where few are feasible.
+            settings = draw(max(shortage, min(draws, LARGEST_DRAW)))
             draws += len(settings)
             batches.append(settings[self._are_accepted(settings, filtered)][:shortage])
         return np.concatenate(batches)
@@ -181,20 +186,21 @@ def region_of(study: Study) -> FeasibleRegion:
     if not bounds:
         return region
 
-    # The original vehicle satisfies every constraint.
     with about(f"{subject()}: the original vehicle"):
-        required = "; the original vehicle must satisfy every constraint"
-        region.check(characteristics.original_settings, otherwise=required)
-
-    # Random settings that do are not too rare.
-    shape = (N_PROBES, len(characteristics))
-    probes = np.random.default_rng(0).uniform(characteristics.lower, characteristics.upper, shape)
-    if np.mean(region.feasible(characteristics.filter(probes))) < LEAST_SHARE:
-        problem = (
-            f"constraints: fewer than {LEAST_SHARE * 1000:g} in 1,000 random settings satisfy them:"
-            f" {region}"
+        region.check(
+            characteristics.original_settings,
+            otherwise="; the original vehicle must satisfy every constraint",
         )
+
+    # Searches start from random settings.
+    probes = np.random.default_rng(0).uniform(
+        characteristics.lower, characteristics.upper, (N_PROBES, len(characteristics))
+    )
+    if np.mean(region.feasible(characteristics.filter(probes))) < LEAST_SHARE:
         raise InputError(
-            "", problem, "narrower domains, or constraints that leave more than an equation does"
+            "",
+            f"constraints: fewer than {LEAST_SHARE * 1000:g} in 1,000 random settings satisfy them:"
+            f" {region}",
+            "narrower domains, or constraints that leave more than an equation does",
         )
     return region

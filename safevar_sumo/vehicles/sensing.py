@@ -111,9 +111,8 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         slope: Slope = LEVEL,
         water: FloatOrArray = 0.0,
     ) -> _PreparedSumo:
-        c = characteristics
-
         # Brakes and drive are those of a vehicle of the reference mass.
+        c = characteristics
         mass_ratio = self.reference_mass / c["mass"]
         decel = c["decel"] * mass_ratio
         return _PreparedSumo(
@@ -278,8 +277,6 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         water: FloatOrArray = 0.0,
     ) -> _PreparedWorn:
         c = characteristics
-
-        # How the payload loads the rear axle.
         mass = self.kerb_mass + c["payload"]
         rear_load = (
             (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"])
@@ -287,20 +284,19 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
             / self.wheelbase
         )
 
-        # Tread that is left, and the field of view.
-        tread = np.maximum(c["treadDepth"], 0.0)
         tangent: FloatArray | None = None
         if "sensorAngle" in c:
-            tangent = np.asarray(
-                np.round(np.tan(np.radians(c["sensorAngle"])), TANGENT_DECIMALS), dtype=float
-            )
+            exact_tangent = np.tan(np.radians(c["sensorAngle"]))
+            tangent = np.asarray(np.round(exact_tangent, TANGENT_DECIMALS), dtype=float)
         return _PreparedWorn(
             step=step,
             mass=mass,
             drive=self.drive_force / mass,
             brake=c["brakeTorque"] * (self.brake_force / mass),
             grip=self.tyre_friction * road_friction,
-            lift=lift_of(water, tread, self.water_lift, self.road_texture),
+            lift=lift_of(
+                water, np.maximum(c["treadDepth"], 0.0), self.water_lift, self.road_texture
+            ),
             max_speed=self.max_speed,
             front_load=1 - rear_load,
             rear_load=rear_load,
@@ -313,34 +309,31 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         )
 
     def sense(
-        self, prepared: Prepared, state: SensingState, seen: Observation
+        self, prepared: Prepared, state: SensingState, observation: Observation
     ) -> tuple[Observation, SensingState]:
         """What sensors see that look aside and lose frames."""
-        sensed, state = SensingVehicle.sense(self, prepared, state, seen)
+        sensed, state = SensingVehicle.sense(self, prepared, state, observation)
 
-        # An angle of the sensors shifts what is ahead sideways.
         if prepared.tangent is not None:
             distance = np.where(np.isfinite(sensed.gap), sensed.gap, 0.0)
             sensed = sensed._replace(lateral=sensed.lateral + distance * prepared.tangent)
         if prepared.dropout is None:
             return sensed, state
 
-        # A lost frame repeats the one before.
         frame = np.stack([getattr(sensed, name) for name in DELAYED])
         if state.frame is not None:
-            number = round(seen.time / prepared.step)
+            number = round(observation.time / prepared.step)
             is_lost = np.random.default_rng([self.frame_seed, number]).random() < prepared.dropout
             frame = np.where(is_lost, state.frame, frame)
-        return sensed._replace(**dict(zip(DELAYED, frame, strict=True))), state._replace(
-            frame=frame
-        )
+        sensed = sensed._replace(**dict(zip(DELAYED, frame, strict=True)))
+        return sensed, state._replace(frame=frame)
 
     def sumo_type(self, prepared: _PreparedWorn) -> SumoType:
         p = prepared
-        ones = np.ones_like(prepared.mass)
-        grip = lifted_friction(p.grip, p.lift, 0 * ones)
-        limits = np.minimum(p.drive, grip * p.slope.down), self._deceleration(p, ones, grip)
-        return SumoType(p.mass, *limits, self.max_speed * ones, p.brake_delay + p.step)
+        full_pedal = np.ones_like(prepared.mass)
+        grip = lifted_friction(p.grip, p.lift, 0 * full_pedal)
+        limits = np.minimum(p.drive, grip * p.slope.down), self._deceleration(p, full_pedal, grip)
+        return SumoType(p.mass, *limits, self.max_speed * full_pedal, p.brake_delay + p.step)
 
     def _acceleration(
         self, p: _PreparedWorn, state: SensingState, throttle: FloatArray, brake: FloatArray

@@ -58,7 +58,6 @@ class DelayedSignal:
         InputError
             If a delay is longer than any run.
         """
-        # How many steps and which part of a step each delay is.
         longest = float(np.max(delay))
         age = delay / step
         if not longest <= LONGEST_DELAY:
@@ -66,27 +65,24 @@ class DelayedSignal:
                 "vehicle", f"one of its delays is {longest:g} s", f"up to {LONGEST_DELAY:g} s"
             )
         whole_steps = np.floor(age)
-        newer = whole_steps.astype(np.intp) * sample.size + np.arange(sample.size).reshape(
-            sample.shape
-        )
-        return cls(
-            np.repeat(sample[np.newaxis], int(longest / step) + 2, axis=0), newer, age - whole_steps
-        )
+        first_sample = np.arange(sample.size).reshape(sample.shape)
+        newer = whole_steps.astype(np.intp) * sample.size + first_sample
+        samples = np.repeat(sample[np.newaxis], int(longest / step) + 2, axis=0)
+        return cls(samples, newer, age - whole_steps)
 
-    def where(self, chosen: BoolArray, other: DelayedSignal) -> DelayedSignal:
+    def where(self, chosen: BoolArray, history: DelayedSignal) -> DelayedSignal:
         """This history of the `chosen` vehicles, shape (N,), and another one, of equal length, of
         all others.
         """
-        samples = np.where(chosen, self.samples, other.samples)
-        newer = np.where(chosen, self.newer, other.newer)
-        return DelayedSignal(samples, newer, np.where(chosen, self.share, other.share))
+        samples = np.where(chosen, self.samples, history.samples)
+        newer = np.where(chosen, self.newer, history.newer)
+        return DelayedSignal(samples, newer, np.where(chosen, self.share, history.share))
 
     def extended(self, sample: FloatArray) -> DelayedSignal:
         """The history with a new sample at its front and the oldest one dropped."""
+        # Another history may go on from the same room, or the room may be full.
         room = self._room
-        if (
-            room.begin != self._begin or not room.begin
-        ):  # another history goes on there, or it is full
+        if room.begin != self._begin or not room.begin:
             room = _Room(self.samples)
         room.begin -= 1
         room.samples[room.begin] = sample
@@ -98,9 +94,8 @@ class DelayedSignal:
         """
         newer = self.samples.take(self.newer)
         older = self.samples[1:].take(self.newer)
-        with np.errstate(
-            invalid="ignore"
-        ):  # a signal is infinite while out of sight, finite a step later
+        # A signal is infinite while out of sight, finite a step later.
+        with np.errstate(invalid="ignore"):
             signal = newer * (1 - self.share) + older * self.share
         np.copyto(signal, newer, where=np.isnan(signal))
         return signal
@@ -131,7 +126,7 @@ DELAYED = (
 
 
 def sensed_observation(
-    seen: Observation,
+    observation: Observation,
     past: DelayedSignal | None,
     latency: FloatArray,
     reach: FloatArray,
@@ -140,22 +135,22 @@ def sensed_observation(
     """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility;
     and the history for the next call.
     """
-    # What was sensed `latency` ago, if it is within reach.
-    sample = np.empty((len(DELAYED), *seen.gap.shape))
+    sample = np.empty((len(DELAYED), *observation.gap.shape))
     for row, name in enumerate(DELAYED):
-        sample[row] = getattr(seen, name)
+        sample[row] = getattr(observation, name)
     past = DelayedSignal.of(sample, latency, step) if past is None else past.extended(sample)
     then = dict(zip(DELAYED, past.delayed(), strict=True))
-    is_detected = then["gap"] <= reach * seen.visibility
+    is_detected = then["gap"] <= reach * observation.visibility
     then["gap"] = np.where(is_detected, then["gap"], np.inf)
-    return seen._replace(**then), past
+    return observation._replace(**then), past
 
 
 class SensingState(NamedTuple):
     """State of N vehicles: speed [m/s], positions of the actuators [-], and acceleration by the
     wheels [m/s^2].
 
-    `seen` and `brake_commands` are delayed signals; `seen` is None before the first observation.
+    `observations` and `brake_commands` are delayed signals; `observations` is None before the first
+    one.
     `frame` is what the sensors last reported, in the order of `DELAYED`, in vehicles whose sensors
     may lose frames.
     """
@@ -164,7 +159,7 @@ class SensingState(NamedTuple):
     throttle: FloatArray
     brake: FloatArray
     gear: FloatArray
-    seen: DelayedSignal | None
+    observations: DelayedSignal | None
     brake_commands: DelayedSignal
     acceleration: FloatArray
     frame: FloatArray | None = None
@@ -185,15 +180,15 @@ class SensingVehicle(Vehicle):
         return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
 
     def sense(
-        self, prepared: Prepared, state: SensingState, seen: Observation
+        self, prepared: Prepared, state: SensingState, observation: Observation
     ) -> tuple[Observation, SensingState]:
         """Sensors report the scene as it was one latency ago, and nothing beyond their range times
         the visibility.
         """
         sensed, past = sensed_observation(
-            seen, state.seen, prepared.latency, prepared.sensor_range, prepared.step
+            observation, state.observations, prepared.latency, prepared.sensor_range, prepared.step
         )
-        return sensed, state._replace(seen=past)
+        return sensed, state._replace(observations=past)
 
     def at_rest(self, prepared: Prepared) -> SensingState:
         zeros = np.zeros_like(prepared.mass)
@@ -202,31 +197,29 @@ class SensingVehicle(Vehicle):
 
     def at_speed(self, prepared: Prepared, speed: FloatArray) -> SensingState:
         """The steady state: the pedals balance the slope, the only resistance."""
-        rest = self.at_rest(prepared)
+        standing = self.at_rest(prepared)
         back = prepared.slope.back
         throttle = np.minimum(np.maximum(back / prepared.drive, 0.0), 1.0)
         brake = np.minimum(np.maximum(-back / prepared.brake, 0.0), 1.0)
-        return rest._replace(
+        return standing._replace(
             speed=speed,
             throttle=throttle,
             brake=brake,
             brake_commands=DelayedSignal.of(brake, prepared.brake_delay, prepared.step),
-            acceleration=rest.acceleration + back,  # shape (N,)
+            acceleration=standing.acceleration + back,
         )
 
     def advance(self, prepared: Prepared, state: SensingState, command: Command) -> SensingState:
         p = prepared
 
-        # The brake as it was commanded some time ago.
         commands = state.brake_commands.extended(command.brake)
         brake = commands.delayed()
         acceleration = self._acceleration(p, state, command.throttle, brake)
 
-        # The speed at the end of the step, within its limits.
-        highest_speed = np.maximum(p.max_speed, state.speed)  # who is faster is not slowed down
-        speed = np.minimum(
-            np.maximum(state.speed + (acceleration - p.slope.back) * p.step, 0.0), highest_speed
-        )
+        # Who is faster than the top speed, such as downhill, is not slowed down to it.
+        highest_speed = np.maximum(p.max_speed, state.speed)
+        speed = state.speed + (acceleration - p.slope.back) * p.step
+        speed = np.minimum(np.maximum(speed, 0.0), highest_speed)
         return state._replace(
             speed=speed,
             acceleration=(speed - state.speed) / p.step + p.slope.back,
