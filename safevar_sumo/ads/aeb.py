@@ -136,7 +136,6 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         pedals = self.pedals(cruising, observation.speed, nominal, cruise_trim)
         throttle, cruise_brake = (np.where(has_intervened, 0.0, pedal) for pedal in pedals)
 
-        # A braking stage presses the brake, partly or fully.
         stage_brake = np.where(stage == FULL_BRAKING, 1.0, self.partial_share)
         command = Command(throttle, np.where(stage > NO_BRAKING, stage_brake, cruise_brake))
 

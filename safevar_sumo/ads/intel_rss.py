@@ -98,7 +98,9 @@ class AdRss(ScalarAds):
             self.has_braked = True
             return 0.0, 1.0
         if self.has_braked:
-            return self.pedals(-ROLLING_OUT, observation.speed) if is_blocked else (0.0, 0.0)
+            if is_blocked:
+                return self.pedals(-ROLLING_OUT, observation.speed)
+            return (0.0, 0.0)
         return self.pedals(self.cruise_speed - observation.speed, observation.speed)
 
 

@@ -95,7 +95,9 @@ class Reaction(NamedTuple):
     def acceleration(self, observation: Observation) -> FloatArray:
         """Mean acceleration since the last call [m/s^2]; 0 at the first call."""
         change = observation.speed - self.speed
-        return change / self.step if self.cruise else np.zeros_like(change)
+        if self.cruise:
+            return change / self.step
+        return np.zeros_like(change)
 
     @property
     def leader_brakes(self) -> BoolArray:

@@ -53,11 +53,9 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
         metrics=metrics,
         **system.characteristics.change_objectives(settings),
     )
-    return (
-        evaluations
-        if system.repeats == 1
-        else joined(evaluations, system.repeats, system.criterion)
-    )
+    if system.repeats == 1:
+        return evaluations
+    return joined(evaluations, system.repeats, system.criterion)
 
 
 def reason_against_scenes(system: System) -> str:
@@ -101,7 +99,7 @@ def drive_all(
     vehicles, encounters = system.split(settings)
     on_road = system.at_encounters(encounters)
     scenario = on_road.points[0].scenario
-    # Outside the time limit, which is one of user code.
+    # Compilation takes longer than many a simulation, and is no part of its time limit.
     system.vehicle.compile()
     with user_errors(system.source), end_if_longer(system.time_limit):
         reason = reason_against_scenes(system)
@@ -185,7 +183,9 @@ def _vehicles_per_encounter(encounters: FloatArray) -> int:
     turns, else 1.
     """
     is_paired = len(encounters) % 2 == 0 and np.array_equal(encounters[::2], encounters[1::2])
-    return 2 if is_paired else 1
+    if is_paired:
+        return 2
+    return 1
 
 
 def open_points_world(
@@ -204,7 +204,7 @@ def open_points_world(
         scenarios = [encounter(point, values).scenario for values in searched]
     networks = networks_for(scenarios)
 
-    # Bodies on tracks are moved to their places.
+    # SUMO cannot drive along tracks: bodies on them are put at their places.
     create: Callable[[Api, int], SumoWorld] = SumoWorld
     if traffic is not None:
         speeds = _start_speeds(system.at_encounters(encounters).points, n)

@@ -322,7 +322,6 @@ def find_touches(body: Body, obstacle: Body) -> Touches:
     began (r - |x|) / v ago. The bodies touched in the direction in which the overlap began last,
     or, if they approach each other in neither direction, in the one with the smaller overlap.
     """
-    # Distance, speed and overlap along both axes of the vehicle.
     axes = _axes_of(body)
     distance = _dot(obstacle.middle - body.middle, axes)
     speed = _dot(body.velocity - obstacle.velocity, axes)
@@ -330,7 +329,7 @@ def find_touches(body: Body, obstacle: Body) -> Touches:
     closing_speed = np.copysign(1.0, distance) * speed
     is_closing = closing_speed > 0
 
-    # How long ago the sides touched that approach each other.
+    # Sides that do not approach each other were never apart: they touched infinitely long ago.
     ages = np.where(
         is_closing, np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0), np.inf
     )
@@ -338,7 +337,6 @@ def find_touches(body: Body, obstacle: Body) -> Touches:
     is_lengthwise = np.where(approaches, ages[0] < ages[1], overlap[0] < overlap[1])
     age = np.where(approaches, np.min(ages, axis=0), 0.0)
 
-    # The side that touched last, and the place on it.
     is_ahead, is_left = distance > 0
     side = np.where(is_lengthwise, np.where(is_ahead, FRONT, REAR), np.where(is_left, LEFT, RIGHT))
     return Touches(side, age, body.length / 2 - (distance[0] + age * speed[0]))
@@ -349,9 +347,9 @@ def find_overlaps(body: Body, obstacle: Body) -> FloatArray:
     least; negative for bodies that do not touch.
     """
     overlaps = _overlaps_along(body, obstacle)
-    return (
-        np.minimum(overlaps, _overlaps_along(obstacle, body)) if (overlaps > 0).any() else overlaps
-    )
+    if (overlaps > 0).any():
+        return np.minimum(overlaps, _overlaps_along(obstacle, body))
+    return overlaps
 
 
 def _overlaps_along(body: Body, obstacle: Body) -> FloatArray:

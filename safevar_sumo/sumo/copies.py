@@ -60,7 +60,9 @@ _COPY_PLACEHOLDER = "\x01"
 
 def copied_id(copy: int | str, name: str) -> str:
     """The id of `name` in a copy; internal edges keep their leading colon."""
-    return f":{copy}.{name[1:]}" if name.startswith(":") else f"{copy}.{name}"
+    if name.startswith(":"):
+        return f":{copy}.{name[1:]}"
+    return f"{copy}.{name}"
 
 
 def copy_and_name(copied: str) -> tuple[int, str]:
@@ -147,7 +149,9 @@ def parse_seconds(text: str) -> float | None:
             total += seconds * float(field)
     except ValueError:
         return None
-    return total if math.isfinite(total) else None
+    if math.isfinite(total):
+        return total
+    return None
 
 
 def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:

@@ -91,7 +91,7 @@ def drive(
             # SUMO misses contacts in some places; bodies on tracks touch wherever they overlap.
             if isinstance(observer, SceneObserver):
                 contacts.check(observer.world, scene, outcomes.is_open & ~scene.over, time)
-            # Recorded scenes end by their time: nobody knows how their actors go on.
+            # Tracks go on, and so may a run among them; a scene ends by its time.
             if isinstance(observer, Traffic):
                 ends = may_go_on & outcomes.is_open & (sample == last_sample)
                 if ends.any():
@@ -228,7 +228,9 @@ def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Quantity, ...]
     slope = slope_of(np.repeat(grades, size)) if any(grades) else LEVEL
     if any(water):
         return friction, step, slope, np.repeat(water, size)
-    return (friction, step, slope) if any(grades) else (friction, step)
+    if any(grades):
+        return (friction, step, slope)
+    return (friction, step)
 
 
 def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:

@@ -93,7 +93,7 @@ class DrivingRobot:
         """
         if not self._is_needed:
             return command, state
-        # Where all have braked, only the error up to now remains to be noted.
+        # Once all have braked, this is the last call that it is needed for.
         self._is_needed = not self._has_braked.all()
 
         error = np.where(self._is_driving, state.speed - self._test_speed, 0.0)

@@ -55,7 +55,7 @@ def find_problems(system: System) -> dict[str, EmptyRoadFault]:
     it does not reach the place of the encounter before the encounter is over, or brakes on its way,
     the obstacle is not what keeps it from a collision.
     """
-    # A simulator of the user's own may not be able to show nobody.
+    # A simulator of the user's own cannot be told that nobody is there.
     if not system.mover.has("a driving system"):
         return {}
     original = system.characteristics.original_settings
@@ -108,7 +108,7 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
         for values in (trace.obstacle_speed, trace.obstacle_width)
     )
 
-    # Some cruise controls brake for nothing, but take no speed off by it.
+    # Cruise controls brake to hold a speed, but take little off it.
     if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
         return EmptyRoadFault(Reason.BRAKES, "brakes without an obstacle")
 

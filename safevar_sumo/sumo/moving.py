@@ -87,7 +87,7 @@ class Moving(NamedTuple):
         half_length = (track.length * cosine + track.width * sine) / 2
         half_width = (track.length * sine + track.width * cosine) / 2
 
-        # A vehicle touches a rotated body first at a side, which may be ahead of its rear corner.
+        # The rear corner of a rotated body may be beside the path: its first point in it counts.
         rear = track.x - half_length
         edge = rear
         is_lengthwise = _rotated(track) & (cosine > sine)
@@ -171,7 +171,9 @@ def row(column: Sampled, sample: int, group: IntArray | None) -> Sampled:
     of each vehicle.
     """
     values: Sampled = column[sample if len(column) > 1 else 0]
-    return values[group] if group is not None and len(values) > 1 else values
+    if group is not None and len(values) > 1:
+        return values[group]
+    return values
 
 
 def tracks_of(

@@ -184,12 +184,14 @@ def _is_same(stated: str, value: str) -> bool:
         return (stated.lower() in TRUE_VALUES) == (value == "true")
     if number is None:
         return stated == value
-    return number <= 0 if value == SWITCHED_OFF else number == parse_seconds(value)
+    if value == SWITCHED_OFF:
+        return number <= 0
+    return number == parse_seconds(value)
 
 
 @lru_cache(maxsize=100)
 def _check_files(network: NetworkFiles) -> None:
-    # Of these options SUMO would wait for a client at the remote port.
+    # With a remote-port SUMO would wait for a client.
     options = {
         "step-length": str(STEP_LENGTH),
         "route-files": TRAFFIC_FILE,

@@ -118,4 +118,6 @@ def per_vehicle(values: Sequence[Quantity], size: int) -> Quantity:
     or that of the only point, if all are equal.
     """
     is_shared = len(values) == 1 or all(value == values[0] for value in values)
-    return values[0] if is_shared else np.repeat(values, size)
+    if is_shared:
+        return values[0]
+    return np.repeat(values, size)

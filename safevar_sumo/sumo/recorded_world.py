@@ -139,14 +139,16 @@ class RecordedWorld:
             return self._now.fronts
         motion = self._scene.tracks[actor].motion
         places = motion[self.sample, ..., :2]
-        return (
-            np.full((self.n, 2), places) if motion.ndim == 2 else places.repeat(self._size, axis=0)
-        )
+        if motion.ndim == 2:
+            return np.full((self.n, 2), places)
+        return places.repeat(self._size, axis=0)
 
     person_positions = vehicle_positions
 
     def vehicle_length(self, actor: str) -> float:
-        return self._scene.length if actor == VUT else self._scene.tracks[actor].length
+        if actor == VUT:
+            return self._scene.length
+        return self._scene.tracks[actor].length
 
     @property
     def vehicle_width(self) -> float:

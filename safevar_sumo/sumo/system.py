@@ -128,7 +128,6 @@ class System:
             return 0.0
         assert isinstance(scenario, WorldScenario)
 
-        # The lengths of both bodies, in the recorded scene or in SUMO.
         recording = self.scenes.of(scenario)
         with ExitStack() as stack:
             world: SceneWorld
@@ -143,7 +142,9 @@ class System:
 
     def with_contact(self, unsafe: Unsafe) -> Unsafe:
         """A criterion with the safety degree at which bodies touch, if it is a clearance."""
-        return unsafe if unsafe.below is None else replace(unsafe, contact=self.contact)
+        if unsafe.below is None:
+            return unsafe
+        return replace(unsafe, contact=self.contact)
 
     def split(self, settings: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Of N settings, shape (N, n), the vehicles, shape (N, k), and the encounters that they

@@ -178,7 +178,6 @@ class CommandedSpeed:
         """Process a command at a time [s] and speed [m/s]; raises `InputError` if an argument is no
         legal number.
         """
-        # Legal arguments.
         for argument, number in zip(COMMANDS[name], values, strict=True):
             returns_control = number == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
             is_legal = math.isfinite(number) and (
@@ -202,7 +201,6 @@ class CommandedSpeed:
                 "0, 256 or 512, without changes of lane",
             )
 
-        # What the vehicle does from now on.
         if name == "setSpeedMode":
             self.mode = self.DEFAULT_MODE if value == SUMO_CONTROL else int(value)
         elif name == "setSpeed":

@@ -331,7 +331,9 @@ class TraciView:
         vut = self._vut
         dist = dist or vehicle.getSpeed(vut) ** 2 / (2 * vehicle.getDecel(vut))
         leader = self._traffic.seen[self._copy].leader
-        return leader if leader and leader[1] <= dist else None
+        if leader and leader[1] <= dist:
+            return leader
+        return None
 
     def _sumo_value(self, domain: str, name: str, *arguments: Value) -> Value:
         copied = [_copied_ids(self._copy, argument) for argument in arguments]
@@ -366,7 +368,9 @@ class TraciView:
                     number: self._query(domain, name, id_, *extras)
                     for number, (name, extras) in variables.items()
                 }
-        return values if actor is None else values.get(actor, {})
+        if actor is None:
+            return values
+        return values.get(actor, {})
 
 
 def _copied_ids(copy: int, value: Value) -> Value:

@@ -156,7 +156,9 @@ class Traffic:
             over = over & (ended | ~counts)
             views.append(_View(k, gap, closing, is_passed, self._is_visible(k, front)))
 
-        return self._scene_of(views[0], over) if len(views) == 1 else self._nearest(views, over)
+        if len(views) == 1:
+            return self._scene_of(views[0], over)
+        return self._nearest(views, over)
 
     def _is_visible(self, number: int, front: FloatArray) -> BoolArray:
         """Whether a body is there, and nobody on the line from the sensors to its middle."""
@@ -369,7 +371,9 @@ class Traffic:
     def _table(self, column: Sampled, samples: slice) -> Sampled:
         """A column at some samples, for each vehicle or for all of them."""
         values = column[samples] if len(column) > 1 else column
-        return values if self.group is None or values.shape[1] == 1 else values[:, self.group]
+        if self.group is None or values.shape[1] == 1:
+            return values
+        return values[:, self.group]
 
 
 class _View(NamedTuple):

@@ -194,7 +194,9 @@ class TrafficWorld(SumoWorld):
 
     def _at_copies(self, column: Sampled) -> Sampled:
         values = row(column, self._sample, self._traffic.group)
-        return values if len(values) == self.n else np.repeat(values, self.n)
+        if len(values) == self.n:
+            return values
+        return np.repeat(values, self.n)
 
     def _checked(self, motion: VehicleStates) -> VehicleStates:
         """The motion on the lane; refuses a simulation in which SUMO has a vehicle or an actor

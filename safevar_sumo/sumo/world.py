@@ -213,7 +213,9 @@ class SumoWorld:
         )
 
     def _domain_of(self, id_: str) -> Api:
-        return self.api.person if id_ in self.api.person.getIDList() else self.api.vehicle
+        if id_ in self.api.person.getIDList():
+            return self.api.person
+        return self.api.vehicle
 
     def speeds(self) -> FloatArray:
         """Speeds of the vehicles under test in this step [m/s]."""

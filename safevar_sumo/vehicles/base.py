@@ -223,7 +223,9 @@ class Vehicle:
             return standing
         # Those that stand get any speed above 0, and their state is not used.
         steady = self.at_speed(prepared, np.where(is_rolling, speed, 1.0))
-        return steady if is_rolling.all() else _select_state(is_rolling, steady, standing)
+        if is_rolling.all():
+            return steady
+        return _select_state(is_rolling, steady, standing)
 
     def hold_gear(self, prepared: Prepared, state: State, holds: BoolArray) -> State:
         """The state in which vehicles do not change gear where `holds`, shape (N,), is true; for
@@ -281,7 +283,9 @@ def _select_state(is_rolling: BoolArray, steady: State, standing: State) -> Stat
         return steady.where(is_rolling, standing)
     if isinstance(steady, tuple):
         columns = [_select_state(is_rolling, *pair) for pair in zip(steady, standing, strict=True)]
-        return type(steady)(*columns) if hasattr(steady, "_fields") else tuple(columns)
-    return (
-        standing if steady is None or standing is None else np.where(is_rolling, steady, standing)
-    )
+        if hasattr(steady, "_fields"):
+            return type(steady)(*columns)
+        return tuple(columns)
+    if steady is None or standing is None:
+        return standing
+    return np.where(is_rolling, steady, standing)

@@ -84,7 +84,9 @@ class Characteristic:
     @property
     def error(self) -> float:
         """How far a measured value may be from the true one; 0 where no precision is stated."""
-        return 0.0 if self.precision is None else self.precision.value
+        if self.precision is None:
+            return 0.0
+        return self.precision.value
 
     def measured(self, value: float) -> tuple[float, float]:
         """The least and greatest value of the domain that a measured one may really be."""
@@ -97,7 +99,9 @@ class Characteristic:
         """Largest change that the filter removes: Th = beta (u - l) (method section 2); 0 for a
         parameter of the scenario, of which any value is an encounter.
         """
-        return 0.0 if self.is_scenario else self.resolution
+        if self.is_scenario:
+            return 0.0
+        return self.resolution
 
     @property
     def resolution(self) -> float:
@@ -134,7 +138,9 @@ class Characteristic:
         down = math.floor(scaled + ROUNDING)
         rounded = (up if upwards else down) / 10**self.digits
         is_beyond = rounded > original >= value if upwards else rounded < original <= value
-        return original if is_beyond else rounded
+        if is_beyond:
+            return original
+        return rounded
 
     def rounded_inwards(self, interval: tuple[float, float]) -> tuple[float, float]:
         """An interval around the original, rounded inwards; ends of the domain stay."""

@@ -216,7 +216,7 @@ class SensingVehicle(Vehicle):
         brake = commands.delayed()
         acceleration = self._acceleration(p, state, command.throttle, brake)
 
-        # Who is faster than the top speed, such as downhill, is not slowed down to it.
+        # Who is faster than the top speed is not slowed down to it.
         highest_speed = np.maximum(p.max_speed, state.speed)
         speed = state.speed + (acceleration - p.slope.back) * p.step
         speed = np.minimum(np.maximum(speed, 0.0), highest_speed)
