@@ -6,7 +6,7 @@ An ADS may drive N vehicles at once, or one vehicle (`ScalarAds`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
@@ -172,15 +172,19 @@ class PerVehicleAds(Ads):
     def drive(
         self, observation: Observation, memory: list[ScalarAds]
     ) -> tuple[Command, list[ScalarAds]]:
-        observations = list(_scalar_observations(observation, len(memory)))
-        pedals = [(0.0, 0.0)] * len(memory)
+        n = len(memory)
+        values = np.empty((len(observation), n))
+        for row, value in enumerate(observation):
+            values[row] = value
+        observations = [*map(Observation._make, values.T.tolist())]
+        pedals = [(0.0, 0.0)] * n
         # A vehicle whose run has ended may have left what its driver expects.
-        rows = open_rows(np.ones(len(memory), dtype=bool)).tolist()
+        rows = open_rows(np.ones(n, dtype=bool)).tolist()
         with np.errstate():
             for i in rows:
                 command = self._code.call("drive", memory[i].drive, observations[i])
                 pedals[i] = self._checked_pedals(command)
-        return Command(*np.array(pedals, dtype=float).reshape(len(memory), 2).T.copy()), memory
+        return Command(*np.array(pedals, dtype=float).reshape(n, 2).T.copy()), memory
 
     def warns(self, memory: list[ScalarAds]) -> BoolArray:
         return np.array([bool(driver.warns) for driver in memory], dtype=bool)
@@ -198,12 +202,6 @@ class PerVehicleAds(Ads):
             self._code.check_numbers("drive", name, value, (), SHARE) for name, value in pedals
         )
         return float(throttle), float(brake)
-
-
-def _scalar_observations(observation: Observation, n: int) -> Iterator[Observation]:
-    """The observation of each of N vehicles, as plain numbers."""
-    columns = (np.broadcast_to(value, n).astype(float).tolist() for value in observation)
-    return map(Observation._make, zip(*columns, strict=True))
 
 
 def interpolate_tables(

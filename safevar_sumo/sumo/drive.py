@@ -96,8 +96,7 @@ def drive(
                 ends = may_go_on & outcomes.is_open & (sample == last_sample)
                 if ends.any():
                     may_go_on &= ~_go_on(observer, motion, ends, last_sample)
-            is_last = sample >= last_sample
-            active = outcomes.note_sample(speed, scene.over, collisions, is_last=is_last)
+            active = outcomes.note_sample(speed, scene.over, collisions, sample >= last_sample)
 
             observation = perception.observe(time, speed, scene)
             observation = observation._replace(throttle=state.throttle, brake=state.brake)
@@ -118,9 +117,8 @@ def drive(
             motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace()
     outcomes.ended = outcomes.classify()
-    return _runs(
-        points, outcomes, robot, contacts, trace=trace, encounter=observer.encounter(trace)
-    )
+    encounter = observer.encounter(trace)
+    return _runs(points, outcomes, robot, contacts, trace=trace, encounter=encounter)
 
 
 def _go_on(
@@ -316,7 +314,6 @@ class _Outcomes:
         speed: FloatArray,
         over: BoolArray,
         collisions: dict[int, float],
-        *,
         is_last: BoolArray | bool,
     ) -> BoolArray:
         """Process one sample; returns for which vehicles the sample is part of the run."""

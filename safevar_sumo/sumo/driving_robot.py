@@ -124,4 +124,4 @@ class DrivingRobot:
     @property
     def invalid(self) -> BoolArray:
         """Which vehicles left the tolerance before the system acted, shape (N,)."""
-        return np.asarray(self._error_share > 1)
+        return self._error_share > 1

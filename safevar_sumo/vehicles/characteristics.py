@@ -138,9 +138,7 @@ class Characteristic:
         down = math.floor(scaled + ROUNDING)
         rounded = (up if upwards else down) / 10**self.digits
         is_beyond = rounded > original >= value if upwards else rounded < original <= value
-        if is_beyond:
-            return original
-        return rounded
+        return original if is_beyond else rounded
 
     def rounded_inwards(self, interval: tuple[float, float]) -> tuple[float, float]:
         """An interval around the original, rounded inwards; ends of the domain stay."""
@@ -266,7 +264,7 @@ class CharacteristicSet:
         """Settings of other characteristics, shape (N, m), with those of this set alone, shape
         (N, n).
         """
-        return np.asarray(settings[:, [characteristics.names.index(name) for name in self.names]])
+        return settings[:, [characteristics.names.index(name) for name in self.names]]
 
     def with_original_vehicle(self, settings: FloatArray) -> FloatArray:
         """The original vehicle in the encounters of settings, shape (N, n)."""
