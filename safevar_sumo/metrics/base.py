@@ -49,11 +49,9 @@ def sum_in_order(samples: FloatArray) -> FloatArray:
 
     In numpy's own sum the order depends on the shape, so that a vehicle's result would depend on N.
     """
-    return (
-        np.asarray(np.add.accumulate(samples, axis=0)[-1])
-        if len(samples)
-        else np.zeros(samples.shape[1:])
-    )
+    if not len(samples):
+        return np.zeros(samples.shape[1:])
+    return np.asarray(np.add.accumulate(samples, axis=0)[-1])
 
 
 MeasureName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
@@ -101,12 +99,16 @@ class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     @property
     def quantities(self) -> tuple[str, ...]:
         """The quantities that it needs, by default those of every trace."""
-        return OF_EVERY_TRACE if self.needs is UNSET else self.needs
+        if self.needs is UNSET:
+            return OF_EVERY_TRACE
+        return self.needs
 
     @property
     def sign(self) -> float:
         """Factor on the values after which a search minimises them."""
-        return -1.0 if self.more_is_unsafe else 1.0
+        if self.more_is_unsafe:
+            return -1.0
+        return 1.0
 
     @property
     def facts(self) -> Measure:
@@ -118,13 +120,13 @@ class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         says; NaN where a run lacks what it needs.
         """
         rows = np.flatnonzero(~runs.lacking(*self.quantities))
-        values = np.full(len(runs.outcome), np.nan)
+        values = np.full(len(runs), np.nan)
         if len(rows) == len(values):
             values = self.function(runs, thresholds)
         elif len(rows):
             values[rows] = self.function(runs.of(rows), thresholds)
-        own = runs.stated.get(self.name, values)
-        return np.where(np.isnan(own), values, own)
+        stated = runs.stated.get(self.name, values)
+        return np.where(np.isnan(stated), values, stated)
 
 
 def mask_collisions(runs: SimulationRuns, values: FloatArray) -> FloatArray:
@@ -150,10 +152,10 @@ def checked_measure(code: UserCode) -> Measure:
         raise InputError("", f"{code.name}: {error}", expected) from None
     for need in facts.quantities:
         check_name("", f"{code.name}: needs = {measure.needs!r}", need, QUANTITIES)
-    is_of_runs = facts.of == "runs"
-    count = (lambda runs: len(runs.outcome)) if is_of_runs else len
-    legal = Legal(undefined=True) if is_of_runs else FINITE
-    function = code.checked_function(measure.function, facts.name, legal, count)
+    legal = FINITE
+    if facts.of == "runs":
+        legal = Legal(undefined=True)
+    function = code.checked_function(measure.function, facts.name, legal, len)
     return replace(facts, function=function)
 
 

@@ -13,14 +13,14 @@ PEDAL_ROUNDING = 1e-6
 """Change of the brake pedal that is a rounding error of its delay [-]."""
 
 
-@np.errstate(all="ignore")  # of vehicles that do not brake
+# Vehicles that do not brake divide by 0.
+@np.errstate(all="ignore")
 def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Distance from the first brake force to standstill [m]; shape (N,), NaN for a vehicle that
     does not brake or stop.
 
     A sample's pedal acts in the step before it. A dead time of the brake may end inside that step.
     """
-    # The step in which the brake first acts.
     trace = runs.trace
     pedal = np.broadcast_to(trace.pedal, trace.speed.shape)
     vehicles = np.arange(trace.speed.shape[1])
@@ -33,15 +33,14 @@ def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatAr
     first_command = trace.brake[
         np.argmax(trace.brake > pedal[0] + PEDAL_ROUNDING, axis=0), vehicles
     ]
-    _, part, whole = pedal[samples, vehicles]
-    lost, lost_later = -np.diff(trace.speed[samples, vehicles], axis=0)
-    is_part = (part < whole) & (np.abs(whole - first_command) <= PEDAL_ROUNDING) & (lost_later > 0)
-    shares = np.maximum(part / whole, lost / lost_later)
+    _, part, full = pedal[samples, vehicles]
+    loss, later_loss = -np.diff(trace.speed[samples, vehicles], axis=0)
+    is_part = (part < full) & (np.abs(full - first_command) <= PEDAL_ROUNDING) & (later_loss > 0)
+    shares = np.maximum(part / full, loss / later_loss)
     share = np.where(is_part, np.minimum(shares, 1.0), 1.0)
 
-    # From there to standstill.
-    begin, after, _ = trace.position[samples, vehicles]
-    distance = trace.position[-1] - after + share * (after - begin)
+    step_begin, step_end, _ = trace.position[samples, vehicles]
+    distance = trace.position[-1] - step_end + share * (step_end - step_begin)
     return _of_stops(runs, np.where(is_pressed.any(axis=0), distance, np.nan))
 
 
@@ -90,7 +89,8 @@ MFDD_SHARES = 0.8, 0.1
 """Shares of the first speed between which the mean fully developed deceleration counts."""
 
 
-@np.errstate(all="ignore")  # of vehicles that do not stop
+# Vehicles that do not stop divide by 0.
+@np.errstate(all="ignore")
 def mean_fully_developed_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Mean fully developed deceleration of UN R13-H, (v_b^2 - v_e^2) / (2 (s_e - s_b)) [m/s^2],
     with the places s_b and s_e where the speed is 80 and 10 % of the first one; shape (N,), NaN for
@@ -100,11 +100,11 @@ def mean_fully_developed_deceleration(runs: SimulationRuns, thresholds: MetricsT
     """
     trace = runs.trace
     squares = trace.speed * trace.speed
-    wanted = np.square(MFDD_SHARES)[:, np.newaxis] * squares[0]
-    columns = zip(wanted.T, squares.T, trace.position.T, strict=True)
+    end_squares = np.square(MFDD_SHARES)[:, np.newaxis] * squares[0]
+    columns = zip(end_squares.T, squares.T, trace.position.T, strict=True)
     places = np.array([np.interp(-levels, -square, way) for levels, square, way in columns])
     ways = 2 * (places[:, 1] - places[:, 0])
-    return _of_stops(runs, (wanted[0] - wanted[1]) / ways)
+    return _of_stops(runs, (end_squares[0] - end_squares[1]) / ways)
 
 
 MFDD = Measure(

@@ -134,8 +134,8 @@ def least_time_to_collision(runs: SimulationRuns, thresholds: MetricsTable) -> F
     approaches nobody in its path.
     """
     _, ttc = conflict(runs)
-    least = np.min(ttc, axis=0, initial=np.inf)
-    return mask_collisions(runs, np.where(np.isfinite(least), least, np.nan))
+    smallest = np.min(ttc, axis=0, initial=np.inf)
+    return mask_collisions(runs, np.where(np.isfinite(smallest), smallest, np.nan))
 
 
 def largest_deceleration_rate(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
@@ -193,7 +193,6 @@ def post_encroachment_time(runs: SimulationRuns, thresholds: MetricsTable) -> Fl
     """
     trace = runs.trace
 
-    # Where both are in the last sample of the run.
     number = np.count_nonzero(trace.active, axis=0)
     at_end = np.minimum(number, len(trace.time) - 1), np.arange(len(number))
     speed, gap, lateral, lateral_speed, obstacle_width = (
@@ -208,15 +207,14 @@ def post_encroachment_time(runs: SimulationRuns, thresholds: MetricsTable) -> Fl
     )
 
     # Who leaves the shared place last, and how far the other one is from it.
-    apart = np.abs(lateral) - (trace.vehicle_width + obstacle_width) / 2
+    lateral_gap = np.abs(lateral) - (trace.vehicle_width + obstacle_width) / 2
     crossing = np.abs(lateral_speed)
     leaves = (lateral * lateral_speed > 0) & (gap > 0)
     comes = (lateral * lateral_speed < 0) & (gap <= 0)
-    way = np.where(leaves, gap, apart)
+    way = np.where(leaves, gap, lateral_gap)
     rate = np.where(leaves, speed, crossing)
-    is_defined = (
-        (runs.outcome == Outcome.PASSED) & (apart >= 0) & (leaves | comes) & (rate > STANDSTILL)
-    )
+    passes = (runs.outcome == Outcome.PASSED) & (lateral_gap >= 0)
+    is_defined = passes & (leaves | comes) & (rate > STANDSTILL)
     return np.asarray(np.divide(way, rate, out=np.full_like(way, np.nan), where=is_defined))
 
 
@@ -227,10 +225,10 @@ def reaction_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """
     trace = runs.trace
     visible = trace.active & trace.visible
-    first = np.argmax(visible, axis=0)
+    first_sight = np.argmax(visible, axis=0)
     has_seen = np.logical_or.accumulate(visible, axis=0)
     brakes = trace.active & has_seen & (trace.brake > 0)
-    steps = np.argmax(brakes, axis=0) - first
+    steps = np.argmax(brakes, axis=0) - first_sight
     return np.where(brakes.any(axis=0), np.round(steps * trace.step, TIME_DECIMALS), np.nan)
 
 
@@ -292,7 +290,7 @@ AVE_DECE = Measure(
 
 def _undefined_share(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """NaN, shape (N,): a single run has no share."""
-    return np.full(len(runs.outcome), np.nan)
+    return np.full(len(runs), np.nan)
 
 
 UNSAFE_SHARE = Measure(

@@ -6,6 +6,7 @@ import math
 import operator
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -93,12 +94,16 @@ class Unsafe:
             return str(self.bound)
         if self.degree is not None:
             return f"{SAFETY_DEGREE} < {self.degree!r}"
-        return COLLISION if self.below is None else f"below={self.below!r}"
+        if self.below is not None:
+            return f"below={self.below!r}"
+        return COLLISION
 
     @property
     def measure(self) -> str:
         """The column that decides: a metric, or the safety degree."""
-        return self.bound.measure if self.bound is not None else F_SAFE.name
+        if self.bound is None:
+            return F_SAFE.name
+        return self.bound.measure
 
     @property
     def is_collision(self) -> bool:
@@ -110,14 +115,18 @@ class Unsafe:
         """The clearance below which a vehicle is unsafe [m], between bumpers; 0 if a collision
         alone is.
         """
-        return self.keep if self.below is None else self.below
+        if self.below is None:
+            return self.keep
+        return self.below
 
     @property
     def limit(self) -> float:
         """What is limited: a safety degree, or the value of a metric."""
         if self.bound is not None:
             return self.bound.limit
-        return self.contact + self.distance if self.degree is None else self.degree
+        if self.degree is not None:
+            return self.degree
+        return self.contact + self.distance
 
     @property
     def is_of_impacts(self) -> bool:
@@ -139,37 +148,55 @@ class Unsafe:
         """Which of several values is the worst: `min`, or `max` where a bound forbids large
         ones.
         """
-        return max if self.bound is not None and self.bound.worst_is_largest else min
+        if self._worst_is_largest:
+            return max
+        return min
+
+    @property
+    def _worst_is_largest(self) -> bool:
+        return self.bound is not None and self.bound.worst_is_largest
 
     @property
     def description(self) -> str:
         """The criterion in words, rounded: `collision, or clearance below 0.3 m`, `safety degree
         below 1.4 m, half of the original's`, `drac > 6, or a collision`.
         """
+        if self._stands_alone:
+            return str(self.bound)
         if self.bound is not None:
-            return f"{self.bound}{'' if self._stands_alone else ', or a collision'}"
-        if self.degree is None:
-            where = ", from bumper to bumper" if self.contact else ""
-            clearance = f"collision, or clearance below {self.distance:g} m{where}"
-            return clearance if self.distance else COLLISION
-        share = ", half of the original's" if self.is_half else ""
-        return f"safety degree below {_degree_in_words(self.degree)}{share}"
+            return f"{self.bound}, or a collision"
+        if self.degree is not None:
+            words = f"safety degree below {_degree_in_words(self.degree)}"
+            if self.is_half:
+                words += ", half of the original's"
+            return words
+        if not self.distance:
+            return COLLISION
+        words = f"collision, or clearance below {self.distance:g} m"
+        if self.contact:
+            words += ", from bumper to bumper"
+        return words
 
     @property
     def verbs(self) -> tuple[str, str]:
         """What an unsafe vehicle does, and what several do, in short."""
-        return ("collides", "collide") if self.is_collision else ("is unsafe", "are unsafe")
+        if self.is_collision:
+            return "collides", "collide"
+        return "is unsafe", "are unsafe"
 
     def number_in_words(self, number: float) -> str:
         """How many vehicles are unsafe: `1,234 collide`, `none is unsafe (drac > 6, or a
         collision)`.
         """
-        counted = (
-            (f"{number:,}" if number == int(number) else f"{number:,.1f}") if number else "none"
-        )
+        counted = f"{number:,}"
+        if not number:
+            counted = "none"
+        elif number != int(number):
+            counted = f"{number:,.1f}"
         if self.is_collision and not self.keep:
             return f"{counted} {self.verbs[number > 1]}"
-        return f"{counted} {'are' if number > 1 else 'is'} unsafe ({self.description})"
+        verb = ("is", "are")[number > 1]
+        return f"{counted} {verb} unsafe ({self.description})"
 
     @property
     def remark(self) -> str:
@@ -187,7 +214,9 @@ class Unsafe:
         """
         if self.is_collision and (not self.keep or original.collided[0]):
             return ""
-        option = "--margin" if self.is_collision else "--unsafe"
+        option = "--unsafe"
+        if self.is_collision:
+            option = "--margin"
         return f"Ask again with a weaker criterion ({option})."
 
     @property
@@ -197,7 +226,9 @@ class Unsafe:
             return f"has {self.bound}"
         if self.below is not None:
             return f"keeps less than {self.below:.3g} m of clearance"
-        return "collides" if self.degree is None else f"has a safety degree below {self.degree:.3g}"
+        if self.degree is not None:
+            return f"has a safety degree below {self.degree:.3g}"
+        return "collides"
 
     def of(self, evaluations: Evaluations) -> BoolArray:
         """Which evaluations are unsafe; shape (M,). An undefined measure is not, a collision is by
@@ -209,13 +240,20 @@ class Unsafe:
         """Which of M evaluations are unsafe in which of their R repeats; shape (R, M), R is 1
         without repeats.
         """
-        rounds = [] if self._is_of_shares else evaluations.rounds
-        return np.stack([self._holds(one.outcome, one.column) for one in rounds or [evaluations]])
+        rounds = self._rounds(evaluations)
+        return np.stack([self._holds(repeat.outcome, repeat.column) for repeat in rounds])
+
+    def _rounds(self, evaluations: Evaluations) -> list[Evaluations]:
+        if self._is_of_shares:
+            return [evaluations]
+        return evaluations.rounds or [evaluations]
 
     def number(self, evaluations: Evaluations) -> float:
         """How many evaluations are unsafe; each counts by the share of its repeats."""
         total = round(float(self.runs(evaluations).mean(axis=0).sum()), SHARE_DECIMALS)
-        return int(total) if total == int(total) else total
+        if total == int(total):
+            return int(total)
+        return total
 
     def rows(self, solutions: pd.DataFrame) -> pd.Series[bool]:
         """Which rows of `solutions`, a data frame from `safevar_sumo.results.load_runs`, are
@@ -230,24 +268,28 @@ class Unsafe:
         if self.bound is not None:
             name, comparison, limit = self.bound
             is_beyond = COMPARISONS[comparison](column(name), limit)
-            return is_beyond if self._stands_alone else collides | is_beyond
-        return collides | (column(F_SAFE.name) < self.limit) if self.distance else collides
+            if self._stands_alone:
+                return is_beyond
+            return collides | is_beyond
+        if not self.distance:
+            return collides
+        return collides | (column(F_SAFE.name) < self.limit)
 
     def robustness(self, evaluations: Evaluations) -> FloatArray:
         """How far evaluations are from the limit, in its unit, shape (M,): below 0 where they are
         unsafe; infinite where the measure is undefined; on a collision by a bound, minus the speed
         of the collision.
         """
-        if (rounds := evaluations.rounds) and not self._is_of_shares:  # the worst of them
-            return np.asarray(np.min([self._robustness(one) for one in rounds], axis=0))
-        return self._robustness(evaluations)
+        rounds = self._rounds(evaluations)
+        return np.asarray(np.min([self._robustness(repeat) for repeat in rounds], axis=0))
 
     def _robustness(self, evaluations: Evaluations) -> FloatArray:
         if self.bound is None:
             robustness = evaluations.f_safe - self.limit
         else:
-            difference = evaluations.column(self.bound.measure) - self.limit
-            robustness = -difference if self.bound.worst_is_largest else difference
+            robustness = evaluations.column(self.bound.measure) - self.limit
+            if self._worst_is_largest:
+                robustness = -robustness
             if not self._stands_alone:
                 robustness = np.where(evaluations.collided, evaluations.f_safe, robustness)
         robustness = np.where(np.isnan(robustness), np.inf, robustness)
@@ -258,9 +300,11 @@ class Unsafe:
         """What has a robustness: a distance between bumpers [m], or the value that is
         limited.
         """
-        sign = -1 if self.bound is not None and self.bound.worst_is_largest else 1
-        is_distance = self.bound is None and self.degree is None
-        return (self.distance if is_distance else self.limit) + sign * robustness
+        if self._worst_is_largest:
+            return self.limit - robustness
+        if self.bound is None and self.degree is None:
+            return self.distance + robustness
+        return self.limit + robustness
 
     def value_in_words(self, value: float) -> str:
         """What a safe vehicle has: `keeps 0.31 m of clearance`, `has drac 5.9`."""
@@ -279,7 +323,6 @@ class Unsafe:
     def _breach_in_words(self, vehicle: Evaluations) -> str:
         degree = float(vehicle.f_safe[0])
 
-        # In the unit of the criterion: a metric, or a safety degree.
         if self.is_of_impacts and vehicle.collided[0]:
             columns = (vehicle.column(name)[0] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
             return f"has an {impact_in_words(*columns)}"
@@ -287,19 +330,16 @@ class Unsafe:
             measure, comparison, limit = self.bound
             value = float(vehicle.column(measure)[0])
             if COMPARISONS[comparison](value, limit):
-                return (
-                    f"has {measure} {_on_its_side(value, limit, 'g', 3)} {comparison} {limit:.12g}"
-                )
+                text = _on_its_side(value, limit, "g", 3)
+                return f"has {measure} {text} {comparison} {limit:.12g}"
         if self.degree is not None and (degree >= 0 or self.degree < 0):
-            unit = "m" if degree >= 0 else "m/s"
+            unit = _unit_of(degree)
             text = _on_its_side(degree, self.degree, "g", 3)
             return f"has a safety degree of {text} {unit}, below {self.degree:.3g} {unit}"
-
-        # Otherwise a collision, or a distance that is too small.
         if vehicle.collided[0]:
             return f"collides at {abs(degree):.2f} m/s"
-        left = _on_its_side(degree - self.contact, self.distance, "f", 2)
-        return f"keeps {left} m of clearance, less than {self.distance:g} m"
+        clearance = _on_its_side(degree - self.contact, self.distance, "f", 2)
+        return f"keeps {clearance} m of clearance, less than {self.distance:g} m"
 
     @classmethod
     def parse(cls, criterion: CriterionLike) -> Unsafe:
@@ -316,28 +356,25 @@ class Unsafe:
         if criterion == COLLISION:
             return cls()
 
-        # A measure, a comparison and a number.
-        parts = re.fullmatch(r"\s*([A-Za-z]\w*)\s*(<=|>=|<|>|=)\s*(\S+)\s*", str(criterion))
-        quantity, comparison, text = (
-            ("below", "=", criterion)
-            if isinstance(criterion, float | int)
-            else parts.groups()
-            if parts
-            else ("", "", "")
-        )
-        try:
-            limit = float(text)
-        except (TypeError, ValueError):
-            limit = math.nan
-
-        # A safety degree, or any metric of the study.
-        if math.isfinite(limit):
+        text = str(criterion)
+        if isinstance(criterion, float | int):
+            text = f"below={float(criterion)!r}"
+        parts = re.fullmatch(r"\s*([A-Za-z]\w*)\s*(<=|>=|<|>|=)\s*(\S+)\s*", text)
+        limit = math.nan
+        if parts:
+            with suppress(ValueError):
+                limit = float(parts[3])
+        if parts and math.isfinite(limit):
+            quantity, comparison = parts[1], parts[2]
             if (quantity, comparison) == (SAFETY_DEGREE, "<"):
                 return cls(degree=limit)
             if (quantity, comparison) == ("below", "="):
                 if limit < 0:
-                    legal = f'a clearance of at least 0 m, or "{cls(degree=limit)}"'
-                    raise InputError("unsafe", f"below={limit:g} is no clearance", legal)
+                    raise InputError(
+                        "unsafe",
+                        f"below={limit:g} is no clearance",
+                        f'a clearance of at least 0 m, or "{cls(degree=limit)}"',
+                    )
                 return cls(below=limit)
             if comparison in COMPARISONS:
                 return cls(bound=MetricBound(quantity, comparison, limit))
@@ -373,9 +410,8 @@ class Unsafe:
             If no vehicle can be unsafe by this criterion.
         """
         outcomes = np.concatenate([original.outcome, evaluations.outcome])
-        unsafe = cls.default(
-            {name: float(values[0]) for name, values in original.metrics.items()}, outcomes
-        )
+        metrics = {name: float(values[0]) for name, values in original.metrics.items()}
+        unsafe = cls.default(metrics, outcomes)
         if unsafe == cls() and not (outcomes == COLLISION).any():
             raise InputError(
                 "unsafe",
@@ -389,7 +425,8 @@ def runs_in_words(fails: BoolArray) -> str:
     """In how many runs of a setting it is unsafe, shape (R,), with the exact interval (Clopper and
     Pearson) of their share; "" if there is a single run.
     """
-    import scipy  # takes a second
+    # This module takes a second to load.
+    import scipy
 
     if len(fails) < 2:
         return ""
@@ -401,28 +438,42 @@ def runs_in_words(fails: BoolArray) -> str:
 
 def impact_in_words(speed: float, excess: float) -> str:
     """An impact [m/s] and its excess, such as `impact at 12 km/h where 15 is allowed`."""
-    allowed = KMH_PER_MS * (speed - excess)
-    words = f"{allowed:.3g} is" if allowed >= ALLOWED_ROUNDING else "none is"
-    return f"impact at {KMH_PER_MS * speed:.3g} km/h where {words} allowed"
+    allowed_speed = KMH_PER_MS * (speed - excess)
+    words = "none"
+    if allowed_speed >= ALLOWED_ROUNDING:
+        words = f"{allowed_speed:.3g}"
+    return f"impact at {KMH_PER_MS * speed:.3g} km/h where {words} is allowed"
+
+
+def _unit_of(degree: float) -> str:
+    """The unit of a safety degree, which is minus a speed on a collision."""
+    if degree >= 0:
+        return "m"
+    return "m/s"
 
 
 def _degree_in_words(degree: float) -> str:
-    """A safety degree with its unit, which is minus a speed on a collision."""
-    return f"{degree:.3g} {'m' if degree >= 0 else 'm/s'}"
+    """A safety degree with its unit."""
+    return f"{degree:.3g} {_unit_of(degree)}"
 
 
 def _on_its_side(value: float, limit: float, kind: str, digits: int) -> str:
     """A value with so many digits, or as few more as keep it on its side of a limit."""
-    texts = (f"{value:.{number}{kind}}" for number in range(digits, 17))
     side = np.sign(value - limit)
-    return next((text for text in texts if np.sign(float(text) - limit) == side), repr(value))
+    for number in range(digits, 17):
+        text = f"{value:.{number}{kind}}"
+        if np.sign(float(text) - limit) == side:
+            return text
+    return repr(value)
 
 
 def margin_of(study: Study, margin: float | None) -> float:
     """The distance to keep [m]: the stated one, else the study's error of its model, else
     `DEFAULT_MARGIN`.
     """
-    return study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN) if margin is None else margin
+    if margin is None:
+        return study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN)
+    return margin
 
 
 CriterionLike = Unsafe | float | str

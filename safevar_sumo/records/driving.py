@@ -56,7 +56,9 @@ def finite_or_none(value: float) -> float | None:
     """Make a number fit for JSON, which has neither NaN nor infinities: such a number becomes
     None.
     """
-    return float(value) if np.isfinite(value) else None
+    if not np.isfinite(value):
+        return None
+    return float(value)
 
 
 class Observation(NamedTuple):

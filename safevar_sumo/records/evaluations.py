@@ -53,9 +53,9 @@ class Evaluations:
     @property
     def points(self) -> npt.NDArray[np.intp]:
         """`worst_points`; without a matrix the only point, 0."""
-        return (
-            np.zeros(len(self), dtype=np.intp) if self.worst_points is None else self.worst_points
-        )
+        if self.worst_points is None:
+            return np.zeros(len(self), dtype=np.intp)
+        return self.worst_points
 
     @property
     def results(self) -> ResultColumns:
@@ -108,36 +108,36 @@ class Evaluations:
         """The evaluations of each repeat, where settings are repeated: their outcomes as far as
         they collide, and the metrics that are kept of each.
         """
-        found = list[Evaluations]()
-        while (end := f"_{len(found) + 1}") and f"{SAFETY_DEGREE}{end}" in self.metrics:
-            own = {
+        rounds = list[Evaluations]()
+        while (end := f"_{len(rounds) + 1}") and f"{SAFETY_DEGREE}{end}" in self.metrics:
+            metrics = {
                 name: self.metrics[f"{name}{end}"]
                 for name in self.metrics
                 if f"{name}{end}" in self.metrics
             }
-            others = np.where(self.collided, "", self.outcome)
-            outcome = np.where(own[SAFETY_DEGREE] < 0, Outcome.COLLISION.value, others)
-            found.append(replace(self, outcome=outcome, metrics={**self.metrics, **own}))
-        return found
+            safe_outcome = np.where(self.collided, "", self.outcome)
+            outcome = np.where(metrics[SAFETY_DEGREE] < 0, Outcome.COLLISION.value, safe_outcome)
+            rounds.append(replace(self, outcome=outcome, metrics={**self.metrics, **metrics}))
+        return rounds
 
     def take(self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> Evaluations:
         """The evaluations of `rows`, in that order."""
-        return replace(
-            self,
-            **{name: getattr(self, name)[rows] for name in COLUMNS},
-            metrics={name: values[rows] for name, values in self.metrics.items()},
-            worst_points=None if self.worst_points is None else self.worst_points[rows],
-            reasons=dict(self.reasons),  # user code has a view, which no process can send
-        )
+        columns = {name: getattr(self, name)[rows] for name in COLUMNS}
+        columns["metrics"] = {name: values[rows] for name, values in self.metrics.items()}
+        if self.worst_points is not None:
+            columns["worst_points"] = self.worst_points[rows]
+        # User code has a view of the reasons, which no process can send.
+        return replace(self, **columns, reasons=dict(self.reasons))
 
     def where(self, is_kept: BoolArray, outcome: str) -> Evaluations:
         """Evaluations, undefined and with this outcome where they are not kept, shape (M,)."""
-        metrics = {name: np.where(is_kept, own, np.nan) for name, own in self.metrics.items()}
         return replace(
             self,
             outcome=np.where(is_kept, self.outcome, str(outcome)),
             collision_speed=np.where(is_kept, self.collision_speed, np.nan),
-            metrics=metrics,
+            metrics={
+                name: np.where(is_kept, values, np.nan) for name, values in self.metrics.items()
+            },
         )
 
     @classmethod
@@ -167,20 +167,17 @@ class Evaluations:
 
         The worst point of a batch without `worst_points` is the first.
         """
-        # Rows of all batches.
-        columns = {
-            name: np.concatenate([getattr(batch, name) for batch in batches]) for name in COLUMNS
-        }
+        columns = dict[str, Any]()
+        for name in COLUMNS:
+            columns[name] = np.concatenate([getattr(batch, name) for batch in batches])
         reasons = dict[bytes, str]()
         names = dict[str, None]()
         for batch in batches:
             reasons |= batch.reasons
             names |= dict.fromkeys(batch.metrics)
-        metrics = {
-            name: np.concatenate([batch.column(name) for batch in batches]) for name in names
-        }
-
-        # Worst points, if some batches have them.
+        metrics = {}
+        for name in names:
+            metrics[name] = np.concatenate([batch.column(name) for batch in batches])
         worst_points = None
         if any(batch.worst_points is not None for batch in batches):
             worst_points = np.concatenate([batch.points for batch in batches])
@@ -188,15 +185,16 @@ class Evaluations:
 
 
 def differences(
-    outputs: ResultColumns, others: ResultColumns, tolerance: float = 0.0
+    outputs: ResultColumns, references: ResultColumns, tolerance: float = 0.0
 ) -> Iterator[tuple[int, str]]:
     """Yield, for each result that differs, the first row where it does, and both values in
     words.
     """
     for name, values in outputs.items():
-        is_same = values == others[name]
+        reference = references[name]
+        is_same = values == reference
         if values.dtype.kind == "f":
-            is_same |= np.isclose(values, others[name], rtol=0, atol=tolerance, equal_nan=True)
+            is_same |= np.isclose(values, reference, rtol=0, atol=tolerance, equal_nan=True)
         if not is_same.all():
             row = int(np.argmin(is_same))
-            yield row, f"{name} is {others[name][row]} instead of {values[row]}"
+            yield row, f"{name} is {reference[row]} instead of {values[row]}"

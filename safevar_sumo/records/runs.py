@@ -95,13 +95,8 @@ class Trace:
 
     def of(self, vehicles: slice | IntArray) -> Trace:
         """The trace of some of the vehicles."""
-        arrays = {item.name: getattr(self, item.name) for item in fields(self)}
-        return replace(
-            self,
-            **{
-                name: values[:, vehicles] for name, values in arrays.items() if np.ndim(values) == 2
-            },
-        )
+        matrices = {name: value for name, value in vars(self).items() if np.ndim(value) == 2}
+        return replace(self, **{name: value[:, vehicles] for name, value in matrices.items()})
 
 
 QUANTITIES: Mapping[str, tuple[str, ...]] = {
@@ -166,6 +161,9 @@ class SimulationRuns:
     lacks: Mapping[str, BoolArray] = field(default_factory=dict)
     stated: Mapping[str, FloatArray] = field(default_factory=dict)
 
+    def __len__(self) -> int:
+        return len(self.outcome)
+
     @cached_property
     def is_approach(self) -> BoolArray:
         """Whether a sample is in the encounter, before the vehicle has stopped after moving; shape
@@ -201,8 +199,10 @@ class SimulationRuns:
             if isinstance(value, Encounter | Contact):
                 return type(value)(*map(select, value))
             if isinstance(value, Mapping):
-                return {name: select(inner) for name, inner in value.items()}
-            return value[..., vehicles] if np.ndim(value) else value
+                return {name: select(item) for name, item in value.items()}
+            if np.ndim(value):
+                return value[..., vehicles]
+            return value
 
         return replace(
             self, **{item.name: select(getattr(self, item.name)) for item in fields(self)}
@@ -210,9 +210,9 @@ class SimulationRuns:
 
     def lacking(self, *quantities: str) -> BoolArray:
         """Which runs lack one of these quantities, shape (N,)."""
-        none = np.zeros(len(self.outcome), dtype=bool)
-        lacks = [self.lacks.get(name, none) for name in quantities]
-        return np.asarray(np.any([none, *lacks], axis=0))
+        no_runs = np.zeros(len(self), dtype=bool)
+        lacks = [self.lacks.get(name, no_runs) for name in quantities]
+        return np.asarray(np.any([no_runs, *lacks], axis=0))
 
     def with_all(self, quantity: str, value: float) -> SimulationRuns:
         """The runs with one value of a quantity at all samples; how hard a collision is stays."""
@@ -270,9 +270,8 @@ class SimulationRuns:
         """
         trace = self.trace
         if not len(trace.time):
-            return np.full(len(self.outcome), np.nan)
+            return np.full(len(self), np.nan)
 
-        # In the last active sample and the one before.
         vehicles = np.arange(len(self.collision_speed))
         last_sample = trace.last_active
         sample_before = np.maximum(last_sample - 1, 0)

@@ -64,21 +64,19 @@ def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
     reference
         The CSV file.
     """
-    # The reference's settings, simulated here.
     study = evaluator.study
     evaluator.begin({STAGE: 1})
     data = read_reference(reference, evaluator.characteristics)
-    here = evaluator.evaluate(data.settings, STAGE, ignore_constraints=True)
-    if not here.valid.any():
+    evaluations = evaluator.evaluate(data.settings, STAGE, ignore_constraints=True)
+    valid = evaluations.valid
+    if not valid.any():
         raise SimulationError(
             f"study {study.name!r} cannot be simulated with any row of {reference}"
         )
-    data = data.take(here.valid)
-    here = here.take(here.valid)
-
-    # How the values agree.
-    numbers = agreement_counts(data, here)
-    table = measure_agreement(data, here)
+    data = data.take(valid)
+    evaluations = evaluations.take(valid)
+    numbers = agreement_counts(data, evaluations)
+    table = measure_agreement(data, evaluations)
     measures = table.loc[
         table["metric"] == SAFETY_DEGREE, ["spearman", "mean_absolute_error", "bias"]
     ]
@@ -95,24 +93,23 @@ def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
         verdict=verdict,
         numbers={**numbers},
         tables={"agreement": table},
-        draw=partial(_draw, f"{study.title}\nagainst {reference.name}", data, here),
+        draw=partial(_draw, f"{study.title}\nagainst {reference.name}", data, evaluations),
     )
 
 
-def _draw(title: str, reference: ReferenceData, here: Evaluations, answer: Answer) -> Figure:
+def _draw(title: str, reference: ReferenceData, evaluations: Evaluations, answer: Answer) -> Figure:
     """The values here over those in the reference, metric by metric."""
     table = answer.tables["agreement"]
     figure, axes = new_panels(title, len(table), 4, (3.0, 2.6), min_width=12.0, title_height=0.6)
-    colours = np.where(reference.collided | here.collided, VERMILION, BLUE)
+    colours = np.where(reference.collided | evaluations.collided, VERMILION, BLUE)
     for axis, name, order in zip(axes, table["metric"], table["spearman"], strict=True):
-        there = reference.metrics[name]
-        simulated = here.metrics[name]
+        published = reference.metrics[name]
+        simulated = evaluations.metrics[name]
         label = f"{METRICS[name].title} [{as_formula(METRICS[name].unit)}]"
-        axis.scatter(there, simulated, s=6, alpha=0.4, c=colours, linewidths=0)
-        defined, _ = defined_pairs(there, simulated)
-        origin = (
-            float(defined[0]) if defined.size else 0.0
-        )  # in the values' range, so that the axes keep theirs
+        axis.scatter(published, simulated, s=6, alpha=0.4, c=colours, linewidths=0)
+        # A point in the range of the values lets the axes keep theirs.
+        defined, _ = defined_pairs(published, simulated)
+        origin = float(next(iter(defined), 0.0))
         axis.axline((origin, origin), slope=1, color="black", linewidth=0.8, linestyle="--")
         axis.set_title(f"rho = {two_decimals(order)}", fontsize=FONT_SIZE)
         axis.set(xlabel=f"reference: {label}", ylabel=f"here: {label}")
@@ -120,24 +117,26 @@ def _draw(title: str, reference: ReferenceData, here: Evaluations, answer: Answe
     return figure
 
 
-def agreement_counts(reference: ReferenceData, here: Evaluations) -> dict[str, int]:
+def agreement_counts(reference: ReferenceData, evaluations: Evaluations) -> dict[str, int]:
     """Numbers of rows, and of those that collide here, in the reference, and in both."""
     return {
-        "rows": len(here),
-        "collisions_here": int(here.collided.sum()),
+        "rows": len(evaluations),
+        "collisions_here": int(evaluations.collided.sum()),
         "collisions_reference": int(reference.collided.sum()),
-        "collisions_both": int((here.collided & reference.collided).sum()),
+        "collisions_both": int((evaluations.collided & reference.collided).sum()),
     }
 
 
-def measure_agreement(reference: ReferenceData, here: Evaluations) -> pd.DataFrame:
+def measure_agreement(reference: ReferenceData, evaluations: Evaluations) -> pd.DataFrame:
     """The table of `COLUMNS`, a row for each metric; NaN where undefined."""
     rows = []
     for name, values in reference.metrics.items():
-        there, simulated = defined_pairs(values, here.metrics[name])
-        errors = simulated - there
-        measures = (np.abs(errors).mean(), errors.mean()) if errors.size else (np.nan, np.nan)
-        rows.append((name, METRICS[name].unit, rank_correlation(there, simulated), *measures))
+        published, simulated = defined_pairs(values, evaluations.metrics[name])
+        errors = simulated - published
+        measures = np.nan, np.nan
+        if errors.size:
+            measures = np.abs(errors).mean(), errors.mean()
+        rows.append((name, METRICS[name].unit, rank_correlation(published, simulated), *measures))
     return tabulate("Agreement with the reference", COLUMNS, rows)
 
 
@@ -160,15 +159,10 @@ def shipped_agreement(study: Study) -> pd.DataFrame:
     `SIMULATION_KEYS`.
     """
     frame = pd.read_csv(SHIPPED_AGREEMENT)
-    keys = {
-        name: evaluation_keys(tables_of(read_study(name)))
-        for name in frame["study"].unique()
-        if name in study_names()
-    }
     own_keys = evaluation_keys(tables_of(study))
-    same = [
-        name
-        for name, keys in keys.items()
-        if all(keys.get(key) == own_keys.get(key) for key in SIMULATION_KEYS)
-    ]
-    return frame[frame["study"].isin(same)]
+    names = []
+    for name in {*frame["study"]} & {*study_names()}:
+        keys = evaluation_keys(tables_of(read_study(name)))
+        if all(keys.get(key) == own_keys.get(key) for key in SIMULATION_KEYS):
+            names.append(name)
+    return frame[frame["study"].isin(names)]

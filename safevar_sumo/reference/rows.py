@@ -91,7 +91,6 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         With file, row and column, if the file cannot be read, lacks a column or rows, or has a cell
         without a number in range.
     """
-    # A table of texts.
     try:
         file = BytesIO(read_file(path))
         lines = pd.read_csv(
@@ -102,32 +101,28 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         table = lines.rename(columns=str.strip).dropna(how="all")
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}", "a CSV file") from None
-    except ValueError as error:  # pandas' errors are of this kind
+    # The errors of pandas are ValueErrors, too.
+    except ValueError as error:
         raise InputError(
             path, f"is not CSV: {str(error).splitlines()[0]}", "a CSV file with a header and rows"
         ) from None
-
-    # Columns by their names, whatever their spelling.
     by_plain_name = {_plain_name(str(column)): str(column) for column in table}
     columns = {name: by_plain_name.get(_plain_name(name), name) for name in characteristics.names}
-    columns |= {
-        name: column
-        for name, column in COLUMNS.items()
-        if name != OPTIONAL_METRIC or column in table
-    }
+    columns |= COLUMNS
+    if columns[OPTIONAL_METRIC] not in table:
+        del columns[OPTIONAL_METRIC]
     missing_columns = [column for column in columns.values() if column not in table]
+    problem = "has no rows"
+    if missing_columns:
+        problem = f"lacks the columns {', '.join(missing_columns)}"
     if missing_columns or table.empty:
-        problem = (
-            f"lacks the columns {', '.join(missing_columns)}" if missing_columns else "has no rows"
-        )
         raise InputError(path, problem, "the format of the published package")
     counts = Counter(_plain_name(str(column)) for column in table)
-    if doubled := ", ".join(
-        column for column in columns.values() if counts[_plain_name(column)] > 1
-    ):
-        raise InputError(path, f"has more than one column for {doubled}", "each column once")
-
-    # Settings within the domains.
+    doubled = [column for column in columns.values() if counts[_plain_name(column)] > 1]
+    if doubled:
+        raise InputError(
+            path, f"has more than one column for {', '.join(doubled)}", "each column once"
+        )
     numbers = {
         name: _parse_numbers(path, table[column], *RANGES.get(name, (-np.inf, np.inf)))
         for name, column in columns.items()
@@ -145,30 +140,30 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     if skipped := np.count_nonzero(~is_in_domain):
         warn(f"{path}: {skipped} rows with values outside the domains are left out")
 
-    # The paper's metrics: a collision has no TET and TIT.
-    metrics = {
-        name: numbers.get(name, np.full(len(table), np.nan))[is_in_domain] for name in COLUMNS
-    }
+    undefined = np.full(len(table), np.nan)
+    metrics = {name: numbers.get(name, undefined)[is_in_domain] for name in COLUMNS}
     metrics["ave_dece"] = np.abs(metrics["ave_dece"])
-    metrics |= {
-        name: np.where(metrics[SAFETY_DEGREE] <= 0, np.nan, metrics[name])
-        for name in ("tet", "tit")
-    }
+    # In the paper a collision has no TET and TIT.
+    for name in ("tet", "tit"):
+        metrics[name] = np.where(metrics[SAFETY_DEGREE] <= 0, np.nan, metrics[name])
     return ReferenceData(package_filter(characteristics, settings[is_in_domain]), metrics)
 
 
 def _plain_name(name: str) -> str:
-    key = (
-        name.removesuffix(".1").replace("_", "").lower()
-    )  # pandas calls a second column of a name NAME.1
+    # pandas calls a second column of a name NAME.1.
+    key = name.removesuffix(".1").replace("_", "").lower()
     return ALIASES.get(key, key)
 
 
 def _parse_numbers(path: Path, column: pd.Series[str], lowest: float, highest: float) -> FloatArray:
     values = pd.to_numeric(column, errors="coerce")
     for row, cell in column[~(np.isfinite(values) & values.between(lowest, highest))].items():
-        legal = "a finite number" if lowest == -np.inf else f"a number in [{lowest:g}, {highest:g}]"
-        fault = "is empty" if pd.isna(cell) else f"= {cell!r}"
+        legal = f"a number in [{lowest:g}, {highest:g}]"
+        if lowest == -np.inf:
+            legal = "a finite number"
+        fault = f"= {cell!r}"
+        if pd.isna(cell):
+            fault = "is empty"
         raise InputError(path, f"row {int(row) + FIRST_ROW}, column {column.name} {fault}", legal)
     return values.to_numpy(dtype=float)
 
@@ -230,21 +225,21 @@ def import_published(
         If the study or a file cannot be used, no file is given, or the original vehicle's safety
         degree is unknown.
     """
-    # The files of the algorithms.
     loaded_study = read_study(study)
     directory = Path(out)
-    given = {"nsga2": nsga2, "rs": rs, "safe_fuzzer": safe_fuzzer}
-    files = {algorithm: Path(file) for algorithm, file in given.items() if file is not None}
+    arguments = {"nsga2": nsga2, "rs": rs, "safe_fuzzer": safe_fuzzer}
+    files = {name: Path(file) for name, file in arguments.items() if file is not None}
     if not files:
         raise InputError("import", "no file is given", "at least one of nsga2, rs, safe_fuzzer")
 
-    # The original vehicle's metrics.
     metrics = {name: loaded_study.published.get(name) for name in METRICS}
     if metrics[SAFETY_DEGREE] is None:
-        problem = "published: the study has no values of the original vehicle"
-        raise InputError(loaded_study.source, problem, "at least its safety_degree")
+        raise InputError(
+            loaded_study.source,
+            "published: the study has no values of the original vehicle",
+            "at least its safety_degree",
+        )
 
-    # The solutions, as a directory of results.
     characteristics = CharacteristicSet.of(loaded_study)
     solutions = {
         algorithm: evaluations_of(read_reference(path, characteristics), characteristics)

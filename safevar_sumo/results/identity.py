@@ -65,14 +65,18 @@ def packages_of(study: Study) -> tuple[str, ...]:
     """
     has_pymoo = any(name.startswith(PYMOO) for name in study.search.algorithms)
     has_pymoo = has_pymoo and find_spec("pymoo") is not None
-    libraries = [LIBRARIES[key] for key in (study.ads.model, study.ads.kind) if key in LIBRARIES]
-    return (*PACKAGES, *libraries, *(PYMOO_PACKAGES if has_pymoo else ()))
+    packages = [*PACKAGES]
+    packages += [LIBRARIES[key] for key in (study.ads.model, study.ads.kind) if key in LIBRARIES]
+    if has_pymoo:
+        packages += PYMOO_PACKAGES
+    return tuple(packages)
 
 
 def evaluation_keys(tables: Tables) -> JsonObject:
     """Those of a study's tables that affect evaluations: of the axes only what is driven."""
-    driven = tables if tables.get("encounters") == RANGES else _without_ranges(tables)
-    keys: JsonObject = with_effect(driven, Study)
+    if tables.get("encounters") != RANGES:
+        tables = _without_ranges(tables)
+    keys: JsonObject = with_effect(tables, Study)
     return keys
 
 
@@ -80,23 +84,28 @@ def _without_ranges(tables: Tables) -> JsonObject:
     """A study's tables with listed encounters alone, without what is about others."""
 
     def lists(table: JsonObject) -> JsonObject:
-        axes = table.get("over", {}).items()
-        listed = {name: axis.get("at") if isinstance(axis, dict) else axis for name, axis in axes}
-        over = {name: values for name, values in listed.items() if values}
-        return {
-            **{key: table[key] for key in table if key != "over"},
-            **({"over": over} if over else {}),
-        }
+        listed = dict(table)
+        over = {}
+        for name, values in listed.pop("over", {}).items():
+            if isinstance(values, dict):
+                values = values.get("at")
+            if values:
+                over[name] = values
+        if over:
+            listed["over"] = over
+        return listed
 
     result = {**tables, "scenario": lists(tables.get("scenario", {}))}
     result["scenario"].pop("margin", None)
     if matrix := tables.get("matrix"):
-        tests = [lists(test) for test in matrix.get("tests", [])]
-        result["matrix"] = {**matrix, **({"tests": tests} if tests else {})}
+        result["matrix"] = dict(matrix)
+        if tests := matrix.get("tests"):
+            result["matrix"]["tests"] = [*map(lists, tests)]
     if constraints := result.pop("constraints", None):
-        known = tables["vehicle"]["characteristics"].keys()
-        of_vehicle = [one for one in constraints if one["sum"].keys() <= known]
-        result |= {"constraints": of_vehicle} if of_vehicle else {}
+        names = tables["vehicle"]["characteristics"].keys()
+        constraints = [item for item in constraints if item["sum"].keys() <= names]
+        if constraints:
+            result["constraints"] = constraints
     return result
 
 
@@ -125,26 +134,27 @@ def manifest_differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[
     new keys of a study do not.
     """
     inputs_before = identity_in(stored)
-    searching = {*SEARCH_PACKAGES} - {*now.get("libraries", ())}  # a simulator may use them, too
+    # A simulator may use libraries of searches, too.
+    searching = {*SEARCH_PACKAGES} - {*now.get("libraries", ())}
     for layer, inputs in identity_in(now).items():
-        for key, before, after in changed_values(inputs_before[layer], inputs):
-            if key in PYMOO_PACKAGES and None in (before, after):
+        for key, old, new in changed_values(inputs_before[layer], inputs):
+            if key in PYMOO_PACKAGES and None in (old, new):
                 continue
-            if layer == "files":
-                change = "is new" if before is None else "has changed since"
-                text = f"{key} no longer exists" if after is None else f"{key} {change}"
-            else:
-                name = (
-                    f"version of {key}"
-                    if layer == "versions"
-                    else key or "the version of the package's results"
-                )
-                text = f"{name} was {before!r} and is {after!r} now"
             is_harmless = (
                 layer == "platform"
                 or (layer == "versions" and key in searching)
-                or (layer == "study" and before is None)
+                or (layer == "study" and old is None)
             )
+            name = key or "the version of the package's results"
+            if layer == "versions":
+                name = f"version of {key}"
+            text = f"{name} was {old!r} and is {new!r} now"
+            if layer == "files":
+                text = f"{key} has changed since"
+                if old is None:
+                    text = f"{key} is new"
+                if new is None:
+                    text = f"{key} no longer exists"
             yield layer, text, not is_harmless
 
 
@@ -156,14 +166,15 @@ def search_extent_of(manifest: JsonObject) -> tuple[list[str], int, int]:
     return search["algorithms"], search["runs"], search["evaluations"]
 
 
-def changed_values(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """The innermost keys at which two values differ, with the first and the second value; 2 and 2.0
-    are different.
+def changed_values(old: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """The innermost keys at which two values differ, with the old and the new value; 2 and 2.0 are
+    different.
     """
-    if isinstance(first, dict) and isinstance(second, dict):
-        for name in sorted({*first, *second}):
-            yield from changed_values(
-                first.get(name), second.get(name), f"{key}.{name}" if key else name
-            )
-    elif json.dumps(first, sort_keys=True) != json.dumps(second, sort_keys=True):
-        yield key, first, second
+    if isinstance(old, dict) and isinstance(new, dict):
+        for name in sorted({*old, *new}):
+            path = name
+            if key:
+                path = f"{key}.{name}"
+            yield from changed_values(old.get(name), new.get(name), path)
+    elif json.dumps(old, sort_keys=True) != json.dumps(new, sort_keys=True):
+        yield key, old, new

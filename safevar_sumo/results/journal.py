@@ -138,16 +138,19 @@ class Journal:
             POSITION: list(positions),
             OUTCOME: evaluations.outcome.tolist(),
             **dict(zip(self._characteristics, evaluations.settings.T.tolist(), strict=True)),
-            **{name: getattr(evaluations, name).tolist() for name in OBJECTIVE_COLUMNS},
-            **{name: values.tolist() for name, values in evaluations.metrics.items()},
         }
+        for name in OBJECTIVE_COLUMNS:
+            line[name] = getattr(evaluations, name).tolist()
+        for name, values in evaluations.metrics.items():
+            line[name] = values.tolist()
         if evaluations.worst_points is not None:
             line[POINT] = evaluations.worst_points.tolist()
         if evaluations.reasons:
             reasons = [
                 evaluations.reasons.get(setting.tobytes()) for setting in evaluations.settings
             ]
-            line |= {REASON: reasons} if any(reasons) else {}
+            if any(reasons):
+                line[REASON] = reasons
         self._add(line)
 
     def finish(self, positions: Sequence[int], budget: int) -> None:
@@ -185,7 +188,10 @@ def read_journal(path: Path, head: JsonObject, *, head_only: bool = False) -> Jo
     """
     try:
         with path.open("rb") as file:
-            data = file.readline() + file.read(1 if head_only else -1)
+            # One byte after the head says that it is not alone, so that its owner counts.
+            data = file.readline() + file.read(1)
+            if not head_only:
+                data += file.read()
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     return _read(data, path, head)
@@ -231,7 +237,9 @@ class JournalReader:
     @property
     def left(self) -> int:
         """Number of evaluations that the run may still ask for."""
-        return 0 if self.is_finished else self._budget - self._asked
+        if self.is_finished:
+            return 0
+        return self._budget - self._asked
 
 
 def open_and_lock(path: Path) -> IO[bytes]:
@@ -266,15 +274,19 @@ def _read(
     results = {}
 
     # The first line says to which run the journal belongs.
-    first, *lines = data.splitlines(keepends=True) or [b""]
-    owner = _decoded(first)
+    head_line, *lines = data.splitlines(keepends=True) or [b""]
+    owner = _decoded(head_line)
     if lines and owner != head:
-        legal = "the manifest.json and journals of one study, as it was run; or another `out`"
-        raise InputError(path, "belongs to another study, version or run, or is no journal", legal)
+        raise InputError(
+            path,
+            "belongs to another study, version or run, or is no journal",
+            "the manifest.json and journals of one study, as it was run; or another `out`",
+        )
 
-    # Each line is a batch of evaluations or the run's solutions, with a checksum.
-    size = len(first) if lines or owner == head else 0
-    checksum = zlib.crc32(first.rstrip())
+    size = 0
+    if owner == head:
+        size = len(head_line)
+    checksum = zlib.crc32(head_line.rstrip())
     for text in lines:
         line, checksum_of_line = _checked(text, checksum)
         try:
@@ -304,13 +316,17 @@ def _checked(text: bytes, checksum: int) -> tuple[JsonObject, int]:
     """
     content, _, stated = text.rpartition(CHECKSUM_MARK)
     checksum = zlib.crc32(content + b"}", checksum)
-    return _decoded(content + b"}\n") if stated == b"%d}\n" % checksum else {}, checksum
+    if stated != b"%d}\n" % checksum:
+        return {}, checksum
+    return _decoded(content + b"}\n"), checksum
 
 
 def _decoded(text: bytes) -> JsonObject:
     """A line of a journal; empty if it is torn or damaged."""
+    if not text.endswith(b"\n"):
+        return {}
     try:
-        return msgspec.json.decode(text, type=JsonObject) if text.endswith(b"\n") else {}
+        return msgspec.json.decode(text, type=JsonObject)
     except msgspec.DecodeError:
         return {}
 
@@ -319,7 +335,6 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
     """The batch of evaluations in a line; raises an error if its columns are wrong or have
     different lengths.
     """
-    # Numbers by column, one for each setting.
     if len({len(values) for values in line.values()}) > 1:
         raise ValueError
     columns = {
@@ -328,7 +343,10 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
         if name not in (POSITION, OUTCOME, REASON, POINT)
     }
     settings = np.stack([columns.pop(name) for name in characteristics], axis=1)
-    reasons = line.get(REASON, [None] * len(settings))
+    reasons = zip(map(bytes, settings), line.get(REASON, [None] * len(settings)), strict=True)
+    worst_points = None
+    if POINT in line:
+        worst_points = np.array(line[POINT], dtype=np.intp)
     speed, f_diff, f_num_diff = (columns.pop(name) for name in OBJECTIVE_COLUMNS)
     return Evaluations(
         settings=settings,
@@ -337,10 +355,6 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
         f_diff=f_diff,
         f_num_diff=f_num_diff,
         metrics=columns,
-        reasons={
-            setting.tobytes(): reason
-            for setting, reason in zip(settings, reasons, strict=True)
-            if reason
-        },
-        worst_points=np.array(line[POINT], dtype=np.intp) if POINT in line else None,
+        reasons={key: reason for key, reason in reasons if reason},
+        worst_points=worst_points,
     )

@@ -36,7 +36,7 @@ def failure_lines(failures: Sequence[tuple[str, str]]) -> list[str]:
     firsts = {reason: place for place, reason in reversed(failures)}
     counts = Counter(reason for _, reason in failures)
     return [
-        f"{firsts[reason]}: {reason}{f' (and {count - 1} more)' if count > 1 else ''}"
+        f"{firsts[reason]}: {reason} (and {count - 1} more)".removesuffix(" (and 0 more)")
         for reason, count in counts.items()
     ]
 
@@ -86,7 +86,6 @@ def load_runs(directory: str | Path) -> StoredResults:
         no_evaluations = evaluations_frame(characteristics, []).assign(evaluation=0)
         return StoredResults(manifest, no_evaluations, read_imported(folder, characteristics))
 
-    # Every run has a journal.
     evaluations_of_runs = []
     solutions_of_runs = []
     all_positions = []
@@ -97,20 +96,15 @@ def load_runs(directory: str | Path) -> StoredResults:
         positions, evaluations = content.requested_within(budget)
         evaluations_of_runs.append((key, evaluations))
         all_positions += positions
-        # The settings of a run that could not be simulated.
-        rows = np.flatnonzero(evaluations.failed).tolist()
-        failures += [
-            (f"{key[0]}:{key[1]}, evaluation {positions[row]}", evaluations.reason(row))
-            for row in rows
-        ]
+        for row in np.flatnonzero(evaluations.failed).tolist():
+            place = f"{key[0]}:{key[1]}, evaluation {positions[row]}"
+            failures.append((place, evaluations.reason(row)))
         if budget in content.results:
             solutions_of_runs.append((key, content.take_positions(content.results[budget])))
 
-    # Tables of all runs.
+    # The rows of the frame are in the order of their runs, as the positions are.
     frame = evaluations_frame(characteristics, evaluations_of_runs)
-    frame.insert(
-        2, "evaluation", all_positions
-    )  # behind algorithm and run; rows are in the order of their runs
+    frame.insert(2, "evaluation", all_positions)
     return StoredResults(
         manifest,
         frame,
@@ -160,7 +154,7 @@ def handles_of(solutions: pd.DataFrame) -> list[SolutionId]:
     """
     import pandas as pd
 
-    runs = solutions["run"] if "run" in solutions else pd.Series(0, index=solutions.index)
+    runs = solutions.get("run", pd.Series(0, index=solutions.index))
     rows = solutions.groupby([solutions["algorithm"], runs], sort=False).cumcount()
     return [
         SolutionId(str(algorithm), int(run), int(row))
@@ -179,13 +173,14 @@ def row_of_handle(solutions: pd.DataFrame, handle: SolutionId) -> int:
     all_handles = handles_of(solutions)
     if handle in all_handles:
         return all_handles.index(handle)
-    last_handles = {
-        (other.algorithm, other.run): str(other) for other in all_handles
-    }  # of each run the last
-    expected = (
-        f"{HANDLE_FORMAT}; the last ones are {', '.join([*last_handles.values()][:MAX_EXAMPLES])}"
+    # Of each run the last handle stays.
+    last_handles = {solution[:2]: str(solution) for solution in all_handles}
+    examples = ", ".join([*last_handles.values()][:MAX_EXAMPLES])
+    raise InputError(
+        "solution",
+        f"there is no solution {handle}",
+        f"{HANDLE_FORMAT}; the last ones are {examples}",
     )
-    raise InputError("solution", f"there is no solution {handle}", expected)
 
 
 CHOICES = {
@@ -213,13 +208,15 @@ def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str) -> Solut
         If there is no such solution.
     """
     table = solutions.reset_index(drop=True)
-    candidates = table if choice == "most_severe" else table[unsafe.rows(table)]
+    candidates = table
+    if choice != "most_severe":
+        candidates = table[unsafe.rows(table)]
     if candidates.empty:
-        missing = "solution" if table.empty else "unsafe solution"
+        problem = "these results hold no unsafe solution"
+        if table.empty:
+            problem = "these results hold no solution"
         raise InputError(
-            "",
-            f"these results hold no {missing}",
-            "other results, the most severe solution, or a solution by its handle",
+            "", problem, "other results, the most severe solution, or a solution by its handle"
         )
     position = candidates.sort_values(CHOICES[choice], kind="stable").index[0]
     return handles_of(table)[int(position)]

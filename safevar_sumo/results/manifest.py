@@ -77,19 +77,19 @@ def make_directory(path: Path) -> None:
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
-        is_dangling = path.is_symlink() and not path.exists()
-        problem = "it is a link whose target does not exist" if is_dangling else error.strerror
+        problem = error.strerror
+        if path.is_symlink() and not path.exists():
+            problem = "it is a link whose target does not exist"
         raise InputError(
             "out", f"cannot write to {path}: {problem}", "a directory that can be written"
         ) from None
-    for name, is_right in {
-        MANIFEST: Path.is_file,
-        SOLUTIONS: Path.is_file,
-        RUNS: Path.is_dir,
-    }.items():
+    for name, kind, is_right in (
+        (MANIFEST, "file", Path.is_file),
+        (SOLUTIONS, "file", Path.is_file),
+        (RUNS, "folder", Path.is_dir),
+    ):
         if (path / name).exists() and not is_right(path / name):
-            problem = f"is no {'folder' if name == RUNS else 'file'}"
-            raise InputError(path / name, problem, "nothing of this name, or another `out`")
+            raise InputError(path / name, f"is no {kind}", "nothing of this name, or another `out`")
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -146,7 +146,6 @@ def read_manifest(directory: Path) -> JsonObject:
     InputError
         If there is no manifest, or it is damaged, was edited, or is of another format.
     """
-    # The manifest, in whatever format it is.
     file = directory / MANIFEST
     try:
         manifest = json.loads(read_file(file).decode(errors="replace"))
@@ -154,36 +153,31 @@ def read_manifest(directory: Path) -> JsonObject:
         format_number = manifest.get("format", 1)
     except (FileNotFoundError, NotADirectoryError):
         likely_path = Path("results") / directory.name
-        hint = (
-            f"; did you mean {likely_path}?"
-            if likely_path != directory and likely_path.is_dir()
-            else ""
-        )
-        problem = f"is not a results directory: there is no {MANIFEST}{hint}"
+        problem = f"is not a results directory: there is no {MANIFEST}"
+        if likely_path != directory and likely_path.is_dir():
+            problem += f"; did you mean {likely_path}?"
         raise InputError(directory, problem, "a directory written by the command `study`") from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        problem = f"cannot be read, is torn or was edited: {error!r}"
         raise InputError(
-            file, problem, "the file as it was, or no file: the same command then writes it again"
+            file,
+            f"cannot be read, is torn or was edited: {error!r}",
+            "the file as it was, or no file: the same command then writes it again",
         ) from None
-
-    # Results in another format are those of another release.
+    legal = f"the release that wrote them, safevar_sumo {written_by}; or another `out`"
     if format_number != FORMAT:
         raise InputError(
             directory,
             f"holds results in format {format_number}; this version reads format {FORMAT}",
-            f"the release that wrote them, safevar_sumo {written_by}; or another `out`",
+            legal,
         )
 
-    # So are those of a study with keys that ended, but for those without effect.
+    # Keys that ended without an effect are no reason to refuse results of another release.
     study = manifest.get("study")
     if isinstance(study, dict):
         for key in ("wider", "correlations"):
             study.pop(key, None)
-    if isinstance(study, dict) and "search" in (study.get("scenario") or ()):
-        problem = "holds results of a study with [scenario.search]"
-        legal = f"the release that wrote them, safevar_sumo {written_by}; or another `out`"
-        raise InputError(directory, problem, legal)
+        if "search" in (study.get("scenario") or ()):
+            raise InputError(directory, "holds results of a study with [scenario.search]", legal)
     with about(file):
         convert_table(manifest, _Manifest)
     return dict(manifest)
@@ -193,9 +187,7 @@ def folders_of(directory: Path, manifest: JsonObject) -> tuple[str, ...]:
     """Folders of the user code and files of a directory's study: those of the manifest that exist,
     then the nearest two folders that contain the directory.
     """
-    folders = [
-        os.path.abspath(directory.resolve() / folder) for folder in manifest.get("folders", ())
-    ]
-    return tuple(
-        dict.fromkeys([*filter(os.path.isdir, folders), *map(str, directory.resolve().parents[:2])])
-    )
+    base = directory.resolve()
+    folders = [os.path.abspath(base / folder) for folder in manifest.get("folders", ())]
+    places = [*filter(os.path.isdir, folders), *map(str, base.parents[:2])]
+    return tuple(dict.fromkeys(places))

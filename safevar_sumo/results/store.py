@@ -65,14 +65,14 @@ class ResultsDirectory:
         The study's manifest; see `safevar_sumo.campaign.identity.manifest_now`.
     scoring
         Metrics and objectives.
-    wanted
+    run_names
         Names of the runs that are to be carried out.
 
     Raises
     ------
     SafevarError
         If the directory cannot be written, it or a journal in it belongs to another study or
-        version, or another process works on a wanted run; then nothing in it was changed.
+        version, or another process works on such a run; then nothing in it was changed.
     """
 
     def __init__(
@@ -81,9 +81,8 @@ class ResultsDirectory:
         study: Study,
         manifest: JsonObject,
         scoring: Scoring = PUBLISHED_SCORING,
-        wanted: Collection[str] = (),
+        run_names: Collection[str] = (),
     ) -> None:
-        # The manifest as it would be written now.
         self.path = path
         self._study = study
         folders = [os.path.relpath(folder, path.resolve()) for folder in study.origin.places]
@@ -91,21 +90,22 @@ class ResultsDirectory:
         if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
 
-        # Earlier results in the directory are those of this study.
+        # Earlier results of another study are refused here, too.
         make_directory(path)
         self._earlier_manifest()
 
         # Journals that the runs cannot continue are refused before anything is changed.
         for key, journal, head in stored_journals(path, self.manifest):
             read_journal(journal, head, head_only=True)
-            if run_name(*key) in wanted:
+            if run_name(*key) in run_names:
                 open_and_lock(journal).close()
 
     def begin(self, original: Evaluations) -> None:
         """Write the manifest with the original vehicle's evaluation; remove a table of solutions
         that covers other runs.
         """
-        earlier_manifest = self._earlier_manifest()  # another study may have begun meanwhile
+        # Another study may have begun meanwhile.
+        earlier_manifest = self._earlier_manifest()
         now = record(original, row=0)
         manifest = {**self.manifest, "original": now}
         if self._study.scenario.repeats == 1:
@@ -127,21 +127,19 @@ class ResultsDirectory:
         earlier_manifest = self._earlier_manifest()
         remarks = []
 
-        # What differs from the earlier extent.
         if not earlier_manifest:
             return []
-        _, _, before = search_extent_of(earlier_manifest)
-        _, _, now = search_extent_of(self.manifest)
-        if before != now:
+        *_, budget = search_extent_of(self.manifest)
+        *_, old_budget = search_extent_of(earlier_manifest)
+        if old_budget != budget:
             remarks.append(
-                f"{self.path}: each run had {before} evaluations before and has {now} now: an id"
-                " such as nsga2:0:0 may name another solution than in earlier output and reports"
+                f"{self.path}: each run had {old_budget} evaluations before and has {budget} now:"
+                " an id such as nsga2:0:0 may name another solution than in earlier output and"
+                " reports"
             )
         stored = {path.stem for path in (self.path / RUNS).glob("*.jsonl")}
-        if left_out := sorted(stored - set(names)):
-            remarks.append(
-                f"{self.path}: earlier runs are left out of the results: {', '.join(left_out)}"
-            )
+        if other_runs := ", ".join(sorted(stored - {*names})):
+            remarks.append(f"{self.path}: earlier runs are left out of the results: {other_runs}")
         return remarks
 
     def _earlier_manifest(self) -> JsonObject:
@@ -203,33 +201,28 @@ def evaluations_frame(
     """
     import pandas as pd
 
-    # All columns, even without runs.
     all_runs = list(runs)
-    metrics = dict.fromkeys(
-        [*METRICS, *(name for _, evaluations in all_runs for name in evaluations.metrics)]
-    )
-    empty = (
-        ("", 0),
-        Evaluations.none(len(characteristics), metrics),
-    )  # all columns even without runs
-    return pd.concat(
-        [
-            pd.DataFrame(
-                {
-                    "algorithm": np.full(len(evaluations), algorithm, dtype=object),
-                    "run": np.full(len(evaluations), run),
-                    **dict(zip(characteristics, evaluations.settings.T, strict=True)),
-                    "f_safe": evaluations.f_safe,
-                    "f_diff": evaluations.f_diff,
-                    "f_num_diff": evaluations.f_num_diff.astype(int),
-                    **evaluations.metrics,
-                    "outcome": evaluations.outcome.astype(object),
-                }
-            )
-            for (algorithm, run), evaluations in [empty, *all_runs]
-        ],
-        ignore_index=True,
-    )
+    metrics = dict[str, Any](METRICS)
+    for _, evaluations in all_runs:
+        metrics |= evaluations.metrics
+    # Without runs the frame has all columns, too.
+    empty = ("", 0), Evaluations.none(len(characteristics), metrics)
+    frames = [
+        pd.DataFrame(
+            {
+                "algorithm": np.full(len(evaluations), algorithm, dtype=object),
+                "run": np.full(len(evaluations), run),
+                **dict(zip(characteristics, evaluations.settings.T, strict=True)),
+                "f_safe": evaluations.f_safe,
+                "f_diff": evaluations.f_diff,
+                "f_num_diff": evaluations.f_num_diff.astype(int),
+                **evaluations.metrics,
+                "outcome": evaluations.outcome.astype(object),
+            }
+        )
+        for (algorithm, run), evaluations in [empty, *all_runs]
+    ]
+    return pd.concat(frames, ignore_index=True)
 
 
 def record(evaluations: Evaluations, row: int) -> JsonObject:
@@ -258,17 +251,20 @@ def refuse_other_original(
     InputError
         With the first of its results that differs by more than rounding.
     """
-    for name, before in stored.items():
-        value = now.get(name, before)
-        if isinstance(before, str) or isinstance(value, str):
-            is_same = before == value
+    for name, old in stored.items():
+        new = now.get(name, old)
+        if isinstance(old, str) or isinstance(new, str):
+            is_same = old == new
         else:
-            first, second = (np.nan if one is None else float(one) for one in (before, value))
-            is_same = bool(np.isclose(first, second, ROUNDING, ROUNDING, equal_nan=True))
+            # A value that is undefined, None, becomes NaN.
+            pair = np.array([old, new], dtype=float)
+            is_same = bool(np.isclose(pair[0], pair[1], ROUNDING, ROUNDING, equal_nan=True))
         if not is_same:
-            problem = f"the original vehicle had {name} = {before}, and has {value} now"
-            legal = "what the simulator read and ran at that time; or another `out`"
-            raise InputError(directory, problem, legal)
+            raise InputError(
+                directory,
+                f"the original vehicle had {name} = {old}, and has {new} now",
+                "what the simulator read and ran at that time; or another `out`",
+            )
 
 
 UNKNOWN = "unknown"
@@ -300,12 +296,10 @@ def write_imported(
     InputError
         If the directory cannot be written, or holds results of a campaign.
     """
-    # A directory without runs.
     make_directory(path)
     if (path / RUNS).exists():
         raise InputError(path, "holds results of a campaign", "another directory")
 
-    # Solutions and manifest.
     runs = (((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items())
     frame = solutions_frame(study.vehicle.characteristics, runs).drop(columns="run")
     manifest = {
@@ -341,5 +335,8 @@ def read_imported(path: Path, characteristics: Collection[str]) -> pd.DataFrame:
         )
         return frame[columns].astype({**numbers, "f_num_diff": int})
     except (OSError, KeyError, ValueError) as error:
-        problem = f"holds no imported solutions: {str(error).splitlines()[0]}"
-        raise InputError(file, problem, "what the command `import` has written") from None
+        raise InputError(
+            file,
+            f"holds no imported solutions: {str(error).splitlines()[0]}",
+            "what the command `import` has written",
+        ) from None

@@ -73,9 +73,12 @@ def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
     """
     if scenario.brakes_fully:
         return {}
-    of_weather = WEATHER_PARAMETERS if scenario.mover.has("weather") else {}
-    phases = PHASES if scenario.has_phase else {}
-    return {**free_parameters(type(scenario)), **of_weather, **phases}
+    parameters = free_parameters(type(scenario))
+    if scenario.mover.has("weather"):
+        parameters |= WEATHER_PARAMETERS
+    if scenario.has_phase:
+        parameters |= PHASES
+    return parameters
 
 
 def unit_of(scenario: Scenario, name: str) -> str:
@@ -85,8 +88,9 @@ def unit_of(scenario: Scenario, name: str) -> str:
         return searchable[name].unit
     # A scenario whose speed cannot move declares no unit, but has it in m/s, too.
     speed = KMH_PER_MS * (scenario.test_speed or 0.0)
-    is_kmh = name == SPEED_DIMENSION and isclose(getattr(scenario, name), speed)
-    return "km/h" if is_kmh else ""
+    if name == SPEED_DIMENSION and isclose(getattr(scenario, name), speed):
+        return "km/h"
+    return ""
 
 
 def weather_of(choice: str | Weather) -> Weather:
@@ -99,7 +103,8 @@ def weather_of(choice: str | Weather) -> Weather:
     """
     if isinstance(choice, Weather):
         return choice
-    choice = choice or "clear"  # a simulator of the user's own has none
+    # A simulator of the user's own has no weather.
+    choice = choice or "clear"
     fields = ", ".join(Weather.__struct_fields__)
     check_name("", f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
     return WEATHERS[choice]
@@ -123,9 +128,11 @@ def distance_in_words(safety_degree: float, contact: float, digits: int = 2) -> 
     """A safety degree above 0 as text, with the gap where bodies touch at a safety degree of
     `contact` above 0 [m].
     """
+    text = f"{safety_degree:.{digits}f} m"
+    if not contact:
+        return text
     gap = f"{round(safety_degree - contact, digits) + 0.0:.{digits}f}"
-    beside = f"{FROM_CENTRES} (gap {gap} m)" if contact else ""
-    return f"{safety_degree:.{digits}f} m{beside}"
+    return f"{text}{FROM_CENTRES} (gap {gap} m)"
 
 
 def pre_crash_sentence(points: Iterable[Point]) -> str:
@@ -135,4 +142,6 @@ def pre_crash_sentence(points: Iterable[Point]) -> str:
     points = tuple(points)
     types = dict.fromkeys(filter(None, (point.scenario.pre_crash for point in points)))
     light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
-    return f"NHTSA's pre-crash types: {'; '.join(types)}; {light}." if types else ""
+    if not types:
+        return ""
+    return f"NHTSA's pre-crash types: {'; '.join(types)}; {light}."

@@ -108,8 +108,8 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields
         speeds = self.target_speed_at(times)
         y = direction.left * body.length / 2 - self.offset
         at_gap = Track("target", target, *body, self.gap, y, *direction, speeds)
-        first = first_in_strip(at_gap._replace(x=0.0), self.vut_width / 2)
-        return [at_gap._replace(x=self.gap - first + travelled(speeds, times))]
+        first_point = first_in_strip(at_gap._replace(x=0.0), self.vut_width / 2)
+        return [at_gap._replace(x=self.gap - first_point + travelled(speeds, times))]
 
 
 class Along(TargetAhead, frozen=True, kw_only=True):
@@ -177,11 +177,9 @@ class Along(TargetAhead, frozen=True, kw_only=True):
 
     @property
     def _profile(self) -> TargetProfile:
-        return TargetProfile(
-            0.0,
-            np.float64(self.parameter("target_speed")) * KMH,  # 0 of a target that stands
-            self.parameter("acceleration_distance"),
-        )
+        # A target that stands has the speed 0, by which a number of Python does not divide.
+        speed = np.float64(self.parameter("target_speed")) * KMH
+        return TargetProfile(0.0, speed, self.parameter("acceleration_distance"))
 
 
 class CarToCar(TargetAhead, frozen=True, kw_only=True):
@@ -248,8 +246,8 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         """Length of a run [s]: the target has stopped braking by then."""
         end = self._time_to_impact()
         if self._target_brakes:
-            lost = self._target_speed - self.target_speed_at(math.inf)
-            end = np.maximum(end, self.brakes_at + lost / self.target_deceleration)
+            speed_drop = self._target_speed - self.target_speed_at(math.inf)
+            end = np.maximum(end, self.brakes_at + speed_drop / self.target_deceleration)
         return end + self.time_after
 
     @property
@@ -274,8 +272,11 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     def direction(self) -> Direction:
         """Direction of the target."""
         if self.heading and self._target_speed:
-            problem = f"heading = {self.heading:g} with a moving target"
-            raise InputError("", problem, "a heading for a standing target")
+            raise InputError(
+                "",
+                f"heading = {self.heading:g} with a moving target",
+                "a heading for a standing target",
+            )
         return SAME_DIRECTION.turned(self.heading)
 
     @property
@@ -285,11 +286,11 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     @property
     def _target_speed(self) -> Quantity:
         """Speed of the target at the start [m/s]."""
+        if self.target_speed is not None:
+            return self.target_speed * KMH
         slower_speed = 20.0 + np.maximum(self.speed - STEADY_SPEED_LIMIT, 0.0)
-        default = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}.get(
-            self.pre_crash, self.speed
-        )
-        return (default if self.target_speed is None else self.target_speed) * KMH
+        defaults = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}
+        return defaults.get(self.pre_crash, self.speed) * KMH
 
     @property
     def target_speed_at(self) -> Callable[[Quantity], Quantity]:
@@ -304,7 +305,8 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
             first_speed - deceleration * np.maximum(time - brakes_at, 0.0), last_speed
         )
 
-    @np.errstate(all="ignore")  # of the speeds that do not count
+    # Speeds that do not count may divide by 0.
+    @np.errstate(all="ignore")
     def _time_to_impact(self) -> Quantity:
         """Time to the impact if the vehicle does not brake [s].
 
@@ -317,8 +319,11 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         # A target at constant speed.
         if not self._target_brakes:
             if np.any(closing_speed <= 0):
-                problem = f"speed = {np.min(self.speed):g} km/h never reaches the target"
-                raise InputError("", problem, "a slower target")
+                raise InputError(
+                    "",
+                    f"speed = {np.min(self.speed):g} km/h never reaches the target",
+                    "a slower target",
+                )
             return gap / closing_speed
 
         # A target that brakes: what is left of the gap, before, in and after braking.

@@ -88,10 +88,11 @@ def check_changes(code: UserCode, method: str, changes: Any, roads: Roads) -> Xm
     """Refuse changes to a network or its traffic that are no mapping; values become texts."""
     if not isinstance(changes, Mapping):
         raise code.wrong(method, quoted(changes), "a mapping from XPaths to attributes")
-    return {  # None, which removes an element, stays None
-        path: change and {name: str(value) for name, value in change.items()}
-        for path, change in changes.items()
-    }
+    texts = {}
+    for path, change in changes.items():
+        # None, which removes an element, stays None.
+        texts[path] = change and {name: str(value) for name, value in change.items()}
+    return texts
 
 
 def check_fields(code: UserCode, scenario: Any, **further: Legal) -> None:
@@ -271,9 +272,9 @@ class Scenario:
 
     def at(self, values: Mapping[str, Quantity]) -> Scenario:
         """This scenario at other values of parameters, created anew."""
-        create: Any = (
-            msgspec.structs.replace if isinstance(self, msgspec.Struct) else dataclasses.replace
-        )
+        create: Any = dataclasses.replace
+        if isinstance(self, msgspec.Struct):
+            create = msgspec.structs.replace
         return create(self, **values)  # type: ignore[no-any-return]
 
     def lanes(self, roads: Roads) -> XmlChanges:

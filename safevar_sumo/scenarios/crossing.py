@@ -98,9 +98,11 @@ class _Start(NamedTuple):
         # The target's side, speed and place of impact.
         lateral_start = test.parameter("lateral_start")
         speed = test.parameter("target_speed") * KMH
-        side = 1.0 if test.parameter("side") == "near" else -1.0
+        side, direction = -1.0, FROM_LEFT
+        if test.parameter("side") == "near":
+            side, direction = 1.0, FROM_RIGHT
+        direction = direction.turned(test.heading)
         impact_lateral = lateral_offset(test.impact_location, test.vut_width)
-        direction = (FROM_RIGHT if side > 0 else FROM_LEFT).turned(test.heading)
 
         # A target that starts at its speed, or accelerates from standstill.
         if lateral_start is None:
@@ -233,13 +235,10 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def obstacle(self) -> str:
         """The target, and where it comes from."""
-        target = self.parameter("target")
-        start = (
-            "behind a parked car"
-            if self.parameter("hidden")
-            else f"the {self.parameter('side')} side"
-        )
-        return f"{'an' if target == 'adult' else 'a'} {target} from {start}"
+        target = f"a {self.parameter('target')}".replace("a adult", "an adult")
+        if self.parameter("hidden"):
+            return f"{target} from behind a parked car"
+        return f"{target} from the {self.parameter('side')} side"
 
     @property
     def is_on_foot(self) -> bool:
@@ -261,11 +260,9 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         start = _Start.of(self)
         target = self.parameter("target")
         way = start.profile.travelled(times)
-        end = (
-            start.distance_to_impact + self.stop - start.side * start.impact_left
-            if self.is_on_foot
-            else np.inf
-        )
+        end: Quantity = np.inf
+        if self.is_on_foot:
+            end = start.distance_to_impact + self.stop - start.side * start.impact_left
         path = np.minimum(way, end) - start.distance_to_impact
         speed = np.where(way < end, start.profile.speed_at(times), 0.0)
 
@@ -274,7 +271,9 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         x = impact + start.direction.along * path
         y = start.impact_left + start.direction.left * path
         crossing = Track("target", target, *BODIES[target], x, y, *start.direction, speed)
-        return [crossing, *self._parked_cars(impact)] if self.parameter("hidden") else [crossing]
+        if not self.parameter("hidden"):
+            return [crossing]
+        return [crossing, *self._parked_cars(impact)]
 
     def benign(self) -> NamedScenarios:
         """A pedestrian stops short of the vehicle's path or leaves it in time; a car is in the next
@@ -292,13 +291,9 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def _parked_cars(self, impact: Quantity) -> list[Track]:
         """The parked cars beside the lane, and the row that hides the target."""
         front = impact - PARKED_GAP
-        left = -self.vut_width / 2 - PARKED_GAP - PARKED_WIDTH / 2
-        parked = [
-            Track.of("row", SCREEN, front - ROW_LENGTH / 2, left, size=(ROW_LENGTH, PARKED_WIDTH))
-        ]
-        for car, length in PARKED_LENGTHS.items():
-            parked.append(
-                Track.of(car, "car", front - length / 2, left, size=(length, PARKED_WIDTH))
-            )
+        y = -self.vut_width / 2 - PARKED_GAP - PARKED_WIDTH / 2
+        cars = [Track.of("row", SCREEN, front - ROW_LENGTH / 2, y, size=(ROW_LENGTH, PARKED_WIDTH))]
+        for name, length in PARKED_LENGTHS.items():
+            cars.append(Track.of(name, "car", front - length / 2, y, size=(length, PARKED_WIDTH)))
             front = front - length - PARKED_GAP
-        return parked
+        return cars

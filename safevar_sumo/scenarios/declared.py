@@ -57,8 +57,8 @@ def with_ranges(study: Study) -> Study:
         return study
     tables = _with_declared({**tables_of(study), "encounters": RANGES}, study.origin.places)
     tests = tables.get("matrix", {}).get("tests", [])
-    overs = [one.get("over", {}) for one in (tables["scenario"], *tests)]
-    axes = [axis for over in overs for axis in over.values()]
+    places = [tables["scenario"], *tests]
+    axes = [axis for place in places for axis in place.get("over", {}).values()]
     if not any(isinstance(axis, dict) and "lower" in axis for axis in axes):
         return study
     origin = msgspec.structs.replace(study.origin, ranges=True)
@@ -73,33 +73,32 @@ def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
     matrix = tables.get("matrix")
     if not isinstance(scenario, dict):
         return tables
+    # A matrix without tests drops those of a study that it extends.
     if matrix is not None and not (isinstance(matrix, dict) and matrix.get("tests") == []):
-        convert_table(matrix, MatrixTable, "matrix")  # none drops those of a study that it extends
-    tests = matrix.get("tests", []) if matrix else []
+        convert_table(matrix, MatrixTable, "matrix")
+    tests = (matrix or {}).get("tests", [])
     is_range = tables.get("encounters", TESTS) == RANGES
     declared = _Declared(tables, places)
 
     def completed(over: Parameters, key: str, test: Parameters) -> Parameters:
-        return {
-            name: declared.completed(f"{key}.{name}", name, axis, test)
-            if isinstance(axis, dict) or (is_range and isinstance(axis, list))
-            else axis
-            for name, axis in over.items()
-        }
+        axes = dict(over)
+        for name, axis in over.items():
+            if isinstance(axis, dict) or (is_range and isinstance(axis, list)):
+                axes[name] = declared.completed(f"{key}.{name}", name, axis, test)
+        return axes
 
-    # Axes of all tests, and of each.
     result = {**tables}
     if isinstance(shared := scenario.get("over"), dict):
-        first = tests[0] if tests else {}
-        result["scenario"] = {**scenario, "over": completed(shared, "scenario.over", first)}
-    if any("over" in test for test in tests):
-        own = [
-            {**test, "over": completed(test["over"], f"matrix.tests: {test['name']!r}: over", test)}
-            if "over" in test
-            else test
-            for test in tests
-        ]
-        result["matrix"] = {**(matrix or {}), "tests": own}
+        test: Parameters = next(iter(tests), {})
+        result["scenario"] = {**scenario, "over": completed(shared, "scenario.over", test)}
+    completed_tests = []
+    for test in tests:
+        if "over" in test:
+            key = f"matrix.tests: {test['name']!r}: over"
+            test = {**test, "over": completed(test["over"], key, test)}
+        completed_tests.append(test)
+    if completed_tests:
+        result["matrix"] = {**(matrix or {}), "tests": completed_tests}
     return result
 
 
@@ -109,12 +108,12 @@ class _Declared:
     def __init__(self, tables: Parameters, places: Sequence[str]) -> None:
         self._scenario: Parameters = tables["scenario"]
         weather = tables.get("weather", "")
-        table = weather_of(
-            weather if isinstance(weather, str) else convert_table(weather, Weather, "weather")
-        )
-        self._weather = msgspec.structs.asdict(table)
+        if not isinstance(weather, str):
+            weather = convert_table(weather, Weather, "weather")
+        self._weather = msgspec.structs.asdict(weather_of(weather))
         self._lookup = Lookup(places)
-        if "search" in tables:  # one without it is refused when all of it is read
+        # A study without a search is refused when all of it is read.
+        if "search" in tables:
             limit = convert_table(tables["search"], SearchTable, "search").time_limit
             self._lookup = Lookup(places, time_limit=limit)
 
@@ -123,45 +122,47 @@ class _Declared:
 
         The original is by default the first value of a list, else the test's own value.
         """
-        table = {"at": axis} if isinstance(axis, list) else axis
+        table = axis
+        if is_list := isinstance(axis, list):
+            table = {"at": axis}
         values = table.get("at", [])
-        is_listed = isinstance(axis, list) and (
-            len({*map(str, values)}) < 2 or not are_numbers(values)
-        )
-        if is_listed or {"unit", "original", "lower", "upper"} <= table.keys():
+        is_fixed = is_list and (len({*map(str, values)}) < 2 or not are_numbers(values))
+        if is_fixed or {"unit", "original", "lower", "upper"} <= table.keys():
             return axis
-        parameter, own = self._parameter(name, test)
+        parameter, original = self._parameter(name, test)
         if parameter is None:
-            if isinstance(axis, list):
+            if is_list:
                 return axis
-            problem = f"{key}: no scenario or weather declares a range of {name}"
-            raise InputError("", problem, "unit, original, lower and upper, or a list of values")
+            raise InputError(
+                "",
+                f"{key}: no scenario or weather declares a range of {name}",
+                "unit, original, lower and upper, or a list of values",
+            )
 
-        # What the class says, then the values, then the study.
-        found: Parameters = {
+        # The values say more than the class, and the study more than both.
+        declared: Parameters = {
             "unit": parameter.unit,
             "lower": parameter.lower,
             "upper": parameter.upper,
             "meaning": parameter.meaning,
         }
-        if isinstance(own, int | float):
-            found["original"] = own
+        if isinstance(original, int | float):
+            declared["original"] = original
         if values and are_numbers(values):
-            found |= {"lower": min(values), "upper": max(values), "original": values[0]}
-        return {**found, **table}
+            declared |= {"lower": min(values), "upper": max(values), "original": values[0]}
+        return {**declared, **table}
 
     def _parameter(self, name: str, test: Parameters) -> tuple[FreeParameter | None, Any]:
         """What is declared of a parameter, and the value that a test has of it."""
         if name in WEATHER_PARAMETERS:
             return WEATHER_PARAMETERS[name], self._weather[name]
         model = test.get("model") or self._scenario.get("model")
+        # The check of the whole study refuses a scenario without a model.
         if not isinstance(model, str):
-            return None, None  # which the check of the whole study refuses
-        own = model == self._scenario.get("model")
-        stated = {
-            **(self._scenario.get("parameters", {}) if own else {}),
-            **test.get("parameters", {}),
-        }
+            return None, None
+        stated = test.get("parameters", {})
+        if model == self._scenario.get("model"):
+            stated = {**self._scenario.get("parameters", {}), **stated}
         member = self._lookup.class_of(SCENARIOS, model, "scenario.model", *SCENARIO_BASES)
         default = stated.get(name, _defaults(member.target).get(name))
         return free_parameters(member.target).get(name), default
@@ -169,9 +170,9 @@ class _Declared:
 
 def _defaults(model: type) -> Parameters:
     """The defaults of a class's fields."""
-    fields: Sequence[Any] = (
-        msgspec.structs.fields(model) if issubclass(model, msgspec.Struct) else ()
-    )
+    fields: Sequence[Any] = ()
+    if issubclass(model, msgspec.Struct):
+        fields = msgspec.structs.fields(model)
     if dataclasses.is_dataclass(model):
         fields = dataclasses.fields(model)
     return {field.name: field.default for field in fields}

@@ -40,19 +40,17 @@ class Direction(NamedTuple):
 
         Sine and cosine are rounded, as their last bits differ between machines.
         """
-        cosine, sine = (
-            round(function(math.radians(heading)), 12) for function in (math.cos, math.sin)
-        )
+        angle = math.radians(heading)
+        cosine, sine = round(math.cos(angle), 12), round(math.sin(angle), 12)
         return Direction(
             self.along * cosine - self.left * sine, self.left * cosine + self.along * sine
         )
 
     def extent(self, body: BodySize) -> BodySize:
         """Size along the lane and across it of a body that faces in this direction [m]."""
-        along = abs(self.along)
-        left = abs(self.left)
+        cosine, sine = abs(self.along), abs(self.left)
         return BodySize(
-            body.length * along + body.width * left, body.length * left + body.width * along
+            body.length * cosine + body.width * sine, body.length * sine + body.width * cosine
         )
 
 
@@ -137,15 +135,14 @@ class TargetProfile(NamedTuple):
             )
         return cls(begin, speed, run_up)
 
-    @np.errstate(all="ignore")  # where there is no run-up
+    # A target without a run-up divides by 0.
+    @np.errstate(all="ignore")
     def travelled(self, time: Quantity) -> Quantity:
         """Distance covered [m] at a time [s]."""
         elapsed = np.maximum(time - self.begin, 0.0)
+        # The run-up takes twice the time that it would take at full speed.
         return np.where(
-            elapsed
-            >= 2
-            * self.run_up
-            / self.speed,  # twice the time that the run-up would take at full speed
+            elapsed >= 2 * self.run_up / self.speed,
             self.speed * elapsed - self.run_up,
             self.speed * self.speed / (4 * np.float64(self.run_up)) * elapsed * elapsed,
         )[()]
@@ -193,11 +190,12 @@ class ProtocolTest(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def parameter(self, name: str) -> Any:
         """A parameter as the study sets it, by default as the protocol does."""
         value = getattr(self, name, None)
-        return getattr(TESTS[self.test], name) if value is None else value
+        if value is None:
+            return getattr(TESTS[self.test], name)
+        return value
 
     def remarks(self) -> list[str]:
         """Remarks on parameters outside the protocol's ranges and on a road that is not level."""
-        # What lies outside the protocol.
         row = TESTS[self.test]
         remarks = []
         if not row.slowest <= self.speed <= row.fastest:

@@ -56,9 +56,9 @@ class LaneChange(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle under test, with the next lane at the side where it is needed."""
-        lane = {"departLane": "0" if self.side == "left" else "1"}
         changes = super().actors(roads)
-        return {**changes, DEPARTURE: {**(changes[DEPARTURE] or {}), **lane}}
+        lane = f"{self.sign < 0:d}"
+        return {**changes, DEPARTURE: {**(changes[DEPARTURE] or {}), "departLane": lane}}
 
     def benign(self) -> NamedScenarios:
         """A car stays in the next lane."""
@@ -71,7 +71,9 @@ class LaneChange(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     @property
     def sign(self) -> float:
         """1 if the next lane is to the left, -1 if it is to the right."""
-        return 1.0 if self.side == "left" else -1.0
+        if self.side == "left":
+            return 1.0
+        return -1.0
 
 
 class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -120,20 +122,21 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
     @property
     def first_speed(self) -> Quantity:
         """Speed of the other car at the start [m/s]."""
-        return (
-            np.maximum(self.speed - 20.0, 10.0) if self.target_speed is None else self.target_speed
-        ) * KMH
+        if self.target_speed is None:
+            return np.maximum(self.speed - 20.0, 10.0) * KMH
+        return self.target_speed * KMH
 
     def check(self) -> None:
         """Refuse a car that is beside the vehicle before any of it is in the vehicle's lane."""
         enters_after = (LANE_WIDTH - CAR.width) / 2 / self.lateral_speed
-        left = self.gap - (self.start_speed - self.first_speed) * enters_after
-        if left <= 0:
-            problem = (
+        closed_gap = (self.start_speed - self.first_speed) * enters_after
+        if self.gap - closed_gap <= 0:
+            raise InputError(
+                "",
                 f"gap = {self.gap:g} m is closed before the car is in the lane, after"
-                f" {enters_after:.2f} s"
+                f" {enters_after:.2f} s",
+                f"a gap above {closed_gap:.4g} m",
             )
-            raise InputError("", problem, f"a gap above {self.gap - left:.4g} m")
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """The car that cuts in."""
@@ -141,8 +144,8 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
         speed = np.maximum(
             self.first_speed - self.target_deceleration * np.maximum(times - arrives, 0.0), 0.0
         )
-        ahead = self.gap + (self.start_speed - self.first_speed) * BEGINS_AT
-        x = ahead + CAR.length / 2 + travelled(speed, times)
+        first_gap = self.gap + (self.start_speed - self.first_speed) * BEGINS_AT
+        x = first_gap + CAR.length / 2 + travelled(speed, times)
         y = self.sign * (LANE_WIDTH - self.moved(times))
         return [Track("target", "car", *CAR, x, y, 1.0, 0.0, speed)]
 
@@ -198,16 +201,15 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """
         # The leader has left the path when he reaches the standing car.
         speed = self.start_speed
-        apart = self.gap / self.start_speed * self.lateral_speed
-        if np.any(apart < CAR.width):
-            moved = (
-                f"the leader has moved {np.min(apart):.2f} m sideways when he drives through the"
-                " standing car"
+        lateral_way = self.gap / self.start_speed * self.lateral_speed
+        if np.any(lateral_way < CAR.width):
+            raise InputError(
+                "",
+                f"gap = {np.min(self.gap):g} m: the leader has moved {np.min(lateral_way):.2f} m"
+                " sideways when he drives through the standing car",
+                f"{CAR.width:g} m or more: a larger gap or lateral_speed",
             )
-            problem = f"gap = {np.min(self.gap):g} m: {moved}"
-            raise InputError("", problem, f"{CAR.width:g} m or more: a larger gap or lateral_speed")
 
-        # Both cars.
         front = self.headway * speed + CAR.length
         x = front - CAR.length / 2 + speed * times
         leader = Track("leader", "car", *CAR, x, self.sign * self.moved(times), 1.0, 0.0, speed)

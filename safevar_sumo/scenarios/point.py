@@ -32,17 +32,18 @@ class Point(NamedTuple):
 
     def own(self, values: Mapping[str, Quantity]) -> dict[str, Quantity]:
         """Those of the values that are of parameters of this point."""
-        known = values if self.ranges is None else self.ranges
-        return {name: value for name, value in values.items() if name in known}
+        if self.ranges is None:
+            return dict(values)
+        return {name: value for name, value in values.items() if name in self.ranges}
 
     def meets(self, values: Mapping[str, Quantity]) -> Quantity:
         """Whether the encounters with these values are some of this point's, of shape (N,), or one
         truth for all.
         """
-        found: Quantity = True
+        holds: Quantity = True
         for name, domain in (self.ranges or {}).items():
             if name in values:
-                found &= (values[name] >= domain.lower) & (values[name] <= domain.upper)
+                holds &= (values[name] >= domain.lower) & (values[name] <= domain.upper)
         for constraint in self.constraints:
-            found &= constraint.allows(values)
-        return found
+            holds &= constraint.allows(values)
+        return holds

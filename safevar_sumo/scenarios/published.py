@@ -57,8 +57,11 @@ def _place(position: float, name: str) -> str:
     the lane's end.
     """
     if position < 0:
-        problem = f"{name} is {-position:.2f} m longer than the lane before the encounter"
-        raise InputError("scenario.parameters", problem, f"a smaller {name}")
+        raise InputError(
+            "scenario.parameters",
+            f"{name} is {-position:.2f} m longer than the lane before the encounter",
+            f"a smaller {name}",
+        )
     return as_text(position)
 
 
@@ -147,10 +150,9 @@ class PedestrianCrossing(
         if self.distance is not None:
             changes["vehicle[@id='vut']"] = {"departPos": _place(self._front(roads), "distance")}
         if self.lateral_start is not None:
-            _, left = approach(roads).lane_coordinates(roads.lane(FOOTPATH_LANE).start)
-            changes["person[@id='pedestrian']"] = {
-                "departPos": _place(-left - self.lateral_start, "lateral_start")
-            }
+            _, footpath = approach(roads).lane_coordinates(roads.lane(FOOTPATH_LANE).start)
+            start = _place(-footpath - self.lateral_start, "lateral_start")
+            changes["person[@id='pedestrian']"] = {"departPos": start}
         if self.walking_speed is not None:
             changes["person[@id='pedestrian']/walk"] = {"speed": as_text(self.walking_speed)}
         return changes
@@ -167,30 +169,29 @@ class PedestrianCrossing(
         """Pedestrians at this one's speed, near those that vehicles reach him with, who cross for
         nobody.
         """
-        near = Crossing(test="CPNA", target_speed=WALKING_SPEED * KMH_PER_MS, time_to_impact=7.0)
-        for walk, speed in product((near, replace(near, test="CPFA")), SLOW_SPEEDS):
+        adult = Crossing(test="CPNA", target_speed=WALKING_SPEED * KMH_PER_MS, time_to_impact=7.0)
+        for walk, speed in product((adult, replace(adult, test="CPFA")), SLOW_SPEEDS):
             yield from replace(walk, speed=speed).benign()
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        # The walk at constant speed.
         times = np.arange(samples)[:, np.newaxis]
-        speed = WALKING_SPEED if self.walking_speed is None else self.walking_speed
-        start = LATERAL_START if self.lateral_start is None else self.lateral_start
+        speed, start = self.walking_speed, self.lateral_start
+        if speed is None:
+            speed = WALKING_SPEED
+        if start is None:
+            start = LATERAL_START
         lateral = speed * step * times - start
         turned = np.zeros((samples, 1), dtype=bool)
 
-        # He turns round and walks back.
         if self.turns_after is not None:
-            beyond = lateral > self.turns_after + ROUNDING
-            first = np.where(
-                beyond[-1], np.argmax(beyond, axis=0), samples
-            )  # he is back at his place two steps before
-            turned = times >= first
-            lateral = lateral - 2 * speed * step * np.maximum(times - first + 1, 0)
+            is_past = lateral > self.turns_after + ROUNDING
+            turn = np.where(is_past[-1], np.argmax(is_past, axis=0), samples)
+            turned = times >= turn
+            # When he turns round, he is already back at his place two steps before.
+            lateral = lateral - 2 * speed * step * np.maximum(times - turn + 1, 0)
         return Layout(self._front(roads), PEDESTRIAN, lateral, speed, turned)
 
     def begin(self, world: World) -> _Memory:
-        # The path of the pedestrian across the lane.
         frame = Frame.through_origin(world.lane_of(VUT))
         path = frame.crossing_position(world, CROSSING_LANE)
         lateral = frame.left(world.person_positions(PEDESTRIAN)) - frame.left(
@@ -203,7 +204,6 @@ class PedestrianCrossing(
                 "to the right of it, or turns_after = None",
             )
 
-        # Where the vehicle has passed him.
         half_width = world.person_width(PEDESTRIAN) / 2
         clear_point = path + half_width + world.vehicle_length(VUT)
         return _Memory(
@@ -211,7 +211,6 @@ class PedestrianCrossing(
         )
 
     def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
-        # Where the pedestrian is, and how fast he crosses.
         vehicle_positions = world.vehicle_positions(VUT)
         lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(
             vehicle_positions
@@ -245,9 +244,9 @@ class PedestrianCrossing(
         section 4); theta is the angle between the lane and the line of sight.
         """
         half_length = trace.vehicle_length / 2
-        ahead = trace.gap + half_length
-        centre_distance = np.sqrt(ahead * ahead + trace.lateral * trace.lateral)
-        approach = trace.speed * ahead + np.abs(trace.lateral_speed * trace.lateral)
+        centre_gap = trace.gap + half_length
+        centre_distance = np.sqrt(centre_gap * centre_gap + trace.lateral * trace.lateral)
+        approach = trace.speed * centre_gap + np.abs(trace.lateral_speed * trace.lateral)
         return Encounter(
             separation=trace.gap,
             distance=centre_distance - half_length,
@@ -311,18 +310,16 @@ class LeadVehicleStopped(
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle at its distance from the parked one, if the study sets it."""
-        return (
-            {}
-            if self.distance is None
-            else {"vehicle[@id='vut']": {"departPos": _place(self._front, "distance")}}
-        )
+        if self.distance is None:
+            return {}
+        return {"vehicle[@id='vut']": {"departPos": _place(self._front, "distance")}}
 
     @property
     def _front(self) -> Quantity:
         """Position of the vehicle's front on its lane at the start [m]."""
-        return (
-            VUT_FRONT if self.distance is None else PARKED_POSITION - PARKED_LENGTH - self.distance
-        )
+        if self.distance is None:
+            return VUT_FRONT
+        return PARKED_POSITION - PARKED_LENGTH - self.distance
 
     def benign(self) -> NamedScenarios:
         """A car is in the next lane."""

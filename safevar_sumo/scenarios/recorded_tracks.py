@@ -52,7 +52,8 @@ class RecordedTracks(
     ego: str = "ego"
     speed: Annotated[Speed, VEHICLE_SPEED] = 40.0
     grade: Grade = 0.0
-    goes_on = False  # after the last row nobody is there
+    # After the last row nobody is there.
+    goes_on = False
 
     @cached_property
     def _bodies(self) -> dict[str, pd.DataFrame]:
@@ -63,14 +64,20 @@ class RecordedTracks(
         """The first row of `ego`."""
         if self.ego in self._bodies:
             return self._bodies[self.ego].iloc[0]
-        problem = f"scenario.parameters.ego = {self.ego!r}: the file has no row of it"
-        raise InputError("", problem, one_of(self._bodies))
+        raise InputError(
+            "",
+            f"scenario.parameters.ego = {self.ego!r}: the file has no row of it",
+            one_of(self._bodies),
+        )
 
     def check(self) -> None:
         """Refuse a file without anybody else."""
         if self.duration <= 0:
-            problem = f"{key_of(self.file)}: nobody else is there once {self.ego} is"
-            raise InputError("", problem, "rows of another name, and of a later time")
+            raise InputError(
+                "",
+                f"{key_of(self.file)}: nobody else is there once {self.ego} is",
+                "rows of another name, and of a later time",
+            )
 
     @property
     def duration(self) -> float:
@@ -96,19 +103,19 @@ class RecordedTracks(
     def tracks(self, times: FloatArray) -> list[Track]:
         """All bodies but `ego`; before its first row and after its last one a body has no size."""
         start = self._start
-        ahead = np.exp(1j * start["heading"])
-        front = start["x"] + 1j * start["y"] + start["length"] / 2 * ahead
+        direction = np.exp(1j * start["heading"])
+        front = start["x"] + 1j * start["y"] + start["length"] / 2 * direction
         now = times + start["time"]
         tracks = []
         for name, rows in self._bodies.items():
             if name != self.ego:
-                known = rows["time"].to_numpy()
+                row_times = rows["time"].to_numpy()
                 x, y, heading, speed, length, width = (
-                    np.interp(now, known, rows[column]) for column in COLUMNS[2:]
+                    np.interp(now, row_times, rows[column]) for column in COLUMNS[2:]
                 )
-                place = np.round((x + 1j * y - front) / ahead, DIGITS)
-                facing = np.round(np.exp(1j * heading) / ahead, DIGITS)
-                is_there = (now > known[0] - SAME) & (now < known[-1] + SAME)
+                place = np.round((x + 1j * y - front) / direction, DIGITS)
+                facing = np.round(np.exp(1j * heading) / direction, DIGITS)
+                is_there = (now > row_times[0] - SAME) & (now < row_times[-1] + SAME)
                 size = length * is_there, width * is_there
                 columns = place.real, place.imag, facing.real, facing.imag, speed
                 tracks.append(Track(name, "recorded", *size, *columns))
@@ -137,12 +144,14 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
             BytesIO(read_file(Path(file))), dtype=str, keep_default_na=False, skipinitialspace=True
         )
     except (OSError, ValueError) as error:
-        problem = f"{key_of(file)}: cannot be read: {error}"
-        raise InputError("", problem, "a CSV file") from None
-    missing = [name for name in COLUMNS if name not in table]
-    if missing:
-        problem = f"{key_of(file)}: there is no column {missing[0]}"
-        raise InputError("", problem, f"the columns {', '.join(COLUMNS)}")
+        raise InputError("", f"{key_of(file)}: cannot be read: {error}", "a CSV file") from None
+    for name in COLUMNS:
+        if name not in table:
+            raise InputError(
+                "",
+                f"{key_of(file)}: there is no column {name}",
+                f"the columns {', '.join(COLUMNS)}",
+            )
 
     # Numbers; of a name its length.
     values = table[COLUMNS].assign(name=table["name"].str.len())
@@ -151,19 +160,23 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
     legal[ABOVE_ZERO] &= values[ABOVE_ZERO] > 0
     for row, column in np.argwhere(~legal.to_numpy())[:1]:
         name = COLUMNS[column]
-        expected = "above 0" if name in ABOVE_ZERO else "that is finite"
-        problem = f"{key_of(file)}: row {row + 1}: {name} = {table[name].iloc[row]!r}"
-        raise InputError("", problem, "a name" if name == "name" else f"a number {expected}")
+        expected = "a number that is finite"
+        if name in ABOVE_ZERO:
+            expected = "a number above 0"
+        if name == "name":
+            expected = "a name"
+        raise InputError(
+            "", f"{key_of(file)}: row {row + 1}: {name} = {table[name].iloc[row]!r}", expected
+        )
 
-    # Rows of each body.
-    names = table["name"]
-    bodies = {
-        str(name): rows.sort_values("time") for name, rows in values.groupby(names, sort=False)
-    }
-    steps = {name: np.diff(rows["time"]) for name, rows in bodies.items()}
-    usual = np.median(np.concatenate([*steps.values()])) if len(table) > len(bodies) else 0.0
+    groups = values.groupby(table["name"], sort=False)
+    bodies = {str(name): rows.sort_values("time") for name, rows in groups}
+    longest_step = 0.0
+    if len(table) > len(bodies):
+        steps = [np.diff(rows["time"]) for rows in bodies.values()]
+        longest_step = LONGEST_STEP * np.median(np.concatenate(steps))
     for name, rows in bodies.items():
-        _check_steps(f"{key_of(file)}: {name}", rows["time"].to_numpy(), LONGEST_STEP * usual)
+        _check_steps(f"{key_of(file)}: {name}", rows["time"].to_numpy(), longest_step)
         rows["heading"] = np.unwrap(rows["heading"])
     return bodies
 
@@ -174,5 +187,8 @@ def _check_steps(body: str, times: FloatArray, longest: float) -> None:
     for row in np.flatnonzero(steps <= 0)[:1]:
         raise InputError("", f"{body} has two rows at {times[row]:g} s", "one row at a time")
     for row in np.flatnonzero(steps > longest + SAME)[:1]:
-        problem = f"{body} has no row from {times[row]:g} to {times[row + 1]:g} s"
-        raise InputError("", problem, f"a row every {longest:g} s, or another name after the gap")
+        raise InputError(
+            "",
+            f"{body} has no row from {times[row]:g} to {times[row + 1]:g} s",
+            f"a row every {longest:g} s, or another name after the gap",
+        )

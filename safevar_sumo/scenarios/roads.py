@@ -40,16 +40,16 @@ def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
     x, y = points[0]
     to_x, to_y = points[-1]
     length = math.hypot(to_x - x, to_y - y)
-    # The largest distance of a point from the line through the first and the last point:
-    bend = max(
-        (
-            abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length
-            if length
-            else math.hypot(at_x - x, at_y - y)
-        )
-        for at_x, at_y in points
-    )
-    flaw = f"lane {name!r} deviates {bend:.2f} m from a straight line" if bend > MAX_BEND else ""
+    bend = 0.0
+    for at_x, at_y in points:
+        deviation = math.hypot(at_x - x, at_y - y)
+        # A lane that ends where it begins has no line through both.
+        if length:
+            deviation = abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length
+        bend = max(bend, deviation)
+    flaw = ""
+    if bend > MAX_BEND:
+        flaw = f"lane {name!r} deviates {bend:.2f} m from a straight line"
     return Lane(points[0], points[-1], flaw)
 
 
@@ -115,8 +115,11 @@ class Frame(NamedTuple):
         start = self.lane_coordinates(crossing.start)[0]
         end = self.lane_coordinates(crossing.end)[0]
         if abs(end - start) > MAX_SKEW:
-            problem = f"lane {lane!r} leads {abs(end - start):.2f} m along the road"
-            raise InputError(NETWORK_KEY, problem, "a crossing at right angles")
+            raise InputError(
+                NETWORK_KEY,
+                f"lane {lane!r} leads {abs(end - start):.2f} m along the road",
+                "a crossing at right angles",
+            )
         return start
 
     def point(self, along: Quantity, left: Quantity) -> Coordinates:

@@ -70,38 +70,45 @@ def check_result(code: UserCode, method: str, result: Any, setting: Any) -> Mapp
     """
     if not isinstance(result, Mapping):
         raise code.wrong(method, quoted(result), f"a mapping with {', '.join(SAMPLED)}, {OUTCOME}")
-    needed = [*(SAMPLED if TIME in result else [SAFETY_DEGREE]), OUTCOME]
-    for name in needed:
+    check = _checked_metrics
+    names = [SAFETY_DEGREE]
+    if TIME in result:
+        check = _checked_trace
+        names = [*SAMPLED]
+    for name in (*names, OUTCOME):
         if name not in result:
-            legal = (
+            raise code.wrong(
+                method,
+                f"a result without {name}",
                 f"{', '.join(SAMPLED)} of each sample, and {OUTCOME}; or, without a trace,"
-                f" {OUTCOME}, {SAFETY_DEGREE} and metrics by name"
+                f" {OUTCOME}, {SAFETY_DEGREE} and metrics by name",
             )
-            raise code.wrong(method, f"a result without {name}", legal)
     outcome = str(result[OUTCOME])
     if outcome not in OUTCOMES:
         raise code.wrong(method, f"{OUTCOME} = {quoted(result[OUTCOME])}", ", ".join(OUTCOMES))
-    checked = _checked_trace if TIME in result else _checked_metrics
-    return {**checked(code, method, result, outcome == Outcome.COLLISION), OUTCOME: outcome}
+    return {**check(code, method, result, outcome == Outcome.COLLISION), OUTCOME: outcome}
 
 
 def _checked_trace(
     code: UserCode, method: str, result: Mapping[str, Any], has_collided: bool
 ) -> Mapping[str, Any]:
     """The columns of a trace, each of shape (T,), and what it says of a collision."""
-    known = {**SAMPLED, **ALSO_SAMPLED, **OF_COLLISION, OUTCOME: None}
+    sampled = SAMPLED | ALSO_SAMPLED
+    legal_keys = {**sampled, **OF_COLLISION, OUTCOME: None}
     for name in result:
-        if name not in known:
-            raise code.wrong(method, f"a trace with {name!r}", f"keys among {', '.join(known)}")
-
-    # Samples in equal steps.
+        if name not in legal_keys:
+            raise code.wrong(
+                method, f"a trace with {name!r}", f"keys among {', '.join(legal_keys)}"
+            )
     shape = np.shape(result[TIME])
-    columns = {
-        name: code.check_numbers(method, name, result[name], shape, legal).astype(float)
-        for name, legal in {**SAMPLED, **ALSO_SAMPLED}.items()
-        if name in result
-    }
-    steps = np.diff(columns[TIME]) if len(shape) == 1 else np.zeros(0)
+    columns = {}
+    for name, legal in sampled.items():
+        if name in result:
+            values = code.check_numbers(method, name, result[name], shape, legal)
+            columns[name] = values.astype(float)
+    steps = np.zeros(0)
+    if len(shape) == 1:
+        steps = np.diff(columns[TIME])
     if not len(steps) or np.ptp(steps) > STEP_TOLERANCE or steps[0] <= 0:
         raise code.wrong(
             method, f"{TIME} = {quoted(result[TIME])}", "at least 2 times, equal steps"
@@ -109,15 +116,18 @@ def _checked_trace(
     if not has_collided and not np.isfinite(columns["separation"]).any():
         raise code.wrong(method, "separation = inf", "a finite number at some time")
 
-    # How hard a collision was.
-    if has_collided and IMPACT_SPEED not in result:
-        raise code.wrong(method, f"a collision without {IMPACT_SPEED}", "the speed at impact [m/s]")
-    ends = OF_COLLISION if has_collided else {}
-    numbers = {name: result.get(name, 0.0) for name in ends}
-    numbers = _numbers(code, method, numbers, ends)
+    numbers = NamedValues()
+    if has_collided:
+        if IMPACT_SPEED not in result:
+            raise code.wrong(
+                method, f"a collision without {IMPACT_SPEED}", "the speed at impact [m/s]"
+            )
+        ends = {name: result.get(name, 0.0) for name in OF_COLLISION}
+        numbers = _numbers(code, method, ends, OF_COLLISION)
     if contradiction := _contradiction(str(result[OUTCOME]), columns, numbers, steps[0]):
-        legal = "an end that the trace allows within one of its steps"
-        raise code.wrong(method, contradiction, legal)
+        raise code.wrong(
+            method, contradiction, "an end that the trace allows within one of its steps"
+        )
     return {**columns, **numbers}
 
 
@@ -130,12 +140,12 @@ def _contradiction(
     speed, separation = columns["speed"], columns["separation"]
     braked = max(float(np.abs(np.diff(speed)).max()), MOST_DECELERATION * step)
     if outcome == Outcome.COLLISION:
-        # What it struck moves as fast as it is known to.
-        others = [ends[STRUCK_SPEED], *columns.get("obstacle_speed", ())]
+        # What it struck moves as fast as the trace says of anybody.
+        obstacle_speeds = [ends[STRUCK_SPEED], *columns.get("obstacle_speed", ())]
         finite = separation[np.isfinite(separation)]
-        near = (speed.max() + braked + np.abs(others).max()) * step
-        near += float(np.abs(np.diff(finite)).max(initial=0.0))
-        if finite.size and finite.min() > near + SLACK:
+        reach = (speed.max() + braked + np.abs(obstacle_speeds).max()) * step
+        reach += float(np.abs(np.diff(finite)).max(initial=0.0))
+        if finite.size and finite.min() > reach + SLACK:
             return f"a collision at a separation of {finite.min():.3g} m"
         impact = ends[IMPACT_SPEED]
         if np.abs(speed - impact).min() > braked + SLACK:
@@ -152,24 +162,23 @@ def unit_contradiction(trace: Trace) -> str:
     """Where the first run of a trace, or its first step, moves by another factor than its speed
     says, as with km/h for m/s; "" if it does not, or has neither a position nor a gap.
     """
-    here = trace.active[:, 0]
-    if here.sum() < 2:
+    active = trace.active[:, 0]
+    if active.sum() < 2:
         return ""
-    speed, gap = trace.speed[here, 0], trace.gap[here, 0]
+    speed, gap = trace.speed[active, 0], trace.gap[active, 0]
+    position, obstacle_speed = trace.position[active, 0], trace.obstacle_speed[active, 0]
     driven = float(np.sum(speed[1:] + speed[:-1]) * trace.step / 2)
-    stands = (trace.obstacle_speed[here, 0] == 0).all() and (np.diff(gap) <= 0).all()
-    ways = {"position": np.ptp(trace.position[here, 0]), "gap": np.ptp(gap) if stands else np.nan}
+    ways = {"position": np.ptp(position)}
+    if (obstacle_speed == 0).all() and (np.diff(gap) <= 0).all():
+        ways["gap"] = np.ptp(gap)
     for name, way in ways.items():
         is_apart = abs(way - driven) > max(speed.max() * trace.step, 1.0)
         if is_apart and max(way, driven) > FACTOR * min(way, driven):
             return f"speed and {name} disagree: {driven:.3g} m and {way:.3g} m of way"
 
     # The first step, also towards somebody who moves.
-    closing = speed - trace.obstacle_speed[here, 0]
-    for name, rate, column in (
-        ("position", speed, trace.position[here, 0]),
-        ("gap", closing, -gap),
-    ):
+    closing = speed - obstacle_speed
+    for name, rate, column in (("position", speed, position), ("gap", closing, -gap)):
         (way,), (low, *_, high) = np.diff(column[:2]), np.sort(rate[:2]) * trace.step
         slack = (FACTOR - 1) * max(abs(low), abs(high)) + FIRST_SLACK
         if way < low - slack or way > high + slack:
@@ -181,12 +190,12 @@ def _checked_metrics(
     code: UserCode, method: str, result: Mapping[str, Any], has_collided: bool
 ) -> Mapping[str, float]:
     """The metrics of a run without a trace; NaN is one that is undefined."""
-    degree = Legal(highest=0.0) if has_collided else Legal(0.0)
-    legal = {name: Legal(infinite=True, undefined=True) for name in result if name != OUTCOME} | {
-        SAFETY_DEGREE: degree
-    }
-    legal |= {name: OF_COLLISION[name] for name in OF_COLLISION if name in result and has_collided}
-    return _numbers(code, method, {name: result[name] for name in legal}, legal)
+    values = {name: value for name, value in result.items() if name != OUTCOME}
+    legal = dict.fromkeys(values, Legal(infinite=True, undefined=True))
+    legal[SAFETY_DEGREE] = Legal(0.0)
+    if has_collided:
+        legal |= {**OF_COLLISION, SAFETY_DEGREE: Legal(highest=0.0)}
+    return _numbers(code, method, values, legal)
 
 
 def _numbers(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -114,8 +114,8 @@ class Track(NamedTuple):
         moves = speed > 0
         divisor = np.where(moves, speed, 1.0)
         along = np.where(moves, vx / divisor, 1.0)
-        left = np.where(moves, vy / divisor, 0.0)
-        return cls(name, kind, length, width, x, y, along, left, speed)
+        lateral = np.where(moves, vy / divisor, 0.0)
+        return cls(name, kind, length, width, x, y, along, lateral, speed)
 
 
 def travelled(speeds: Quantity, times: FloatArray) -> FloatArray:
@@ -132,17 +132,15 @@ def first_in_strip(body: Track, half_width: float) -> Quantity:
     around the lane's middle; of a body beside the strip that of its first corner.
     """
     corners = corners_of(body)
-    first = np.full(
-        np.broadcast_shapes(*(np.shape(value) for corner in corners for value in corner)), np.inf
-    )
+    first_x = np.full(np.broadcast(*chain(*corners)).shape, np.inf)
     for (x, y), (to_x, to_y) in pairwise([*corners, corners[0]]):
-        first = np.where(np.abs(y) <= half_width, np.minimum(first, x), first)
+        first_x = np.where(np.abs(y) <= half_width, np.minimum(first_x, x), first_x)
         for side in (-half_width, half_width):
             crosses = (np.minimum(y, to_y) < side) & (side < np.maximum(y, to_y))
             share = (side - y) / np.where(crosses, to_y - y, 1.0)
-            first = np.where(crosses, np.minimum(first, x + (to_x - x) * share), first)
+            first_x = np.where(crosses, np.minimum(first_x, x + (to_x - x) * share), first_x)
     beside = np.minimum.reduce(np.broadcast_arrays(*(x for x, _ in corners)))
-    return np.where(np.isinf(first), beside, first)[()]
+    return np.where(np.isinf(first_x), beside, first_x)[()]
 
 
 def corners_of(body: Track) -> list[tuple[Quantity, Quantity]]:
@@ -258,21 +256,24 @@ class TrackScenario(Scenario):
         # A user's class may read the first column of the times alone.
         if self.is_user_code and since.shape[1] > 1:
             alone = self.tracks(np.maximum(since[:, -1:], 0.0))
-            last = (np.atleast_2d(track.x)[:, -1] for track in (*tracks, *alone))
-            columns = np.broadcast_arrays(*last)
+            ends = (np.atleast_2d(track.x)[:, -1] for track in (*tracks, *alone))
+            columns = np.broadcast_arrays(*ends)
             if not np.allclose(columns[: len(alone)], columns[len(alone) :]):
-                problem = f"{type(self).__name__}.tracks reads the first of several times alone"
-                raise InputError("", problem, "tracks that take times of shape (T, N)")
+                raise InputError(
+                    "",
+                    f"{type(self).__name__}.tracks reads the first of several times alone",
+                    "tracks that take times of shape (T, N)",
+                )
 
         # Before its encounter each body keeps its first velocity.
-        before = np.minimum(since, 0.0)
+        early = np.minimum(since, 0.0)
         way = self.start_speed * later
-        moved = list[Track]()
+        begun = list[Track]()
         for track in tracks:
-            along, left, speed = (np.atleast_2d(column)[:1] for column in track[6:])
-            x = track.x + way + speed * along * before
-            moved.append(track._replace(x=x, y=track.y + speed * left * before))
-        return moved
+            along, lateral, speed = (np.atleast_2d(column)[:1] for column in track[6:])
+            x = track.x + way + speed * along * early
+            begun.append(track._replace(x=x, y=track.y + speed * lateral * early))
+        return begun
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle under test, at its speed."""

@@ -51,22 +51,26 @@ class Problem:
         def draw(count: int) -> FloatArray:
             return rng.uniform(lower, upper, (count, len(lower)))
 
-        return (
-            self.region.draw_feasible(draw, number, filtered=True) if self.region else draw(number)
-        )
+        if not self.region:
+            return draw(number)
+        return self.region.draw_feasible(draw, number, filtered=True)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
         """Which settings, shape (k, n), satisfy the study's constraints after the filter; shape
         (k,).
         """
         filtered = self.characteristics.filter(settings)
-        return self.region.feasible(filtered) if self.region else np.ones(len(filtered), dtype=bool)
+        if not self.region:
+            return np.ones(len(filtered), dtype=bool)
+        return self.region.feasible(filtered)
 
     def repaired(self, settings: FloatArray) -> FloatArray:
         """Settings moved towards the original until they are feasible after the filter; shape (k,
         n).
         """
-        return self.region.repaired(settings) if self.region else settings
+        if not self.region:
+            return settings
+        return self.region.repaired(settings)
 
     def nondominated(self, evaluations: Evaluations) -> Evaluations:
         """The valid evaluations that no other one of them dominates."""
@@ -84,8 +88,6 @@ def check_search(
             quoted(search),
             "a generator: a method that yields settings and returns its result",
         )
-
-    # Every request is checked, and within the budget.
     yielded = set[bytes]()
     budget = problem.evaluations
     answer = None
@@ -102,7 +104,6 @@ def check_search(
 
 
 def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int) -> FloatArray:
-    # A matrix of legal values.
     characteristics = problem.characteristics
     shape = (
         f"shape (k, {len(characteristics)}) with k from 1 to the {budget} evaluations that are left"
@@ -114,7 +115,6 @@ def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int
         legal = Legal(characteristic.lower, characteristic.upper)
         code.check_numbers("search", characteristic.name, values, (len(output),), legal)
 
-    # Filtered and feasible settings.
     settings: FloatArray = output.astype(float)
     if (characteristics.filter(settings) != settings).any():
         raise code.wrong(
@@ -142,8 +142,11 @@ def _checked_result(
     if not isinstance(result, Evaluations) or any(
         setting.tobytes() not in yielded for setting in result.settings
     ):
-        expected = "an Evaluations of settings that it was sent, such as evaluations.take(rows)"
-        raise code.wrong("search", quoted(result), expected)
+        raise code.wrong(
+            "search",
+            quoted(result),
+            "an Evaluations of settings that it was sent, such as evaluations.take(rows)",
+        )
     return result
 
 

@@ -67,7 +67,6 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
     safety_weight: Annotated[float, Meta(ge=0, le=1e6)] = 6.0
 
     def search(self, problem: Problem, rng: Generator) -> Search:
-        # Random settings, generation by generation.
         ranges = Ranges(problem)
         generations = []
         scores = []
@@ -78,11 +77,13 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
             used += len(evaluated)
             generations.append(evaluated)
 
-            # Did the lowest score fall? If it has not for long, the search ends.
+            # A search whose lowest score has not fallen for long ends.
             scores.append(_scores(evaluated, problem.scoring, self.safety_weight))
             lowest_in_generation = np.nanmin(scores[-1], initial=np.inf)
             is_improved = lowest_in_generation < lowest_score or used <= self.warm_up
-            unimproved = 0 if is_improved else unimproved + 1
+            unimproved += 1
+            if is_improved:
+                unimproved = 0
             lowest_score = min(lowest_score, lowest_in_generation)
 
             # Ranges narrow to the best settings of the last generations.
@@ -151,32 +152,27 @@ class Ranges:
         if width_below + width_above <= 0:
             return float(original)
         position = rng.uniform(0.0, width_below + width_above)
-        return float(
-            self.lower[i] + position
-            if position < width_below
-            else self.upper[i] - (position - width_below)
-        )
+        if position < width_below:
+            return float(self.lower[i] + position)
+        return float(self.upper[i] - (position - width_below))
 
     def narrow(self, window: Evaluations) -> None:
         """End each range at the mean of the increased values and the mean of the decreased values,
         over the settings of `window` that are less safe than the original.
         """
-        # Settings that are less safe than the original.
         is_less_safe = self._scoring.values(window)[:, 0] < self._originals(window)
         less_safe = window.take(self._scoring.valid(window) & is_less_safe)
         if not len(less_safe):
             return
 
-        # Ranges end at their means on both sides.
         for i, original in enumerate(self._characteristics.original):
             values = less_safe.settings[:, i]
             if np.any(values > original):
                 self.upper[i] = np.mean(values[values > original])
             if np.any(values < original):
                 self.lower[i] = np.mean(values[values < original])
-        self.max_changes = max(
-            1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5))
-        )  # rounded, halves upwards
+        # Python's own rounding takes halves to even numbers, not upwards.
+        self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))
 
     def _originals(self, window: Evaluations) -> FloatArray:
         """The first objective of the original vehicle; in its own encounter, if that is a safety

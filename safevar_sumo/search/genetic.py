@@ -8,6 +8,8 @@ import random
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
+from itertools import compress, filterfalse
+from operator import attrgetter
 from threading import Lock
 from typing import Annotated
 
@@ -87,29 +89,22 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     tournament_size: TournamentSize = 2
 
     def search(
-        self, problem: Problem, rng: np.random.Generator, first: FloatArray | None = None
+        self, problem: Problem, rng: np.random.Generator, generation: FloatArray | None = None
     ) -> Search:
         reproduction = Reproduction(self, problem, rng)
-
-        # The first generation is random, unless it is given.
-        if first is None:
-            first = problem.uniform(min(problem.population, problem.evaluations), rng)
-        offspring = [*map(Individual, first.tolist())]
+        if generation is None:
+            generation = problem.uniform(min(problem.population, problem.evaluations), rng)
+        offspring = [*map(Individual, generation.tolist())]
         survivors = list[Individual]()
         used = 0
 
-        # Evaluate the offspring, keep the best, and let them reproduce.
         while offspring:
             used += yield from request_evaluations(offspring, problem)
-            alive = survivors + [
-                individual for individual in offspring if not individual.has_failed
-            ]
-            survivors = select_survivors(alive, problem.population)
+            alive = [individual for individual in offspring if not individual.has_failed]
+            survivors = select_survivors(survivors + alive, problem.population)
             offspring = reproduction.draw_offspring(
                 survivors, min(problem.population, problem.evaluations - used)
             )
-
-        # The non-dominated survivors are the result.
         batches = [individual.evaluation for individual in survivors if individual.standing[0] == 0]
         front = [evaluations.take([row]) for evaluations, row in batches]
         return Evaluations.concatenate([problem.original.take([]), *front])
@@ -125,9 +120,9 @@ class Reproduction:
         self._random_state = random.Random(int(rng.integers(2**63))).getstate()
         self._misses = 0
         probability = operators.mutation_probability
-        self._mutation_probability = (
-            1 / len(characteristics) if probability is None else probability
-        )
+        if probability is None:
+            probability = 1 / len(characteristics)
+        self._mutation_probability = probability
         self._lower = characteristics.lower.tolist()
         self._upper = characteristics.upper.tolist()
 
@@ -136,7 +131,8 @@ class Reproduction:
         """Set the global `random`, from which DEAP draws, to this run's state; restore the caller's
         state afterwards.
         """
-        with _ONE_AT_A_TIME:  # another thread would draw from this state
+        # Another thread would draw from this run's state.
+        with _ONE_AT_A_TIME:
             state_of_caller = random.getstate()
             random.setstate(self._random_state)
             try:
@@ -151,7 +147,6 @@ class Reproduction:
         operators = self._operators
         domains = (self._lower, self._upper)
         with self._randomness():
-            # Two parents, crossed and mutated.
             while population and len(offspring) < number:
                 pair = [
                     Individual(run_tournament(population, operators.tournament_size))
@@ -178,20 +173,19 @@ class Reproduction:
         if not self._problem.region:
             return children
         feasible = self._problem.feasible(np.array(children))
-        self._misses = 0 if feasible.any() else self._misses + 1
+        self._misses += 1
+        if feasible.any():
+            self._misses = 0
         if self._misses > MAX_MISSES:
             self._misses = 0
-            return [
-                Individual(values) for values in self._problem.repaired(np.array(children)).tolist()
-            ]
-        return [child for child, is_feasible in zip(children, feasible, strict=True) if is_feasible]
+            return [*map(Individual, self._problem.repaired(np.array(children)).tolist())]
+        return [*compress(children, feasible)]
 
 
 def request_evaluations(
     individuals: Sequence[Individual], problem: Problem
 ) -> Generator[FloatArray, Evaluations, int]:
     """Request and store the evaluations of individuals; returns the number of evaluations."""
-    # Values of the objectives, and violations.
     evaluated = yield problem.characteristics.filter(np.array(individuals))
     scoring = problem.scoring
     fitness = fitness_class(len(problem.scoring.objectives))
@@ -199,7 +193,6 @@ def request_evaluations(
     failed = ~np.where(violations > 0, np.isfinite(violations), scoring.valid(evaluated))
     columns = scoring.values(evaluated).tolist(), violations.tolist(), failed.tolist()
 
-    # Each individual knows its own.
     for row, (individual, values, violation, has_failed) in enumerate(
         zip(individuals, *columns, strict=True)
     ):
@@ -216,25 +209,18 @@ def select_survivors(individuals: list[Individual], number: int) -> list[Individ
     individuals follow all feasible ones, each in a rank of its own, by their violation (constrained
     domination, Deb et al. 2002).
     """
-    # Infeasible individuals come after all others, by violation.
-    infeasible = sorted(
-        (individual for individual in individuals if individual.violation),
-        key=lambda individual: individual.violation,
-    )
+    by_violation = attrgetter("violation")
+    infeasible = sorted(filter(by_violation, individuals), key=by_violation)
     for place, individual in enumerate(infeasible):
         individual.standing = len(individuals) + place, 0.0
-    individuals = [individual for individual in individuals if not individual.violation]
-
-    # Fronts by rank, and within a front by crowding distance.
-    sorted_individuals = sorted(
-        individuals, key=lambda individual: individual.fitness.wvalues, reverse=True
-    )
+    feasible = filterfalse(by_violation, individuals)
+    best_first = sorted(feasible, key=attrgetter("fitness.wvalues"), reverse=True)
     best = []
-    for rank, front in enumerate(sort_into_fronts(sorted_individuals)):
+    for rank, front in enumerate(sort_into_fronts(best_first)):
         tools.emo.assignCrowdingDist(front)
         for individual in front:
             individual.standing = rank, -individual.fitness.crowding_dist
-        best += sorted(front, key=lambda individual: individual.standing)
+        best += sorted(front, key=attrgetter("standing"))
         if len(best) >= number:
             break
     return [*best, *infeasible][:number]
@@ -258,8 +244,9 @@ def run_tournament(population: list[Individual], size: int = 2) -> Individual:
     """The best, by standing, of `size` individuals drawn without replacement; chance decides
     ties.
     """
+    # A single individual draws nothing from `random`.
     if len(population) == 1:
-        return population[0]  # draws nothing from `random`
+        return population[0]
     best, *rivals = random.sample(population, min(size, len(population)))
     for rival in rivals:
         if rival.standing < best.standing or (

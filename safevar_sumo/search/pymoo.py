@@ -105,9 +105,8 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
     def search(self, problem: Problem, rng: Generator) -> Search:
         randomness = _Randomness(self.name, rng)
 
-        # What is left of the budget, and all that was evaluated.
-        left = problem.evaluations
-        seen = [problem.original.take([])]
+        budget = problem.evaluations
+        batches = [problem.original.take([])]
         with randomness:
             from pymoo.core.individual import Individual
             from pymoo.core.population import Population
@@ -116,41 +115,44 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
             algorithm = self.begin(problem, randomness.seed)
             optimum = Population()
 
-        # Ask, evaluate what is new, and tell.
-        while left > 0 and algorithm.has_next():
+        while budget > 0 and algorithm.has_next():
             with randomness:
-                asked = algorithm.ask()
-            group = [asked] if isinstance(asked, Individual) else asked
+                infills = algorithm.ask()
+            group = infills
+            if isinstance(infills, Individual):
+                group = [infills]
             if group is None or not len(group):
                 break
             new = [individual for individual in group if not individual.evaluated]
-            batch = Population.create(*new[:left])
-            left = left - len(new)
+            batch = Population.create(*new[:budget])
+            budget -= len(new)
             if new:
                 evaluations = yield _settings(batch, problem)
-                seen.append(evaluations)
+                batches.append(evaluations)
                 _score(batch, evaluations, problem, algorithm)
             with randomness:
-                if left >= 0:
-                    algorithm.tell(infills=asked)
+                if budget >= 0:
+                    algorithm.tell(infills=infills)
                     optimum = algorithm.opt
                 else:
                     optimum = filter_optimum(
                         Population.merge(optimum, batch), least_infeasible=True
                     )
-
-        # What the algorithm found, as evaluated.
-        every = Evaluations.concatenate(seen)
-        rows = {setting.tobytes(): row for row, setting in enumerate(every.settings)}
-        result = every.take([rows[setting.tobytes()] for setting in _settings(optimum, problem)])
+        evaluations = Evaluations.concatenate(batches)
+        rows = {setting.tobytes(): row for row, setting in enumerate(evaluations.settings)}
+        optimal_rows = [rows[setting.tobytes()] for setting in _settings(optimum, problem)]
+        result = evaluations.take(optimal_rows)
         return result.take(problem.scoring.valid(result))
 
     def try_out(self, problem: Problem) -> None:
         """Refuse arguments that pymoo refuses before its first request."""
         size = getattr(self, "pop_size", UNSET)
         if size is not UNSET and size > problem.evaluations:
-            legal = f"at most the {problem.evaluations} evaluations of a run"
-            raise InputError(self.name, f"pop_size = {size}", legal)
+            raise InputError(
+                self.name,
+                f"pop_size = {size}",
+                f"at most the {problem.evaluations} evaluations of a run",
+            )
         with _Randomness(self.name, default_rng(0)):
             self.begin(problem, 0)
 
@@ -159,46 +161,43 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         from pymoo.core.problem import Problem as PymooProblem
         from pymoo.util.ref_dirs import get_reference_directions
 
-        # Arguments: pymoo's defaults, the study's population, the user's values.
-        objectives = (
-            len(problem.scoring.objectives) if PYMOO_ALGORITHMS[self.name].startswith("moo.") else 1
-        )
+        # The user's values come before the study's population, and this before pymoo's defaults.
+        objectives = 1
+        if PYMOO_ALGORITHMS[self.name].startswith("moo."):
+            objectives = len(problem.scoring.objectives)
         defaults = _plain_arguments(self.name)
-        given = {
-            name: np.array(value) if isinstance(value, list) and name != "F" else value
-            for name in defaults
-            if (value := getattr(self, name)) is not UNSET
-        }
+        arguments = dict[str, Any]()
         if isinstance(defaults.get("pop_size"), int):
-            given = {"pop_size": problem.population, **given}
-        if given.get("pop_size", LEAST_POPULATION) < LEAST_POPULATION:
-            raise ValueError(f"pop_size = {given['pop_size']} is below {LEAST_POPULATION}")
-
-        # Reference directions for as many objectives.
+            arguments["pop_size"] = problem.population
+        for name in defaults:
+            value = getattr(self, name)
+            if isinstance(value, list) and name != "F":
+                value = np.array(value)
+            if value is not UNSET:
+                arguments[name] = value
+        if arguments.get("pop_size", LEAST_POPULATION) < LEAST_POPULATION:
+            raise ValueError(f"pop_size = {arguments['pop_size']} is below {LEAST_POPULATION}")
         if "ref_dirs" in defaults:
-            partitions = given.get("ref_dirs", PARTITIONS)
+            partitions = arguments.get("ref_dirs", PARTITIONS)
             if isinstance(partitions, int):
                 if math.comb(partitions + objectives - 1, partitions) > MAX_DIRECTIONS:
                     raise ValueError(
                         f"ref_dirs = {partitions} are more than {MAX_DIRECTIONS:,} reference"
                         " directions"
                     )
-                given["ref_dirs"] = get_reference_directions(
+                arguments["ref_dirs"] = get_reference_directions(
                     "das-dennis", objectives, n_partitions=partitions
                 )
-            if given.get("pop_size", np.inf) < len(given["ref_dirs"]):
-                raise ValueError(
-                    f"pop_size is less than the {len(given['ref_dirs'])} reference directions"
-                )
-
-        # The problem, and the algorithm on it.
+            number = len(arguments["ref_dirs"])
+            if arguments.get("pop_size", np.inf) < number:
+                raise ValueError(f"pop_size is less than the {number} reference directions")
         lower = problem.characteristics.lower
         upper = problem.characteristics.upper
-        constraints = 0 if self.name.endswith("MOEAD") else 1  # it refuses constraints
+        # MOEAD refuses constraints.
+        constraints = int(not self.name.endswith("MOEAD"))
         task = PymooProblem(len(lower), objectives, n_ieq_constr=constraints, xl=lower, xu=upper)
-        algorithm = copy.deepcopy(
-            _class_of(self.name)(**given)
-        )  # runs share the defaults of pymoo's classes
+        # Without a copy, runs would share the defaults of pymoo's classes.
+        algorithm = copy.deepcopy(_class_of(self.name)(**arguments))
         return algorithm.setup(task, termination=("n_eval", problem.evaluations), seed=seed)
 
 
@@ -215,9 +214,9 @@ def _score(population: Any, evaluations: Evaluations, problem: Problem, algorith
     scoring = problem.scoring
     valid = scoring.valid(evaluations)
     violations = scoring.violation(evaluations)
-    values = np.where(valid[:, np.newaxis], scoring.values(evaluations), FAILED)[
-        :, : algorithm.problem.n_obj
-    ]
+    values = np.where(
+        valid[:, np.newaxis], scoring.values(evaluations)[:, : algorithm.problem.n_obj], FAILED
+    )
     violations = np.where(valid | (violations > 0), np.minimum(violations, FAILED), FAILED)
     population.set("F", values, "G", violations[:, np.newaxis])
     population.apply(lambda individual: individual.evaluated.update("FGH"))
@@ -238,7 +237,9 @@ class _Randomness:
 
     def default_rng(self, seed: int | None) -> Generator:
         """What pymoo takes for numpy's function."""
-        return self._unseeded if seed is None else default_rng(seed)
+        if seed is None:
+            return self._unseeded
+        return default_rng(seed)
 
     def __enter__(self) -> None:
         import pymoo.util
@@ -268,11 +269,13 @@ def pymoo_algorithm(name: str) -> type[PymooAlgorithm]:
         If pymoo is not installed or has no such algorithm.
     """
     check_name("", f"search.algorithms = {name!r}", name, PYMOO_ALGORITHMS)
-    fields = []
+    fields = list[Any]()
     for argument, default in _plain_arguments(name).items():
         kind = TYPES.get(argument, type(default))
-        is_required = default is inspect.Parameter.empty and argument != "ref_dirs"
-        fields.append((argument, kind) if is_required else (argument, kind | UnsetType, UNSET))
+        if default is inspect.Parameter.empty and argument != "ref_dirs":
+            fields.append((argument, kind))
+        else:
+            fields.append((argument, kind | UnsetType, UNSET))
     namespace = {"name": name, "title": f"{name.removeprefix(PYMOO)} (pymoo)"}
     algorithm: Any = msgspec.defstruct(
         label_of(name), fields, bases=(PymooAlgorithm,), namespace=namespace
@@ -285,8 +288,9 @@ def _class_of(name: str) -> Any:
     try:
         from pymoo.config import Config
     except ImportError:
-        problem = "pymoo, the library of search algorithms, is not installed"
-        raise missing_extra(name, problem, "pymoo") from None
+        raise missing_extra(
+            name, "pymoo, the library of search algorithms, is not installed", "pymoo"
+        ) from None
     Config.warnings["not_compiled"] = False
     from pymoo.functions import FunctionLoader
 
@@ -304,16 +308,12 @@ def _plain_arguments(name: str) -> dict[str, Any]:
     values.
     """
     algorithm = _class_of(name)
-
-    # Arguments of the class and its bases.
     arguments = dict[str, inspect.Parameter]()
-    variant = getattr(
-        importlib.import_module(algorithm.__module__), "Variant", algorithm
-    )  # takes those of DE
+    # The arguments of DE are those of a class Variant.
+    variant = getattr(importlib.import_module(algorithm.__module__), "Variant", algorithm)
     for ancestor in (*algorithm.__mro__[:-2], variant):
         arguments = {**inspect.signature(ancestor.__init__).parameters, **arguments}
 
-    # Those that a study may set.
     if "ref_points" in arguments:
         arguments.pop("ref_dirs", None)
     return {

@@ -34,56 +34,59 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
     def search(self, problem: Problem, rng: np.random.Generator, _: object = None) -> Search:
         draw = Ranges(problem).draw
         predicted = replace(problem, population=100, evaluations=1500)
-        known = yield draw(min(problem.population, problem.evaluations), rng)
-        while left := problem.evaluations - len(known):
-            # NSGA-II on the prediction, from the best known settings and random ones.
-            predict = _learn(known, problem, int(rng.integers(2**31)))
-            first = np.concatenate([problem.nondominated(known).settings, draw(100, rng)])
-            search = super().search(predicted, rng, first)
+        archive = yield draw(min(problem.population, problem.evaluations), rng)
+        while budget := problem.evaluations - len(archive):
+            predict = _learn(archive, problem, int(rng.integers(2**31)))
+            best = problem.nondominated(archive).settings
+            search = super().search(predicted, rng, np.concatenate([best, draw(100, rng)]))
             settings = next(search)
             try:
                 while True:
                     settings = search.send(predict(settings))
             except StopIteration as stop:
-                found = stop.value
+                front = stop.value
 
-            # Its new settings: the best ones, then the most uncertain ones.
-            new = {bytes(setting): row for row, setting in enumerate(found.settings)}
-            for setting in known.settings:
+            # The best settings are simulated first, then those with the most uncertain prediction.
+            new = {bytes(setting): row for row, setting in enumerate(front.settings)}
+            for setting in archive.settings:
                 new.pop(bytes(setting), None)
             rows = [*new.values()]
-            number = 10 + len(known) // 10
+            number = 10 + len(archive) // 10
             promising = number * 4 // 5
-            rows[promising:] = sorted(rows[promising:], key=found.column("certainty").__getitem__)
+            rows[promising:] = sorted(rows[promising:], key=front.column("certainty").__getitem__)
 
             # Random settings if they are too few; a smaller budget begins as a larger one does.
-            chosen = np.concatenate([found.settings[rows], draw(number, rng)])[: min(number, left)]
-            known = Evaluations.concatenate([known, (yield chosen)])
-        return problem.nondominated(known)
+            candidates = np.concatenate([front.settings[rows], draw(number, rng)])
+            batch = yield candidates[: min(number, budget)]
+            archive = Evaluations.concatenate([archive, batch])
+        return problem.nondominated(archive)
 
 
-def _learn(known: Evaluations, problem: Problem, seed: int) -> Callable[[FloatArray], Evaluations]:
+def _learn(
+    archive: Evaluations, problem: Problem, seed: int
+) -> Callable[[FloatArray], Evaluations]:
     """Fit models of all metrics; the result predicts the evaluations of settings, shape (k, n).
 
     Its metric `certainty` says how little the predictions of the safety degree differ. The models
     are linear: unlike trees, they predict settings that are less safe than all known ones. An
     undefined value counts as that of the original vehicle.
     """
-    from sklearn.ensemble import BaggingRegressor  # takes a second to load
+    # These modules take a second to load.
+    from sklearn.ensemble import BaggingRegressor
     from sklearn.linear_model import Ridge
 
     # Each model predicts all metrics, and the first one twice: one column has another shape.
     targets = [
         np.where(np.isnan(values), np.nan_to_num(problem.original.column(name)), values)
-        for name, values in known.metrics.items()
+        for name, values in archive.metrics.items()
     ]
     columns = np.stack([*targets, targets[0]], axis=1)
-    bag = BaggingRegressor(Ridge(0.1), 20, random_state=seed).fit(known.settings, columns)
+    bag = BaggingRegressor(Ridge(0.1), 20, random_state=seed).fit(archive.settings, columns)
 
     # Further decimals differ between libraries of linear algebra, and so would searches.
     def predict(settings: FloatArray) -> Evaluations:
         values = np.array([model.predict(settings).T for model in bag.estimators_]).round(6)
-        metrics = dict(zip(known.metrics, values.mean(axis=0), strict=False))
+        metrics = dict(zip(archive.metrics, values.mean(axis=0), strict=False))
         metrics["certainty"] = -values.std(axis=0)[0]
         exact = problem.characteristics.change_objectives(settings)
         return replace(Evaluations.undefined(settings, "", (), **exact), metrics=metrics)

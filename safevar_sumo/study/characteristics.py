@@ -80,7 +80,18 @@ class CharacteristicTable(Domain, frozen=True, kw_only=True):
 
 def unit_text(unit: str) -> str:
     """A unit as text after a number; empty for a pure number."""
-    return "" if unit in ("-", "") else f" {unit}"
+    if unit in ("-", ""):
+        return ""
+    return f" {unit}"
+
+
+def _number_within(lower: float, upper: float, row: Domain) -> str:
+    """What an error expects of a value of a characteristic."""
+    return f"a number in [{lower:g}, {upper:g}]{unit_text(row.unit)}"
+
+
+def _check_characteristic(key: str, name: str, rows: Mapping[str, Domain]) -> None:
+    check_name("", f"{key}{name}: there is no such characteristic", name, rows)
 
 
 class _Distribution(Table, frozen=True, tag_field="distribution"):
@@ -136,7 +147,7 @@ Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
 def check_variation(rows: Mapping[str, Domain], variation: Mapping[str, Distribution]) -> None:
     """Refuse distributions that do not fit the characteristics' domains."""
     for name, distribution in variation.items():
-        check_name("", f"variation.{name}: there is no such characteristic", name, rows)
+        _check_characteristic("variation.", name, rows)
         _check_distribution(f"variation.{name}", rows[name], distribution)
 
 
@@ -150,9 +161,6 @@ def stated_values(distribution: Distribution) -> dict[str, float]:
 
 
 def _check_distribution(key: str, row: Domain, distribution: Distribution) -> None:
-    unit = unit_text(row.unit)
-
-    # The stated values, else those of the domain.
     stated = stated_values(distribution)
     lower = stated.get("lower", row.lower)
     upper = stated.get("upper", row.upper)
@@ -160,16 +168,12 @@ def _check_distribution(key: str, row: Domain, distribution: Distribution) -> No
     for field, value in stated.items():
         if field not in ("deviation", "sigma") and not row.lower <= value <= row.upper:
             raise InputError(
-                "",
-                f"{key}.{field} = {value:g}",
-                f"a number in [{row.lower:g}, {row.upper:g}]{unit}",
+                "", f"{key}.{field} = {value:g}", _number_within(row.lower, row.upper, row)
             )
-
-    # In an order that the distribution has.
     if lower >= upper:
         raise InputError("", f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
     if isinstance(distribution, Triangular) and not lower <= mode <= upper:
-        raise InputError("", f"{key}.mode = {mode:g}", f"a number in [{lower:g}, {upper:g}]{unit}")
+        raise InputError("", f"{key}.mode = {mode:g}", _number_within(lower, upper, row))
     if isinstance(distribution, Lognormal) and row.lower <= 0:
         raise InputError(
             "", f"{key}: lognormal, with a domain that begins at {row.lower:g}", "a domain above 0"
@@ -200,13 +204,9 @@ class Constraint(Table, frozen=True, kw_only=True):
     @property
     def quantity(self) -> str:
         """The sum in words, such as `mass - 2 radius`."""
-        terms = [
-            f"{'-' if weight < 0 else '+'} {'' if abs(weight) == 1 else f'{abs(weight):g} '}{name}"
-            for name, weight in self.sum.items()
-        ]
-        return re.sub(
-            "^- ", "-", " ".join(terms).removeprefix("+ ")
-        )  # the first term has its sign without a space
+        text = " ".join(_term(name, weight) for name, weight in self.sum.items())
+        # The first term has its sign without a space.
+        return re.sub("^- ", "-", text.removeprefix("+ "))
 
     def allows(self, values: Mapping[str, Any]) -> Any:
         """Whether the sum is within its bounds at these values, numbers or arrays of shape (N,), or
@@ -220,8 +220,9 @@ class Constraint(Table, frozen=True, kw_only=True):
 
     def unit_of(self, rows: Mapping[str, Domain]) -> str:
         """The unit of the sum; `rows` are the characteristics of the vehicle."""
-        units = {rows[name].unit for name in self.sum if name in rows}
-        return self.unit if self.unit is not None else next(iter(units), "-")
+        if self.unit is not None:
+            return self.unit
+        return next((rows[name].unit for name in self.sum if name in rows), "-")
 
     def bounds_in_words(self, rows: Mapping[str, Domain]) -> str:
         """The bounds in words."""
@@ -230,6 +231,14 @@ class Constraint(Table, frozen=True, kw_only=True):
         return " and ".join(
             f"{word} {value:g}{unit}" for word, value in bounds.items() if value is not None
         )
+
+
+def _term(name: str, weight: float) -> str:
+    """A term of a sum with its sign, such as `- 2 radius`."""
+    factor = f"{abs(weight):g} {name}"
+    if abs(weight) == 1:
+        factor = name
+    return f"{'+-'[weight < 0]} {factor}"
 
 
 def check_bounds(at_least: float | None, at_most: float | None) -> None:
@@ -245,21 +254,25 @@ def check_constraints(rows: Mapping[str, Domain], constraints: Sequence[Constrai
     for index, constraint in enumerate(constraints):
         key = f"constraints[{index}]"
         for name in constraint.sum:
-            check_name("", f"{key}.sum.{name}: there is no such characteristic", name, rows)
+            _check_characteristic(f"{key}.sum.", name, rows)
         units = {rows[name].unit for name in constraint.sum}
-        legal_units = {"-", *(units if len(units) == 1 else (row.unit for row in rows.values()))}
-        if (constraint.unit is None and len(units) > 1) or constraint.unit not in (
-            None,
-            *legal_units,
-        ):
+        is_mixed = len(units) > 1
+        legal_units = units | {"-"}
+        if is_mixed:
+            legal_units |= {row.unit for row in rows.values()}
+        if constraint.unit not in legal_units and (constraint.unit is not None or is_mixed):
             terms = ", ".join(f"{name} [{rows[name].unit}]" for name in constraint.sum)
-            problem = f"{key}: unit = {constraint.unit!r} for the sum of {terms}"
-            raise InputError("", problem, f"{one_of(legal_units)}; weights may convert units")
+            raise InputError(
+                "",
+                f"{key}: unit = {constraint.unit!r} for the sum of {terms}",
+                f"{one_of(legal_units)}; weights may convert units",
+            )
 
 
 LIMIT_FORM = re.compile(
     r"\s*([^<>=]*[^\s<>=])\s*(>=|<=)\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*"
 )
+SIDES = {">=": "at_least", "<=": "at_most"}
 FORMS = (
     '"NAME >= X" or "NAME <= X" with a number in the unit of the characteristic, such as'
     ' "treadDepth >= 3"'
@@ -280,8 +293,11 @@ class Limit(Table, frozen=True, kw_only=True):
 
     def interval(self, row: Domain) -> tuple[float, float]:
         """The limited interval [unit]; a side without a limit ends with the domain."""
-        low = row.lower if self.at_least is None else self.at_least
-        high = row.upper if self.at_most is None else self.at_most
+        low, high = self.at_least, self.at_most
+        if low is None:
+            low = row.lower
+        if high is None:
+            high = row.upper
         return low, high
 
 
@@ -297,11 +313,14 @@ class UnmeasuredValue(Table, frozen=True, kw_only=True):
 def check_unmeasured(rows: Mapping[str, Domain], values: Mapping[str, float]) -> None:
     """Refuse values of unknown characteristics, or outside of their domains."""
     for name, value in values.items():
-        check_name("", f"unmeasured.{name}: there is no such characteristic", name, rows)
+        _check_characteristic("unmeasured.", name, rows)
         row = rows[name]
         if not row.lower <= value <= row.upper:
-            legal = f"a number in [{row.lower:g}, {row.upper:g}]{unit_text(row.unit)}"
-            raise InputError("", f"unmeasured.{name} = {value:g} is outside its domain", legal)
+            raise InputError(
+                "",
+                f"unmeasured.{name} = {value:g} is outside its domain",
+                _number_within(row.lower, row.upper, row),
+            )
 
 
 def limits_of(
@@ -316,14 +335,13 @@ def limits_of(
         If a text is no limit, its characteristic is unknown, a limit is given twice, two limits of
         one characteristic cross, or a limit is outside the domain or excludes the original.
     """
-    # A limit is a name, a comparison and a number.
     sides: dict[str, dict[str, Any]] = {}
     for text in texts:
         match = LIMIT_FORM.fullmatch(text)
         if match is None:
             raise InputError("", repr(text), FORMS)
         name = match[1]
-        side = "at_least" if match[2] == ">=" else "at_most"
+        side = SIDES[match[2]]
         if side in sides.setdefault(name, {}):
             raise InputError("", f"{name} {match[2]} is given twice", "each limit once")
         sides[name][side] = float(match[3])
@@ -344,19 +362,18 @@ def check_limits(rows: Mapping[str, Domain], limits: Mapping[str, Limit], table:
     original.
     """
     for name, limit in limits.items():
-        check_name("", f"{table}{name}: there is no such characteristic", name, rows)
+        _check_characteristic(table, name, rows)
         row = rows[name]
-        unit = unit_text(rows[name].unit)
-        for side, lower, upper in (
-            ("at_least", row.lower, row.original),
-            ("at_most", row.original, row.upper),
+        for side, opposite, lower, upper in (
+            ("at_least", "<=", row.lower, row.original),
+            ("at_most", ">=", row.original, row.upper),
         ):
             value = getattr(limit, side)
             if value is not None and not lower <= value <= upper:
                 why = " is outside its domain"
+                legal = _number_within(lower, upper, row)
                 if row.lower <= value <= row.upper:
-                    why = f": the original, {row.original:g}{unit}, does not keep it"
-                legal = f"a number in [{lower:g}, {upper:g}]{unit}"
-                if row.lower <= value <= row.upper:
-                    legal += f"; did you mean {'<=' if side == 'at_least' else '>='} {value:g}?"
+                    original = f"{row.original:g}{unit_text(row.unit)}"
+                    why = f": the original, {original}, does not keep it"
+                    legal += f"; did you mean {opposite} {value:g}?"
                 raise InputError("", f"{table}{name}.{side} = {value:g}{why}", legal)

@@ -78,7 +78,8 @@ class AxisTable(Table, frozen=True, kw_only=True):
     short_name: ShortText = ""
 
     def __post_init__(self) -> None:
-        _ = self.range  # refused with the path of the axis
+        # An illegal range is refused here, with the path of the axis.
+        _ = self.range
 
     @property
     def range(self) -> Domain | None:
@@ -150,12 +151,30 @@ def are_numbers(values: Iterable[object]) -> bool:
     return all(type(value) in (int, float) for value in values)
 
 
-def as_axes(over: Axes) -> dict[str, AxisTable]:
+def as_axes(over: Parameters) -> dict[str, AxisTable]:
     """Axes as tables."""
-    return {
-        name: axis if isinstance(axis, AxisTable) else AxisTable(at=axis)
-        for name, axis in over.items()
-    }
+    axes = dict(over)
+    for name, at in over.items():
+        if not isinstance(at, AxisTable):
+            axes[name] = AxisTable(at=at)
+    return axes
+
+
+def _ranges_of(axes: Iterable[tuple[str, AxisTable]]) -> dict[str, Domain]:
+    """The ranges of axes that have one."""
+    return {name: axis.range for name, axis in axes if axis.range is not None}
+
+
+def _lists_of(axes: dict[str, AxisTable]) -> Axes:
+    """The lists of axes that have one."""
+    return {name: axis.at for name, axis in axes.items() if axis.at}
+
+
+def _widest(domains: Sequence[Domain]) -> Domain:
+    """The first of several domains, as wide as all of them together."""
+    lower = min(domain.lower for domain in domains)
+    upper = max(domain.upper for domain in domains)
+    return replace(domains[0], lower=lower, upper=upper)
 
 
 class MatrixTest(Table, frozen=True, kw_only=True):
@@ -202,8 +221,10 @@ class MatrixTable(Table, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if self.aggregate != BY_EXCESS and any(test.allowed_impact_speed for test in self.tests):
-            problem = f"aggregate = {self.aggregate!r}, and a test allows an impact"
-            raise mistake(problem, f"{BY_EXCESS!r}, or no allowed_impact_speed")
+            raise mistake(
+                f"aggregate = {self.aggregate!r}, and a test allows an impact",
+                f"{BY_EXCESS!r}, or no allowed_impact_speed",
+            )
 
 
 class Encounters(Table, frozen=True, kw_only=True):
@@ -227,7 +248,7 @@ class Encounters(Table, frozen=True, kw_only=True):
 
     def check_axes(self, characteristics: Mapping[str, Domain]) -> None:
         """Refuse axes that something else sets, too, and what is about ranges without any."""
-        axes = [pair for _, own in self._axes_by_test for pair in own.items()]
+        axes = self._named_axes
         for name, axis in axes:
             if name in characteristics:
                 problem = f"over.{name}: a characteristic of the vehicle has this name"
@@ -237,16 +258,24 @@ class Encounters(Table, frozen=True, kw_only=True):
                 raise InputError("", problem, "original = a value of its range")
         for name, axis in as_axes(self.scenario.over).items():
             if axis.at and self.matrix is None:
-                problem = f"scenario.over.{name} lists values, and the study has no tests"
-                raise InputError("", problem, "[[matrix.tests]], or a range alone")
+                raise InputError(
+                    "",
+                    f"scenario.over.{name} lists values, and the study has no tests",
+                    "[[matrix.tests]], or a range alone",
+                )
         if self.encounters == RANGES and not self.states_ranges:
-            problem = f"encounters = {RANGES!r}, and no axis has a range"
-            raise InputError("", problem, "over = { NAME = { lower = X, upper = Y } }, or 'tests'")
+            raise InputError(
+                "",
+                f"encounters = {RANGES!r}, and no axis has a range",
+                "over = { NAME = { lower = X, upper = Y } }, or 'tests'",
+            )
         if self.scenario.margin not in (None, ORIGINAL_MARGIN) and not axes:
-            problem = f"scenario.margin = {self.scenario.margin:g}, and no encounter has an axis"
-            raise InputError("", problem, "an axis with lower and upper, or no margin")
-        of_axes = {name: axis.range for name, axis in axes if axis.range is not None}
-        check_constraints({**characteristics, **of_axes}, self.constraints)
+            raise InputError(
+                "",
+                f"scenario.margin = {self.scenario.margin:g}, and no encounter has an axis",
+                "an axis with lower and upper, or no margin",
+            )
+        check_constraints({**characteristics, **_ranges_of(axes)}, self.constraints)
         tests = [test.name for test in self.tests]
         for constraint in self.constraints:
             for name in constraint.tests:
@@ -255,12 +284,19 @@ class Encounters(Table, frozen=True, kw_only=True):
     @property
     def tests(self) -> list[MatrixTest]:
         """The tests of the matrix; none without one."""
-        return [] if self.matrix is None else self.matrix.tests
+        if self.matrix is None:
+            return []
+        return self.matrix.tests
 
     @property
     def axes(self) -> set[str]:
         """The names of the axes that a test has."""
-        return {name for _, own in self._axes_by_test for name in own}
+        return {name for name, _ in self._named_axes}
+
+    @property
+    def _named_axes(self) -> list[tuple[str, AxisTable]]:
+        """The axes of all tests, with their names."""
+        return [pair for _, axes in self._axes_by_test for pair in axes.items()]
 
     @property
     def _axes_by_test(self) -> list[tuple[MatrixTest | None, dict[str, AxisTable]]]:
@@ -270,10 +306,14 @@ class Encounters(Table, frozen=True, kw_only=True):
 
     def axes_of(self, test: MatrixTest | None) -> dict[str, AxisTable]:
         """The axes of a test, its own first; those of all tests, unless it has values of them."""
-        own = {} if test is None else test.axes
         shared = as_axes(self.scenario.over)
-        stated = free_parameters(Weather) if shared and test and test.weathers else {}
-        return own | {name: shared[name] for name in shared if name not in {*own, *stated}}
+        if test is None:
+            return shared
+        if shared and test.weathers:
+            for name in free_parameters(Weather):
+                shared.pop(name, None)
+        axes = test.axes
+        return axes | shared | axes
 
     def lists_of(self, test: MatrixTest | None) -> dict[str, list[Any]]:
         """The axes of a test whose values are driven one after another."""
@@ -285,14 +325,12 @@ class Encounters(Table, frozen=True, kw_only=True):
         """The axes of a test of which any value may occur."""
         if self.encounters == TESTS:
             return {}
-        ranges = {name: axis.range for name, axis in self.axes_of(test).items()}
-        return {name: domain for name, domain in ranges.items() if domain is not None}
+        return _ranges_of(self.axes_of(test).items())
 
     @property
     def states_ranges(self) -> bool:
         """Whether an axis has a range beside or without listed values."""
-        axes = [axis for _, own in self._axes_by_test for axis in own.values()]
-        return any(axis.range for axis in axes)
+        return any(axis.range for _, axis in self._named_axes)
 
     @property
     def ranges(self) -> dict[str, Domain]:
@@ -300,16 +338,16 @@ class Encounters(Table, frozen=True, kw_only=True):
         axes of all tests whose values may be any, each as wide as in its widest test; those of
         [scenario.over] alone come last.
         """
-        found: dict[str, Domain] = {}
         by_test = [(test, self.ranges_of(test)) for test, _ in self._axes_by_test]
-        names = [name for test, own in by_test for name in own if test and name in test.over]
-        names += [name for _, own in by_test for name in own]
-        for name in dict.fromkeys(names):
-            own = [ranges[name] for _, ranges in by_test if name in ranges]
-            lower = min(domain.lower for domain in own)
-            upper = max(domain.upper for domain in own)
-            found[name] = replace(own[0], lower=lower, upper=upper)
-        return found
+        domains: dict[str, list[Domain]] = {}
+        for test, ranges in by_test:
+            for name in ranges:
+                if test and name in test.over:
+                    domains[name] = []
+        for _, ranges in by_test:
+            for name, domain in ranges.items():
+                domains.setdefault(name, []).append(domain)
+        return {name: _widest(alternatives) for name, alternatives in domains.items()}
 
     def points_of(self, test: MatrixTest) -> list[MatrixTest]:
         """A test at each of its points alone: at each combination of its listed values, in each of
@@ -327,8 +365,9 @@ class Encounters(Table, frozen=True, kw_only=True):
         """The study with other axes of each test, and of all; lists alone are written as such."""
 
         def changed(over: Axes) -> Axes:
-            axes = as_axes(change(as_axes(over))).items()
-            return {name: each.at if each == AxisTable(at=each.at) else each for name, each in axes}
+            axes = as_axes(change(as_axes(over)))
+            lists = {name: axis.at for name, axis in axes.items() if axis == AxisTable(at=axis.at)}
+            return {**axes, **lists}
 
         matrix = self.matrix
         if matrix is not None:
@@ -341,7 +380,7 @@ class Encounters(Table, frozen=True, kw_only=True):
         """The study without the ranges of axes that list values; itself if any value may occur."""
         if self.encounters == RANGES:
             return self
-        return self.mapped(lambda axes: {name: each.at for name, each in axes.items() if each.at})
+        return self.mapped(_lists_of)
 
     @property
     def all_count(self) -> Self:
@@ -352,10 +391,10 @@ class Encounters(Table, frozen=True, kw_only=True):
         """The study in these tests alone, with the constraints that concern them."""
         assert self.matrix is not None
         names = {test.name for test in tests}
-        constraints = [
-            replace(one, tests=[name for name in one.tests if name in names])
-            for one in self.constraints
-            if not one.tests or names & {*one.tests}
-        ]
+        constraints = []
+        for constraint in self.constraints:
+            common = [name for name in constraint.tests if name in names]
+            if common or not constraint.tests:
+                constraints.append(replace(constraint, tests=common))
         matrix = replace(self.matrix, tests=[*tests])
         return replace(self, matrix=matrix, constraints=constraints)

@@ -37,10 +37,12 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     the records say when; of another weather not the axes of its parameters.
     """
     # Keys about this one study, and keys about its scenario, if the overrides name another one.
-    left_out = {*keys_with(OF_STUDY, Study)}
-    if _names_scenario(overrides.get("scenario"), base.tables.get("scenario")):
-        left_out.update(keys_with(OF_SCENARIO, Study))
-    inherited = {key: value for key, value in base.tables.items() if key not in left_out}
+    inherited = dict(base.tables)
+    own_keys = keys_with(OF_STUDY, Study)
+    if _names_scenario(overrides, base.tables):
+        own_keys += keys_with(OF_SCENARIO, Study)
+    for key in own_keys:
+        inherited.pop(key, None)
     scenario = inherited.get("scenario")
     if isinstance(scenario, dict) and "over" in scenario:
         inherited["scenario"] = _with_axes_for(overrides, scenario)
@@ -52,9 +54,12 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
         for key in keys_with(PART_OF_SYSTEM, Study)
         if _model_and_network(tables.get(key)) != _model_and_network(inherited.get(key))
     ]
-    marks = [OF_SYSTEM] if parts else []
-    marks += [OF_VEHICLE_AND_ADS] if {"vehicle", "ads"} & {*parts} else []
-    for key in {key for mark in marks for key in keys_with(mark, Study)} - overrides.keys():
+    base_keys: tuple[str, ...] = ()
+    if parts:
+        base_keys += keys_with(OF_SYSTEM, Study)
+    if {"vehicle", "ads"} & {*parts}:
+        base_keys += keys_with(OF_VEHICLE_AND_ADS, Study)
+    for key in {*base_keys} - overrides.keys():
         tables.pop(key, None)
     if "matrix" in parts:
         tables |= _for_tests(tables, overrides)
@@ -63,16 +68,17 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     if parts or base.tables.get("title", "") == base.tables.get("name"):
         tables["title"] = overrides.get("title", tables.get("name", ""))
     remarks = base.remarks
+    # What is about one study alone is dropped without a remark: no study inherits it.
+    named_keys = {*tables, *keys_with(OF_STUDY, Study)}
     dropped = [
         f"[{key}]"
         for key, value in base.tables.items()
-        if isinstance(value, dict)
-        and key not in {*tables, *keys_with(OF_STUDY, Study)}  # which no study inherits
+        if isinstance(value, dict) and key not in named_keys
     ]
-    lost = _set_in(base.tables.get("scenario")) - _set_in(tables.get("scenario"))
-    dropped += [f"{name} of [scenario]" for name in sorted(lost)]
+    names = _scenario_parameters(base.tables) - _scenario_parameters(tables)
+    dropped += [f"{name} of [scenario]" for name in sorted(names)]
     if parts and dropped:
-        differences = " and a different ".join("ADS" if key == "ads" else key for key in parts)
+        differences = " and a different ".join(parts).replace("ads", "ADS")
         of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
         remarks = (*remarks, f"{source}: has a different {differences} {of_base}")
     return StudyTables(source, tables, base.origin, remarks)
@@ -82,39 +88,39 @@ def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:
     """A table [scenario] that a study inherits: of another weather without the axes of its
     parameters, and for tests of other models with these alone.
     """
-    names = scenario["over"].keys() - (WEATHER if "weather" in overrides else ())
-    tests = _tables_in(_table_in(overrides, "matrix"), "tests")
+    axes = scenario["over"]
+    names = {*axes}
+    if "weather" in overrides:
+        names -= {*WEATHER}
+    tests = _tables_in(table_in(overrides, "matrix"), "tests")
     if tests and all(test.get("model") not in (None, scenario.get("model")) for test in tests):
         names &= {*WEATHER}
-    return {
-        **scenario,
-        "over": {name: scenario["over"][name] for name in scenario["over"] if name in names},
-    }
+    return {**scenario, "over": {name: axes[name] for name in axes if name in names}}
 
 
 def _for_tests(tables: Tables, overrides: Tables) -> Parameters:
     """The constraints and distributions that a study with tests of its own inherits: of what can
     vary in these tests.
     """
-    # What can vary, the vehicle's characteristics and the axes.
-    tests = _tables_in(_table_in(tables, "matrix"), "tests")
-    known = {*_table_in(_table_in(tables, "vehicle"), "characteristics")}
-    for place in (_table_in(tables, "scenario"), *tests):
-        known |= {*_table_in(place, "over")}
-
-    # Constraints in tests that are still there.
+    # What can vary are the vehicle's characteristics and the axes.
+    tests = _tables_in(table_in(tables, "matrix"), "tests")
+    variables = {*table_in(table_in(tables, "vehicle"), "characteristics")}
+    for place in (table_in(tables, "scenario"), *tests):
+        variables |= {*table_in(place, "over")}
     names = {str(test.get("name")) for test in tests}
-    kept = [
-        {**one, "tests": [name for name in _list_in(one, "tests") if str(name) in names]}
-        for one in _tables_in(tables, "constraints")
-        if known >= {*_table_in(one, "sum")}
-        and (not one.get("tests") or names & {*map(str, _list_in(one, "tests"))})
-    ]
-    chosen = known | {*_table_in(overrides, "variation")}
-    varied = _table_in(tables, "variation")
+    constraints: Any = []
+    for constraint in _tables_in(tables, "constraints"):
+        common = [name for name in _list_in(constraint, "tests") if str(name) in names]
+        has_test = common or not constraint.get("tests")
+        if has_test and variables >= {*table_in(constraint, "sum")}:
+            constraints.append({**constraint, "tests": common})
+    if "constraints" in overrides:
+        constraints = tables.get("constraints")
+    variables |= {*table_in(overrides, "variation")}
+    variation = table_in(tables, "variation")
     return {
-        "constraints": tables.get("constraints") if "constraints" in overrides else kept,
-        "variation": {name: varied[name] for name in varied if name in chosen},
+        "constraints": constraints,
+        "variation": {name: variation[name] for name in variation if name in variables},
     }
 
 
@@ -125,39 +131,37 @@ def _tables_in(tables: Tables, key: str) -> list[Parameters]:
 
 def _list_in(tables: Tables, key: str) -> list[Any]:
     value = tables.get(key)
-    return value if isinstance(value, list) else []
+    if isinstance(value, list):
+        return value
+    return []
 
 
-def _table_in(tables: object, key: str) -> Parameters:
+def table_in(tables: object, key: str) -> Parameters:
     """An inner table; empty where there is none."""
-    table = tables.get(key) if isinstance(tables, dict) else None
-    return dict(table) if isinstance(table, dict) else {}
+    if isinstance(tables, dict) and isinstance(tables.get(key), dict):
+        return dict(tables[key])
+    return {}
 
 
-def _names_scenario(table: object, base_table: object) -> bool:
+def _names_scenario(tables: Tables, base_tables: Tables) -> bool:
     """Whether a table [scenario] names another model than that of its base, whose matrix is not
     about it.
     """
-    if not isinstance(table, dict):
-        return False
-    base_model = base_table.get("model") if isinstance(base_table, dict) else None
-    return table.get("model", base_model) != base_model
+    base_model = table_in(base_tables, "scenario").get("model")
+    return bool(table_in(tables, "scenario").get("model", base_model) != base_model)
 
 
-def _set_in(scenario: object) -> set[str]:
-    """The parameters that a table [scenario] sets or searches."""
-    inner_tables = scenario.values() if isinstance(scenario, dict) else ()
-    return {name for table in inner_tables if isinstance(table, dict) for name in table}
+def _scenario_parameters(tables: Tables) -> set[str]:
+    """The parameters that the table [scenario] sets or searches."""
+    scenario = table_in(tables, "scenario")
+    return {name for key in scenario for name in table_in(scenario, key)}
 
 
 def _model_and_network(table: object) -> object:
     """The model and network that a table names; instead of a model, a weather or matrix itself."""
     if not isinstance(table, dict):
         return table
-    parameters = table.get("parameters")
-    return table.get("model", table), (
-        parameters.get("network") if isinstance(parameters, dict) else None
-    )
+    return table.get("model", table), table_in(table, "parameters").get("network")
 
 
 def _merge(base: Tables, overrides: Tables) -> Parameters:
@@ -169,7 +173,9 @@ def _merge(base: Tables, overrides: Tables) -> Parameters:
         if value is False and isinstance(result.get(key), dict):
             del result[key]
             continue
-        result[key] = _merge(base[key], value) if _refines(key, base.get(key), value) else value
+        if _refines(key, base.get(key), value):
+            value = _merge(base[key], value)
+        result[key] = value
     return result
 
 

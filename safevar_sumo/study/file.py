@@ -6,6 +6,7 @@ import os
 import re
 import tomllib
 from collections.abc import Mapping
+from itertools import filterfalse
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from safevar_sumo.errors import InputError, about, did_you_mean, one_of
 from safevar_sumo.output import read_file, whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study.encounters import Parameters
-from safevar_sumo.study.extending import StudyTables, with_overrides
+from safevar_sumo.study.extending import StudyTables, table_in, with_overrides
 from safevar_sumo.study.schema import (
     NAME_PATTERN,
     OBJECTIVES,
@@ -81,19 +82,26 @@ def study_path(study: str) -> Path:
     if study in study_names():
         return STUDIES / f"{study}.toml"
     if os.path.isdir(study):
-        legal = "the name of a study, or the path of its file (TOML)"
-        raise InputError("study", f"{study!r} is a directory", legal)
+        raise InputError(
+            "study",
+            f"{study!r} is a directory",
+            "the name of a study, or the path of its file (TOML)",
+        )
     if study.endswith(".xosc"):
         raise InputError("study", f"{study!r}: such files are not read any more", RECORDED)
     if os.path.exists(study):
         return Path(study)
     if study in ENDED_STUDIES:
-        problem = f"{study!r} is a study of releases before 0.5"
-        raise InputError("study", problem, ENDED_STUDIES[study])
+        raise InputError(
+            "study", f"{study!r} is a study of releases before 0.5", ENDED_STUDIES[study]
+        )
     problem = f"there is no study or file {study!r}"
     names = study_names()
-    legal = f"the path of a study file (TOML), or {one_of(names)}"
-    raise InputError("study", f"{problem}{did_you_mean(study, names)}", legal)
+    raise InputError(
+        "study",
+        f"{problem}{did_you_mean(study, names)}",
+        f"the path of a study file (TOML), or {one_of(names)}",
+    )
 
 
 def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
@@ -101,7 +109,8 @@ def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
     `safevar_sumo.scenarios.declared.read_study` completes and checks them.
     """
     raw = _raw_study(study)
-    if "encounters" in changes:  # is another view of the study, and not another study
+    # Other encounters are another view of the study, and not another study.
+    if "encounters" in changes:
         raw = raw._replace(tables={**raw.tables, "encounters": changes.pop("encounters")})
     if changes:
         arguments = ", ".join(f"{name}=..." for name in changes)
@@ -118,7 +127,7 @@ def _refuse_ended(tables: Tables) -> None:
     """Refuse keys of earlier releases, with what to write instead."""
     for key, legal in ENDED_KEYS.items():
         table, _, name = key.rpartition(".")
-        if name in (tables.get(table) or {} if table else tables):
+        if name in table_in({"": tables, **tables}, table):
             raise InputError("", f"{key} is a key of releases before 0.5", legal)
 
 
@@ -133,7 +142,9 @@ def plain_values(value: Any) -> Any:
         return [plain_values(item) for item in value]
     if hasattr(value, "to_dict") and all(isinstance(name, str) for name in value.index):
         return plain_values(value.to_dict())
-    return plain_values(value.tolist()) if hasattr(value, "tolist") else value
+    if hasattr(value, "tolist"):
+        return plain_values(value.tolist())
+    return value
 
 
 def _raw_study(study: StudyLike) -> StudyTables:
@@ -146,19 +157,17 @@ def _raw_study(study: StudyLike) -> StudyTables:
 
 def checked_study(raw: StudyTables) -> Study:
     """The study of complete tables; the error of a mistake does not name its source."""
-    # A table that is empty on purpose drops the one of the base.
+    # Tests that are empty on purpose drop the matrix of the study that it extends.
     tables = dict(raw.tables)
-    matrix = tables.get("matrix")
-    vehicle = tables.get("vehicle")
-    if isinstance(matrix, dict) and matrix.get("tests") == []:
-        del tables["matrix"]  # of a study that it extends
-    if isinstance(vehicle, dict) and "model" in vehicle and "characteristics" not in vehicle:
+    vehicle = table_in(tables, "vehicle")
+    if table_in(tables, "matrix").get("tests") == []:
+        del tables["matrix"]
+    if "model" in vehicle and "characteristics" not in vehicle:
         raise _without_characteristics(vehicle["model"])
 
     # With repeats the search maximises the share of unsafe runs.
-    scenario, search = tables.get("scenario"), tables.get("search")
-    has_repeats = isinstance(scenario, dict) and scenario.get("repeats", 1) != 1
-    if has_repeats and isinstance(search, dict):
+    search = table_in(tables, "search")
+    if search and table_in(tables, "scenario").get("repeats", 1) != 1:
         tables["search"] = {"objectives": ["unsafe_share", *OBJECTIVES[1:]], **search}
 
     # Records, and what concerns several of them.
@@ -173,22 +182,20 @@ def _without_characteristics(model: object) -> InputError:
     """The error for a vehicle without characteristics: another model does not inherit those of the
     study's base.
     """
-    texts = (study_path(name).read_text(encoding="utf-8") for name in study_names())
-
-    # The models of shipped studies.
-    models = {
-        tables["vehicle"]["model"]
-        for text in texts
-        if "model" in (tables := tomllib.loads(text)).get("vehicle", {})
-    }
+    models = set()
+    for name in study_names():
+        tables = tomllib.loads(study_path(name).read_text(encoding="utf-8"))
+        models.add(tables.get("vehicle", {}).get("model"))
+    models.discard(None)
     problem = (
         f"vehicle.model = {model!r} has no characteristics: vehicle.characteristics is missing"
     )
-    legal = (
+    return InputError(
+        "",
+        f"{problem}{did_you_mean(model, models)}",
         "[vehicle.characteristics] of that model; of a shipped study that is extended, those of"
-        f" {one_of(models)}"
+        f" {one_of(models)}",
     )
-    return InputError("", f"{problem}{did_you_mean(model, models)}", legal)
 
 
 def _with_parameters(
@@ -201,7 +208,6 @@ def _with_parameters(
     if not isinstance(table, dict) or not isinstance(table.get("parameters", {}), dict):
         return tables
 
-    # Tables within the table are parameters.
     inner_tables = {
         key: value
         for key, value in table.items()
@@ -209,14 +215,15 @@ def _with_parameters(
     }
     other_keys = {key: value for key, value in table.items() if key not in inner_tables}
     parameters = {**other_keys.get("parameters", {}), **inner_tables}
-    return {**tables, name: {**other_keys, "parameters": parameters}} if inner_tables else tables
+    if not inner_tables:
+        return tables
+    return {**tables, name: {**other_keys, "parameters": parameters}}
 
 
 def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
     """Read a TOML file and the study that it `extends`; keys of the file override that study, table
     by table.
     """
-    # The tables of the file.
     try:
         tables = tomllib.loads(read_file(path).decode("utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
@@ -226,13 +233,10 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
             legal = "TOML, in which each key stands once"
         raise InputError(path, f"cannot be read as TOML: {reason}", legal) from None
 
-    # Where it comes from.
-    folders = () if path.parent == STUDIES else (str(path.resolve().parent),)
-    origin = Origin(
-        called=str(path) if folders else "",
-        places=folders,
-        files=(os.path.abspath(path),) if folders else (),
-    )
+    origin = Origin()
+    if path.parent != STUDIES:
+        folder = str(path.resolve().parent)
+        origin = Origin(called=str(path), places=(folder,), files=(os.path.abspath(path),))
     return _with_base(StudyTables(path, tables, origin), path, visited_paths)
 
 
@@ -250,9 +254,11 @@ def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) ->
     # A study takes its file's name, and its base may stand beside it.
     if "name" not in tables and re.fullmatch(NAME_PATTERN, path.stem):
         tables["name"] = path.stem
-    sibling = path.parent / base
+    name_or_path = base
+    if os.path.isfile(path.parent / base):
+        name_or_path = str(path.parent / base)
     try:
-        base_path = study_path(str(sibling) if os.path.isfile(sibling) else base)
+        base_path = study_path(name_or_path)
     except InputError as error:
         raise InputError(raw.source, f"extends = {base!r}: {error.problem}", error.legal) from None
     if base_path in (*visited_paths, path):
@@ -260,19 +266,17 @@ def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) ->
             raw.source, f"extends = {base!r} leads back to {base_path}", "another study"
         )
 
-    # This study's tables over those of its base.
     base_study = _read_file(base_path, (*visited_paths, path))
     merged_study = with_overrides(base_study, tables, raw.source)
-
-    # Where both come from.
-    folders = tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places)))
-    remarks = (
-        () if path.parent == STUDIES else merged_study.remarks
-    )  # shipped studies leave keys out on purpose
-    files = (*raw.origin.files, *base_study.origin.files)
-    return merged_study._replace(
-        origin=Origin(called=raw.origin.called, places=folders, files=files), remarks=remarks
+    origin = Origin(
+        called=raw.origin.called,
+        places=tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places))),
+        files=(*raw.origin.files, *base_study.origin.files),
     )
+    # Shipped studies leave keys out on purpose.
+    if path.parent == STUDIES:
+        return merged_study._replace(origin=origin, remarks=())
+    return merged_study._replace(origin=origin)
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
@@ -287,16 +291,12 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     if re.fullmatch(NAME_PATTERN, path.stem):
         study = replace(study, name=path.stem)
 
-    # A comment of printable characters.
-    lines = (
-        "".join(character if character.isprintable() else "?" for character in line)
-        for line in comment.splitlines()
-    )
-    text = (
-        SCHEMA_LINE
-        + "".join(f"# {line}".rstrip() + "\n" for line in lines)
-        + "\n"
-        + tomli_w.dumps(tables_of(study))
-    )
+    # TOML refuses control characters in comments.
+    text = SCHEMA_LINE
+    for line in comment.splitlines():
+        for character in filterfalse(str.isprintable, line):
+            line = line.replace(character, "?")
+        text += f"# {line}".rstrip() + "\n"
+    text += "\n" + tomli_w.dumps(tables_of(study))
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")

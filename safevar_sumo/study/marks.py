@@ -58,18 +58,21 @@ def with_effect(value: Any, kind: Any) -> Any:
     if get_origin(kind) is Annotated:
         return with_effect(value, inner_kinds[0])
     if get_origin(kind) is dict:
-        return {name: with_effect(inner, inner_kinds[1]) for name, inner in value.items()}
+        return {name: with_effect(item, inner_kinds[1]) for name, item in value.items()}
     if get_origin(kind) is list:
-        return [with_effect(inner, inner_kinds[0]) for inner in value]
+        return [with_effect(item, inner_kinds[0]) for item in value]
     if get_origin(kind) in (Union, UnionType) and isinstance(value, dict):
-        return with_effect(value, next((one for one in inner_kinds if isinstance(one, type)), None))
+        records = (member for member in inner_kinds if isinstance(member, type))
+        return with_effect(value, next(records, None))
     if not (isinstance(kind, type) and issubclass(kind, Table)):
         return value
     kinds = {field.name: field.type for field in fields_of(kind)}
-    left_out = keys_with(WITHOUT_EFFECT, kind)
-    ordered = [key for key in keys_with(ORDERED, kind) if key in value]
-    return {f"order of {key}": list(value[key]) for key in ordered} | {
-        key: with_effect(inner, kinds.get(key))
-        for key, inner in value.items()
-        if key not in left_out
-    }
+    effects = {}
+    for key in keys_with(ORDERED, kind):
+        if key in value:
+            effects[f"order of {key}"] = list(value[key])
+    without_effect = keys_with(WITHOUT_EFFECT, kind)
+    for key, item in value.items():
+        if key not in without_effect:
+            effects[key] = with_effect(item, kinds.get(key))
+    return effects

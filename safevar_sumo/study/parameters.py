@@ -49,20 +49,20 @@ def free_parameters(model: type) -> dict[str, FreeParameter]:
     """
     if not (issubclass(model, msgspec.Struct) or dataclasses.is_dataclass(model)):
         return {}
-    found = {}
+    parameters = {}
     for name, kind in get_type_hints(model, include_extras=True).items():
         for meta in _metas_in(kind):
             extra = meta.extra or {}
             if "free" in extra:
-                found[name] = extra["free"]
+                parameters[name] = extra["free"]
             elif "unit" in extra and meta.ge is not None and meta.le is not None:
-                found[name] = FreeParameter(
+                parameters[name] = FreeParameter(
                     lower=float(meta.ge),
                     upper=float(meta.le),
                     unit=extra["unit"],
                     meaning=meta.description or name,
                 )
-    return found
+    return parameters
 
 
 def _metas_in(kind: Any) -> Iterator[Meta]:
@@ -71,5 +71,5 @@ def _metas_in(kind: Any) -> Iterator[Meta]:
         if isinstance(mark, Meta):
             yield mark
     if not isinstance(kind, str):
-        for inner in get_args(kind):
-            yield from _metas_in(inner)
+        for member in get_args(kind):
+            yield from _metas_in(member)

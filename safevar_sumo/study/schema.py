@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
-from shlex import quote
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
@@ -132,9 +132,9 @@ def label_of(algorithm: str) -> str:
     """Label of an algorithm in results: pymoo_NSGA3 for `pymoo:NSGA3`, the Name of any other
     `package.module:Name`.
     """
-    return (
-        algorithm.replace(":", "_") if algorithm.startswith(PYMOO) else algorithm.rpartition(":")[2]
-    )
+    if algorithm.startswith(PYMOO):
+        return algorithm.replace(":", "_")
+    return algorithm.rpartition(":")[2]
 
 
 class UnsafeTable(Table, frozen=True, kw_only=True):
@@ -238,8 +238,11 @@ class Study(Encounters, frozen=True, kw_only=True):
         if len({len(values) for values in self.spread.values()}) > 1 or not all(
             self.spread.values()
         ):
-            problem = "spread: its lists differ in length or are empty"
-            raise InputError("", problem, "a list for each parameter, all of one length")
+            raise InputError(
+                "",
+                "spread: its lists differ in length or are empty",
+                "a list for each parameter, all of one length",
+            )
         if 0 in self.published.values():
             raise InputError("", f"published = {self.published}", "numbers other than 0")
 
@@ -248,12 +251,12 @@ class Study(Encounters, frozen=True, kw_only=True):
         """The constraints that every setting has to satisfy: those that concern all tests, and no
         parameter that a setting does not have.
         """
-        tests = {"" if test is None else test.name for test, _ in self._axes_by_test}
-        known = self.domains.keys()
+        tests = {test.name for test in self.tests} or {""}
+        names = self.domains.keys()
         return [
             constraint
             for constraint in self.constraints
-            if constraint.sum.keys() <= known and tests <= {*(constraint.tests or tests)}
+            if constraint.sum.keys() <= names and tests <= {*(constraint.tests or tests)}
         ]
 
     @property
@@ -264,10 +267,11 @@ class Study(Encounters, frozen=True, kw_only=True):
     @property
     def unmeasured_values(self) -> dict[str, float]:
         """The values of `unmeasured`, without their sources."""
-        return {
-            name: one.value if isinstance(one, UnmeasuredValue) else one
-            for name, one in self.unmeasured.items()
-        }
+        values = dict[str, Any](self.unmeasured)
+        for name, entry in values.items():
+            if isinstance(entry, UnmeasuredValue):
+                values[name] = entry.value
+        return values
 
     @property
     def source(self) -> str:
@@ -277,10 +281,14 @@ class Study(Encounters, frozen=True, kw_only=True):
     @property
     def words(self) -> str:
         """How a command line names the study, at the point to which it was reduced."""
-        point = f" --point {quote(self.origin.point)}" if self.origin.point else ""
-        ranges = " --ranges" if self.origin.ranges else ""
-        up_to = f" --up-to {quote(self.origin.up_to)}" if self.origin.up_to else ""
-        return f"{quote(self.origin.called or self.name)}{ranges}{point}{up_to}"
+        words = [self.origin.called or self.name]
+        if self.origin.ranges:
+            words.append("--ranges")
+        if self.origin.point:
+            words += ["--point", self.origin.point]
+        if self.origin.up_to:
+            words += ["--up-to", self.origin.up_to]
+        return shlex.join(words)
 
 
 def tables_of(study: Study) -> Parameters:
@@ -294,20 +302,22 @@ def tables_of(study: Study) -> Parameters:
 
 def _without_defaults(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _without_defaults(inner) for key, inner in value.items()}
+        return {key: _without_defaults(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_without_defaults(inner) for inner in value]
+        return [_without_defaults(item) for item in value]
     if not isinstance(value, Table):
         return value
     config = value.__struct_config__
-    table = {} if config.tag_field is None else {config.tag_field: config.tag}
+    table = {}
+    if config.tag_field is not None:
+        table[config.tag_field] = config.tag
     for field in fields_of(type(value)):
-        inner = getattr(value, field.name)
-        default = (
-            field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
-        )
-        if inner != default:
-            table[field.name] = _without_defaults(inner)
+        item = getattr(value, field.name)
+        default = field.default
+        if field.default_factory is not msgspec.NODEFAULT:
+            default = field.default_factory()
+        if item != default:
+            table[field.name] = _without_defaults(item)
     return table
 
 
@@ -319,24 +329,24 @@ def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str]:
     InputError
         If the study has no such number.
     """
-    *path, last = name.split(".")
+    *path, parameter = name.split(".")
     table = tables
     try:
         for key in path:
             table = table[_key_or_index(table, key)]
-        key_or_index = _key_or_index(table, last)
+        key_or_index = _key_or_index(table, parameter)
         is_number = isinstance(table[key_or_index], int | float)
     except (KeyError, IndexError, ValueError, TypeError):
-        is_number = path[:1] == ["weather"] and isinstance(
-            tables["weather"], str
-        )  # a shipped one, looked up later
-        key_or_index = last
+        # A shipped weather is looked up later.
+        is_number = path[:1] == ["weather"] and isinstance(tables["weather"], str)
+        key_or_index = parameter
     if not (is_number and name.startswith(SPREAD_TABLES)):
-        expected = (
-            "a number that is given under"
-            f" {', '.join(prefix.rstrip('.') for prefix in SPREAD_TABLES)}"
+        legal_tables = ", ".join(prefix.rstrip(".") for prefix in SPREAD_TABLES)
+        raise InputError(
+            "",
+            f"spread.{name!r} is no parameter of the study",
+            f"a number that is given under {legal_tables}",
         )
-        raise InputError("", f"spread.{name!r} is no parameter of the study", expected)
     return table, key_or_index
 
 
@@ -344,7 +354,9 @@ def _key_or_index(table: Any, name: str) -> int | str:
     """The key in a table, or the index in a list; an index has one spelling, so that each parameter
     has one name.
     """
-    return int(name) if isinstance(table, list) and name == str(int(name)) else name
+    if isinstance(table, list) and name == str(int(name)):
+        return int(name)
+    return name
 
 
 StudyLike = str | Path | Tables | Study

@@ -26,7 +26,9 @@ def without_skipping(study: Study) -> Study:
 
 def fmus_of(study: Study) -> list[tuple[str, str]]:
     """Key and path of a study's FMU."""
-    return [("ads.model", study.ads.model)] if study.ads.kind == "fmu" else []
+    if study.ads.kind == "fmu":
+        return [("ads.model", study.ads.model)]
+    return []
 
 
 def user_modules(study: Study) -> list[str]:
@@ -37,15 +39,14 @@ def user_modules(study: Study) -> list[str]:
 def user_code(study: Study) -> list[tuple[str, str]]:
     """Keys and names of a study's user code."""
     tests = [test.model for test in study.tests]
+    algorithms = [name for name in study.search.algorithms if not name.startswith(PYMOO)]
     names_by_key = {
         "vehicle.model": [study.vehicle.model],
         "ads.model": [study.ads.model],
         "scenario.model": [study.scenario.model, *tests],
         "metrics.also": study.metrics.also,
         "search.objectives": study.search.objectives,
-        "search.algorithms": [
-            name for name in study.search.algorithms if not name.startswith(PYMOO)
-        ],
+        "search.algorithms": algorithms,
     }
     fmus = fmus_of(study)
     return [
@@ -67,22 +68,22 @@ def data_files(study: Study) -> dict[str, str]:
     """
     places = study.origin.places or (os.getcwd(),)
     paths = {}
-
-    # Each file or folder beside the study.
-    named = [
+    for key, names in (
         ("vehicle.files", study.vehicle.files),
         ("ads.files", study.ads.files),
         ("scenario.files", study.scenario.files),
         ("scenario.parameters.file", _scenario_files(study)),
-    ]
-    for key, name in ((key, name) for key, names in named for name in names):
-        found = [os.path.abspath(path) for place in places if (path := Path(place, name)).exists()]
-        if not found:
-            problem = f"{key}: there is no file {name!r}"
-            raise InputError(
-                study.source, problem, f"the path of a file or folder, relative to {places[0]}"
-            )
-        paths[name] = found[0]
+    ):
+        for name in names:
+            candidates = (Path(place, name) for place in places)
+            path = next(filter(Path.exists, candidates), None)
+            if path is None:
+                raise InputError(
+                    study.source,
+                    f"{key}: there is no file {name!r}",
+                    f"the path of a file or folder, relative to {places[0]}",
+                )
+            paths[name] = os.path.abspath(path)
     return paths
 
 
@@ -92,6 +93,7 @@ def _scenario_files(study: Study) -> list[str]:
     for test in study.tests or [MatrixTest(name="it")]:
         if ":" not in (test.model or study.scenario.model):
             axes = study.axes_of(test)
-            texts += axes["file"].at if "file" in axes else []
+            if "file" in axes:
+                texts += axes["file"].at
             texts += [study.scenario.parameters.get("file"), test.parameters.get("file")]
     return [*dict.fromkeys(text for text in texts if isinstance(text, str))]

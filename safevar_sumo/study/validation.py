@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from types import NoneType, UnionType
 from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin
@@ -32,7 +32,7 @@ WORDS = {
 """What msgspec expects, in words."""
 
 
-def convert_table(raw: Any, table: type[T], prefix: str = "") -> T:
+def convert_table(raw: Any, table: type[T], *prefix: str) -> T:
     """Convert a table to a record.
 
     Raises
@@ -41,7 +41,7 @@ def convert_table(raw: Any, table: type[T], prefix: str = "") -> T:
         With the first mistake.
     """
     try:
-        for path, number in _infinite_numbers(raw, [prefix] if prefix else []):
+        for path, number in _infinite_numbers(raw, prefix):
             raise InputError("", f"{path} = {number}", "a finite number")
         return msgspec.convert(raw, table)
     except msgspec.ValidationError as error:
@@ -69,23 +69,29 @@ class _Place(NamedTuple):
         return f"{_path_text(self.path)} = {_short_text(self.value)}"
 
 
-def _place(raw: Any, table: Any, prefix: str, location: str) -> _Place:
+def _place(raw: Any, table: Any, prefix: Sequence[str], location: str) -> _Place:
     """The place that a message of msgspec names, such as `.search.runs` or `.tests[0]`."""
-    path: list[str | int] = [prefix] if prefix else []
+    path: list[str | int] = [*prefix]
     value = raw
     declared = [table]
     siblings = dict[str, Any]()
     for name, index in re.findall(r"\.(\w+)|\[([\d.]+)\]", location):
-        inner = _inner_type(_intended_type(declared[-1], value), name)
-        siblings = value if isinstance(value, dict) else {}
-        key: Any = name or (_wrong_key(value, inner) if index == "..." else int(index))
+        kind = _inner_type(_intended_type(declared[-1], value), name)
+        key: Any = name
+        if index == "...":
+            key = _wrong_key(value, kind)
+        elif index:
+            key = int(index)
         path.append(key)
+        siblings = {}
+        if isinstance(value, dict):
+            siblings = value
         value = value[key]
-        declared.append(inner)
+        declared.append(kind)
     return _Place(path, value, _intended_type(declared[-1], value), declared, siblings)
 
 
-def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
+def _mistake(raw: Any, table: Any, prefix: Sequence[str], message: str) -> InputError:
     """The error for a message of msgspec, which ends with the place of the mistake."""
     problem, _, location = message.partition(" - at `$")
     place = _place(raw, table, prefix, location)
@@ -95,12 +101,14 @@ def _mistake(raw: Any, table: Any, prefix: str, message: str) -> InputError:
         return _missing_key(place, field[1])
     if problem.startswith("Invalid enum value"):
         return unknown_name("", place.text, place.value, filter(None, get_args(place.kind)))
-    if problem.startswith("Invalid value"):  # of the key that names the kind of table
+    # The value is that of the key that names the kind of table.
+    if problem.startswith("Invalid value"):
         tags = [kind.__struct_config__.tag for kind in get_args(place.declared[-2])]
         return unknown_name("", place.text, place.value, tags)
     if expected := re.match(r"Expected (.*?)(, got `?\w+`?)?$", problem):
         return InputError("", place.text, _expected_in_words(place, expected[1]))
-    problem, _, legal = problem.partition("\n")  # of a `__post_init__`
+    # The message of a `__post_init__` has what is expected on its second line.
+    problem, _, legal = problem.partition("\n")
     return InputError("", f"{_path_text(place.path)}: {problem}".removeprefix(": "), legal)
 
 
@@ -108,14 +116,18 @@ def _missing_key(place: _Place, key: str) -> InputError:
     """The error for a missing key: a table without it may have a mistyped name, and thus be taken
     for a new one.
     """
-    known = [
+    names = [
         name for name, table in place.siblings.items() if isinstance(table, dict) and key in table
     ]
-    hint = did_you_mean(place.path[-1], known) if place.path else ""
-    needed = ", ".join(field.name for field in msgspec.structs.fields(place.kind) if field.required)
-    legal = f"{needed} for what is new here" + (f"; else {', '.join(known)}" if known else "")
-    problem = f"{_path_text(place.path)}: {key} is missing{hint}".removeprefix(": ")
-    return InputError("", problem, legal)
+    keys = ", ".join(field.name for field in msgspec.structs.fields(place.kind) if field.required)
+    legal = f"{keys} for what is new here"
+    hint = ""
+    if names:
+        hint = did_you_mean(place.path[-1], names)
+        legal += f"; else {', '.join(names)}"
+    return InputError(
+        "", f"{_path_text(place.path)}: {key} is missing{hint}".removeprefix(": "), legal
+    )
 
 
 def _expected_in_words(place: _Place, expected: str) -> str:
@@ -133,19 +145,21 @@ def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
     """The error for an unknown key, with the place of a key of this name, else with the nearest key
     of its own table, else of another table in the whole one.
     """
-    own = [name for name in kind.__struct_fields__ if name != NO_KEY]
+    names = [name for name in kind.__struct_fields__ if name != NO_KEY]
     places = dict[str, str]()
     for field in msgspec.structs.fields(table):
         if field.name != NO_KEY:
-            kind_of_field = getattr(field.type, "__origin__", field.type)  # without its marks
-            inner_keys = getattr(kind_of_field, "__struct_fields__", ())
-            places |= {inner: f"{field.name}.{inner}" for inner in inner_keys}
-    places |= {name: name for name in own}
-    likely = own if "." in path else places  # a key above all tables belongs to any of them
-    nearest = [key] if key in places else get_close_matches(key, likely, n=1)
-    nearest = nearest or get_close_matches(key, places, n=1)
+            record = getattr(field.type, "__origin__", field.type)
+            for name in getattr(record, "__struct_fields__", ()):
+                places[name] = f"{field.name}.{name}"
+    places |= zip(names, names, strict=True)
+    # A key above all tables may belong to any of them.
+    likely: Collection[str] = places
+    if "." in path and key not in places:
+        likely = names
+    nearest = get_close_matches(key, likely, n=1) or get_close_matches(key, places, n=1)
     hint = "".join(f"; did you mean {places[name]!r}?" for name in nearest)
-    return InputError("", f"{path}: there is no such key{hint}", one_of(own))
+    return InputError("", f"{path}: there is no such key{hint}", one_of(names))
 
 
 def _intended_type(kind: Any, value: Any) -> Any:
@@ -174,9 +188,8 @@ def _is_record(kind: Any) -> bool:
 def _inner_type(kind: Any, name: str) -> Any:
     """The type of a record's field, or of the elements of a list or table."""
     if _is_record(kind):
-        return next(
-            (field.type for field in msgspec.structs.fields(kind) if field.encode_name == name), Any
-        )
+        fields = msgspec.structs.fields(kind)
+        return next((field.type for field in fields if field.encode_name == name), Any)
     return (get_args(kind) or [Any])[-1]
 
 
@@ -184,9 +197,9 @@ def _wrong_key(value: Mapping[str, Any], kind: Any) -> str:
     """The first key of a table by names whose value cannot be converted; msgspec does not tell
     it.
     """
-    for key, inner in value.items():
+    for key, item in value.items():
         try:
-            msgspec.convert(inner, kind)
+            msgspec.convert(item, kind)
         except msgspec.ValidationError:
             return key
     raise AssertionError("a value that was wrong is right")
@@ -197,23 +210,29 @@ def _path_text(path: Sequence[str | int]) -> str:
     for key in path:
         if isinstance(key, int):
             text += f"[{key}]"
-        else:
-            text += ("." if text else "") + (
-                repr(key) if ("." in key and text) or not key.isprintable() else key
-            )
+            continue
+        if ("." in key and text) or not key.isprintable():
+            key = repr(key)
+        if text:
+            text += "."
+        text += key
     return text
 
 
 def _short_text(value: object) -> str:
     """A value as an error quotes it."""
     text = repr(value)
-    return text if len(text) <= MAX_QUOTE else f"{text[: MAX_QUOTE - 3]}..."
+    if len(text) <= MAX_QUOTE:
+        return text
+    return f"{text[: MAX_QUOTE - 3]}..."
 
 
-def _infinite_numbers(value: object, path: list[str | int]) -> Iterator[tuple[str, float]]:
+def _infinite_numbers(value: object, path: Sequence[str | int]) -> Iterator[tuple[str, float]]:
     """Numbers in tables that are not finite, with their paths."""
-    if isinstance(value, Mapping | list | tuple):
-        for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
-            yield from _infinite_numbers(inner, [*path, key])
+    if isinstance(value, list | tuple):
+        value = dict(enumerate(value))
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _infinite_numbers(item, [*path, key])
     elif isinstance(value, float) and not math.isfinite(value):
         yield _path_text(path), value

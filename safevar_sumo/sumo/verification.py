@@ -43,7 +43,7 @@ def drive_again(
     `start` may open a window.
     """
     trace = runs.trace
-    n = len(runs.outcome)
+    n = len(runs)
     values = {name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")}
     vehicles, encounters = system.split(settings)
     on_road = system.at_encounters(encounters)
