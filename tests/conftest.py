@@ -22,10 +22,8 @@ from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
-from safevar_sumo.study import study_names
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import InlinePool, inline_worker, searched
-from tests.made_up import MISSING
+from tests.in_process import EVERY_STUDY, InlinePool, inline_worker, searched
 
 collect_ignore = (
     [] if os.name == "posix" else ["campaign/test_pool.py", "end_to_end/test_processes.py"]
@@ -128,17 +126,7 @@ def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(falsify, "USUAL_BUDGET", falsify.LEAST_SIMULATIONS)
 
 
-SLOW_STUDIES = ("wear_idm", "wear_rss")
-"""Studies whose driving systems are called for each vehicle, and are slow."""
-
-
-@pytest.fixture(
-    params=[
-        pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_STUDIES else [])
-        for name in study_names()
-        if name not in MISSING
-    ]
-)
+@pytest.fixture(params=EVERY_STUDY)
 def any_system(request: pytest.FixtureRequest) -> System:
     """The system of each shipped study in turn."""
     system = assemble(load_study(request.param))

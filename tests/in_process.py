@@ -24,10 +24,23 @@ from safevar_sumo.campaign import all_runs, evaluation, run_campaign
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.cli.program import run_command_line
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import Study
+from safevar_sumo.study import Study, study_names
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.terminal import show_no_progress
+from tests.made_up import MISSING
+
+SLOW = pytest.mark.slow
+LONG = (
+    *("alks", "autoware_december", "euro_ncap_pedestrian", "fmvss127", "lgsvl", "r152_laden"),
+    *("sensing", "wear_idm", "wear_realistic", "wear_rss"),
+)
+EVERY_STUDY = [
+    pytest.param(name, marks=SLOW if name in LONG else ())
+    for name in study_names()
+    if name not in MISSING
+]
+"""Shipped studies whose extras are installed; those that take long are slow."""
 
 
 class InlinePool(Pool):

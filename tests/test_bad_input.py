@@ -20,7 +20,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.results import MANIFEST
 from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import refused
+from tests.in_process import SLOW, refused
 
 PIPES = [
     ("simulate", "pipe"),
@@ -64,7 +64,7 @@ def replaced(tables: JsonObject, path: tuple[str, ...], value: object) -> JsonOb
     return {**tables, key: value if not rest else replaced(tables[key], tuple(rest), value)}
 
 
-@pytest.mark.slow
+@SLOW
 @settings(max_examples=60, suppress_health_check=list(HealthCheck))
 @given(path=st.sampled_from(paths(TABLES)), value=ANYTHING)
 def test_a_study_with_anything_in_one_place_is_read_or_refused(

@@ -26,11 +26,12 @@ from safevar_sumo.study import (
     keys_with,
     study_names,
 )
+from tests.in_process import SLOW
 from tests.manual import PROGRAM, ROOT, blocks, written
 from tests.pages import PAGES, run_page
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
 def test_every_block_of_a_page_does_and_shows_what_it_says(page: str, in_tmp: Path) -> None:
     for block, output in run_page(page, options_of_tests=True):
@@ -62,7 +63,7 @@ def test_every_picture_has_its_command_and_its_page() -> None:
     )
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     "name",
     ["failure.png", "failure.gif", "sawtooth.png", "boundary.png", "stops.png", "encounters.png"],
@@ -237,7 +238,7 @@ def test_marked_numbers_stand_in_the_paragraph_below_them() -> None:
             assert value in one.paragraph, f"{one.page}: {value}"
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     "lines", sorted({tuple(one.commands) for one in MARKED}), ids=lambda lines: lines[-1]
 )

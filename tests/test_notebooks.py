@@ -20,6 +20,7 @@ from PIL import Image
 import safevar_sumo as sv
 from safevar_sumo.reference.rows import COLUMNS
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import SLOW
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 SHOWN = {"quickstart": (1, 2), "rq1": (2, 0), "rq2": (1, 2), "rq3": (4, 3)}
@@ -62,7 +63,7 @@ def test_stored_outputs_are_of_todays_vehicle() -> None:
     assert all(path.stat().st_size < 500_000 for path in NOTEBOOKS.glob("*.ipynb"))
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", SHOWN)
 def test_a_notebook_shows_its_tables_and_pictures(
     name: str, place: Path, monkeypatch: pytest.MonkeyPatch
@@ -73,7 +74,7 @@ def test_a_notebook_shows_its_tables_and_pictures(
     assert _shown(_executed(name, place, timeout=240)) == SHOWN[name]
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_notebook_of_the_paper_shows_published_solutions_beside_a_study(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,7 +144,7 @@ def _shown(notebook: nbformat.NotebookNode) -> tuple[int, int]:
     return answers, sum("image/png" in one for one in data)
 
 
-@pytest.mark.slow
+@SLOW
 def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> None:
     notebook = _executed("answers", tmp_path, timeout=900)
     outputs = _outputs(notebook)

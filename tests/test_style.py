@@ -13,6 +13,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.in_process import SLOW
 from tests.manual import ROOT
 from tests.size import elements_in, function_lengths_in, sizes, sources_of
 
@@ -64,7 +65,7 @@ def test_a_public_name_is_defined_once() -> None:
     assert {name for name, paths in places.items() if len(paths) > 1} <= DOUBLE
 
 
-@pytest.mark.slow
+@SLOW
 def test_tests_are_collected_without_the_extras() -> None:
     subprocess.run([sys.executable, "-c", COLLECTION], cwd=ROOT, check=True, capture_output=True)
 

@@ -33,6 +33,7 @@ from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import ModelTable, study_names
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import SLOW
 from tests.made_up import MISSING, seen
 from tests.scenarios.holding import CARLA, Hold, driven
 from tests.scenarios.test_crossing import WORN
@@ -95,7 +96,7 @@ def approach(ads: Ads, nominal: Nominal, speed: FloatArray, gap: FloatArray) -> 
     return np.stack(pedals)
 
 
-@pytest.mark.slow
+@SLOW
 @settings(max_examples=8)
 @given(
     speed=arrays(float, 6, elements=st.floats(0, 15)),
@@ -195,7 +196,7 @@ class NearForMany(Hold):
         return self._near
 
 
-@pytest.mark.slow
+@SLOW
 def test_an_ads_of_ones_own_warns() -> None:
     original = CARLA.characteristics.original
     for_many = checked_class(UserCode("ads", NearForMany), Ads)()
@@ -343,7 +344,7 @@ def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap
     assert command.brake[0] == pytest.approx(min(max(-acceleration / KNOWN.decel, 0), 1), abs=1e-6)
 
 
-@pytest.mark.slow
+@SLOW
 def test_autowares_emergency_stop_ends_where_the_ramp_of_jerk_says() -> None:
     speed = np.repeat([30, 40, 60], 2) / 3.6
     deceleration = np.tile([3.0, 2.5], 3)

@@ -21,6 +21,7 @@ from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import SLOW
 from tests.made_up import original_of, seen
 from tests.scenarios.ideal import point_mass
 
@@ -299,11 +300,9 @@ def behind_a_braking_leader(
     return float(gaps.min() if gaps[-1] >= 0 else -closing)
 
 
+@pytest.mark.parametrize("headway", [1.0, *(pytest.param(v, marks=SLOW) for v in (1.4, 2.0))])
 @pytest.mark.parametrize(
-    "headway", [1.0, *(pytest.param(v, marks=pytest.mark.slow) for v in (1.4, 2.0))]
-)
-@pytest.mark.parametrize(
-    "speed", [50.0, *(pytest.param(v, marks=pytest.mark.slow) for v in (30.0, 80.0, 100.0, 130.0))]
+    "speed", [50.0, *(pytest.param(v, marks=SLOW) for v in (30.0, 80.0, 100.0, 130.0))]
 )
 def test_the_competent_driver_behind_a_braking_leader_does_what_the_rule_says(
     speed: float, headway: float
@@ -337,6 +336,7 @@ def test_the_rule_has_the_numbers_of_the_regulation() -> None:
     assert by_the_rule(speeds[0], 1.0, 7.0, 0.0) == pytest.approx(-8.8, abs=0.05)
 
 
+@SLOW
 def test_in_a_car_the_competent_driver_is_the_rule_and_the_cars_delays() -> None:
     """A worn car on a dry road, whose sensors are 0.05 s and whose brakes 0.1 s late; the leader
     brakes to 2 km/h.

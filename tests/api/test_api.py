@@ -19,6 +19,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.part import at_point
 from safevar_sumo.study import tables_of
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import SLOW
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +136,7 @@ def test_a_collision_with_a_moving_car_has_its_closing_speed_and_the_cars_own() 
     assert one.verdict == f"collides at {speeds}"
 
 
+@SLOW
 def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehicle() -> None:
     """A table, a trace, and a picture show the same two drives."""
     one = sv.simulate("wear", {"brakeTorque": 0.6})
@@ -204,7 +206,7 @@ def test_load_reads_the_results_of_run(results: sv.Results) -> None:
     assert_frame_equal(again.solutions, stored, check_dtype=False)
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     ("options", "error"),
     [
@@ -246,7 +248,7 @@ def test_a_value_of_another_type_is_refused_by_the_name_of_its_argument(
         function(**values) if isinstance(values, dict) else function(values)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
     Path("script.py").write_text(
         "import safevar_sumo as sv\nprint('begun')\nresults = sv.run(sv.load_study('smoke',"
@@ -258,7 +260,7 @@ def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
     assert done.stdout.split() == ["begun", "True"]
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_title_of_an_own_algorithm_stands_in_tables(in_tmp: Path) -> None:
     Path("mine.py").write_text(
         "class Mine:\n    title = 'My own search'\n\n    def search(self, problem, rng):\n"

@@ -31,7 +31,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import InlinePool
+from tests.in_process import SLOW, InlinePool
 
 OWN_ADS = """
 from threshold import TTC
@@ -94,7 +94,7 @@ def assert_equal(one: Evaluations, other: Evaluations) -> None:
     assert_array_equal(one.points, other.points)
 
 
-@pytest.mark.parametrize("name", ["smoke", "alks", "sun"])
+@pytest.mark.parametrize("name", ["smoke", "r152", "sun"])
 def test_what_was_simulated_is_read_and_is_the_same_to_the_bit(
     name: str, folder: Path, simulated: list[int]
 ) -> None:
@@ -109,6 +109,7 @@ def test_what_was_simulated_is_read_and_is_the_same_to_the_bit(
     assert sum(simulated) == 128
 
 
+@SLOW
 def test_what_differs_is_simulated(folder: Path, simulated: list[int]) -> None:
     """Other settings, other points, another study, and what the title does not change."""
     study = load_study("alks")
@@ -164,6 +165,7 @@ def test_a_distribution_may_lack_a_version(
     assert sum(simulated) == 4
 
 
+@SLOW
 def test_what_was_simulated_while_an_input_changed_is_refused_and_not_kept(
     folder: Path, simulated: list[int], in_tmp: Path
 ) -> None:
@@ -185,7 +187,7 @@ def test_what_was_simulated_while_an_input_changed_is_refused_and_not_kept(
     assert_equal(evaluated(study, settings, fresh=True), edited)
 
 
-@pytest.mark.slow
+@SLOW
 def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_continuation(
     folder: Path, simulated: list[int], in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -313,7 +315,7 @@ def test_the_oldest_simulations_make_room(folder: Path, monkeypatch: pytest.Monk
         assert kept.extent()[1] < 450_000
 
 
-@pytest.mark.slow
+@SLOW
 def test_two_processes_share_a_cache(folder: Path) -> None:
     """Both ask the same question at once, then one of them asks again: the same bytes."""
     question = ["risk", "smoke", "--samples", "500", "--json"]

@@ -29,7 +29,7 @@ from safevar_sumo.results import Journal, journal_file, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study
 from tests.campaign.formulas import SUN, FormulaPool, carried_out, evaluated, solutions, with_search
-from tests.in_process import InlinePool, searched
+from tests.in_process import SLOW, InlinePool, searched
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_runs_are_dealt_in_equal_shares_with_equally_many_runs_of_each_algorithm
         assert len(share) < 3 or max(numbers.values()) - min(numbers.values()) <= 1
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_run_in_other_hands_is_left_to_them_and_named(study: Study, tmp_path: Path) -> None:
     study = with_search(study, algorithms=["nsga2", "rs"])
     carried_out(study, tmp_path / "whole")
@@ -93,7 +93,7 @@ def test_a_run_in_other_hands_is_left_to_them_and_named(study: Study, tmp_path: 
     assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("budgets", [(55, 130), (100, 60)])
 def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_others(
     study: Study, tmp_path: Path, budgets: tuple[int, int]

@@ -29,9 +29,10 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from tests.campaign import formulas
 from tests.campaign.formulas import FormulaPool
-from tests.in_process import refused, run
+from tests.in_process import SLOW, refused, run
 
 
+@SLOW
 def test_a_file_that_changes_while_a_study_runs_ends_it_before_a_run_counts_as_finished(
     tmp_path: Path,
 ) -> None:
@@ -147,9 +148,8 @@ class Hidden(ScalarAds):
 """
 
 
-@pytest.mark.parametrize(
-    "workers", ["in this process", pytest.param("processes", marks=pytest.mark.slow)]
-)
+@SLOW
+@pytest.mark.parametrize("workers", ["in this process", "processes"])
 def test_what_user_code_imports_while_it_runs_counts_and_what_it_opens_is_named(
     workers: str, in_tmp: Path, request: pytest.FixtureRequest
 ) -> None:
@@ -286,7 +286,7 @@ def broken(study: Study, path: Path, disk: Disk) -> bool:
         return False
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("stays", [False, True])
 def test_every_step_on_the_disk_may_fail(stays: bool, tiny: Study, tmp_path: Path) -> None:
     expected = carried_out(tiny, tmp_path / "whole")

@@ -37,6 +37,7 @@ from safevar_sumo.study import ModelTable, Origin, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.campaign.formulas import SUN, evaluated
+from tests.in_process import SLOW
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 
@@ -62,7 +63,7 @@ def die(path: Path, times: int) -> str:
     return "done"
 
 
-@pytest.mark.slow
+@SLOW
 def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:
     with open_pool(2) as pool:
         assert not processes()
@@ -73,7 +74,7 @@ def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:
     assert not processes()
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_job_of_a_dead_worker_is_carried_out_once_more_and_others_go_on(tmp_path: Path) -> None:
     with open_pool(2) as pool:
         jobs = [(tmp_path / str(k), int(k == 1)) for k in range(4)]
@@ -94,7 +95,7 @@ def take(task: Task, seconds: float) -> None:
         time.sleep(seconds)
 
 
-@pytest.mark.slow
+@SLOW
 def test_work_of_which_two_workers_die_is_named_with_its_study_and_user_code(
     pool: Pool, in_tmp: Path
 ) -> None:

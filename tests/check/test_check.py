@@ -12,7 +12,7 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.check import check_study, study_to_check, trials
-from tests.in_process import json_of, run
+from tests.in_process import SLOW, json_of, run
 from tests.manual import files_of
 
 SCALAR = """import random
@@ -242,14 +242,11 @@ DEFECTS = {
         "parked_ahead",
     ),
 }
-FAST = (
-    *("random", "mean over vehicles", "out of range"),
-    *("scenario undeclared reaction", "scenario beside its speed"),
-)
+FAST = ("random", "mean over vehicles", "out of range", "scenario beside its speed")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in FAST else pytest.mark.slow) for name in DEFECTS]
+    "name", [pytest.param(name, marks=[] if name in FAST else SLOW) for name in DEFECTS]
 )
 def test_a_planted_defect_is_found_with_the_input_that_shows_it(name: str, in_tmp: Path) -> None:
     defect = DEFECTS[name]
@@ -284,7 +281,7 @@ def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass(
     ] == [("reaction", True)]
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     ("pace", "found", "words"),
     [
@@ -313,6 +310,7 @@ def test_others_who_have_left_in_time_or_never_come_are_the_scenarios_matter(
     assert all("mine.py:4" in finding.where and words in finding.finding for finding in findings)
 
 
+@SLOW
 @pytest.mark.parametrize("criterion", ["", '[unsafe]\ncriterion = "safety_degree < 99"\n'])
 def test_an_original_that_is_unsafe_does_not_pass(criterion: str, in_tmp: Path) -> None:
     """With a wrong sign a driving system hits the pedestrian; with a right one it stops nearer
@@ -328,11 +326,7 @@ def test_an_original_that_is_unsafe_does_not_pass(criterion: str, in_tmp: Path) 
 
 
 @pytest.mark.parametrize(
-    "study",
-    [
-        "smoke",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("lgsvl", "native", "wear")),
-    ],
+    "study", ["smoke", *(pytest.param(name, marks=SLOW) for name in ("lgsvl", "native", "wear"))]
 )
 def test_what_is_shipped_passes(study: str) -> None:
     """What is right of users is in the tutorials, whose studies begin with these checks."""
@@ -366,7 +360,7 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
     assert (passed["numbers"]["passed"], passed["tables"]["findings"]["rows"]) == (True, [])
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     ("longest", "options", "vehicles"),
     [(1e6, (), 100), (0.0, (), 3), (0.0, ("--vehicles", "7"), 7)],

@@ -28,9 +28,7 @@ from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import json_of, refused, run
-
-SLOW = pytest.mark.slow
+from tests.in_process import SLOW, json_of, refused, run
 
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 

@@ -20,10 +20,9 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.results import FILES, load_runs, read_manifest
 from safevar_sumo.shipped import NETWORKS
 from tests.end_to_end.conftest import solutions, study, written
-from tests.in_process import json_of, run
+from tests.in_process import SLOW, json_of, run
 
 pytestmark = pytest.mark.usefixtures("small")
-SLOW = pytest.mark.slow
 
 
 @pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
@@ -57,6 +56,7 @@ def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> Non
     assert np.allclose(np.diff(frame["speed [m/s]"]) / step, frame["acceleration [m/s^2]"][1:])
 
 
+@SLOW
 def test_a_title_is_no_markup(in_tmp: Path) -> None:
     Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\ntitle = "[red]x[/blue] {$"\n')
     assert "[red]x[/blue]" in run("simulate", "mine.toml", "--details").stdout

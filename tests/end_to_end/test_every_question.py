@@ -15,12 +15,11 @@ import pytest
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.study import study_names
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import json_of, run
+from tests.in_process import SLOW, json_of, run
 from tests.made_up import MISSING
 from tests.manual import files_of
 from tests.scenarios.test_simulated import MODELS, STUDY
 
-SLOW = pytest.mark.slow
 WIDTH, MAX_LINES = 100, 30
 NO_NUMBER = re.compile(r"(?<![\w./-])-?(nan|inf)\b|\d[eE]\+\d")
 FEW = "--simulations {}"
@@ -106,20 +105,23 @@ def test_every_shipped_study_has_answers_or_reasons(words: str) -> None:
     ("typed", "told"),
     [
         ("permit autoware_july --quick --set brakeTorque=0.5 --others new", "may not drive"),
-        (
-            "permit autoware_july --quick --set brakeTorque=0.9 --others new",
-            "may drive from 30 up to",
-        ),
-        (
-            "permit autoware_july --quick --limits 'brakeTorque >= 0.5' --others new",
-            "may not drive",
-        ),
-        ("tolerance smoke --simulations 200", ""),
-        pytest.param("explain smoke --simulations 60", "", marks=SLOW),
-        pytest.param("risk smoke --simulations 90", "", marks=SLOW),
         ("risk autoware_july --simulations 9", None),
-        pytest.param(
-            "repair autoware_july --promise brakeTorque>=0.9 --quick", "smallest", marks=SLOW
+        *(
+            pytest.param(*row, marks=SLOW)
+            for row in (
+                (
+                    "permit autoware_july --quick --set brakeTorque=0.9 --others new",
+                    "may drive from 30 up to",
+                ),
+                (
+                    "permit autoware_july --quick --limits 'brakeTorque >= 0.5' --others new",
+                    "may not drive",
+                ),
+                ("tolerance smoke --simulations 200", ""),
+                ("explain smoke --simulations 60", ""),
+                ("risk smoke --simulations 90", ""),
+                ("repair autoware_july --promise brakeTorque>=0.9 --quick", "smallest"),
+            )
         ),
     ],
 )

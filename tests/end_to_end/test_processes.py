@@ -22,12 +22,11 @@ from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.output import SETTLING_TIME
 from safevar_sumo.results import load_runs, write_whole
 from tests.end_to_end.conftest import ended, killed, solutions, started, until, workers_of, written
-from tests.in_process import refused, run
+from tests.in_process import SLOW, refused, run
 from tests.scenarios.test_simulated import MODELS, STUDY
 
 Process = subprocess.Popen[str]
 pytestmark = pytest.mark.usefixtures("small")
-SLOW = pytest.mark.slow
 OUT = Path("out")
 
 
@@ -57,9 +56,8 @@ def assert_ends_with_the_results(process: Process, whole: Path) -> None:
     assert (load_runs(OUT).evaluations["outcome"] != "simulator-error").all()
 
 
-@pytest.mark.parametrize(
-    "when", ["mid-run", *(pytest.param(moment, marks=SLOW) for moment in ("loading", "twice"))]
-)
+@SLOW
+@pytest.mark.parametrize("when", ["mid-run", "loading", "twice"])
 def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
     process = started("study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo")
     if when == "loading":

@@ -14,7 +14,7 @@ from safevar_sumo.reference.rows import package_filter
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import json_of, refused, run
+from tests.in_process import SLOW, json_of, refused, run
 
 COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
 
@@ -39,7 +39,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.slow
+@SLOW
 def test_validate_agrees_perfectly_with_itself(data: Path) -> None:
     output = json_of("validate", "sun", str(data))
     assert (output["question"], output["study"], output["numbers"]["rows"]) == (
@@ -66,7 +66,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-@pytest.mark.slow
+@SLOW
 def test_figures_are_png_and_pdf_files(results: Path, in_tmp: Path) -> None:
     run("tables", str(results), "--figures", "pictures", "--plot", "counts.svg")
     files = sorted(Path("pictures").iterdir())
@@ -79,7 +79,7 @@ def test_figures_are_png_and_pdf_files(results: Path, in_tmp: Path) -> None:
     assert Path("counts.svg").read_bytes().startswith(b"<?xml")
 
 
-@pytest.mark.slow
+@SLOW
 def test_tables_prints_what_answers_the_questions_and_all_of_them_if_asked(results: Path) -> None:
     short, whole = (run("tables", str(results), *more).stdout for more in ((), ("--details",)))
     for title in ("RQ2 over runs", "RQ3.1", "Medians over runs"):
@@ -115,7 +115,7 @@ def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Pa
     assert np.allclose(frame["f_diff"], np.max(np.abs(frame.iloc[:, 1:13] / original - 1), axis=1))
 
 
-@pytest.mark.slow
+@SLOW
 def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_tmp: Path) -> None:
     shutil.copytree(results, "part")
     Path("part/runs/rs-01.jsonl").unlink()

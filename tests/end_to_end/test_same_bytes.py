@@ -17,7 +17,7 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.search import ALGORITHMS
 from tests.campaign.formulas import FormulaPool, carried_out
 from tests.end_to_end.conftest import solutions, study
-from tests.in_process import run
+from tests.in_process import SLOW, run
 
 QUESTIONS = {
     "explain": "small.toml --quick --top 1",
@@ -29,7 +29,7 @@ QUESTIONS = {
 """What each command is asked."""
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("small", "worker_processes")
 @pytest.mark.parametrize("command", QUESTIONS)
 def test_an_answer_has_the_same_bytes_for_one_worker_process_and_for_two(command: str) -> None:
@@ -37,7 +37,7 @@ def test_an_answer_has_the_same_bytes_for_one_worker_process_and_for_two(command
     assert len({run(*words, "--json", "--jobs", jobs).stdout for jobs in ("1", "2")}) == 1
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("small", "worker_processes")
 def test_a_search_has_the_same_bytes_in_two_worker_processes(whole: Path) -> None:
     study("--jobs", "2", "--out", "out")
@@ -48,7 +48,7 @@ OURS = [*ALGORITHMS]
 MIXED = ["nsga2", "surrogate", "pymoo:NSGA3", "pymoo:CMAES", "pymoo:MOEAD"]
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     ("algorithms", "workers", "batch", "breaks_after"),
     [(OURS, 7, None, None), (OURS, 3, 3, None), (OURS, 2, 1, None), (MIXED, 1, 11, 9)],

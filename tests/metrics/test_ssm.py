@@ -16,6 +16,7 @@ from safevar_sumo.metrics import OPTIONAL_METRICS
 from safevar_sumo.records import Encounter, FloatArray, SimulationRuns
 from safevar_sumo.study import MetricsTable
 from safevar_sumo.sumo.network import program_of_sumo
+from tests.in_process import SLOW
 from tests.made_up import made_up_runs
 
 RUNS = 50
@@ -100,7 +101,7 @@ def measured(name: str, run: SimulationRuns) -> float:
     return float(OPTIONAL_METRICS[name].function(run, THRESHOLDS)[0])
 
 
-@pytest.mark.slow
+@SLOW
 def test_behind_a_slower_car_ttc_and_drac_are_those_of_the_device(tmp_path: Path) -> None:
     """Both divide the gap by the closing speed, and half its square by the gap, at the ends of
     steps.

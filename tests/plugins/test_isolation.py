@@ -20,7 +20,7 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Vehicle
-from tests.in_process import json_of, refused, run, searched
+from tests.in_process import SLOW, json_of, refused, run, searched
 from tests.manual import files_of
 from tests.plugins.conftest import Mine
 from tests.scenarios.holding import Pedals
@@ -84,7 +84,7 @@ def test_members_of_user_code_are_simulated_and_scored(six: None) -> None:
     assert output["mean_change"] == pytest.approx(3 / 8 / 3)
 
 
-@pytest.mark.slow
+@SLOW
 def test_members_of_user_code_are_searched_and_tabulated(six: None) -> None:
     run("study", "six.toml", "--out", "out", "--runs", "1", "--evaluations", "20", "--quiet")
     solutions = load_runs("out").solutions
@@ -113,7 +113,7 @@ class Late(ScalarAds):
 """A driving system that no longer brakes after 1,200 instances: more than `check` makes."""
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     "command", ["rules late.toml --samples 1500", "study late.toml --out out --quiet"]
 )

@@ -29,11 +29,9 @@ from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import VEHICLES
-from tests.in_process import searched
+from tests.in_process import SLOW, searched
 from tests.made_up import drawn
 from tests.manual import ROOT
-
-SLOW = pytest.mark.slow
 
 BASES = {"pedestrian_crossing": "sun", "lead_vehicle_stopped": "native", "stop": "stop"}
 """A study with each scenario; all others are driven by the car of `wear`."""

@@ -24,7 +24,7 @@ from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, json_of
+from tests.in_process import SLOW, InlinePool, json_of
 from tests.questions.conftest import model_of
 
 AHEAD = """
@@ -99,7 +99,7 @@ def test_a_scope_names_a_range_only_where_it_was_driven(
     assert said in scope_of(load_study("own.toml"), between=between)
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", ["ahead.toml", "rain"])
 @pytest.mark.usefixtures("few_simulations")
 def test_more_parameter_sets_never_widen_limits_which_hold_between_the_tests(
@@ -145,7 +145,7 @@ def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]], fits: int) -
             assert kept[0] < least or kept.min() >= least, (number, result.point.name)
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("few_simulations")
 def test_a_set_in_which_the_original_is_unsafe_is_named_with_its_test(ahead: Study) -> None:
     text = Path("ahead.toml").read_text()

@@ -18,10 +18,8 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.by_criterion import STAGE, study_by
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import Evaluations, FloatArray
-from tests.in_process import InlinePool, json_of, run, searched
+from tests.in_process import SLOW, InlinePool, json_of, run, searched
 from tests.made_up import HARDEST_BRAKING
-
-SLOW = pytest.mark.slow
 
 STUDY = """
 extends = "rain"
@@ -144,7 +142,7 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
     assert json_of("verify", "pack.zip")["numbers"]["passed"]
 
 
-@pytest.mark.slow
+@SLOW
 def test_an_undefined_measure_is_counted(folder: Path) -> None:
     (folder / "nowhere.py").write_text(
         HARDEST_BRAKING.replace("return np.where", "return np.nan * np.where")

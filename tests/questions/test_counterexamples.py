@@ -18,7 +18,7 @@ from safevar_sumo.questions.models import judges_of
 from safevar_sumo.questions.reach import falsify_limits, reach, rounded_towards
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import Characteristic, region_of
-from tests.in_process import InlinePool, json_of, numbers_of, refused
+from tests.in_process import SLOW, InlinePool, json_of, numbers_of, refused
 from tests.questions.conftest import made_up_model, made_up_study, nowhere
 
 
@@ -105,7 +105,7 @@ def test_a_margin_that_the_original_does_not_keep_ends_the_question() -> None:
     assert answer.numbers["kept"] is False
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_failure_between_tests_of_any_set_is_simulated_by_its_command() -> None:
     car = ["--set", "treadDepth=2", "--set", "brakeTorque=0.55", "--set", "payload=500"]
     asked = json_of("permit", "wear", *car, "--others", "new")
@@ -115,7 +115,7 @@ def test_a_failure_between_tests_of_any_set_is_simulated_by_its_command() -> Non
         assert numbers_of(row["simulate"])["f_safe"] < 0.3, row["simulate"]
 
 
-@pytest.mark.slow
+@SLOW
 def test_an_axis_of_the_matrix_is_set_where_tests_have_it() -> None:
     point = ("--point", "CPFA, speed 40, wet")
     at_test = json_of("simulate", "wear", "--set", "speed=40", *point)

@@ -18,6 +18,7 @@ from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import SLOW
 
 JOINT = with_ranges(sv.load_study("wear"))
 LIMIT = [{"sum": {"payload": 1, "payloadCentre": -100}, "at_most": 200, "unit": "kg"}]
@@ -49,7 +50,7 @@ def are_no_thousands(value: float) -> bool:
     return len(repr(value).partition(".")[2]) != 3
 
 
-@pytest.mark.slow
+@SLOW
 @given(
     rows=st.lists(
         st.tuples(

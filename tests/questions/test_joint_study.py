@@ -22,7 +22,7 @@ from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import scans
 from safevar_sumo.results.identity import identity_digest, manifest_of
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import json_of, refused, run, searched
+from tests.in_process import SLOW, json_of, refused, run, searched
 
 STUDY = """
 extends = "rain"
@@ -82,7 +82,7 @@ def _few_encounters(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "typed",
     [
-        pytest.param(typed, marks=pytest.mark.slow if typed.startswith("explain") else ())
+        pytest.param(typed, marks=SLOW if "tiny" in typed or "explain" in typed else ())
         for typed in QUESTIONS
     ],
 )
@@ -147,6 +147,7 @@ class TakesAll:
 """
 
 
+@SLOW
 def test_a_study_counts_what_an_own_algorithm_returns_and_is_no_solution(folder: Path) -> None:
     (folder / "takes.py").write_text(TAKES_ALL)
     own = 'extends = "tiny.toml"\nname = "own"\nsearch.algorithms = ["takes:TakesAll"]\n'
@@ -201,7 +202,7 @@ small pocket of the encounters, such as 0.15 km/h by 4 % of the path.
 """
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", WORN)
 def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
     with open_evaluator(load_study(name, encounters="ranges"), jobs=2) as judging:
@@ -234,7 +235,7 @@ def test_changes_are_those_of_the_vehicle(case: Case) -> None:
     assert "distance" not in {one["characteristic"] for one in tables["rq3.2"]["rows"]}
 
 
-@pytest.mark.slow
+@SLOW
 def test_two_studies_are_compared_in_the_encounters_that_both_search(folder: Path) -> None:
     (folder / "wider.toml").write_text(
         STUDY.replace("lower = 8, upper = 18", "lower = 10, upper = 20")
@@ -248,7 +249,7 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(folder: Pat
     assert "distance" not in {one["characteristic"] for one in answer["tables"]["limits"]["rows"]}
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_page_replays_causes_in_their_encounters() -> None:
     ask = ("--ask", "explain --quick --top 2", "--jobs", "1")
     run("report", "results", "--out", "page.html", *ask)

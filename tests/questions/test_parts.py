@@ -12,10 +12,10 @@ import safevar_sumo as sv
 from safevar_sumo.questions.ask import find_question
 from safevar_sumo.questions.part import at_point
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, json_of, numbers_of
+from tests.in_process import SLOW, InlinePool, json_of, numbers_of
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     ("name", "options"), [("rules", {"samples": 32}), ("tolerance", {"simulations": 240})]
 )
@@ -30,7 +30,7 @@ def test_a_question_about_a_part_prints_commands_about_it(
     assert following == ["wear", "--ranges", "--point", "CPLA", "--up-to", "speed=40"]
 
 
-@pytest.mark.slow
+@SLOW
 def test_limits_are_attacked_in_the_ranges_of_their_study_by_a_car_that_can_be_simulated() -> None:
     part = {"characteristics": ("brakeTorque",), "point": "CPNCO"}
     answer = sv.tolerance("wear", fits=0, pool=InlinePool(), **part)

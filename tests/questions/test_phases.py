@@ -26,11 +26,11 @@ from safevar_sumo.questions.phases import COUNTS_STEPS, at_worst_phases, in_phas
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import Track, TrackScenario
 from safevar_sumo.scenarios.declared import with_ranges
-from safevar_sumo.study import Study, study_names
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import InlinePool, json_of, numbers_of, refused
+from tests.in_process import EVERY_STUDY, SLOW, InlinePool, json_of, numbers_of, refused
 from tests.made_up import drawn
 
 STEP = 0.05
@@ -47,7 +47,7 @@ def degrees(system: System, settings: FloatArray) -> FloatArray:
     return np.stack([result.evaluations.f_safe for result in found])
 
 
-@pytest.mark.parametrize("name", study_names())
+@pytest.mark.parametrize("name", EVERY_STUDY)
 def test_an_encounter_that_begins_a_whole_step_later_is_the_same(name: str) -> None:
     study = load_study(name)
     system = assemble(study)
@@ -130,6 +130,7 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     assert_array_equal(np.round(rows[:, -1], 4), rows[:, -1])
 
 
+@SLOW
 def test_no_phase_is_unsafe_where_the_worst_is_not() -> None:
     evaluator = Evaluator(ahead(), InlinePool())
     model = Model(0, evaluator, Unsafe(below=0.0))
@@ -147,7 +148,7 @@ def test_no_phase_is_unsafe_where_the_worst_is_not() -> None:
     assert ((worst < 0) == is_unsafe).all()
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_car_may_not_drive_where_it_fails_at_another_phase() -> None:
     car = ["--set", "brakeTorque=0.93", "--others", "new", "--margin", "0.3"]
     (row,) = json_of("permit", "autoware_july", *car)["tables"]["cars"]["rows"]
@@ -185,12 +186,13 @@ def test_tracks_that_ignore_the_phases_of_others_are_refused() -> None:
         Careless().tracks_begun(times, np.array([0.0, 0.01]))
 
 
+@SLOW
 @pytest.mark.parametrize(
     ("question", "options"),
     [
         (sv.permit, {"set": ("brakeTorque=1",), "others": "new", "step": 30}),
         (sv.tolerance, {"characteristics": ("brakeTorque",), "at_tests": True}),
-        pytest.param(sv.repair, {"promise": ("brakeTorque >= 0.9",)}, marks=pytest.mark.slow),
+        (sv.repair, {"promise": ("brakeTorque >= 0.9",)}),
     ],
 )
 def test_an_answer_says_that_a_driving_system_counts_steps(

@@ -31,11 +31,9 @@ from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import ModelTable, ScenarioTable
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import InlinePool
+from tests.in_process import SLOW, InlinePool
 from tests.made_up import drawn, made_up_runs, original_of
 from tests.questions.conftest import box, made_up_evaluator
-
-SLOW = pytest.mark.slow
 
 COLLISION = Unsafe()
 

@@ -201,7 +201,7 @@ class Counted(Rig):
 """
 
 
-@pytest.mark.parametrize("number", [10, 40, 300])
+@pytest.mark.parametrize("number", [10, 40, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("question", ["risk", "rules", "tolerance --limits decel>=5", "explain"])
 def test_a_number_is_that_of_all_simulations_of_an_edited_class(

@@ -14,6 +14,7 @@ from hypothesis import given, strategies as st
 import safevar_sumo as sv
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.terminal import Pace, Parts
+from tests.in_process import SLOW
 
 RECORDED = Path(__file__).with_name("progress.csv")
 """What `benchmarks/progress.py` recorded: command, time [s], done, total; the last row of a command
@@ -27,11 +28,9 @@ QUESTIONS: list[Any] = [
     (lambda study, **options: sv.compare(study, "smoke", **options), {"samples": 100}),
     (sv.risk, {"samples": 200}),
     (sv.rules, {"samples": 200}),
-    pytest.param(sv.tolerance, {"quick": True}, marks=pytest.mark.slow),
+    pytest.param(sv.tolerance, {"quick": True}, marks=SLOW),
     pytest.param(
-        sv.repair,
-        {"promise": ("mass <= 2450",), "change": ("brake_gap",), "fits": 1},
-        marks=pytest.mark.slow,
+        sv.repair, {"promise": ("mass <= 2450",), "change": ("brake_gap",), "fits": 1}, marks=SLOW
     ),
 ]
 
@@ -43,7 +42,7 @@ def assert_counts(shown: Shown) -> None:
     assert all(done <= total for _, done, total in shown)
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(("ask", "options"), QUESTIONS)
 def test_phases_come_in_order_and_all_that_is_done_is_in_the_total(
     ask: Callable[..., Any], options: Mapping[str, Any]

@@ -33,10 +33,8 @@ from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, run
+from tests.in_process import SLOW, InlinePool, run
 from tests.made_up import original_of
-
-SLOW = pytest.mark.slow
 
 SPEED, MARGIN, GAP_TODAY = 20.0, 0.3, 12.0
 """Speed [m/s] of the planted system; its gap of today lets even a new sled collide, so that the
@@ -374,7 +372,9 @@ def test_what_cannot_be_repaired_is_refused(
         sv.repair(planted, change=[change], pool=InlinePool())
 
 
-@pytest.mark.parametrize("model", CHANGEABLE)
+@pytest.mark.parametrize(
+    "model", [pytest.param(name, marks=SLOW if name[0] in "aik" else ()) for name in CHANGEABLE]
+)
 def test_one_driving_system_drives_vehicles_with_different_parameters(model: str) -> None:
     shipped = {"world_on_rails": "sun", "apollo": "lgsvl"}
     parameters = sv.load_study(shipped[model]).ads.parameters if model in shipped else {}

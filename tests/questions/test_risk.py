@@ -28,7 +28,7 @@ from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool
+from tests.in_process import SLOW, InlinePool
 from tests.questions.conftest import (
     Plant,
     Region,
@@ -259,7 +259,7 @@ def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any]
         assert low < numbers[other]["share"] < high
 
 
-@pytest.mark.slow
+@SLOW
 def test_risk_rules_and_explain_simulate_the_same_vehicles_with_each_parameter_set() -> None:
     study = load_study("wear")
     vehicles = VariationModel(study).draw(VEHICLES, default_rng(study.search.seed))
@@ -298,7 +298,7 @@ def test_a_parameter_set_is_named_where_its_interval_leaves_the_others_out(
     assert greatest in words
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_other_parameter_sets_are_planned() -> None:
     """Progress counts them from the beginning. A number of simulations that suffices for all but
     these is a bound, within which the own set answers alone.

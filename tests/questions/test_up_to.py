@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pytest
 
 from safevar_sumo import tolerance
 from safevar_sumo.api.simulation import load_study
@@ -25,6 +24,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
+from tests.in_process import SLOW
 from tests.questions.conftest import Plant
 
 AHEAD = """
@@ -85,7 +85,7 @@ def limits_up_to(study: Study, value: float, **options: Any) -> Answer:
     return tolerance(study, up_to=f"speed={value:g}", characteristics=("brakeTorque",), **options)
 
 
-@pytest.mark.slow
+@SLOW
 def test_limits_up_to_a_value_between_two_tests_hold_there_and_lie_between_theirs(
     ahead: Study,
 ) -> None:
@@ -134,7 +134,7 @@ def test_limits_up_to_a_value_lie_within_those_up_to_smaller_ones(ahead: Study) 
         assert smaller_cuts(study, f"speed={value}") == cuts
 
 
-@pytest.mark.slow
+@SLOW
 def test_limits_up_to_a_larger_value_are_never_wider(ahead: Study) -> None:
     """With a search of its own for each value, 0.279 s were the limit up to 30 km/h and 0.294 s up
     to 40.
@@ -148,7 +148,7 @@ def test_limits_up_to_a_larger_value_are_never_wider(ahead: Study) -> None:
                 assert (sign * np.array(ends[0]) <= sign * np.array(ends[1])).all(), (kind, name)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_vehicle_that_is_said_to_fail_fails_and_a_rough_answer_keeps_nothing(
     in_tmp: Path,
 ) -> None:

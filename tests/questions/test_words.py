@@ -15,7 +15,7 @@ from safevar_sumo.questions import words
 from safevar_sumo.questions.case import load_cases
 from safevar_sumo.questions.words import undecidable_in_words
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import json_of, searched
+from tests.in_process import SLOW, json_of, searched
 
 STUDY = """
 extends = "sun"
@@ -71,7 +71,7 @@ def silence(patch: pytest.MonkeyPatch) -> int:
     return replaced
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("typed", TYPED, ids=" ".join)
 @pytest.mark.usefixtures("few_simulations")
 def test_without_words_every_number_stays(
@@ -93,7 +93,7 @@ def test_without_words_every_number_stays(
     assert said["verdict"] != silent["verdict"]
 
 
-@pytest.mark.slow
+@SLOW
 def test_half_of_the_originals_is_said_by_every_question(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

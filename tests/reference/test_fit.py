@@ -28,7 +28,7 @@ from safevar_sumo.reference.rows import COLUMNS, ReferenceData
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool
+from tests.in_process import SLOW, InlinePool
 from tests.made_up import made_up_evaluations
 
 GAP = "ads.parameters.brake_gap"
@@ -44,7 +44,7 @@ def data() -> ReferenceData:
     return ReferenceData(settings, dict(drive_and_score(system, settings).metrics))
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_search_brings_a_planted_parameter_nearer_to_the_truth(
     data: ReferenceData, in_tmp: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -214,7 +214,7 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
     assert not other.model_error
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("few_simulations")
 def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scans, "SCAN_VALUES", 21)

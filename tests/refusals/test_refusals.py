@@ -25,7 +25,7 @@ from typing import Any
 import pytest
 
 from safevar_sumo.shipped import NETWORKS
-from tests.in_process import refused
+from tests.in_process import SLOW, refused
 
 FOLDERS: dict[str, Callable[[Path], object]] = {
     "network": lambda folder: shutil.copytree(NETWORKS / "pedestrian_crossing", folder / "mine")
@@ -38,7 +38,7 @@ def rows(table: str = "*") -> Iterator[Any]:
         for row in tables["refused"]:
             base = tables["base"][row["base"]] if "base" in row else {}
             whole = {**tables.get("default", {}), **base, **row}
-            slow = [pytest.mark.slow] if whole.get("slow") else []
+            slow = [SLOW] if whole.get("slow") else []
             first = whole["told"] if isinstance(whole["told"], str) else whole["told"][0]
             yield pytest.param(whole, id=f"{path.stem}: {first.strip()[:60]}", marks=slow)
 

@@ -24,7 +24,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.comparison import Comparison, comparison_of
 from safevar_sumo.results import write_imported
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import refused, run
+from tests.in_process import SLOW, refused, run
 from tests.made_up import made_up_evaluations
 
 ASAM = Path(sys.prefix) / "asam" / "bin"
@@ -60,8 +60,7 @@ def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]
 @pytest.fixture(
     scope="module",
     params=[
-        pytest.param(name, marks=() if name == "lead_vehicle_stopped" else pytest.mark.slow)
-        for name in SCENES
+        pytest.param(name, marks=() if name == "lead_vehicle_stopped" else SLOW) for name in SCENES
     ],
 )
 def exported(
@@ -79,6 +78,7 @@ def exported(
     )
 
 
+@SLOW
 def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Comparison]) -> None:
     xosc = pytest.importorskip("scenariogeneration.xosc")
     out, comparison = exported
@@ -130,7 +130,7 @@ def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(
         )
 
 
-@pytest.mark.slow
+@SLOW
 def test_asam_finds_no_fault(exported: tuple[Path, Comparison]) -> None:
     if not ASAM.is_dir() and os.environ.get("SAFEVAR_ASAM") != "required":
         pytest.skip("make .venv/installed-asam installs ASAM's checks")

@@ -37,6 +37,7 @@ from safevar_sumo.replay.comparison import COLOURS, Comparison, comparison_of, l
 from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import SLOW
 
 
 def test_a_replay_that_differs_from_its_row_is_reported(case: Case) -> None:
@@ -119,7 +120,7 @@ def of_colour(picture: np.ndarray, colour: str) -> np.ndarray:
     return np.array(np.nonzero(np.abs(picture.astype(int) - wanted).max(axis=2) < 26))
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("screen")
 def test_both_vehicles_are_in_the_window_at_the_nearest_moment(
     comparison: Comparison, tmp_path: Path
@@ -205,7 +206,7 @@ def test_an_impact_is_marked_from_its_moment_on_at_the_bumper_of_the_vehicle_tha
         assert marked.max() == pytest.approx(front, abs=1.2 * scale)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_gif_lasts_as_long_as_the_drive_and_has_the_same_bytes_twice(
     comparison: Comparison, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,9 +30,8 @@ from safevar_sumo.replay.comparison import comparison_of
 from safevar_sumo.report.page import TEMPLATE_FOLDER
 from safevar_sumo.study.file import study_names
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import SLOW
 from tests.report.test_sheet import sheet_of_shipped
-
-SLOW = pytest.mark.slow
 
 A4 = {"width": round(190 / 25.4 * 96), "height": round(279 / 25.4 * 96)}
 """The part of a page within its margins [px]."""

@@ -29,11 +29,9 @@ from safevar_sumo.report.evidence import _files_of_user
 from safevar_sumo.report.pack import DESCRIPTION, _check_entries, digests_of, read_pack
 from safevar_sumo.results import load_runs
 from safevar_sumo.shipped import NETWORKS
-from tests.in_process import json_of, refused, run, searched
+from tests.in_process import SLOW, json_of, refused, run, searched
 from tests.manual import files_of
 from tests.questions.test_repair import planted as planted
-
-SLOW = pytest.mark.slow
 
 MINE = """
 from pathlib import Path
@@ -240,7 +238,7 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     assert done.stdout.startswith("7 of 8 claims are the same")
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_pack_holds_a_list_of_cars_without_their_names(
     slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -526,6 +524,7 @@ def test_a_solution_that_a_run_returns_twice_is_no_damage(tmp_path: Path) -> Non
     assert "solutions" in verified(str(tmp_path / "it.zip"))
 
 
+@SLOW
 @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
 def test_a_flipped_bit_is_damage_however_the_archive_is_compressed(
     method: int, bare: Path, tmp_path: Path

@@ -38,10 +38,8 @@ from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress
 from safevar_sumo.vehicles import VEHICLES
-from tests.in_process import run, searched
+from tests.in_process import SLOW, run, searched
 from tests.report.conftest import ASK, page_of
-
-SLOW = pytest.mark.slow
 
 
 def words_of(page: str) -> str:
@@ -144,6 +142,7 @@ def test_chosen_solutions_and_causes_have_replays_that_end_as_recorded(
     )
 
 
+@SLOW
 def test_settings_that_answers_name_are_replayed_once_for_each_set_of_changes(
     case: Case, slippery: Path
 ) -> None:
@@ -186,6 +185,7 @@ def test_a_question_is_read_as_its_command_is_printed(text: str) -> None:
     assert question.command_line([], {}, values) == f"python -m safevar_sumo {text}"
 
 
+@SLOW
 def test_the_staircase_is_on_the_page_as_a_table_and_as_steps_with_names(slippery: Path) -> None:
     asked = "explain --of-study --simulations 600"
     page = page_of(slippery, ask=("rules --samples 20", asked), jobs=1)

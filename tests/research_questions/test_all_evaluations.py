@@ -26,6 +26,7 @@ from safevar_sumo.questions.research_questions.fronts import (
 from safevar_sumo.questions.research_questions.statistics import can_be_significant
 from safevar_sumo.questions.subject import load
 from tests.campaign.formulas import carried_out
+from tests.in_process import SLOW
 from tests.research_questions.cases import made_up, row
 
 FIVE_WORST = """
@@ -147,6 +148,7 @@ def test_whether_runs_can_be_significant_follows_from_the_exact_distribution(
         assert found == [False, True]
 
 
+@SLOW
 def test_what_was_not_tested_is_neither_significant_nor_not() -> None:
     """The original's TET is unknown, and all of one algorithm's solutions collide, which have no
     TET.
@@ -167,6 +169,7 @@ def test_what_was_not_tested_is_neither_significant_nor_not() -> None:
     assert re.search(r"│ ?TET .* - ?│", answer.render("text", "rq1"))
 
 
+@SLOW
 def test_a_study_prints_tests_only_where_its_runs_can_be_significant(
     case: Case, study: Path, tmp_path: Path
 ) -> None:

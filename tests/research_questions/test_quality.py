@@ -39,6 +39,7 @@ from safevar_sumo.questions.research_questions.statistics import (
     signed_rank_test,
 )
 from safevar_sumo.study import CharacteristicTable
+from tests.in_process import SLOW
 from tests.research_questions.cases import made_up, made_up_study, row, three_algorithms
 
 
@@ -264,7 +265,7 @@ DOCUMENT = r"""\documentclass{article}
 @pytest.mark.skipif(
     shutil.which("pdflatex") is None, reason="there is no TeX here, as there is in CI"
 )
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("name", CASES)
 def test_latex_compiles(name: str, tmp_path: Path) -> None:
     document = DOCUMENT % answer_about(name).render("latex")
@@ -280,6 +281,7 @@ def test_latex_compiles(name: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout[-2000:]
 
 
+@SLOW
 def test_the_table_for_a_paper_marks_each_metric_that_is_significant() -> None:
     answer = answer_questions([three_algorithms()])
     long = answer.tables["rq2-runs"].set_index(["metric", "baseline"])
@@ -311,7 +313,7 @@ def test_tables_have_the_columns_that_their_command_declares() -> None:
             assert all(isinstance(number, int) for number in numbers), name
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_tests_of_each_question_are_corrected_as_a_family() -> None:
     """Runs that are all apart: Holm multiplies the smallest p-value of RQ1, 2 / 2^n, by its 8
     tests, and that of RQ2, 2 / C(2n, n), by its 7: 11 and 7 runs are needed where 8 and 5 would be
@@ -379,6 +381,7 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
     assert imported.tables["rq1"]["significant"].any(), "the runs of imported solutions are unknown"
 
 
+@SLOW
 def test_readers_see_a_long_table_crosswise_and_every_table_within_100_columns() -> None:
     text = answer_about("two").render("text", "rq3.2")
     assert re.search(r"setting +┃ *characteristic +┃ *1 ┃ *2 ┃ *3 ┃ *any ", text)

@@ -38,6 +38,7 @@ from safevar_sumo.questions.research_questions.comparisons import (
 from safevar_sumo.questions.research_questions.fronts import compute_convergence, count_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, compare_samples
 from safevar_sumo.records import JsonObject
+from tests.in_process import SLOW
 from tests.research_questions.cases import ORIGINAL, made_up, row, three_algorithms
 
 
@@ -94,7 +95,7 @@ def test_rq2_is_high_where_nsga2_is_better() -> None:
     assert rq2(made_up(*exchanged))["effect_size"].tolist() == [0] * 7
 
 
-@pytest.mark.slow
+@SLOW
 def test_rq2_compares_the_algorithm_asked_for_else_nsga2_else_the_first() -> None:
     case = three_algorithms()
     means = case.solutions.groupby(["algorithm", "run"])["safety_degree"].mean()
@@ -128,6 +129,7 @@ def test_rq2_compares_the_algorithm_asked_for_else_nsga2_else_the_first() -> Non
     assert "no finished run of nsga2" in " ".join(asked.tables["remarks"]["remark"])
 
 
+@SLOW
 def test_rq2_and_a_table_say_how_many_settings_each_algorithm_simulated() -> None:
     """Of 100 evaluations one algorithm repeats settings, the other stops early; in the last
     generation only repeats may be missing.
@@ -265,7 +267,7 @@ def test_algorithms_are_compared_after_equal_numbers_of_simulations(
     )
 
 
-@pytest.mark.slow
+@SLOW
 def test_minimal_causes_of_runs_are_compared_if_they_were_counted() -> None:
     case = three_algorithms()
     counts = [
@@ -428,7 +430,7 @@ def test_collisions_and_their_share() -> None:
     assert frame.to_numpy().tolist() == [["nsga2", 3, 2, pytest.approx(2 / 3)], ["rs", 1, 0, 0]]
 
 
-@pytest.mark.slow
+@SLOW
 def test_equal_solutions_of_a_run_are_counted_and_said_in_pooled_tables() -> None:
     """Equal ones of two runs are not equal solutions of a run."""
     rows = [row("nsga2", run) for run in (0, 0, 0, 1)] + [row("rs", 0)]

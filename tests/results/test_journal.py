@@ -19,6 +19,7 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations, differences
 from safevar_sumo.results import Journal, JournalReader, journal_head
 from safevar_sumo.results.journal import JournalContent, read_journal
+from tests.in_process import SLOW
 
 BATCHES = 4
 ROWS = 3
@@ -114,7 +115,7 @@ def test_a_journal_is_a_table_that_pandas_reads(tmp_path: Path) -> None:
     assert lines[0]["tet"][2] is None, "undefined"
 
 
-@pytest.mark.slow
+@SLOW
 @in_one_folder
 @given(st.data())
 def test_a_truncated_journal_loads_its_whole_lines_and_continues(
@@ -282,7 +283,7 @@ def test_a_journal_of_another_study_or_run_is_refused(
         opened(tmp_path / "a.jsonl", journal_head(study, run, ("a", "b")))
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
     code = "from safevar_sumo.results import Journal\nfrom pathlib import Path\n"

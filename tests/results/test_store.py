@@ -40,7 +40,7 @@ from safevar_sumo.results.identity import (
 from safevar_sumo.results.manifest import read_manifest
 from safevar_sumo.study import Study, tables_of
 from tests.campaign.formulas import carried_out, with_search
-from tests.in_process import json_of, refused, run
+from tests.in_process import SLOW, json_of, refused, run
 from tests.made_up import made_up_evaluations
 
 NAMES = ("a", "b")
@@ -452,6 +452,7 @@ def test_a_study_under_way(copied: Path) -> None:
     assert load_cases([copied])[0].evaluations.empty
 
 
+@SLOW
 def test_results_of_a_study_whose_search_was_a_key_are_read_by_their_release(
     tmp_path: Path,
 ) -> None:

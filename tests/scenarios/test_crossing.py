@@ -23,6 +23,7 @@ from safevar_sumo.scenarios.tracks import VUT_WIDTH
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import SLOW
 from tests.made_up import made_up_runs
 from tests.scenarios.holding import at_contact, driven
 
@@ -89,7 +90,7 @@ def moved(folder: Path, network: str, forth: tuple[float, float]) -> str:
 
 
 @pytest.mark.parametrize("forth", TURNS.values(), ids=TURNS)
-@pytest.mark.parametrize("study", ["rain", "native"])
+@pytest.mark.parametrize("study", ["rain", pytest.param("native", marks=SLOW)])
 def test_a_turned_road_changes_nothing(
     study: str, forth: tuple[float, float], tmp_path: Path
 ) -> None:

@@ -20,6 +20,7 @@ from safevar_sumo.sumo import drive
 from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
+from tests.in_process import SLOW
 from tests.made_up import original_of
 from tests.scenarios.holding import CARLA, Hold, Pedals, at_contact, driven
 from tests.sumo.test_recording import assert_same
@@ -171,7 +172,7 @@ def check(cells: list[Cell]) -> None:
         assert run.relative_speed[0] == pytest.approx(cell.relative, abs=0.1 * KMH), scenario
 
 
-@pytest.mark.slow
+@SLOW
 def test_impacts_at_the_edges_of_ranges_agree_with_the_closed_forms() -> None:
     check([*edge_cells()])
 
@@ -255,7 +256,7 @@ def original_and_half_its_brakes(study: str, system: System) -> np.ndarray:
     return np.stack([system.characteristics.original, half])
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("study", BRAKE)
 def test_the_originals_avoid_every_shipped_point_and_with_half_their_brakes_some_fail(
     study: str,

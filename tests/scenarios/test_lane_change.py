@@ -17,7 +17,7 @@ from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
 from safevar_sumo.sumo.matrix import drive_worst, simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import verify_everywhere
+from tests.in_process import SLOW, verify_everywhere
 from tests.made_up import original_of
 from tests.scenarios.holding import Hold, at_contact, driven
 from tests.scenarios.ideal import STEP, Mass, agreement, ideal, met_at_once, point_mass
@@ -57,7 +57,7 @@ def assert_near(same: Any, late: Any) -> None:
     assert np.mean(np.abs(late) < 0.5) >= 0.98
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_competent_driver_answers_cut_ins_by_the_rule() -> None:
     """Ahead and beside: he brakes for a car that he will be beside, too."""
     v = draw(40.0, 130.0)
@@ -78,7 +78,7 @@ def test_the_competent_driver_answers_cut_ins_by_the_rule() -> None:
     assert same[~is_ahead].mean() >= 0.98
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_competent_driver_answers_cut_outs_by_the_rule() -> None:
     """At the regulation's headway of 2 s."""
     v = draw(20.0, 130.0)
@@ -149,7 +149,7 @@ def test_whose_collision_it_is() -> None:
     assert mirrored.contact.side[0] == "right"
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_original_avoids_all_encounters_and_the_regulations_driver_all_but_two() -> None:
     """He waits for a TTC of 2 s, which is too late before a standing car at 60 km/h."""
     too_fast = {"cut_out, speed 60, wet", "cut_out, speed 80, wet"}
@@ -189,7 +189,7 @@ ENCOUNTERS = (
 )
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("ads", ["aeb", "idm", "acc", "script:step"])
 @pytest.mark.parametrize(("model", "parameters"), ENCOUNTERS)
 def test_whoever_drives_the_actors_are_where_sumo_has_them(

@@ -12,7 +12,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, run
+from tests.in_process import SLOW, InlinePool, run
 from tests.made_up import original_of
 
 KMH = 1 / 3.6
@@ -59,6 +59,7 @@ def test_the_new_car_passes_the_test_of_the_study(name: str) -> None:
 FAST = "impact at 35 km/h, speed 60, clear"
 
 
+@SLOW
 def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_no_failure() -> (
     None
 ):
@@ -91,7 +92,7 @@ def test_a_point_fails_by_the_criterion_of_its_study() -> None:
         assert told in run("simulate", "r13h", "--set", f"brakeTorque={share}").stdout
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_question_about_the_study_asks_by_its_criterion_and_names_the_source() -> None:
     answer = sv.rules("r152", samples=40, pool=InlinePool())
     assert "Criterion: impact_excess > 0 (UN R152" in answer.verdict

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from mypy import api
 
-from tests.in_process import json_of, run
+from tests.in_process import SLOW, json_of, run
 from tests.manual import ROOT, files_of
 
 PAGE = "docs/simulators.md"
-pytestmark = pytest.mark.slow
+pytestmark = SLOW
 if os.environ.get("SAFEVAR_METADRIVE") != "required":
     pytest.importorskip("panda3d")  # MetaDrive's engine; MetaDrive itself takes seconds to import
 

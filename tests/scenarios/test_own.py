@@ -15,7 +15,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo import reason_against_scenes
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import json_of, run, verify_everywhere
+from tests.in_process import SLOW, json_of, run, verify_everywhere
 from tests.made_up import drawn
 
 MINE = """
@@ -58,6 +58,7 @@ def mine(folder: Path, search: dict[str, Any], **tables: Any) -> Study:
     return load_study("wear", matrix=None, scenario=scenario, encounters="ranges", **tables)
 
 
+@SLOW
 def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> None:
     """Each encounter is that of a study with these parameters, and the original vehicle meets the
     same.

@@ -15,7 +15,7 @@ from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.scenarios.recorded_tracks import COLUMNS, RecordedTracks
 from safevar_sumo.study import data_files
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import json_of, refused, run
+from tests.in_process import SLOW, json_of, refused, run
 from tests.manual import files_of
 from tests.scenarios.holding import Hold, driven
 
@@ -110,7 +110,7 @@ def write() -> None:
     Path("walk.toml").write_text(MINE + SEARCH)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_study_is_checked_and_its_limits_are_sought(in_tmp: Path) -> None:
     write()
     assert json_of("check", "walk.toml", "--vehicles", "4")["numbers"]["passed"]
@@ -119,7 +119,7 @@ def test_a_study_is_checked_and_its_limits_are_sought(in_tmp: Path) -> None:
     assert {"treadDepth", "payload"} <= {row["characteristic"] for row in rows}
 
 
-@pytest.mark.slow
+@SLOW
 def test_results_and_packs_depend_on_the_bytes_of_the_file(in_tmp: Path) -> None:
     write()
     run("study", "walk.toml", "--out", "results")

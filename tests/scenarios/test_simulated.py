@@ -32,7 +32,7 @@ from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.simulators import joined
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.without_effect import without_effect
-from tests.in_process import InlinePool, json_of, refused, run
+from tests.in_process import SLOW, InlinePool, json_of, refused, run
 
 MODELS = """
 from dataclasses import dataclass
@@ -345,7 +345,7 @@ def test_a_process_opens_its_worker_once_and_ends_it(wall: Path, name: str) -> N
     refused("check", "wall.toml", message=("open_worker that does not take (worker)",))
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("worker_processes")
 def test_workers_have_numbers_which_those_have_that_replace_them(wall: Path) -> None:
     (wall.parent / "keeps.py").write_text(KEEPS)
@@ -395,6 +395,7 @@ def test_a_speed_that_disagrees_with_the_way_is_a_finding(
     assert told in run("check", "wall.toml", expect=int(bool(told))).stdout
 
 
+@SLOW
 @pytest.mark.parametrize(
     ("reads", "told"),
     [
@@ -428,6 +429,7 @@ def test_versions_belong_to_the_identity_of_results(wall: Path) -> None:
         manifest_now(study, assemble(study))
 
 
+@SLOW
 def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
     run("simulate", "wall.toml", "--set", "decel=4", "--plot", "a.png", "--animate", "a.html")
     assert Path("a.png").stat().st_size
@@ -438,7 +440,7 @@ def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
     refused("study", "wall.toml", "--engine", "sumo", "--out", "r", message=("no other engine",))
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_cause_ends_where_the_formula_does_and_weather_is_not_said(wall: Path) -> None:
     """Failures are explained without reference drivers."""
     found = json_of("explain", "wall.toml")
@@ -470,6 +472,7 @@ class Ends(Wall):
 """
 
 
+@SLOW
 def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(wall: Path) -> None:
     """The worst run counts, each is in the journal, and without repeats the study is refused."""
     (wall.parent / "noisy.py").write_text(NOISY)
@@ -540,7 +543,7 @@ class Rare(Wall):
 """
 
 
-@pytest.mark.slow
+@SLOW
 def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
     """A vehicle that fails in 3 of 20 runs counts 0.15; limits are of the worst run."""
     (wall.parent / "rare.py").write_text(RARE)
@@ -586,7 +589,7 @@ def test_noise_of_one_seed_is_a_remark(wall: Path) -> None:
     assert [point.name for point in system.points] == ["a, seed 1", "a, seed 2", "a, seed 3"]
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("worker_processes")
 @pytest.mark.parametrize("often", [1, 2])
 def test_a_simulator_that_ends_its_process_is_started_again_once(wall: Path, often: int) -> None:
@@ -646,7 +649,7 @@ def children() -> int:
     )
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("worker_processes")
 @pytest.mark.parametrize("failure", ["1 / 0", "os._exit(7)", "time.sleep(60)"])
 def test_settings_that_fail_may_be_skipped_and_tried_again(wall: Path, failure: str) -> None:
@@ -701,7 +704,7 @@ class Leaks(Rig):
 """
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     "damage",
     [
@@ -717,7 +720,7 @@ def test_threads_and_exit_functions_of_a_simulator_keep_no_command(wall: Path, d
     assert Path("results/solutions.csv").exists()
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("worker_processes")
 @pytest.mark.parametrize(
     ("damage", "told"),
@@ -735,7 +738,7 @@ def test_a_simulator_that_takes_its_process_apart_is_named(
     refused("study", "wall.toml", "--out", "results", "--jobs", "1", message=message)
 
 
-@pytest.mark.slow
+@SLOW
 def test_more_than_a_tenth_of_failures_is_an_error(wall: Path) -> None:
     with_failures(wall, "1 / 0", limit=5)
     told = ("settings failed, more than 10 %", "division by zero")
@@ -748,7 +751,7 @@ def test_more_than_a_tenth_of_failures_is_an_error(wall: Path) -> None:
         assemble(sv.load_study("rain", search={"failed": "skip"}))
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_pack_states_the_number_that_followed_from_time(
     wall: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -806,7 +809,7 @@ def with_data(wall: Path, how: str, value: float) -> None:
         database.commit()
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("how", BY)
 def test_results_of_two_simulators_are_not_mixed(wall: Path, how: str) -> None:
     """Neither by `study`, nor by a question; what the simulator has written itself is no input."""
@@ -832,6 +835,7 @@ def test_results_of_two_simulators_are_not_mixed(wall: Path, how: str) -> None:
     assert len(keys) == (2 if named else 1)
 
 
+@SLOW
 def test_an_interrupted_question_of_another_simulator_begins_anew(
     wall: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -859,7 +863,7 @@ def test_an_interrupted_question_of_another_simulator_begins_anew(
     assert changed == pytest.approx(1.1 * ask())
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("worker_processes")
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_study_repeats_three_settings_in_another_process(wall: Path, jobs: int) -> None:
@@ -875,7 +879,7 @@ def test_a_study_repeats_three_settings_in_another_process(wall: Path, jobs: int
             assert "in a new process" in run("check", "wall.toml", expect=1).stdout
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("worker_processes")
 def test_what_an_object_keeps_of_another_point_is_found(wall: Path) -> None:
     """Here an object that is put into the simulator in its first run."""
@@ -888,6 +892,7 @@ def test_what_an_object_keeps_of_another_point_is_found(wall: Path) -> None:
     refused("study", "wall.toml", "--out", "results", message=("points in another order",))
 
 
+@SLOW
 def test_a_library_of_the_search_counts_if_the_simulator_uses_it(wall: Path) -> None:
     run("study", "wall.toml", "--out", "results")
     manifest = Path("results/manifest.json")
@@ -899,7 +904,7 @@ def test_a_library_of_the_search_counts_if_the_simulator_uses_it(wall: Path) -> 
         assert change[2] is matters
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("worker_processes")
 def test_simulators_are_closed_with_their_workers(wall: Path) -> None:
     place = str(wall.parent / "closed")  # also at the end of this process

@@ -28,13 +28,12 @@ from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
 from safevar_sumo.search.surrogate import _learn
 from safevar_sumo.study import ORIGINAL_DEGREE
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from tests.in_process import SLOW
 from tests.made_up import made_up_evaluations
 
 SUN = CharacteristicSet.of(load_study("sun"))
 POPULATION = 20
-OURS = [
-    pytest.param(name, marks=pytest.mark.slow if name == "surrogate" else ()) for name in ALGORITHMS
-]
+OURS = [pytest.param(name, marks=SLOW if name == "surrogate" else ()) for name in ALGORITHMS]
 """Our algorithms; fitting models takes seconds."""
 REQUIRED = {
     "pymoo:RNSGA2": {"ref_points": [[0.5, 0.3, 6.0], [1.0, 0.1, 4.0]]},
@@ -132,9 +131,7 @@ def test_the_budget_is_kept_to_the_evaluation(name: str, evaluations: int) -> No
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(
-            name, marks=pytest.mark.slow if "AGEMOEA" in name or name == "surrogate" else ()
-        )  # those of pymoo are compiled by numba at their first call
+        pytest.param(name, marks=SLOW if "pymoo" in name or name == "surrogate" else ())
         for name in (*ALGORITHMS, *PYMOO_ALGORITHMS)
     ],
 )
@@ -205,7 +202,7 @@ def test_a_score_is_relative_to_its_generation_and_the_fifty_best_are_the_result
     )
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_surrogate_finds_more_than_nsga2_with_four_times_as_many_simulations() -> None:
     few, many = (
         PUBLISHED_SCORING.values(searched(name, 1, count)[0])

@@ -24,6 +24,7 @@ from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.campaign.formulas import carried_out
+from tests.in_process import SLOW
 from tests.search.test_algorithms import POPULATION, begun, built, sphere
 from tests.search.test_standard_problems import PROBLEMS, result_of, standard_problem
 
@@ -48,11 +49,8 @@ def test_arguments_reach_the_algorithm() -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "pymoo:CMAES",
-        "pymoo:DE",
         "pymoo:GA",
-        "pymoo:NSGA2",
-        pytest.param("pymoo:MOEAD", marks=pytest.mark.slow),
+        *(pytest.param(f"pymoo:{name}", marks=SLOW) for name in ("CMAES", "DE", "NSGA2", "MOEAD")),
     ],
 )
 def test_an_encounter_in_which_the_original_is_not_safe_is_infeasible(name: str) -> None:
@@ -127,7 +125,7 @@ def test_an_option_with_which_pymoo_fails_is_refused_with_its_message(
     assert str(refused.value).count("\n") == 1
 
 
-@pytest.mark.slow
+@SLOW
 def test_an_algorithm_that_leaves_most_of_its_budget_is_named_unless_it_says_so(
     in_tmp: Path,
 ) -> None:

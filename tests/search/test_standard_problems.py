@@ -20,6 +20,7 @@ from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search import ALGORITHMS, Problem, Search
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from tests.in_process import SLOW
 from tests.search.test_algorithms import evaluated, steps_of
 
 EVALUATIONS, POPULATION, SEEDS = 5000, 100, range(4)
@@ -159,7 +160,7 @@ def front_of_jmetal(standard: StandardProblem, seed: int) -> FloatArray:
     return np.asarray(front[moocore.is_nondominated(front)])
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("problem", ["zdt3", "dtlz2"])
 def test_hypervolumes_reach_those_of_the_second_implementation(problem: str) -> None:
     standard = PROBLEMS[problem]

@@ -17,7 +17,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.vehicles import region_of
-from tests.in_process import json_of, run
+from tests.in_process import SLOW, json_of, run
 from tests.search.test_algorithms import SUN
 
 BOUND = """
@@ -75,7 +75,7 @@ def bound(in_tmp: Path) -> Path:
     return in_tmp
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.usefixtures("coarse")
 def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     """The region is given in closed form; without constraints a fifth of the domain lies in it."""

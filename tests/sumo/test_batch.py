@@ -18,10 +18,11 @@ from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.perception import Perception
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.without_effect import without_effect
+from tests.in_process import SLOW
 from tests.made_up import drawn, original_of
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
 @settings(max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 23), data=st.data())

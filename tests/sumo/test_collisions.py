@@ -17,7 +17,7 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.network_check import network_remarks
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import json_of
+from tests.in_process import SLOW, json_of
 
 CHECKED = {"collision.mingap-factor": "0", "collision.check-junctions": "true"}
 OPTIONS = {
@@ -86,7 +86,7 @@ def simulated(
     return sv.simulate({"extends": base, "name": "mine", "scenario": scenario, **tables}, changes)
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("options", OPTIONS)
 def test_no_option_of_a_users_file_decides_what_a_collision_is(
     options: str, tmp_path: Path
@@ -106,6 +106,7 @@ def test_no_option_of_a_users_file_decides_what_a_collision_is(
     assert hit.metrics["safety_degree"] == pytest.approx(-2.80, abs=0.005)
 
 
+@SLOW
 def test_a_crossing_car_is_hit_in_the_middle_of_a_users_road(tmp_path: Path) -> None:
     network = own_network(tmp_path / "road", "along")
     set_options(network, OPTIONS["junctions unchecked"])
@@ -120,6 +121,7 @@ def test_a_crossing_car_is_hit_in_the_middle_of_a_users_road(tmp_path: Path) -> 
     assert evaluations.f_safe[0] == -runs.collision_speed[0] < -10
 
 
+@SLOW
 def test_options_of_the_web_wizard_give_the_same_answer_and_leave_json_alone(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -144,7 +146,7 @@ def test_options_of_the_web_wizard_give_the_same_answer_and_leave_json_alone(
     assert "tripinfo-output = tripinfos.xml (NUL counts)" in remarks
 
 
-@pytest.mark.slow
+@SLOW
 def test_one_remark_names_the_options_that_are_overruled(tmp_path: Path) -> None:
     network = own_network(tmp_path / "mine", "lead_vehicle_stopped")
     assert network_remarks(str(network)) == []
@@ -172,6 +174,7 @@ def test_one_remark_names_the_options_that_are_overruled(tmp_path: Path) -> None
     assert "step-method.ballistic = false (true counts)" in remark
 
 
+@SLOW
 def test_the_corners_of_a_car_are_not_cut_off_by_its_shape(tmp_path: Path) -> None:
     """SUMO cuts the corners of a `passenger`, and sees no pedestrian there: of this setting it
     would say "stops".
@@ -225,7 +228,7 @@ def test_a_body_in_the_path_that_sumo_does_not_see_is_an_error_with_its_time(
         simulated("native", network, WEAK_BRAKES)
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     ("own", "other", "centres"),
     [("16.5", "4.7", 12.87), ("4.7", "12", 10.62), ("4.7", "4.7", 6.97)],

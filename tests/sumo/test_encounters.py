@@ -26,11 +26,9 @@ from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import Study, free_parameters
 from safevar_sumo.sumo.matrix import drive_and_score, settings_per_batch
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import InlinePool, searched, verify_everywhere
+from tests.in_process import SLOW, InlinePool, searched, verify_everywhere
 from tests.made_up import case_of, drawn
 from tests.sumo.planted import BRAKING, GAP
-
-SLOW = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
@@ -112,7 +110,7 @@ def searched_study(case: str) -> Study:
     )
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("case", CASES)
 def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> None:
     """Its scene is one that SUMO has played, and its original vehicle drives there."""
@@ -251,7 +249,8 @@ def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Pat
     assert (results.solutions["outcome"] == "collision").any()
 
 
-@pytest.mark.parametrize("name", ["sun", pytest.param("wear", marks=SLOW)])
+@SLOW
+@pytest.mark.parametrize("name", ["sun", "wear"])
 def test_all_solutions_of_the_shipped_studies_have_a_safe_original(
     name: str, tmp_path: Path
 ) -> None:

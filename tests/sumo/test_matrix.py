@@ -21,6 +21,7 @@ from safevar_sumo.sumo.bodies import Body, find_touches
 from safevar_sumo.sumo.driving_robot import DrivingRobot
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst, simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
+from tests.in_process import SLOW
 from tests.made_up import drawn, original_of
 from tests.scenarios.holding import Pedals
 
@@ -44,7 +45,7 @@ def study(tests: list[MatrixTest]) -> Study:
 SYSTEM = assemble(study(TESTS))
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each_other() -> None:
     population = drawn(SYSTEM, 3, 3)
     points = simulate_all_points(SYSTEM, population)
@@ -229,6 +230,7 @@ def test_one_study_has_listed_encounters_and_ranges_and_is_reduced_to_a_test_or_
     assert [*load_study("wear", encounters="ranges").ranges] == ["speed", "impact_location"]
 
 
+@SLOW
 def test_a_setting_meets_only_tests_whose_ranges_and_constraints_have_its_encounter() -> None:
     """The cut-out takes gaps from 20 m, and at 130 km/h from 69 m."""
     study = load_study("alks", encounters="ranges")

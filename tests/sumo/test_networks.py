@@ -22,6 +22,7 @@ from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.network import built_network, copied_network, open_network, program_of_sumo
 from safevar_sumo.sumo.network_check import check_network
 from safevar_sumo.sumo.system import System, assemble
+from tests.in_process import SLOW
 
 FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
 
@@ -113,7 +114,7 @@ GOOD = {
 }
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("what", sorted(GOOD))
 def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> None:
     network = with_traffic(mine, GOOD[what])
@@ -147,6 +148,7 @@ def roads(network: Path, n: int = 1) -> ElementTree.Element:
     return ElementTree.parse(copied_network(open_network(str(network)), n).network).getroot()
 
 
+@SLOW
 def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
     before = open_network(str(mine)).digests
     (mine / "network.typ.xml").write_text(
@@ -236,6 +238,7 @@ def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
     assert len(root.findall("edge")) == 2 * len(plain.findall("edge"))
 
 
+@SLOW
 def test_a_file_that_options_of_sumo_add_is_one_of_the_networks_files(mine: Path) -> None:
     (mine / "more.add.xml").write_text('<additional><vType id="more"/></additional>')
     rewritten(

@@ -15,6 +15,7 @@ from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
+from tests.in_process import SLOW
 from tests.made_up import drawn, original_of
 
 CREEPS = "braking lead vehicle, 50 km/h, headway 0.864, target_deceleration 4.905, clear"
@@ -58,7 +59,7 @@ def test_the_new_car_stops_behind_the_leader(creeping: System, in_sumo: bool) ->
     assert len(heard) == len(runs.trace.time)
 
 
-@pytest.mark.slow
+@SLOW
 def test_an_encounter_that_ended_before_its_collision_counts_as_one() -> None:
     system = assemble(at_point(load_study("alks", encounters="ranges"), "cut_in"))
     (point,) = system.points

@@ -30,7 +30,7 @@ from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import json_of, run, verify_everywhere
+from tests.in_process import SLOW, json_of, run, verify_everywhere
 from tests.made_up import drawn, original_of
 from tests.scenarios.holding import Pedals
 
@@ -116,6 +116,7 @@ def reacting(in_tmp: Path) -> Path:
     return in_tmp
 
 
+@SLOW
 def test_a_scenario_whose_pedestrian_reacts_is_simulated_in_sumo_by_default(reacting: Path) -> None:
     study = load_study(
         "smoke",
@@ -209,7 +210,7 @@ def test_a_driving_system_that_brakes_for_nobody_is_named_with_its_points() -> N
     )
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_reason_counts_the_points_and_names_one() -> None:
     said = reason("euro_ncap_car_to_car", lambda seen: (0, seen.speed > 3))  # not at 10 km/h
     assert said.startswith(f"{BRAKES} at 24 of 27 points, such as CCRs, speed 20, ")
@@ -257,12 +258,13 @@ def begins_with_the_reason(*command: str) -> None:
     assert answer.get("numbers", answer)["driven"] is False
 
 
+@SLOW
 def test_an_answer_begins_with_the_reason(still: str) -> None:
     begins_with_the_reason("rules", still, "--samples", "32", "--unsafe", "collision")
     begins_with_the_reason("simulate", still)
 
 
-@pytest.mark.slow
+@SLOW
 def test_every_command_begins_with_the_reason(still: str) -> None:
     for command in (("explain", still), ("simulate", still, "--set", "mass=2600")):
         begins_with_the_reason(*command)

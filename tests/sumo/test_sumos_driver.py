@@ -19,6 +19,7 @@ from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.without_effect import without_effect
+from tests.in_process import SLOW
 from tests.sumo.test_traci_controller import changed, system
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
@@ -141,7 +142,7 @@ def test_a_vehicle_without_delays_drives_as_in_bare_sumo(name: str) -> None:
     refuse_difference(runs, NET / "traffic.rou.xml", space[name])
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     "attributes",
     [
@@ -165,6 +166,7 @@ def test_sumos_driver_has_the_attributes_of_the_traffic_file(attributes: str, in
     refuse_difference(runs, traffic, lambda *_: None, 0.02 if "IDM" in attributes else 1e-6)
 
 
+@SLOW
 def test_between_two_actions_sumos_driver_asks_for_what_he_decided(in_tmp: Path) -> None:
     """A lag lets through a part of it in the first step, and more in the next ones."""
     vehicle = {**NO_DELAYS, "characteristics": {**NO_DELAY, **{"actuatorLag": {"original": 0.2}}}}

@@ -18,6 +18,7 @@ from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traci_commands import CommandedSpeed
+from tests.in_process import SLOW
 from tests.made_up import original_of
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
@@ -93,7 +94,7 @@ def changed(of: System, **values: float) -> np.ndarray:
     return of.characteristics.setting(values)[np.newaxis]
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_module_that_imports_traci_reads_the_simulation() -> None:
     Path("helper.py").write_text(HELPER)
     runs = system("step", USES_HELPER)

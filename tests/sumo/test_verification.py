@@ -22,7 +22,7 @@ from safevar_sumo.sumo import matrix, verification
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from tests.campaign.formulas import with_search
-from tests.in_process import searched
+from tests.in_process import SLOW, searched
 from tests.made_up import drawn, made_up_evaluations
 
 TESTS = ("CutIn", "CutOut", "CarToCar")
@@ -61,7 +61,7 @@ def with_fault(test: str) -> Callable[..., Any]:
     return drive
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("test", TESTS)
 def test_a_fault_of_the_fast_engine_in_one_test_of_a_matrix_is_found(
     test: str, study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -20,7 +20,7 @@ from safevar_sumo.campaign.batches import COMPILING, compile_vehicle
 from safevar_sumo.records import Command
 from safevar_sumo.vehicles import carla_step, compiled
 from safevar_sumo.vehicles.carla_step import Car, CarlaState
-from tests.in_process import InlinePool
+from tests.in_process import SLOW, InlinePool
 from tests.vehicles.runs import STEP, SYSTEMS, drawn
 
 CARLA = SYSTEMS["carla"].vehicle
@@ -94,7 +94,7 @@ def loaded(folder: str) -> str:
     return done.stdout.strip() + done.stderr
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_process_finds_compiled_what_an_earlier_one_compiled(tmp_path: Path) -> None:
     assert [loaded(str(tmp_path)) for _ in range(2)] == ["False True", "True True"]
 

@@ -24,6 +24,7 @@ from safevar_sumo.vehicles import LEVEL, VEHICLES, _accelerations, slope_of
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, WHEEL_MASS, WHEELS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.sensors import DelayedSignal
+from tests.in_process import SLOW
 from tests.made_up import original_of, seen
 from tests.vehicles.runs import (
     STEP,
@@ -272,7 +273,7 @@ def test_a_vehicle_that_starts_on_a_slope_too_slippery_to_hold_becomes_slower(mo
     assert vehicle.advance(prepared, state, Command(np.ones(1), np.zeros(1))).speed < 10
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
 def test_the_depart_speed_of_the_traffic_is_honoured(study: str, tmp_path: Path) -> None:
     traffic = tmp_path / "net" / "traffic.rou.xml"

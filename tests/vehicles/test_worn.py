@@ -30,7 +30,7 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet, wet_road
 from safevar_sumo.vehicles.sensing import WornVehicle
 from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_friction
-from tests.in_process import InlinePool
+from tests.in_process import SLOW, InlinePool
 from tests.made_up import drawn
 
 CAR = WornVehicle()
@@ -249,7 +249,7 @@ LIMITED = {
 """Characteristics of the headline, each with the decimals on the page."""
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("assumption", ASSUMPTIONS)
 def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(assumption: str) -> None:
     evaluator = Evaluator(
@@ -266,7 +266,7 @@ def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(assumptio
     assert f"|{assumption}|{'|'.join(cells)}|" in PAGE
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_shipped_constants_are_what_the_script_prints() -> None:
     printed = subprocess.run(
         [sys.executable, "calibration/wet_friction.py"], capture_output=True, text=True
