@@ -29,24 +29,27 @@ def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str,
     InputError
         If the simulations do not suffice for all questions.
     """
-    own, others, known = list[str](), list[str](), set[tuple[str, ...]]()
+    costly, free, samples = list[str](), list[str](), set[tuple[str, ...]]()
     replays = simulations // PART_OF_REPLAYS if system.mover.takes_long else 0
-    left = simulations - replays
+    remaining_simulations = simulations - replays
     for text in dict.fromkeys(texts):
         name, *options = text.split()
-        if SIMULATIONS.flag in options:  # which the question states itself
-            left -= int(options[options.index(SIMULATIONS.flag) + 1])
+        # A question may state its number itself.
+        if SIMULATIONS.flag in options:
+            remaining_simulations -= int(options[options.index(SIMULATIONS.flag) + 1])
             continue
-        key = tuple(options) if name in ONE_SAMPLE else (text,)
-        is_free = system.mover.takes_long and (key in known or name == "repair")  # which it refuses
-        (others if is_free else own).append(text)
-        known.add(key)
+        sample = tuple(options) if name in ONE_SAMPLE else (text,)
+        # A simulator that takes long keeps its samples, and has no repairs.
+        if system.mover.takes_long and (sample in samples or name == "repair"):
+            free.append(text)
+        else:
+            costly.append(text)
+        samples.add(sample)
 
-    # What all of them simulate besides counts.
     times, repeats = BESIDES
-    left -= len(others) * (times * simulations_of_setting(system) + repeats)
-    part = left // max(len(own), 1)
+    remaining_simulations -= len(free) * (times * simulations_of_setting(system) + repeats)
+    part = remaining_simulations // max(len(costly), 1)
     if part < 1:
-        problem = f"{simulations:,} do not suffice for {len(own) + len(others)} questions"
+        problem = f"{simulations:,} do not suffice for {len(costly) + len(free)} questions"
         raise InputError("simulations", problem, "a larger number, or fewer questions (--ask)")
-    return {**dict.fromkeys([*own, *others], part), REPLAYS: replays}
+    return {**dict.fromkeys([*costly, *free], part), REPLAYS: replays}

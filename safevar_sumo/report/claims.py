@@ -36,11 +36,11 @@ from safevar_sumo.questions.options import SIMULATIONS, flag_of
 from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject, Outcome
-from safevar_sumo.report.budget import REPLAYS, SPEED
+from safevar_sumo.report.budget import REPLAYS
 from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedManifest, PackedStudy, json_of
 from safevar_sumo.report.page import make_page, usual_questions
 from safevar_sumo.report.sections import ReportedStudy
-from safevar_sumo.report.sheet import with_speed
+from safevar_sumo.report.sheet import with_answers
 from safevar_sumo.report.texts import answer_about, completed, parse_question
 from safevar_sumo.results import (
     MANIFEST,
@@ -117,7 +117,6 @@ class Packed:
         progress: Progress,
         pool: Pool | None = None,
     ) -> None:
-        # The study as its manifest says, and its claims.
         self.packed = packed
         self.files = files
         self._places = places
@@ -126,13 +125,12 @@ class Packed:
         self._progress = progress
         self.manifest: JsonObject = json_of(files[MANIFEST])
         with about(MANIFEST):
-            known = convert_table(self.manifest, PackedManifest)
-        for key, _, _ in changed_values(self.manifest["study"], tables_of(known.study), "study"):
+            manifest = convert_table(self.manifest, PackedManifest)
+        study = manifest.study
+        for key, _, _ in changed_values(self.manifest["study"], tables_of(study), "study"):
             raise ValueError(f"{MANIFEST}: {key} is not as the command `study` writes it")
-        study = msgspec.structs.replace(known.study, origin=Origin(places=tuple(places)))
+        study = msgspec.structs.replace(study, origin=Origin(places=tuple(places)))
         self._check_claims(study)
-
-        # The solutions of its runs, of which no row is missing or new.
         solutions = read_table(files[SOLUTIONS])
         self._check_solutions(study, solutions)
 
@@ -143,9 +141,8 @@ class Packed:
             {"outcome": pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))}
         )
 
-        # The case that questions are asked about.
         original = self.manifest["original"]
-        scoring = known.scoring or PUBLISHED_SCORING
+        scoring = manifest.scoring or PUBLISHED_SCORING
         self.case = build_case(
             study, original, solutions, evaluations, packed.runs, scoring=scoring
         )
@@ -154,7 +151,6 @@ class Packed:
 
     def _check_claims(self, study: Study) -> None:
         """Refuse what no pack claims, before anything is computed."""
-        # Outcomes and runs that the study can have.
         outcomes = self.packed.outcomes
         runs = self.packed.runs
         if unknown := outcomes.keys() - set(Outcome):
@@ -169,16 +165,15 @@ class Packed:
         # No question writes a file, or takes for ever.
         words = [word for text in self.packed.questions for word in split(text)]
         numbers = [int(word) for word in words if WHOLE_NUMBER.fullmatch(word)]
-        asked = sum([*numbers, *self.packed.simulations.values()])
-        if asked > MAX_ASKED:
-            problem = f"its questions ask for {asked:,} vehicles and simulations"
+        total = sum([*numbers, *self.packed.simulations.values()])
+        if total > MAX_ASKED:
+            problem = f"its questions ask for {total:,} vehicles and simulations"
             raise InputError("ask", problem, f"at most {MAX_ASKED:,} in a pack")
         for text in self.packed.questions:
             if "--out" in split(text):
                 raise InputError("ask", f"{text!r} writes a file", "a question without --out")
 
-        # Each question about cars has its list in the pack.
-        named = [name for name in map(list_in, self.packed.questions) if name]
+        named = [*filter(None, map(list_in, self.packed.questions))]
         packed = [name for name in self.files if name.startswith(f"{LISTS}/")]
         if sorted(named) != sorted(packed):
             raise ValueError(f"{LISTS}: {packed or 'nothing'} instead of {named or 'nothing'}")
@@ -189,17 +184,18 @@ class Packed:
             "collision",
             "collision_speed",
         }
-        if wrong := expected ^ {*solutions}:  # pandas calls a second column x "x.1"
+        # Pandas calls a second column x "x.1".
+        if wrong := expected ^ {*solutions}:
             raise ValueError(f"{SOLUTIONS}: the column {min(wrong)} is missing, new or there twice")
         if count_solutions(solutions, self.packed.runs) != self.packed.solutions:
             raise ValueError(f"{SOLUTIONS} has other rows than {DESCRIPTION} says")
-        each = solutions.drop_duplicates(["algorithm", "run", *study.domains])
-        for outcome, count in each["outcome"].value_counts().items():
+        different = solutions.drop_duplicates(["algorithm", "run", *study.domains])
+        for outcome, count in different["outcome"].value_counts().items():
             if count > (stated := self.packed.outcomes.get(str(outcome), 0)):
                 raise ValueError(f"{count} solutions of {stated} simulations have {outcome}")
 
     @cached_property
-    def shown(self) -> Case:
+    def judged_case(self) -> Case:
         """The results by the criterion of the pack; raises InputError if it states a scoring that
         its study does not have.
         """
@@ -213,16 +209,16 @@ class Packed:
         """The criterion of the pack."""
         return None if self.packed.unsafe is None else Unsafe.parse(self.packed.unsafe)
 
-    def answer(self, text: str, asked: tuple[Question, JsonObject] | None = None) -> Answer:
+    def answer(self, text: str, parsed: tuple[Question, JsonObject] | None = None) -> Answer:
         """The answer to a question of the pack, or to another one under a name."""
         if text in self._answers:
             return self._answers[text]
         add_import_folders(self._places)
-        shown = self.shown
-        question, values = asked or parse_question(text)
+        judged = self.judged_case
+        question, values = parsed or parse_question(text)
         part = self.packed.simulations.get(text)
         values = completed(question, values, self.unsafe, part, quick=False)
-        case = shown if values.get("unsafe") == self.unsafe else self.case
+        case = judged if values.get("unsafe") == self.unsafe else self.case
         with temporary_folder() as folder:
             if name := values.get(CARS):
                 path = Path(folder, name)
@@ -233,7 +229,7 @@ class Packed:
                 question,
                 values,
                 *([case], [self._directory], None, self._jobs, self._progress),
-                is_asked=text in {*self.packed.questions} - {*usual_questions(shown)},
+                is_asked=text in {*self.packed.questions} - {*usual_questions(judged)},
                 pool=self.pool,
                 questions=len(self.packed.questions) + 1,
             )
@@ -257,12 +253,11 @@ class Packed:
         """What the page is about, with the answer about the speed of its sheet."""
         study = ReportedStudy(
             directory=self._directory,
-            case=self.shown,
+            case=self.judged_case,
             versions=self.manifest["versions"],
-            answers=[self.answer(text) for text in self.packed.questions],
             simulations=self.packed.simulations.get(REPLAYS),
         )
-        return with_speed(study, partial(self.answer, SPEED))
+        return with_answers(study, self.packed.questions, self.answer)
 
     def page(self) -> bytes:
         return make_page([self.ask_speed()], Parts(self._progress)).encode()
@@ -272,9 +267,8 @@ class Packed:
         with temporary_folder() as folder:
             path = Path(folder, f"{self.case.study.name}.toml")
             write_study(path, self.case.study, "The study as it was run, with all that it extends.")
-            return path.read_bytes().partition(b"\n")[
-                2
-            ]  # without the path of the schema on this machine
+            # Its first line has the path of the schema on this machine.
+            return path.read_bytes().partition(b"\n")[2]
 
     @cached_property
     def simulated(self) -> tuple[bytes, bytes]:
@@ -311,7 +305,6 @@ class Packed:
         """What the pack claims, and the functions that compute it again; the manifest is in
         `folder`.
         """
-        # Inputs and study.
         solutions = self.files[SOLUTIONS]
         yield Claim(
             "inputs",
@@ -320,7 +313,6 @@ class Packed:
         )
         yield Claim("study", self.files[STUDY], self.study_file)
 
-        # The original vehicle, solutions, answers and page.
         yield Claim(
             "original vehicle", json_bytes(self.manifest["original"]), lambda: self.simulated[0]
         )
@@ -329,7 +321,6 @@ class Packed:
             yield Claim(f"answer {text}", json_bytes(answer), partial(self._answer_json, text))
         yield Claim("report", self.files[PAGE], self.page)
 
-        # The whole search, if it is asked for.
         outcomes = "search: outcomes", json_bytes(self.packed.outcomes)
         if not search:
             yield Claim(*outcomes, None)
@@ -418,25 +409,24 @@ def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
     if claim.compute is None:
         return study, claim.name, UNCHECKED, "", "--search repeats the search"
     try:
-        here = claim.compute()
+        computed = claim.compute()
     except SafevarError as error:
         return study, claim.name, CANNOT, "", " ".join(str(error).split())
-    if claim.packed == here:
+    if claim.packed == computed:
         return study, claim.name, SAME, "", ""
 
-    # The first lines that differ, around the first character that does.
+    # Lines may be long: the text around the first character that differs is enough.
     lines = claim.packed.decode().splitlines(keepends=True)
-    pairs = zip_longest(lines, here.decode().splitlines(keepends=True), fillvalue="nothing")
-    first, second = next(
-        (_shown(*pair), _shown(*pair[::-1])) for pair in pairs if len(set(pair)) > 1
-    )
-    same = next(
-        index for index, pair in enumerate(zip_longest(first, second)) if len(set(pair)) > 1
-    )
-    start = max(same - CONTEXT, 0) if max(len(first), len(second)) > SHOWN else 0
-    return study, claim.name, DIFFERS, first[start : start + SHOWN], second[start : start + SHOWN]
+    pairs = zip_longest(lines, computed.decode().splitlines(keepends=True), fillvalue="nothing")
+    pair = next(pair for pair in pairs if len(set(pair)) > 1)
+    line, counterpart = _shown(*pair), _shown(*pair[::-1])
+    letters = enumerate(zip_longest(line, counterpart))
+    index = next(index for index, pair in letters if len(set(pair)) > 1)
+    start = max(index - CONTEXT, 0) if max(len(line), len(counterpart)) > SHOWN else 0
+    part = slice(start, start + SHOWN)
+    return study, claim.name, DIFFERS, line[part], counterpart[part]
 
 
-def _shown(line: str, other: str) -> str:
-    """A line without spaces around it, unless the other line differs in them alone."""
-    return repr(line) if line.strip() in ("", other.strip()) else line.strip()
+def _shown(line: str, counterpart: str) -> str:
+    """A line without spaces around it, unless its counterpart differs in them alone."""
+    return repr(line) if line.strip() in ("", counterpart.strip()) else line.strip()

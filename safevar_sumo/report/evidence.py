@@ -130,17 +130,19 @@ def evidence(
     out = Path(out)
     check_writable(out, "out", (".zip",))
 
-    # Each study once, with its files.
     command = f"evidence {results} {ask} {unsafe}"
+    how: JsonObject = {"jobs": jobs, "cluster": cluster}
+    directories = dict.fromkeys(map(Path, results))
     studies = []
     files = dict[str, bytes]()
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
-        for number, directory in enumerate(dict.fromkeys(map(Path, results)), 1):
-            how: JsonObject = {"jobs": jobs, "cluster": cluster}
-            part = None if simulations is None else simulations // len({*map(Path, results)})
-            described, own_files = _pack_study(number, directory, ask, unsafe, how, show, part)
+        for number, directory in enumerate(directories, 1):
+            part = simulations and simulations // len(directories)
+            described, study_files = _pack_study(number, directory, ask, unsafe, how, show, part)
             studies.append(described)
-            files |= {f"{described.folder}/{name}": content for name, content in own_files.items()}
+            files |= {
+                f"{described.folder}/{name}": content for name, content in study_files.items()
+            }
     write_pack(out, studies, files)
     return f"{out} ({out.stat().st_size / 1e6:.2f} MB, sha256 {digest_of(out)})"
 
@@ -155,7 +157,6 @@ def _pack_study(
     simulations: int | None,
 ) -> tuple[PackedStudy, dict[str, bytes]]:
     """The description of a study in a pack, and its files."""
-    # The results, with what `verify` compares or names of their manifest.
     case = study_or_case(directory, results_only=True)
     assert isinstance(case, Case)
     if not case.has_runs:
@@ -163,25 +164,24 @@ def _pack_study(
             directory, "holds imported solutions, which have no identity", "results of `study`"
         )
     study = case.study
+    # `verify` compares or names what a pack has of the manifest.
     stored = {**read_manifest(directory), "study": tables_of(study)}
     manifest = {name: stored[name] for name in PackedManifest.__struct_fields__ if name in stored}
 
-    # The questions, which are asked by the criterion that the user gave.
-    (shown,) = cases_by([case], unsafe, progress=show_no_progress, **how)
-    questions, lists = _with_lists(list(dict.fromkeys(ask or usual_questions(shown))))
+    (judged,) = cases_by([case], unsafe, progress=show_no_progress, **how)
+    questions, lists = _with_lists(list(dict.fromkeys(ask or usual_questions(judged))))
     folder = f"{number}-{study.name}"
     runs = list(case.finished_runs)
     parts = dict[str, int]()
     if simulations is not None:
-        system = assemble(shown.study)
-        again = len(case.settings) * (shown.study != case.study) * simulations_of_setting(system)
-        parts = divided(with_speed_part(questions, case), simulations - again, system)
+        system = assemble(judged.study)
+        spent = len(case.settings) * (judged.study != case.study) * simulations_of_setting(system)
+        parts = divided(with_speed_part(questions, case), simulations - spent, system)
     outcomes, solutions = count_outcomes(case), count_solutions(case.solutions, runs)
     described = PackedStudy(
         folder, questions, runs, outcomes, solutions, str(unsafe) if unsafe else None, parts
     )
 
-    # The files, and what can be computed from them.
     code = _files_of_user(study, manifest["files"], questions)
     files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **lists, **code}
     show_part = Parts(progress).begin(study.name)
@@ -201,7 +201,7 @@ def _with_lists(questions: Sequence[str]) -> tuple[list[str], dict[str, bytes]]:
     """Questions about the lists of cars as a pack holds them, and these lists by their names in the
     pack.
     """
-    found = list[str]()
+    packed = list[str]()
     lists = dict[str, bytes]()
     for text in questions:
         if path := list_in(text):
@@ -209,8 +209,8 @@ def _with_lists(questions: Sequence[str]) -> tuple[list[str], dict[str, bytes]]:
             ignored = parse_question(text)[1].get("ignore", ())
             lists[name] = list_without_names(Path(path), ignored)
             text = with_list(text, name)
-        found.append(text)
-    return found, lists
+        packed.append(text)
+    return packed, lists
 
 
 def _files_of_user(
@@ -219,7 +219,6 @@ def _files_of_user(
     """The user's files that the results depend on, the files of the user's questions, and the views
     of networks, without which SUMO does not start, by their names in a pack.
     """
-    # Files by the names that the results give them.
     places = study.origin.places
     names = [name for name in named if not is_of_shipped_network(name)]
     # What a study names beside itself is there in a pack, too.
@@ -232,11 +231,10 @@ def _files_of_user(
 
     # Views without which SUMO does not start.
     for name in [name for name in names if Path(name).name == OPTIONS_FILE]:
-        view = options_in(Path(file_by_name(name, places))).get("gui-settings-file", "")
-        names += [str(Path(name).with_name(view))] if view else []
-    paths = {name: Path(found) for name in names if (found := file_by_name(name, places))}
+        if view := options_in(Path(file_by_name(name, places))).get("gui-settings-file"):
+            names.append(str(Path(name).with_name(view)))
+    paths = {name: Path(place) for name in names if (place := file_by_name(name, places))}
 
-    # Modules of the user's questions, with what they import.
     modules = [text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]]
     folders = [folder for folder in (*places, os.getcwd(), *sys.path) if folder]
     for path in code_files(modules, places):
@@ -280,7 +278,6 @@ def verify(
     InputError
         If the pack is damaged, of another version, or holds user code and `run_code` is false.
     """
-    # The studies of the pack, and files that belong to none.
     path = Path(pack).absolute()
     description, files = read_pack(path)
     with temporary_folder() as folder, open_progress(progress) as show, simulate_anew():
@@ -290,10 +287,10 @@ def verify(
             )
             for number, described in enumerate(description.studies)
         }
-        known = {
+        names_of_studies = {
             f"{packed.packed.folder}/{name}" for packed in studies.values() for name in packed.files
         }
-        if unknown := files.keys() - known:
+        if unknown := files.keys() - names_of_studies:
             raise InputError(path, f"{min(unknown)} belongs to no study", PACK)
 
         # Its code runs only if the user trusts it.
@@ -301,7 +298,6 @@ def verify(
             problem = f"`verify` would run code of the pack: {', '.join(code)}"
             raise InputError(path, problem, "`run_code=True`, if you trust it")
 
-        # The files, then each claim of each study.
         names = ", ".join(packed.case.study.name for packed in studies.values())
         of_files = Claim(
             "files", json_bytes(description.files), lambda: json_bytes(digests_of(files))
@@ -314,7 +310,6 @@ def verify(
                     for claim in packed.claims(place, search)
                 ]
 
-    # How many are the same.
     claims = tabulate("Claims", CLAIMS, rows)
     counts = Counter(claims["verdict"])
     return Answer(
@@ -341,9 +336,9 @@ def _not_compared(description: Description, studies: Iterable[Packed], unchecked
     pairs = {DESCRIPTION: ({"versions": description.versions}, {"versions": versions_here()})}
     pairs |= {f"{packed.packed.folder}/{MANIFEST}": packed.versions for packed in studies}
     parts = [
-        f"{key} of {file}: {stated} ({here} here)"
-        for file, both in pairs.items()
-        for key, stated, here in changed_values(*both)
+        f"{key} of {file}: {stated} ({present} here)"
+        for file, versions in pairs.items()
+        for key, stated, present in changed_values(*versions)
     ]
     repeats = "how many simulations had which outcome (--search repeats them)"
     sentence = f" {unchecked} unchecked: {repeats}." if unchecked else ""
@@ -365,7 +360,6 @@ def _unpack(
     InputError
         If it is damaged.
     """
-    # The files of this study.
     prefix = f"{described.folder}/"
     own_files = {
         name.removeprefix(prefix): content
@@ -377,10 +371,9 @@ def _unpack(
 
     # Exactly the files of a study, readable, as the description says.
     try:
-        if wrong := FILES ^ (own_files.keys() - code.keys() - lists):
-            raise ValueError(
-                f"{min(wrong)} {'belongs to no claim' if min(wrong) in own_files else 'is missing'}"
-            )
+        for name in sorted(FILES ^ (own_files.keys() - code.keys() - lists)):
+            problem = "belongs to no claim" if name in own_files else "is missing"
+            raise ValueError(f"{name} {problem}")
         (folder / CODE).mkdir(parents=True)
         for name in (MANIFEST, *code):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -89,7 +89,8 @@ def write_pack(path: Path, studies: list[PackedStudy], files: Mapping[str, bytes
     texts = {DESCRIPTION: msgspec.json.format(described, indent=1) + b"\n", **files}
     with whole_file(path, "out") as file, zipfile.ZipFile(file, "w") as archive:
         for name in sorted(texts):
-            entry = zipfile.ZipInfo(name)  # with the same date on every day, in 1980
+            # Its date is the same on every day, in 1980.
+            entry = zipfile.ZipInfo(name)
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << UNIX_MODE_SHIFT
             archive.writestr(entry, texts[name])
@@ -97,7 +98,8 @@ def write_pack(path: Path, studies: list[PackedStudy], files: Mapping[str, bytes
 
 def versions_here() -> dict[str, str]:
     """Versions of Python and of the packages with which a pack's answers and page are computed."""
-    packages = (*PACKAGES, "matplotlib")  # which draws the pictures of the page
+    # Matplotlib draws the pictures of the page.
+    packages = (*PACKAGES, "matplotlib")
     return {**{name: version(name) for name in packages}, "python": sys.version.split()[0]}
 
 
@@ -113,7 +115,8 @@ def json_of(content: bytes) -> Any:
         return dict(pairs)
 
     value = json.loads(content.decode(), object_pairs_hook=once)
-    json.dumps(value, allow_nan=False)  # refuses 1e999, too
+    # 1e999 is an infinity, too.
+    json.dumps(value, allow_nan=False)
     return value
 
 
@@ -137,7 +140,6 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         If the file is no pack, damaged, too large, written by another version, or holds paths that
         leave it or other files than its description names.
     """
-    # The archive, and its description.
     try:
         with zipfile.ZipFile(io.BytesIO(read_file(path, MAX_UNPACKED))) as archive:
             _check_entries(path, archive.infolist())
@@ -162,25 +164,20 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
     except (ValueError, msgspec.MsgspecError, RecursionError) as error:
         _refuse(path, f"{DESCRIPTION} is damaged, or of another version: {error}")
 
-    # The files that the description names.
     for name in sorted(files.keys() ^ described.files.keys()):
-        _refuse(
-            path, f"{name} {f'is not named in {DESCRIPTION}' if name in files else 'is missing'}"
-        )
+        problem = f"is not named in {DESCRIPTION}" if name in files else "is missing"
+        _refuse(path, f"{name} {problem}")
 
     # Results of other versions may differ.
-    here = {name: version(name) for name in ("safevar_sumo", "libsumo")}
-    other = [
+    present = {name: version(name) for name in ("safevar_sumo", "libsumo")}
+    changed = [
         f"{name} {described.versions.get(name)}"
-        for name in here
-        if described.versions.get(name) != here[name]
+        for name in present
+        if described.versions.get(name) != present[name]
     ]
-    if other:
-        expected = (
-            "a pack of this version:"
-            f" {', '.join(f'{name} {number}' for name, number in here.items())}"
-        )
-        raise InputError(path, f"was made with {', '.join(other)}", expected)
+    if changed:
+        expected = f"a pack of this version: {', '.join(map(' '.join, present.items()))}"
+        raise InputError(path, f"was made with {', '.join(changed)}", expected)
     return described, files
 
 
@@ -196,14 +193,12 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
             and not path_of_entry.is_absolute()
             and ".." not in path_of_entry.parts
         )
-        if (
-            not is_inside or "\\" in name or ":" in name
-        ):  # "a//b" is no path inside either: joined, it is "/b"
+        # "a//b" is no path inside either: joined, it is "/b".
+        if not is_inside or "\\" in name or ":" in name:
             _refuse(path, f"the path {name!r} leaves the pack")
         if stat.S_ISLNK(entry.external_attr >> UNIX_MODE_SHIFT):
             _refuse(path, f"{name!r} is a symbolic link")
 
-    # Neither too many files nor too much data.
     if len(names) > MAX_FILES or len(names) != len(set(names)):
         _refuse(path, f"holds {len(names)} files, at most {MAX_FILES} are allowed, each once")
     if (size := sum(entry.file_size for entry in entries)) > MAX_UNPACKED:

@@ -5,6 +5,7 @@ then all other answers.
 from __future__ import annotations
 
 import re
+from collections import ChainMap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -32,7 +33,7 @@ from safevar_sumo.replay.animation import template_environment
 from safevar_sumo.report.budget import REPLAYS, SPEED, divided
 from safevar_sumo.report.replays import page_commands, replays
 from safevar_sumo.report.sections import ReportedStudy, tested, trust
-from safevar_sumo.report.sheet import sheet_of, speeds_of, with_speed
+from safevar_sumo.report.sheet import sheet_of, speeds_of, with_answers
 from safevar_sumo.report.texts import answer_about, completed, parse_question
 from safevar_sumo.results import read_manifest, write_whole
 from safevar_sumo.sumo.simulators import simulations_of_setting
@@ -132,8 +133,7 @@ def report(
     out = Path(check_text("out", out))
     check_writable(out, "out", (".html", ".htm"))
 
-    # The questions: to each of the results alone, and to all together.
-    paths = [Path(check_text("results", getattr(one, "directory", one))) for one in results]
+    paths = [Path(check_text("results", getattr(place, "directory", place))) for place in results]
     cases = load_cases(paths)
     joint = _joint_questions(ask, len(cases))
     alone = [text for text in ask if text not in joint]
@@ -142,43 +142,41 @@ def report(
     key = f"report {paths} {point} {ask} {unsafe} {quick}"
     with open_progress(progress) as show, keep_simulations(key, fresh=fresh), ExitStack() as stack:
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
-        asked = [alone if ask else usual_questions(case) for case in by_criterion]
-        texts = [*chain(*map(with_speed_part, asked, by_criterion)), *joint]
-        budgets = _budgets(cases, at_point, by_criterion, asked, joint, simulations)
+        questions = [alone] * len(cases) if ask else [*map(usual_questions, by_criterion)]
+        texts = [*chain(*map(with_speed_part, questions, by_criterion)), *joint]
+        budgets = _budgets(cases, at_point, by_criterion, questions, joint, simulations)
         pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
         numbers = count(1)
         costs = [USUAL_COSTS.get(text.split()[0], LEAST_COST) for text in texts]
         parts = Parts(show, [*costs, *PAGE_COSTS * len(cases)])
 
         def next_answer(
-            text: str, chosen: slice, asked: tuple[Question, JsonObject] | None = None
+            chosen: slice, text: str, parsed: tuple[Question, JsonObject] | None = None
         ) -> Answer:
-            # The next answer, about these of the results.
-            question, values = asked or parse_question(text)
-            part = budgets[chosen.start or 0].get(text) if budgets else None
+            question, values = parsed or parse_question(text)
+            part = ChainMap(*budgets[chosen]).get(text)
             values = completed(question, values, unsafe, part, quick=quick)
             subjects = by_criterion if values.get("unsafe") == unsafe else at_point
             name = f"question {next(numbers)} of {len(texts)}, {question.name}"
             about = subjects[chosen], paths[chosen], point, jobs, parts.begin(name)
             how: JsonObject = {"as_it_is_now": as_it_is_now, "pool": pool, "questions": len(texts)}
-            return answer_about(question, values, *about, is_asked=bool(ask) and not asked, **how)
+            return answer_about(question, values, *about, is_asked=bool(ask) and not parsed, **how)
 
-        # The answers, in the order of the page, with the greatest speed of each sheet.
         studies = []
         for number, path in enumerate(paths):
-            chosen = slice(number, number + 1)
             study = ReportedStudy(
                 directory=path,
                 case=by_criterion[number],
                 versions=read_manifest(path)["versions"],
-                answers=[next_answer(text, chosen) for text in asked[number]],
                 point=point or "",
                 later_changes=later_changes[number],
-                simulations=budgets[number][REPLAYS] if budgets else None,
+                simulations=budgets[number].get(REPLAYS),
             )
-            studies.append(with_speed(study, partial(next_answer, SPEED, chosen)))
-        shared = [next_answer(text, slice(None)) for text in joint]
-        stack.close()  # this process simulates the replays
+            ask_study = partial(next_answer, slice(number, number + 1))
+            studies.append(with_answers(study, questions[number], ask_study))
+        shared = [*map(partial(next_answer, slice(None)), joint)]
+        # This process simulates the replays.
+        stack.close()
         write_whole(out, make_page(studies, parts, shared))
     return out
 
@@ -187,32 +185,36 @@ def _simulated(cases: Sequence[Case], point: str | None, *, quick: bool) -> list
     """Results as the page simulates them: at a point, and with the study's own parameter set alone
     if it is quick.
     """
-    at_point = cases if point is None else [case_at(case, point) for case in cases]
-    return [with_own_set(case) if quick else case for case in at_point]
+    if point is not None:
+        cases = [case_at(case, point) for case in cases]
+    return [*map(with_own_set, cases)] if quick else [*cases]
 
 
 def _budgets(
     cases: Sequence[Case],
     at_point: Sequence[Case],
     by_criterion: Sequence[Case],
-    asked: Sequence[Sequence[str]],
+    questions: Sequence[Sequence[str]],
     joint: Sequence[str],
     simulations: int | None,
 ) -> list[dict[str, int]]:
     """The simulations of the questions about each of the results, which have equal parts; those of
-    joint questions are the first one's. Solutions that were simulated again count. None without a
-    number.
+    joint questions are the first one's. Solutions that were simulated again count. Nothing is
+    divided without a number.
     """
-    found = list[dict[str, int]]()
-    for number, case in enumerate(cases if simulations else ()):
-        system = assemble(by_criterion[number].study)
-        again = (at_point[number] is not case) + (
-            by_criterion[number].study != at_point[number].study
-        )
-        spent = again * len(case.settings) * simulations_of_setting(system)
-        texts = [*with_speed_part(asked[number], case), *(joint if number == 0 else [])]
-        found.append(divided(texts, (simulations or 0) // len(cases) - spent, system))
-    return found
+    if not simulations:
+        return [{}] * len(cases)
+    budgets = []
+    for number, case in enumerate(cases):
+        study = by_criterion[number].study
+        system = assemble(study)
+        repetitions = (at_point[number] is not case) + (study != at_point[number].study)
+        spent = repetitions * len(case.settings) * simulations_of_setting(system)
+        texts = with_speed_part(questions[number], case)
+        if number == 0:
+            texts += joint
+        budgets.append(divided(texts, simulations // len(cases) - spent, system))
+    return budgets
 
 
 def _pool_of(
@@ -230,12 +232,12 @@ def _pool_of(
     return pool
 
 
-def with_speed_part(asked: Sequence[str], case: Case) -> list[str]:
+def with_speed_part(questions: Sequence[str], case: Case) -> list[str]:
     """The questions about results, with the name of that of the greatest speed if the sheet of
     their page has it.
     """
-    has_sheet = any(text.startswith("tolerance") for text in asked)
-    return [*asked, *([SPEED] if has_sheet and speeds_of(case) else [])]
+    has_sheet = any(text.startswith("tolerance") for text in questions)
+    return [*questions, SPEED] if has_sheet and speeds_of(case) else [*questions]
 
 
 def _joint_questions(ask: Sequence[str], results: int) -> list[str]:
@@ -261,29 +263,30 @@ def _later_changes(
 
 def usual_questions(case: Case) -> list[str]:
     """The questions of a page about results; a simulator has no time for the smallest changes."""
-    can_repair = case.study.repair.promise or case.study.limits
-    left_out = SMALLEST if assemble(case.study).mover.takes_long else ""
-    questions = [text for text in USUAL_QUESTIONS if text != left_out]
-    return [*questions, *(["repair"] if can_repair else [])]
+    questions = [*USUAL_QUESTIONS]
+    if assemble(case.study).mover.takes_long:
+        questions.remove(SMALLEST)
+    if case.study.repair.promise or case.study.limits:
+        questions.append("repair")
+    return questions
 
 
 def make_page(studies: Sequence[ReportedStudy], parts: Parts, shared: Sequence[Answer] = ()) -> str:
     """The page about studies, with answers about all of them."""
-    # Commands that give the numbers of the page.
-    of_studies = chain(*map(page_commands, studies))
+    names = ", ".join(study.case.name for study in studies)
     of_shared = [
         (f"The answer {answer.question}", answer.command) for answer in shared if answer.command
     ]
     template = template_environment(TEMPLATE_FOLDER).get_template("report.html.j2")
     page = template.render(
-        title=f"Safety report: {', '.join(study.case.name for study in studies)}",
+        title=f"Safety report: {names}",
         studies=[_study_parts(number, study, parts) for number, study in enumerate(studies, 1)],
         shared=list(_sections("all", shared)),
-        commands=[*of_studies, *of_shared],
+        commands=[*chain(*map(page_commands, studies)), *of_shared],
         css=Markup((TEMPLATE_FOLDER / "report.css").read_text(encoding="utf-8")),
     )
-    page = printable(page)
-    return page.replace("^2", "²").replace("^3", "³") + "\n"  # the powers of units, as in m/s^2
+    # Units have powers, as in m/s^2.
+    return printable(page).replace("^2", "²").replace("^3", "³") + "\n"
 
 
 def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
@@ -304,7 +307,7 @@ def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
         "versions": study.versions,
         "is_for_workshop": study.has_workshop_parts,
         "front": front,
-        "replays": list(replays(study, parts.begin(), first=100 * number)),
+        "replays": list(replays(study, parts.begin(), start=100 * number)),
         "sections": sections,
     }
 
@@ -315,7 +318,8 @@ def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
         name = "smallest changes" if "staircase" in answer.tables else answer.question
         try:
             picture = _picture(answer.figure())
-        except InputError:  # it has nothing to draw
+        except InputError:
+            # It has nothing to draw.
             picture = None
         yield {
             "anchor": f"{anchor}-{number}-{re.sub('[^a-z]', '-', name.lower())}",
@@ -331,14 +335,12 @@ def _picture(figure: Figure) -> JsonObject:
     """
     import matplotlib
 
-    # The figure as SVG without its date, with few decimals.
     axis = figure.axes[0]
     buffer = BytesIO()
     with matplotlib.rc_context(SVG_STYLE):  # type: ignore[arg-type]
         figure.savefig(buffer, format="svg", metadata={"Date": None})
-    svg = TAG.sub(
-        lambda tag: LONG_DECIMALS.sub(r"\1", tag[0]), buffer.getvalue().decode()
-    )  # texts keep their digits
+    # Only coordinates, which stand in tags, are shortened: texts keep their digits.
+    svg = TAG.sub(lambda tag: LONG_DECIMALS.sub(r"\1", tag[0]), buffer.getvalue().decode())
     words = (
         f"{figure.get_suptitle()}: {axis.get_ylabel() or 'values'} over"
         f" {axis.get_xlabel() or 'characteristics'}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterator
-from itertools import repeat
+from itertools import islice, repeat
 from typing import Any
 
 from safevar_sumo.api.simulation import simulate_with_original
@@ -27,21 +27,18 @@ vehicle; and, where encounters are ranges, the column of their encounters.
 """
 
 
-def replays(study: ReportedStudy, progress: Progress, first: int = 0) -> Iterator[JsonObject]:
+def replays(study: ReportedStudy, progress: Progress, start: int = 0) -> Iterator[JsonObject]:
     """Replays of chosen solutions, and of settings that answers name by their `CHANGES`: one for
-    each set of changed characteristics. Their players have numbers from `first` on.
+    each set of changed characteristics. Their players have numbers from `start` on.
     """
-    # The fewest changes, as `study` names them, and the chosen solutions.
     characteristics = study.case.characteristics
     settings = dict[str, FloatArray]()
-    most = study.simulations if study.system.mover.takes_long else None
-    fewest = fewest_changes(study.case, jobs=1) if most is None else None
-    if fewest is not None:
+    limit = study.simulations if study.system.mover.takes_long else None
+    if limit is None and (fewest := fewest_changes(study.case, jobs=1)) is not None:
         settings["Fewest changes"] = fewest.settings[0]
-    for handle, setting in zip(study.choices, study.chosen_settings, strict=True):
-        settings[handle] = setting
+    settings.update(zip(study.choices, study.chosen_settings, strict=True))
 
-    # Causes that answers name, each set of changed characteristics once.
+    # Many causes change the same characteristics: the first of them is enough.
     changes: dict[tuple[str, ...], tuple[NamedValues, NamedValues]] = {}
     for answer in study.answers:
         for frame in answer.tables.values():
@@ -49,36 +46,39 @@ def replays(study: ReportedStudy, progress: Progress, first: int = 0) -> Iterato
                 frame.get(CHANGES, ()), frame.get(ENCOUNTER, repeat({})), strict=False
             ):
                 changes.setdefault(tuple(sorted(row)), (row, encounter))
-    for row, encounter in [pair for pair in changes.values() if pair[0]][:MAX_CAUSES]:
-        name = f"Only {', '.join(row)}{', in its encounter' if encounter else ''}"
+    for row, encounter in islice((pair for pair in changes.values() if pair[0]), MAX_CAUSES):
+        ending = ", in its encounter" if encounter else ""
+        name = f"Only {', '.join(row)}{ending}"
         settings[name] = characteristics.setting({**row, **encounter}, beyond=True)
 
-    # Each is simulated again, and compared with what was recorded: as many as there may be, each
-    # with the original vehicle, and at the points of a matrix to know the worst one.
-    if most is not None:
-        each = simulations_of_setting(study.system) + 2 * study.system.repeats
-        settings = dict([*settings.items()][: most // each])
+    # A replay also simulates the original vehicle, and all points of a matrix to know the worst.
+    if limit is not None:
+        simulations = simulations_of_setting(study.system) + 2 * study.system.repeats
+        settings = dict(islice(settings.items(), limit // simulations))
     different = []
     for number, (name, setting) in enumerate(settings.items()):
         progress("replays", number, len(settings))
         comparison = comparison_of(
             simulate_with_original(study.case.study, study.system, setting, filtered=False)
         )
+        # Nothing can be shown if a simulator of the user's own logs no positions.
         if not comparison.has_position:
-            return  # a simulator of the user's own that logs none: nothing can be shown
-        last = comparison.rows[-1]
+            return
+        index = comparison.rows[-1]
+        title = name
         differences = []
         if name in study.choices:
+            title += f" ({study.choices[name]})"
             recorded: dict[Any, Any] = study.chosen_solutions.loc[name].to_dict()
-            differences = list_differences(comparison.evaluations.take([last]), recorded)
-        different += [name] if differences else []
-        reason = f" ({study.choices[name]})" if name in study.choices else ""
+            differences = list_differences(comparison.evaluations.take([index]), recorded)
+        if differences:
+            different.append(name)
         yield {
-            "title": f"{name}{reason}: {comparison.verdict(last)}",
+            "title": f"{title}: {comparison.verdict(index)}",
             "point": comparison.point.name,
             "changes": change_texts(characteristics, characteristics.named(setting)),
             "differences": differences,
-            "player": player_of(comparison, first + number),
+            "player": player_of(comparison, start + number),
         }
     if different:
         why = why_different(is_imported=not study.case.has_runs)
@@ -90,7 +90,6 @@ def replays(study: ReportedStudy, progress: Progress, first: int = 0) -> Iterato
 
 def page_commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
     """The commands that give the numbers of the page, each after what it gives."""
-    # The study itself.
     directory = str(study.directory)
     flag = " --as-it-is-now" if study.later_changes else ""
     if study.case.has_runs:
@@ -99,13 +98,12 @@ def page_commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
             f"import safevar_sumo as sv; sv.run(sv.load({json.dumps(directory)}).study, out={out},"
             " progress=True)"
         )
-        what = (
+        purpose = (
             f"The study {study.case.study.name}, as its manifest.json records it, into another"
             " directory"
         )
-        yield what, f"python -c {shlex.quote(script)}"
+        yield purpose, f"python -c {shlex.quote(script)}"
 
-    # Its answers and replays.
     for answer in study.answers:
         if answer.command:
             yield f"The answer {answer.question}", answer.command + flag

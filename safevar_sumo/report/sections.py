@@ -121,7 +121,7 @@ class ReportedStudy:
     directory: Path
     case: Case
     versions: Mapping[str, str]
-    answers: Sequence[Answer]
+    answers: Sequence[Answer] = ()
     point: str = ""
     later_changes: Sequence[str] = ()
     speed: Answer | None = None
@@ -138,19 +138,20 @@ class ReportedStudy:
         """
         solutions = self.case.solutions
         chosen = dict[str, list[str]]()
-        names = () if solutions.empty else FIRST_CHOICES
-        for name in names if self.case.unsafe.rows(solutions).any() else names[-1:]:
+        if solutions.empty:
+            return {}
+        has_failures = self.case.unsafe.rows(solutions).any()
+        for name in FIRST_CHOICES if has_failures else FIRST_CHOICES[-1:]:
             handle = choose_handle(solutions, self.case.unsafe, name)
             chosen.setdefault(str(handle), []).append(REASONS[name])
         return {handle: ", ".join(reasons) for handle, reasons in chosen.items()}
 
     @cached_property
     def chosen_solutions(self) -> pd.DataFrame:
-        """The rows of these solutions."""
-        solutions = self.case.solutions.set_index(
-            pd.Index(map(str, handles_of(self.case.solutions)))
-        )
-        return solutions.loc[list(self.choices)]
+        """The rows of these solutions, by their handles."""
+        solutions = self.case.solutions
+        handles = pd.Index(map(str, handles_of(solutions)))
+        return solutions.set_index(handles).loc[list(self.choices)]
 
     @property
     def has_workshop_parts(self) -> bool:
@@ -166,11 +167,10 @@ class ReportedStudy:
 
 def tested(study: ReportedStudy) -> Answer:
     """The tested vehicle, driving system and scenario, and the search."""
-    # Vehicle, driving system and scenario, each in a sentence.
     case = study.case
     models = [
-        f"{title}: {name_and_sentence(known, table.model)}"
-        for title, known, table in (
+        f"{title}: {name_and_sentence(catalogue, table.model)}"
+        for title, catalogue, table in (
             ("Vehicle", VEHICLES, case.study.vehicle),
             ("Driving system", ADS, case.study.ads),
             ("Scenario", SCENARIOS, case.study.scenario),
@@ -178,8 +178,6 @@ def tested(study: ReportedStudy) -> Answer:
         if table.model
     ]
 
-    # Pre-crash types, domains and remarks.
-    tags = pre_crash_sentence(study.system.points)
     rows = [
         (item.name, item.unit, item.original, item.lower, item.upper, item.threshold, item.words)
         for item in case.characteristics
@@ -189,11 +187,12 @@ def tested(study: ReportedStudy) -> Answer:
         f"{'. '.join(models)}; {_conditions(study)}.",
         *counted_in_words(case.study),
         _search(study),
+        pre_crash_sentence(study.system.points),
     ]
     return Answer(
         question="what was tested",
         study=case.study,
-        verdict=" ".join([*sentences, *([tags] if tags else [])]),
+        verdict=" ".join(filter(None, sentences)),
         numbers={},
         tables={
             "characteristics": tabulate("Characteristics and their domains", CHARACTERISTICS, rows),
@@ -209,7 +208,6 @@ def _remarks(texts: Sequence[str]) -> pd.DataFrame:
 
 def _conditions(study: ReportedStudy) -> str:
     """The weather or, by test, the points of the matrix."""
-    # One point, one weather, or a matrix.
     points = study.system.matrix
     if study.point:
         return (
@@ -219,14 +217,14 @@ def _conditions(study: ReportedStudy) -> str:
     if not study.system.mover.has("weather"):
         where = f", in {number_of(len(points), 'test case')}" if points else ""
         return f"the simulator of the scenario moves and drives the vehicle{where}"
-    if not points:
-        no_effect = (
-            " (it changes neither road nor sensors, but possibly parameters of the driving system)"
-        )
+    weather = study.case.weather
+    if not points and equals_clear(weather):
         return (
-            "weather:"
-            f" {study.case.weather.name}{no_effect if equals_clear(study.case.weather) else ''}"
+            f"weather: {weather.name} (it changes neither road nor sensors, but possibly"
+            " parameters of the driving system)"
         )
+    if not points:
+        return f"weather: {weather.name}"
     tests = Counter(f"{dict(point.parameters)['test']}, {point.weather.name}" for point in points)
     described = "; ".join(
         f"{test}: {number_of(count, 'test case')}" for test, count in tests.items()
@@ -259,7 +257,6 @@ def trust(study: ReportedStudy) -> Answer:
     """How far the results agree with published data and with other parameter sets, and what
     they leave out.
     """
-    # Agreement with published simulations.
     case = study.case
     tables = dict[str, pd.DataFrame]()
     fitted = "Published data were used to fit the vehicle; the " if case.study.spread else "The "
@@ -274,14 +271,13 @@ def trust(study: ReportedStudy) -> Answer:
         )
         lowest = agreement["spearman"].min()
         highest = agreement["spearman"].max()
+        ending = f" to {highest:.2f}" if lowest != highest else ""
         verdict = (
             f"The safety degrees were compared with {number_of(len(agreement), 'file')} of"
-            f" published simulations. Their rank correlation is {lowest:.2f}"
-            f"{'' if lowest == highest else f' to {highest:.2f}'}. Nothing was compared with a"
-            " real car."
+            f" published simulations. Their rank correlation is {lowest:.2f}{ending}. Nothing was"
+            " compared with a real car."
         )
 
-    # What other parameter sets would give.
     if case.study.spread:
         settings = np.vstack([case.characteristics.original, study.chosen_settings])
         spreads = compute_model_spreads(case.study, settings, study.point)
@@ -294,22 +290,21 @@ def trust(study: ReportedStudy) -> Answer:
         ]
         tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
 
-    # The original vehicle beside its published metrics.
+    # No published value is 0: the study refuses it.
     published = [
-        (name, value, here, 100 * (here / value - 1) if value else math.nan)
+        (name, value, metric, 100 * (metric / value - 1))
         for name, value in case.study.published.items()
-        if not math.isnan(here := case.original.get(name, math.nan))
+        if not math.isnan(metric := case.original.get(name, math.nan))
     ]
     tables["original"] = tabulate("The original vehicle, published and here", PUBLISHED, published)
 
-    # Settings without a result.
     counts = Counter(case.evaluations["outcome"])
-    missing = [
+    remarks = [
         f"{counts[outcome]} of {len(case.evaluations)} settings {words}."
         for outcome, words in NO_RESULT.items()
         if counts[outcome]
     ]
-    tables["remarks"] = _remarks([*missing, *GENERAL_LIMITS])
+    tables["remarks"] = _remarks([*remarks, *GENERAL_LIMITS])
     return Answer(
         question="limits and trust", study=case.study, verdict=verdict, numbers={}, tables=tables
     )

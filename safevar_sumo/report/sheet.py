@@ -18,12 +18,13 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Columns, tabulate
-from safevar_sumo.questions.ask import QUICK, Question, find_question
+from safevar_sumo.questions.ask import QUICK, find_question
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.tables import html_table
 from safevar_sumo.questions.words import join_phrases, undecidable_in_words
 from safevar_sumo.records import JsonObject
+from safevar_sumo.report.budget import SPEED
 from safevar_sumo.report.sections import ReportedStudy, name_and_sentence
 from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.scenarios.euro_ncap import TESTS
@@ -53,63 +54,60 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     if limits is None:
         return None
 
-    # What decides: the limits, and how fast vehicles within them may drive.
     numbers = limits.numbers
     unsafe = Unsafe.parse(numbers.get("unsafe", "collision"))
     is_screening = _is_relative(study.case, unsafe)
-    missing = _why_no_limits(study, limits)
-    found = None if missing else limits.tables.get("ranges")
-    ranges = [] if found is None else _records(found)
+    problem = _why_no_limits(study, limits)
+    ranges = []
+    if not problem and "ranges" in limits.tables:
+        ranges = _records(limits.tables["ranges"])
     claim, up_to, reasons = limits, "", [limits.verdict, *limits.failures]
     if study.speed is not None:
         claim = study.speed
-        up_to, missing = _greatest_speed(study, claim, ranges)
+        up_to, problem = _greatest_speed(study, claim, ranges)
         reasons = [claim.verdict]
 
-    # The table, and what it is about.
     *tests, road = claim.numbers.get("scope", "").split("; ")
-    rows = {} if missing else _rows_of(limits)
+    rows = {} if problem else _rows_of(limits)
     items = study.case.characteristics.vehicle
-    parts = [
-        (
-            name[:1].upper() + name[1:],
-            item.measurement,
-            _limit_in_words(item, rows.get(item.name)),
-            f"{BLANK}{item.suffix}",
-            item.remedy or UNSAID,
-        )
-        for item in items
-        if item.is_for_workshop and not missing and (name := item.meaning or item.short_name)
-    ]
+    measured = [item for item in items if item.is_for_workshop and not problem]
+    parts = [_row_of_part(item, rows.get(item.name)) for item in measured]
+    # The greatest speed holds for the values that the study states of what no workshop measures.
     stated = study.case.study.unmeasured_values if up_to else {}
+    unmeasured = [
+        f"{item.short_name} {_limit_in_words(item, rows.get(item.name), stated.get(item.name))}"
+        for item in items
+        if not item.is_for_workshop
+    ]
+    domains = [f"{item.short_name} {_domain_in_words(item)}" for item in items if item.name in rows]
     return {
-        "missing": missing,
+        "missing": problem,
         "up_to": up_to,
         "is_screening": is_screening,
-        "is_signed": not (missing or numbers["rough"] or study.later_changes or is_screening),
+        "is_signed": not (problem or numbers["rough"] or study.later_changes or is_screening),
         "unsafe": unsafe,
         "parts": Markup(html_table(tabulate("Items and their limits", PARTS, parts))),
-        "others": [
-            f"{item.short_name} {stated[item.name]:.10g}{item.suffix}"
-            if item.name in stated
-            else f"{item.short_name} {_limit_in_words(item, rows.get(item.name))}"
-            for item in items
-            if not item.is_for_workshop
-        ],
+        "others": unmeasured,
         "numbers": numbers,
         "claim": claim,
         "reasons": reasons,
         "vehicle": name_and_sentence(VEHICLES, limits.study.vehicle.model),
         "ads": name_and_sentence(ADS, limits.study.ads.model),
-        "tests": [_tests_in_words(phrase) for phrase in tests],
+        "tests": [*map(_tests_in_words, tests)],
         "road": road,
         "in_ranges": ranges,
         "command": limits.command,
         "digest": sha256(limits.render("json").encode()).hexdigest()[:DIGITS],
-        "ranges": [
-            f"{item.short_name} {_domain_in_words(item)}" for item in items if item.name in rows
-        ],
+        "ranges": domains,
     }
+
+
+def _row_of_part(item: Characteristic, row: Mapping[Any, Any] | None) -> tuple[str, ...]:
+    """A row of `PARTS`."""
+    name = item.meaning or item.short_name
+    limit = _limit_in_words(item, row)
+    blank = f"{BLANK}{item.suffix}"
+    return name[:1].upper() + name[1:], item.measurement, limit, blank, item.remedy or UNSAID
 
 
 def speed_values(study: ReportedStudy) -> JsonObject:
@@ -123,8 +121,7 @@ def speed_values(study: ReportedStudy) -> JsonObject:
     if _is_relative(study.case, unsafe):
         return {}
 
-    # The values of the limits; what a workshop does not measure has the value that the study
-    # states, if it states one.
+    # What a workshop does not measure has the value that the study states, if it states one.
     texts = list[str]()
     rows = _rows_of(limits)
     for item in study.case.characteristics.vehicle:
@@ -137,16 +134,17 @@ def speed_values(study: ReportedStudy) -> JsonObject:
     return {"others": "new", "limits": tuple(texts), **criterion, **rough}
 
 
-def with_speed(
-    study: ReportedStudy, ask: Callable[[tuple[Question, JsonObject]], Answer]
+def with_answers(
+    study: ReportedStudy, questions: Sequence[str], ask: Callable[..., Answer]
 ) -> ReportedStudy:
-    """A study with the answer about the speed of its sheet, if it has one, as the last of its
-    answers: the sheet is about the limits of that question, whatever else was asked.
+    """A study with the answers to questions; the last one, if it has a sheet, is about the speed of
+    this: the sheet is about the limits of that question, whatever else was asked.
     """
+    study = replace(study, answers=[*map(ask, questions)])
     values = speed_values(study)
     if not values:
         return study
-    speed = ask((find_question("permit"), values))
+    speed = ask(SPEED, (find_question("permit"), values))
     return replace(study, answers=[*study.answers, speed], speed=speed)
 
 
@@ -183,8 +181,8 @@ def _greatest_speed(
     span = speeds_of(study.case)
     assert span is not None
     failing = [row["fails_at"] or {} for row in ranges if not row["kept"]]
-    below = [math.ceil(at[SPEED_DIMENSION]) - 1 for at in failing if SPEED_DIMENSION in at]
-    greatest = min([*speed.tables["cars"]["up_to"].astype(float), *below])
+    speeds = [math.ceil(at[SPEED_DIMENSION]) - 1 for at in failing if SPEED_DIMENSION in at]
+    greatest = min([*speed.tables["cars"]["up_to"].astype(float), *speeds])
     if greatest >= span.low:
         return f"{greatest:g} {span.unit} (simulated from {span.low:g} {span.unit} on)", ""
     return "", f"Vehicles within its limits are not safe even at {span.low:g} {span.unit}."
@@ -229,11 +227,15 @@ def _together(item: Characteristic, row: Mapping[Any, Any] | None) -> tuple[floa
     return float(row["together_low"]), float(row["together_high"])
 
 
-def _limit_in_words(item: Characteristic, row: Mapping[Any, Any] | None) -> str:
-    """A limit: `at least 3 mm`. An end of the domain is none, unless both are; an item whose
-    original is at one end has a limit on the other side all the same.
+def _limit_in_words(
+    item: Characteristic, row: Mapping[Any, Any] | None, value: float | None = None
+) -> str:
+    """A limit: `at least 3 mm`, or the value that the study states. An end of the domain is none,
+    unless both are; an item whose original is at one end has a limit on the other side all the
+    same.
     """
-    # An item without room on either side stays as it was.
+    if value is not None:
+        return f"{value:.10g}{item.suffix}"
     domain = (item.lower, item.upper)
     low, high = _together(item, row)
     if row is None or (low == high and low not in domain):
@@ -243,7 +245,7 @@ def _limit_in_words(item: Characteristic, row: Mapping[Any, Any] | None) -> str:
     is_share = not item.suffix and item.original == 1
     unit = " of the original vehicle's" if is_share else item.suffix
     sides = zip(("at least", "at most"), (low, high), domain, strict=True)
-    ends = [f"{word} {end:.10g}{unit}" for word, end, last in sides if end != last]
+    ends = [f"{word} {end:.10g}{unit}" for word, end, bound in sides if end != bound]
     if not ends and item.original == item.upper:
         return f"at least {item.lower:.10g}{unit}, the smallest tested value"
     if not ends and item.original == item.lower:

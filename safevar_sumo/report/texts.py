@@ -28,33 +28,33 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     InputError
         If there is no such question or option, or a value is not allowed.
     """
-    # The question's name.
     try:
         name, *words = split(text)
-    except ValueError:  # nothing, or a quotation mark without its second one
+    except ValueError:
+        # Nothing, or a quotation mark without its second one.
         raise InputError(
             "ask", repr(text), 'a question with its options, such as "risk --samples 4000"'
         ) from None
-    asked = find_question(name)
+    question = find_question(name)
 
-    # Options, each with its value.
     values = dict[str, Any]()
     waiting = iter(words)
-    options = {option.flag: option for option in (*asked.options, SIMULATIONS)}
+    options = {option.flag: option for option in (*question.options, SIMULATIONS)}
     for flag in waiting:
         check_name("ask", f"{name} has no option {flag!r}", flag, options)
         option = options[flag]
         if option.name in values and not option.is_repeated:
             raise InputError(f"ask: {name} {flag}", "is given twice", "it once")
-        value = option.kind is bool or next(waiting, None)
+        value: Any = option.kind is bool or next(waiting, None)
         try:
-            value = value if option.kind is bool else option.kind(value)
+            if value is not True:
+                value = option.kind(value)
         except (TypeError, ValueError):
             raise InputError(f"ask: {name} {flag}", repr(value), option.kind.__name__) from None
-        values[option.name] = option.check(
-            (*values.get(option.name, ()), value) if option.is_repeated else value
-        )
-    return asked, values
+        if option.is_repeated:
+            value = *values.get(option.name, ()), value
+        values[option.name] = option.check(value)
+    return question, values
 
 
 def completed(
@@ -92,19 +92,20 @@ def answer_about(
     InputError
         If the question is asked for and has no answer, or is about another number of results.
     """
-    own = {name: value for name, value in values.items() if name != SIMULATIONS.name}
+    options = {**values}
+    simulations = options.pop(SIMULATIONS.name, None)
     try:
         if len(question.others) + 1 != len(cases):
             expected = f"{len(question.others) + 1} results directories"
             problem = f"{question.name} cannot be asked about {len(cases)}"
             raise InputError("ask", problem, expected)
-        command = question.command_line([*map(str, directories)], {"point": point}, own)
+        command = question.command_line([*map(str, directories)], {"point": point}, options)
         answer = question.answer(
             cases,
-            own,
+            options,
             pool=pool,
             jobs=jobs,
-            simulations=values.get(SIMULATIONS.name),
+            simulations=simulations,
             progress=progress,
             as_it_is_now=as_it_is_now,
             questions=questions,
