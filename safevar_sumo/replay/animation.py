@@ -51,7 +51,8 @@ KINDS = ("area", *LAYERS)
 STRIPE_LENGTH = 0.5
 """Length of a crossing's stripes, and of the space between them [m]."""
 IMPACT_STYLE: Any = {
-    "marker": (11, 1, 0),  # a star with 11 points
+    # A star with 11 points.
+    "marker": (11, 1, 0),
     "markersize": 50,
     "color": IMPACT_COLOUR,
     "markeredgecolor": TEXT_COLOUR,
@@ -75,7 +76,8 @@ LAST_FRAME_DURATION = 2.0
 PLAYER_FOLDER = Path(__file__).parent / "web"
 HTML_CHANGES = {
     r"\\\n": "",
-    r'<link rel="stylesheet"[^>]*>': "",  # icons from the net, which `player.css` has, too
+    # Icons from the net, which `player.css` has, too.
+    r'<link rel="stylesheet"[^>]*>': "",
     r"this\.current_frame = 0;": "this.current_frame = frames.length - 1;",
     r'name="points"': 'aria-label="time"',
 }
@@ -144,7 +146,7 @@ def player_of(
 
     html = re.sub(r'(?<=base64,)[^"]*', _with_palette, html)
 
-    # A number for the random name, and the last frame, with what it shows in words.
+    # Matplotlib gives a player a random name.
     (name,) = set(re.findall(r"_anim_img(\w+)", html))
     frame = re.findall(r'"(data:image[^"]*)"', html)[-1]
     verdicts = (f"{comparison.name(row)} {comparison.verdict(row)}" for row in comparison.rows)
@@ -163,17 +165,17 @@ def _with_palette(picture: re.Match[str]) -> str:
     return b64encode(data.getvalue()).decode()
 
 
-def film_of(comparison: Comparison, frames: int, kept: float = 0.0) -> tuple[FuncAnimation, float]:
+def film_of(comparison: Comparison, frames: int, pause: float = 0.0) -> tuple[FuncAnimation, float]:
     """At most about so many frames, of which the last one is kept for some time [s], and how many
     there are in a second.
     """
     from matplotlib.animation import FuncAnimation
 
     step = comparison.runs.trace.step
-    last = _last_sample(comparison)
-    stride = max(round(SECONDS_PER_FRAME / step), -(-last // frames), 1)
+    end = _last_sample(comparison)
+    stride = max(round(SECONDS_PER_FRAME / step), -(-end // frames), 1)
     fps = 1 / (stride * step)
-    samples = [*range(0, last, stride), *[last] * round(1 + kept * fps)]
+    samples = [*range(0, end, stride), *[end] * round(1 + pause * fps)]
     figure, show = draw_scene(comparison)
     film = FuncAnimation(figure, show, samples, init_func=lambda: [], cache_frame_data=False)
     return film, fps
@@ -186,7 +188,6 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
     from matplotlib.figure import Figure
     from matplotlib.transforms import Affine2D
 
-    # A road that fills the width, and a panel with readings above it.
     bodies, turn = lay_out(comparison)
     left_ends, width, bottom, top = _choose_view(bodies)
     height = WIDTH * (top - bottom) / width
@@ -198,7 +199,6 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
     axis.spines[:].set_visible(False)
     _draw_road(axis, comparison, turn, points=72 * WIDTH / width)
 
-    # What moves, and what is read.
     is_pair = len(comparison.rows) > 1
     patches = [
         axis.add_patch(_draw_body(body, is_outline=is_pair and body.row == ORIGINAL))
@@ -213,7 +213,6 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
     ]
 
     def show(sample: int) -> list[Patch]:
-        # Every body at its place.
         axis.set_xlim(left_ends[sample], left_ends[sample] + width)
         for body, patch in zip(bodies, patches, strict=True):
             x, y = body.x[sample], body.y[sample]
@@ -223,13 +222,13 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
             if body.is_vut:
                 impacts[body.row].set_data([x], [y])
 
-        # The time, both readings, and the impact.
         clock.set_text(f"{sample * comparison.runs.trace.step:.2f} s")
         for row, moments in enumerate(comparison.moments):
             texts[row].set_text(reading(comparison, row, sample))
             has_collided = not np.isnan(comparison.runs.closing_speed[row])
             impacts[row].set_visible(has_collided and sample >= moments.decided)
-        return []  # Matplotlib draws the whole figure again
+        # Matplotlib draws the whole figure again.
+        return []
 
     return figure, show
 
@@ -266,18 +265,18 @@ def _choose_view(bodies: Sequence[DrawnBody]) -> tuple[FloatArray, float, float,
     """The left ends of the part of the road that is shown, shape (T,), its length, and its lower
     and upper end [m].
     """
-    # A frame around all bodies.
-    x, y = (np.array([getattr(body, axis) for body in bodies]) for axis in "xy")
+    x = np.array([body.x for body in bodies])
+    y = np.array([body.y for body in bodies])
     sizes = np.array([(body.length, body.width / 2) for body in bodies])
     length, half_width = sizes.T[:, :, np.newaxis]
-    left, right = np.nanmin(x - length) - MARGIN, np.nanmax(x + length) + MARGIN
+    rear, front = np.nanmin(x - length) - MARGIN, np.nanmax(x + length) + MARGIN
     bottom, top = np.nanmin(y - half_width) - MARGIN, np.nanmax(y + half_width) + MARGIN
     padding = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
 
-    # A camera follows the vehicles where this frame is too long.
-    width = min(right - left, MAX_LENGTH)
+    # A camera follows the vehicles where a view of all bodies is too long.
+    width = min(front - rear, MAX_LENGTH)
     fronts = np.mean([body.x for body in bodies if body.is_vut], axis=0)
-    left_ends = np.clip(fronts - CAMERA_LEAD * width, left, right - width)
+    left_ends = np.clip(fronts - CAMERA_LEAD * width, rear, front - width)
     return left_ends, width, bottom - padding, top + padding
 
 
@@ -296,8 +295,8 @@ def _draw_road(axis: Axes, comparison: Comparison, turn: Affine2D, points: float
             continue
         stripes = STRIPE_LENGTH / lane.width
         style: Any = {"linestyle": (0, (stripes, stripes)) if lane.kind == "crossing" else "-"}
-        for narrower, colour in LAYERS[lane.kind]:
-            style |= {"linewidth": (lane.width - narrower) * points, "color": colour}
+        for reduction, colour in LAYERS[lane.kind]:
+            style |= {"linewidth": (lane.width - reduction) * points, "color": colour}
             axis.plot(*lane.line.T, solid_capstyle="butt", transform=transform, **style)
     axis.xaxis.set_major_locator(MultipleLocator(10))
     axis.xaxis.set_major_formatter("{x:.0f} m")
@@ -326,13 +325,13 @@ def reading(comparison: Comparison, row: int, sample: int) -> str:
     """
     trace = comparison.runs.trace
     moments = comparison.moments[row]
-    shown = min(sample, moments.end)
-    ending = "brakes" if trace.brake[shown, row] > 0 else ""
+    index = min(sample, moments.end)
+    ending = "brakes" if trace.brake[index, row] > 0 else ""
     if sample >= moments.decided:
         ending = comparison.verdict(row)
-    gap = trace.gap[shown, row]
+    gap = trace.gap[index, row]
     words = f"gap {max(gap, 0):.1f} m" if np.isfinite(gap) else ""
-    return f"{comparison.name(row):8}  {trace.speed[shown, row]:4.1f} m/s  {words:10}  {ending}"
+    return f"{comparison.name(row):8}  {trace.speed[index, row]:4.1f} m/s  {words:10}  {ending}"
 
 
 def template_environment(*folders: Path) -> Environment:

@@ -147,7 +147,7 @@ class Comparison:
     def changes(self) -> list[str]:
         """Every change in words, with its unit and share."""
         characteristics = self.system.characteristics
-        # The changed vehicle follows the original, which is alone without a change.
+        # The last row: the original vehicle is alone without a change.
         return change_texts(characteristics, characteristics.named(self.evaluations.settings[-1]))
 
     def verdict(self, row: int) -> str:
@@ -155,7 +155,6 @@ class Comparison:
         runs = self.runs
         nearest = self.moments[row].nearest
 
-        # A collision, or how else it ends.
         if not math.isnan(runs.closing_speed[row]):
             return collision_in_words(runs.closing_speed[row], runs.collision_speed[row], digits=1)
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
@@ -164,14 +163,10 @@ class Comparison:
             distance = runs.trace.gap if has_gap else runs.encounter.separation
             ending = f"{ending} with {distance[nearest, row]:.2f} m to spare"
 
-        # And the metrics that the search minimises.
-        values = [
-            (metric, self.evaluations.metrics[metric.name][row]) for metric in self.objectives
-        ]
         texts = (
             f"{metric.title} {value:.1f}{unit_text(metric.unit)}"
-            for metric, value in values
-            if np.isfinite(value)
+            for metric in self.objectives
+            if np.isfinite(value := self.evaluations.metrics[metric.name][row])
         )
         return ", ".join([ending, *texts])
 
@@ -191,8 +186,8 @@ def films_along(trace: Trace) -> dict[str, Film]:
         return Film(motion, False, BODY_LENGTH, BODY_WIDTH)
 
     gap = np.where(np.isfinite(trace.gap), trace.gap, np.nan)
-    ahead = film(trace.position + gap + BODY_LENGTH, trace.obstacle_speed)
-    return {"obstacle": ahead, VUT: film(trace.position, trace.speed)}
+    obstacle = film(trace.position + gap + BODY_LENGTH, trace.obstacle_speed)
+    return {"obstacle": obstacle, VUT: film(trace.position, trace.speed)}
 
 
 def lane_below(trace: Trace) -> DrawnLane:
@@ -208,10 +203,11 @@ def comparison_of(simulation: Simulation) -> Comparison:
     pair = simulation.pair
     scoring = simulation.scoring
     title = simulation.study.title
-    objectives = {objective.name for objective in scoring.objectives} - {*METRICS}
+    if pair.point.name:
+        title += f" ({pair.point.name})"
+    names = {objective.name for objective in scoring.objectives} - {*METRICS}
 
-    # The pedals of the sample before an impact also at the impact, where a command has no effect
-    # any more.
+    # At an impact a command has no effect any more: the pedals are those of the sample before.
     trace = pair.runs.trace
     pedals = np.stack([trace.throttle, trace.brake])
     has_collided = ~np.isnan(pair.runs.collision_speed) & trace.active.any(axis=0)
@@ -219,12 +215,12 @@ def comparison_of(simulation: Simulation) -> Comparison:
         end = trace.last_active[row]
         pedals[:, end, row] = pedals[:, max(end - 1, 0), row]
     return Comparison(
-        title=f"{title} ({pair.point.name})" if pair.point.name else title,
+        title=title,
         system=pair.system,
         point=pair.point,
         evaluations=pair.evaluations,
         runs=replace(pair.runs, trace=replace(trace, throttle=pedals[0], brake=pedals[1])),
-        objectives=tuple(metric for metric in scoring.metrics if metric.name in objectives),
+        objectives=tuple(metric for metric in scoring.metrics if metric.name in names),
     )
 
 
@@ -233,17 +229,14 @@ def read_road(network: NetworkFiles) -> tuple[DrawnLane, ...]:
     lanes = []
     for edge in ElementTree.parse(built_network(network)).getroot().iter("edge"):
         for lane in edge.iter("lane"):
-            # a point is x,y or x,y,z
-            line = [
-                [float(number) for number in point.split(",")[:2]]
-                for point in lane.attrib["shape"].split()
-            ]
-            kind = {"walkingarea": "area", "crossing": "crossing"}.get(edge.get("function", ""))
-            for_persons = lane.get("allow", "").split() == ["pedestrian"]
-            width = 0.0 if kind == "area" else float(lane.get("width", 3.2))  # SUMO's default width
-            lanes.append(
-                DrawnLane(kind or ("path" if for_persons else "road"), np.array(line), width)
-            )
+            # A point is x,y or x,y,z.
+            line = [point.split(",")[:2] for point in lane.attrib["shape"].split()]
+            usual = "path" if lane.get("allow", "").split() == ["pedestrian"] else "road"
+            kinds = {"walkingarea": "area", "crossing": "crossing"}
+            kind = kinds.get(edge.get("function", ""), usual)
+            # SUMO's lanes are 3.2 m wide by default.
+            width = 0.0 if kind == "area" else float(lane.get("width", 3.2))
+            lanes.append(DrawnLane(kind, np.array(line, dtype=float), width))
     return tuple(lanes)
 
 

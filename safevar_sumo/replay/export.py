@@ -96,15 +96,14 @@ class Poses(NamedTuple):
         """
         return 0.0 if self.kind == "pedestrian" else self.length * WHEELBASE / 2
 
-    def places(self, behind: float = 0.0) -> list[tuple[float, float, float, float]]:
-        """Time [s], x, y [m] and heading [rad] of the point that is `behind` the middle by so much
+    def places(self, distance: float = 0.0) -> list[tuple[float, float, float, float]]:
+        """Time [s], x, y [m] and heading [rad] of the point at this distance behind the middle
         [m].
         """
-        x = self.x - behind * np.cos(self.heading)
-        y = self.y - behind * np.sin(self.heading)
-        return list(
-            zip(self.time.tolist(), x.tolist(), y.tolist(), self.heading.tolist(), strict=True)
-        )
+        x = self.x - distance * np.cos(self.heading)
+        y = self.y - distance * np.sin(self.heading)
+        columns = (values.tolist() for values in (self.time, x, y, self.heading))
+        return list(zip(*columns, strict=True))
 
 
 def poses_of(comparison: Comparison) -> list[Poses]:
@@ -115,7 +114,6 @@ def poses_of(comparison: Comparison) -> list[Poses]:
     actors = []
     end = comparison.moments[row].end + 1
 
-    # A body that is there, by its middle.
     time = np.round(comparison.runs.trace.time[:end], TIME_DECIMALS)
     for name, track in sorted(comparison.tracks.items(), key=lambda item: item[0] != VUT):
         x = track.x[:end, row]
@@ -132,7 +130,6 @@ def poses_of(comparison: Comparison) -> list[Poses]:
         x = x - to_middle * np.cos(heading)
         y = y - to_middle * np.sin(heading)
 
-        # The vehicle under test is Ego.
         time_of, x, y, heading = (values[is_present] for values in (time, x, y, heading))
         actor = Poses(name, kind, track.length, track.width, time_of, x, y, heading)
         if name == VUT:
@@ -202,25 +199,21 @@ def carla_physics(setting: NamedValues) -> dict[str, NamedValues]:
     """
     names = {**CARLA_PHYSICS, **CARLA_WHEELS}
 
-    # Characteristics that CARLA has, and no other ones.
-    if without := [name for name in setting if name not in names]:
-        problem = (
-            f"{', '.join(without)} of its vehicle {'has' if len(without) == 1 else 'have'} no"
-            " counterpart in CARLA"
-        )
+    if surplus := [name for name in setting if name not in names]:
+        verb = "has" if len(surplus) == 1 else "have"
+        problem = f"{', '.join(surplus)} of its vehicle {verb} no counterpart in CARLA"
         raise InputError(
             "", problem, f"the vehicle `carla`, with {', '.join(names)}; or `to=openscenario`"
         )
-    if missing := [name for name in names if name not in setting]:
+    if lacking := [name for name in names if name not in setting]:
         raise InputError(
             "",
-            f"its vehicle has no {', '.join(missing)}",
+            f"its vehicle has no {', '.join(lacking)}",
             "the vehicle `carla`, or `to=openscenario`",
         )
-    return {
-        "physics": {attribute: setting[name] for name, attribute in CARLA_PHYSICS.items()},
-        "wheels": {attribute: setting[name] for name, attribute in CARLA_WHEELS.items()},
-    }
+    physics = {attribute: setting[name] for name, attribute in CARLA_PHYSICS.items()}
+    wheels = {attribute: setting[name] for name, attribute in CARLA_WHEELS.items()}
+    return {"physics": physics, "wheels": wheels}
 
 
 def carla_scene(
@@ -229,11 +222,12 @@ def carla_scene(
     """The content of `vehicle.json`: physics, places in SUMO's frame (x east, y north, headings
     counter-clockwise) and pedals.
     """
-    # What the vehicle is, where it starts, what its pedals do, and how others move.
     row = comparison.rows[-1]
     trace = comparison.runs.trace
-    vut, *others = poses_of(comparison)
+    vut, *actors = poses_of(comparison)
     samples = slice(0, comparison.moments[row].end + 1)
+    commands = zip(trace.throttle[samples, row], trace.brake[samples, row], strict=True)
+    pedals = [{"throttle": throttle, "brake": brake} for throttle, brake in commands]
     return {
         "solution": handle,
         "title": comparison.title,
@@ -244,12 +238,7 @@ def carla_scene(
         "start": {"x": float(vut.x[0]), "y": float(vut.y[0]), "heading": float(vut.heading[0])},
         "start_speed": float(trace.speed[0, row]),
         "route": np.stack([vut.x, vut.y], axis=1).tolist(),
-        "pedals": [
-            {"throttle": throttle, "brake": brake}
-            for throttle, brake in zip(
-                trace.throttle[samples, row], trace.brake[samples, row], strict=True
-            )
-        ],
+        "pedals": pedals,
         "actors": [
             {
                 "name": actor.name,
@@ -257,7 +246,7 @@ def carla_scene(
                 "length": actor.length,
                 "places": actor.places(),
             }
-            for actor in others
+            for actor in actors
         ],
     }
 
@@ -291,7 +280,6 @@ def export(
         Use the present files and versions, although the results were computed with other files or
         versions. Default: an error.
     """
-    # The solution's vehicle, and its simulation.
     if out.exists() or out.is_symlink():
         raise InputError("out", f"{out} exists", "a new directory")
     target = load_target(directory, solution, as_it_is_now, point)
@@ -317,19 +305,18 @@ def write_files(
     """Write the last run of a comparison into a new directory: for "carla", with its `physics`, or
     "openscenario".
     """
-    # The road, and what drives on it.
     files = {ROAD: open_drive(comparison.network)}
     if to == "carla":
         scene = carla_scene(comparison, physics, handle)
         files[SCRIPT] = (PLAYER_FOLDER / SCRIPT).read_text(encoding="utf-8")
         files[VEHICLE] = json.dumps(scene, indent=1, allow_nan=False) + "\n"
     else:
-        ego, *others = poses_of(comparison)
+        ego, *actors = poses_of(comparison)
         template = template_environment().get_template(f"{SCENARIO}.j2")
         files[SCENARIO] = template.render(
             title=f"{comparison.title}, {handle}: {comparison.verdict(comparison.rows[-1])}",
             road=ROAD,
-            actors=[ego, *map(_with_next_place, others)],
+            actors=[ego, *map(_with_next_place, actors)],
             end=float(ego.time[-1]),
             wheelbase=WHEELBASE,
         )

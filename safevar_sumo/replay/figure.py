@@ -36,14 +36,12 @@ def draw_comparison(comparison: Comparison) -> Figure:
 
     comparison.refuse_without_position()
 
-    # Four panels over time.
     with matplotlib.style.context(
         ["seaborn-v0_8-whitegrid", {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE}]
     ):
         figure = Figure(figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08))
         axes = figure.subplots(2, 2, sharex=True).ravel()
 
-    # The quantities of both vehicles, until their ends.
     runs = comparison.runs
     divergence = find_divergence(comparison.runs)
     trace = runs.trace
@@ -70,7 +68,6 @@ def draw_comparison(comparison: Comparison) -> Figure:
         if divergence_time is not None:
             axis.axvline(divergence_time, color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
 
-    # Marks, limits and axes of each panel.
     speed_axis, gap_axis, pedal_axis, ttc_axis = axes
     for row in comparison.rows:
         _mark_moments(speed_axis, gap_axis, comparison, row)
@@ -122,7 +119,6 @@ def _mark_moments(speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row:
             **place,
         )
 
-    # Where braking begins, where the vehicle is nearest, and the impact.
     if start is not None:
         draw(speed_axis, start, trace.speed[start, row], BRAKING_MARK, xytext=(0, 0))
     if has_impact:
@@ -155,7 +151,6 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
     """Draw the legend: vehicles, marks, and lines."""
     from matplotlib.lines import Line2D
 
-    # A line for each vehicle.
     entries: JsonObject = {
         f"{comparison.name(row)} vehicle: {comparison.verdict(row)}": {
             "color": COLOURS[row],
@@ -164,7 +159,6 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
         for row in comparison.rows
     }
 
-    # Marks and lines that are drawn.
     marks = {"begins to brake": BRAKING_MARK, "nearest": NEAREST_MARK}
     if np.isfinite(comparison.runs.collision_speed).any():
         marks["impact"] = IMPACT_MARK
@@ -193,7 +187,7 @@ def find_divergence(runs: SimulationRuns) -> int | None:
 
 def _heading(comparison: Comparison) -> str:
     """The study's title and, below it, the changes; lines break only between changes."""
-    # no line breaks at "\0", which stands for the spaces of a change
+    # No line breaks at "\0", which stands for the spaces of a change.
     changes = ", ".join(change.replace(" ", "\0") for change in comparison.changes)
     line = f"changed: {changes}" if changes else "the original vehicle"
     lines = [*textwrap.wrap(comparison.title, LINE_LENGTH), *textwrap.wrap(line, LINE_LENGTH)]

@@ -58,31 +58,27 @@ def show_in_gui(comparison: Comparison, pictures: Path | None = None) -> None:
     SimulationError
         If SUMO cannot load the network, or its window was closed before the end.
     """
-    # The window pauses where vehicles are nearest, and at the end.
     runs = comparison.runs
     samples = count()
-    pauses = {moments.nearest for moments in comparison.moments} | {
-        max(moments.end for moments in comparison.moments)
-    }
+    end = max(moments.end for moments in comparison.moments)
+    pauses = {end, *(moments.nearest for moments in comparison.moments)}
     start = 0.0
 
     def watch(world: SumoWorld) -> None:
-        # The first step colours the vehicles.
         nonlocal start
         sample = next(samples)
-        if sample == 0:  # to open the window took a while
+        # The pace counts from the first step on: to open the window takes a while.
+        if sample == 0:
             start = time.monotonic()
             for row in comparison.rows:
                 world.api.vehicle.setColor(
                     copied_id(row, VUT), (*bytes.fromhex(COLOURS[row][1:]), 255)
                 )
         _look_at(world)
-        if (
-            pictures is not None and sample + 1 in pauses
-        ):  # sumo-gui takes it at the end of its next step
+        # Sumo-gui takes a picture at the end of its next step.
+        if pictures is not None and sample + 1 in pauses:
             world.api.gui.screenshot(VIEW_NAME, str(pictures / f"{sample + 1:04d}.png"))
 
-        # Pauses, and the pace.
         if sample in pauses:
             time.sleep(PAUSE)
             start += PAUSE
@@ -94,9 +90,9 @@ def show_in_gui(comparison: Comparison, pictures: Path | None = None) -> None:
 def _look_at(world: SumoWorld) -> None:
     """Keep the vehicles in the middle of the view."""
     fronts = world.vehicle_positions(VUT)
-    left, bottom = fronts.min(axis=0) - AROUND
-    right, top = fronts.max(axis=0) + AROUND
-    world.api.gui.setBoundary(VIEW_NAME, left, bottom, right, top)
+    low = fronts.min(axis=0) - AROUND
+    high = fronts.max(axis=0) + AROUND
+    world.api.gui.setBoundary(VIEW_NAME, *low, *high)
 
 
 @contextmanager

@@ -65,14 +65,14 @@ OF_SEARCH = ("gap", "f_safe", "f_diff", "f_num_diff")
 
 def _meets(system: System, setting: FloatArray) -> list[str]:
     """Sentences on an encounter that is not the study's, and on its phase."""
-    met = system.characteristics.named(setting)
+    values = system.characteristics.named(setting)
     places = [
-        f"{item.name.replace('_', ' ')} {met[item.name]:{EXACT}}{item.suffix}"
+        f"{item.name.replace('_', ' ')} {values[item.name]:{EXACT}}{item.suffix}"
         for item in system.characteristics.scenario
-        if item.name != PHASE and met[item.name] != item.original
+        if item.name != PHASE and values[item.name] != item.original
     ]
     sentences = [f"The encounter has {join_phrases(places)}."] if places else []
-    if phase := met.get(PHASE):
+    if phase := values.get(PHASE):
         sentences.append(f"The encounter begins {phase:g} steps of the driving system later.")
     return sentences
 
@@ -94,7 +94,6 @@ def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId
     """A setting beside the original: its values, outcome, metrics and objectives, and the points of
     a matrix; of a solution its handle.
     """
-    # Which numbers are of the filtered setting.
     study = simulation.study
     setting = simulation.evaluation.settings[0]
     remarks = _remarks_of(system)
@@ -109,7 +108,6 @@ def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId
             f" {' and '.join(small)} as unchanged. Everything else is of the vehicle as given."
         )
 
-    # Values and results of both vehicles.
     original = simulation.original.numbers
     simulated = simulation.numbers
     units = {"outcome": "", **simulation.units}
@@ -122,13 +120,12 @@ def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId
     tables["results"].attrs["words"] = {name: name.replace("_", " ") for name in names}
     tables["results"].attrs["lead_rows"] = np.flatnonzero(~names.isin(OF_SEARCH)).tolist()
 
-    # The verdict; of a matrix with the points at which it fails.
     verdict = [simulation.no_verdict, *_verdict(simulation, len(system.matrix))]
     if system.matrix:
         tables["points"], failing = _points(system, setting)
         is_changed = simulation.setting != simulation.original.setting
-        who = "changed" if is_changed else "original"
-        verdict.append(points_in_words(f"The {who} vehicle", failing, len(system.matrix)))
+        vehicle = "changed" if is_changed else "original"
+        verdict.append(points_in_words(f"The {vehicle} vehicle", failing, len(system.matrix)))
 
     rows = [(remark,) for remark in dict.fromkeys(remarks)]
     tables["remarks"] = tabulate("Remarks", REMARKS, rows)
@@ -152,10 +149,11 @@ def _points(system: System, setting: FloatArray) -> tuple[pd.DataFrame, list[str
     """
     results = [*simulate_all_points(system, setting[np.newaxis])]
     records = map(point_record, results)
-    points = [{**row, **row.get("contact", {})} for row in records]  # side and place are columns
+    # Side and place of a contact are columns of their own.
+    points = [{**row, **row.get("contact", {})} for row in records]
     table = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
     table.attrs["lead_rows"] = np.argsort(table[SAFETY_DEGREE], kind="stable").tolist()
-    return table, [one.point.name for one in results if _fails(system, one)]
+    return table, [result.point.name for result in results if _fails(system, result)]
 
 
 def _without_repetition(frame: pd.DataFrame, simulation: Simulation) -> pd.DataFrame:
@@ -180,10 +178,9 @@ def _verdict(simulation: Simulation, point_count: int) -> list[str]:
     """How the simulated vehicle and, if it differs, the original end; of a matrix in the worst of
     its test cases.
     """
-    # Where both meet the obstacle: in an encounter, a test case, or the worst of several.
-    least = simulation.scoring.safe_original
+    demand = simulation.scoring.safe_original
     name = simulation.pair.point.name
-    where = "The" if least is None else "In this encounter the"
+    where = "The" if demand is None else "In this encounter the"
     worst = ""
     if point_count > 1:
         kind = "least" if simulation.metrics[SAFETY_DEGREE] > 0 else "worst"
@@ -192,7 +189,6 @@ def _verdict(simulation: Simulation, point_count: int) -> list[str]:
     elif name:
         where = f"In the test case {name}, the"
 
-    # The simulated vehicle first if the case is its worst one.
     original = f"original vehicle {simulation.original.verdict}"
     changed = f"changed vehicle {simulation.verdict}"
     comparison = _safety_comparison(simulation)
@@ -203,17 +199,16 @@ def _verdict(simulation: Simulation, point_count: int) -> list[str]:
     else:
         verdict = [f"{where} {original}.", f"The {changed}: {comparison}."]
 
-    # Why a search leaves this encounter out.
-    if least is not None and not simulation.original.metrics[SAFETY_DEGREE] >= least:
+    # NaN is no safety degree that suffices.
+    if demand is not None and not simulation.original.metrics[SAFETY_DEGREE] >= demand:
         verdict.append(
             "Here the original vehicle keeps less than a search demands of it in the same"
-            f" encounter: at least {least:.2f} m."
+            f" encounter: at least {demand:.2f} m."
         )
     return verdict
 
 
 def _safety_comparison(simulation: Simulation) -> str:
-    # By the stopping distance, if both stop for it.
     stop = simulation.metrics.get(STOPPING_DISTANCE.name, np.nan)
     original_stop = simulation.original.metrics.get(STOPPING_DISTANCE.name, np.nan)
     if np.isfinite(stop / original_stop):
@@ -222,7 +217,6 @@ def _safety_comparison(simulation: Simulation) -> str:
             " of the original"
         )
 
-    # Else by the safety degree.
     degree = simulation.metrics[SAFETY_DEGREE]
     original = simulation.original.metrics[SAFETY_DEGREE]
     if np.isnan(degree) or np.isnan(original):

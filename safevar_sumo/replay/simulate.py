@@ -116,7 +116,6 @@ def show_simulation(
         Use the present files and versions, although the results were computed with other files or
         versions. Default: an error.
     """
-    # What is simulated: a study or a solution, with changes.
     target = load_target(source, solution, as_it_is_now, point, ranges=ranges, up_to=up_to)
     target = target._replace(study=_with_set(target.study, fit))
     system = assemble(target.study)
@@ -128,9 +127,10 @@ def show_simulation(
         values = read_changes(changes, system.characteristics, beyond=beyond)
         if PHASE in values:
             values[PHASE] = round(values[PHASE], PHASE_DECIMALS)
-        before = system.characteristics.named(target.setting(system))
-        requested = np.array([*{**before, **values}.values()])
-        if changes and not beyond:  # what a study or results hold has been checked
+        target_values = system.characteristics.named(target.setting(system))
+        requested = np.array([*{**target_values, **values}.values()])
+        # What a study or results hold has been checked.
+        if changes and not beyond:
             system.region.check(requested[np.newaxis], otherwise=", or any with --beyond")
 
     # Files that cannot be written are refused first.
@@ -141,7 +141,6 @@ def show_simulation(
     if animate is not None:
         check_writable(animate, "animate", animation.ENDINGS, but=SOLUTIONS)
 
-    # One setting beside the original vehicle, in the tests that have its encounter.
     system = _where_met(system, requested)
     simulation = simulate_with_original(target.study, system, requested, filtered=False)
     # Results belong to the whole matrix.
@@ -163,13 +162,14 @@ def show_simulation(
 
 def _where_met(system: System, setting: FloatArray) -> System:
     """The system at the points that a setting, shape (n,), meets; a warning names other tests."""
-    here = where_met(system, setting)
-    of_test = [
-        {dict(one.parameters).get("test", "") for one in each.points} for each in (system, here)
-    ]
-    if left_out := sorted(of_test[0] - of_test[1]):
-        warn(f"not driven, as their ranges do not have this encounter: {', '.join(left_out)}")
-    return here
+    reduced = where_met(system, setting)
+    if names := sorted(_tests_of(system) - _tests_of(reduced)):
+        warn(f"not driven, as their ranges do not have this encounter: {', '.join(names)}")
+    return reduced
+
+
+def _tests_of(system: System) -> set[str]:
+    return {dict(point.parameters).get("test", "") for point in system.points}
 
 
 def load_target(
@@ -189,17 +189,15 @@ def load_target(
     InputError
         If there is no such study, directory, solution or point.
     """
-    # The study, of results as it is recorded there, at a point.
     subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=solution is not None)
-    if not isinstance(subject, Study) and subject.shortfall:
-        warn(subject.shortfall)
     if not isinstance(subject, Study):
+        if subject.shortfall:
+            warn(subject.shortfall)
         refuse_part_of_results(ranges=ranges, up_to=up_to)
     study = part_of_study(study_in(subject), ranges, point, up_to)
     if isinstance(subject, Study) or solution is None:
         return Target(study, source)
 
-    # The solution, by a choice or its handle.
     subject.require_solutions()
     choice = solution.replace("-", "_")
     with about(source):
@@ -210,8 +208,8 @@ def load_target(
         )
     row = subject.solutions.iloc[row_of_handle(subject.solutions, handle)]
     values = {str(name): value for name, value in row.items()}
-    if choice == "fewest" and (found := fewest_changes(subject)):
-        values = subject.characteristics.named(found.settings[0])
+    if choice == "fewest" and (fewest := fewest_changes(subject)):
+        values = subject.characteristics.named(fewest.settings[0])
     return Target(study, source, handle, values)
 
 

@@ -79,17 +79,17 @@ def spawn(world: Any, scene: Scene) -> tuple[Any, list[tuple[Scene, Any]]]:
         "bicycle": "vehicle.*.crossbike",
         "car": scene["blueprint"],
     }
-    others = []
+    actors = []
     for actor in scene["actors"]:
         body = world.spawn_actor(library.filter(patterns[actor["kind"]])[0], place_at(actor, 0))
         body.set_simulate_physics(False)
-        others.append((actor, body))
-    return vehicle, others
+        actors.append((actor, body))
+    return vehicle, actors
 
 
 def play(world: Any, scene: Scene, agent_class: Any) -> float | None:
     """Play the scene; returns the speed of the first collision [m/s], None without one."""
-    vehicle, others = spawn(world, scene)
+    vehicle, actors = spawn(world, scene)
     sensor = world.spawn_actor(
         world.get_blueprint_library().find("sensor.other.collision"),
         carla.Transform(),
@@ -108,21 +108,22 @@ def play(world: Any, scene: Scene, agent_class: Any) -> float | None:
     try:
         for step in range(len(scene["pedals"])):
             vehicle.apply_control(agent.run_step() if agent else pedals(scene, step))
-            for actor, body in others:
-                if actor["kind"] == "pedestrian":  # it moves its legs; the record places it
+            for actor, body in actors:
+                # A pedestrian moves its legs; the record places it.
+                if actor["kind"] == "pedestrian":
                     body.apply_control(
                         walk(actor["places"], step, scene["step"], body.get_location())
                     )
                 body.set_transform(place_at(actor, step))
-            before = speed
+            speed_before = speed
             speed = math.hypot(vehicle.get_velocity().x, vehicle.get_velocity().y)
             world.tick()
             if touched:
-                return max(before, speed)
+                return max(speed_before, speed)
         return None
     finally:
         sensor.destroy()
-        for actor in (vehicle, *(body for _, body in others)):
+        for actor in (vehicle, *(body for _, body in actors)):
             actor.destroy()
 
 
