@@ -8,7 +8,7 @@ import hashlib
 import math
 import platform
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -44,9 +44,6 @@ from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import VEHICLES, Vehicle
-
-if TYPE_CHECKING:
-    pass
 
 BATCHES_PER_WORKER = 4
 """Largest number of batches per worker: with several, no worker waits long for another, and the
@@ -85,19 +82,19 @@ def _refuse_other_workers(study: Study, used: Iterable[str], pool: Pool) -> None
         pool.on_cluster(refuse_other_worker, study, manifest, package_digest())
 
 
-def spare(most: int, least: int) -> tuple[int, int]:
+def spare(limit: int, minimum: int) -> tuple[int, int]:
     """How many of the allowed simulations the check of a simulator's class may take, and the
     repeats of first batches; what an answer takes at least is left.
     """
-    check = min(most // 10, max(most - least, 0))
-    return check, min(most // 10, MAX_REPEATS, max(most - least - check, 0))
+    check = min(limit // 10, max(limit - minimum, 0))
+    return check, min(limit // 10, MAX_REPEATS, max(limit - minimum - check, 0))
 
 
 def evaluate_all(
     study: Study,
     settings: FloatArray,
     pool: Pool,
-    done: Callable[[int], None] = lambda size: None,
+    finish: Callable[[int], None] = lambda size: None,
     verified: int = VERIFIED_SETTINGS,
     selection: Selection = EVERYTHING,
     begin: Callable[[], None] = lambda: None,
@@ -107,44 +104,44 @@ def evaluate_all(
 
     User code is checked first (`check_code`), and `begin` is called before anything is simulated. A
     sample of the settings in a recorded scene is also simulated in SUMO, until `verified` ones of
-    the study have been. `done` is called with the number of settings of every finished batch. Of a
+    the study have been. `finish` is called with the number of settings of each finished batch. Of a
     `selection`, nothing is verified in SUMO.
     """
     packed_study = msgspec.msgpack.encode(study)
     if pool.shared is not None:
-        return _evaluate_shared(study, settings, pool, done, verified, selection, begin)
+        return _evaluate_shared(study, settings, pool, finish, verified, selection, begin)
     opened = _opened_by(study, pool)
     system = system_of(study)
     if packed_study not in pool.inputs:
         pool.inputs[packed_study] = manifest_now(study, system, opened)
         _refuse_other_workers(study, opened, pool)
 
-    # Equal settings are simulated once, and none again that the cache has: a portion is an entry.
+    # The cache has an entry for each portion.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     batches = choose_batches(study, selection)
     cache = cache_of(study, opened)
-    found = list[Evaluations]()
+    evaluated = list[Evaluations]()
     portions = math.ceil(len(distinct_settings) / batches.portion) if cache else 1
     for portion in np.array_split(distinct_settings, portions):
         key = b""
         if cache:
             key = key_of_settings(cache.key_of(study, opened), selection, portion)
-            if kept := evaluations_in(cache.get(key)):
-                found.append(kept)
-                done(len(portion))
+            if cached := evaluations_in(cache.get(key)):
+                evaluated.append(cached)
+                finish(len(portion))
                 continue
         begin()
         sample_size = verified - pool.verified[packed_study]
         task = Task(study=study, batch_size=batches.best, selection=selection)
-        evaluations = _simulate(task, portion, pool, batches, done, sample_size)
+        evaluations = _simulate(task, portion, pool, batches, finish, sample_size)
         inputs = pool.inputs[packed_study]
         if files_of(study, system, inputs["files"]) != inputs["files"]:
             refuse_changed_inputs(study, system, inputs)
         pool.verified[packed_study] += max(min(sample_size, len(portion)), 0)
         if cache and not evaluations.failed.any():
             cache.put(key, content_of(evaluations), len(portion))
-        found.append(evaluations)
-    evaluations = Evaluations.concatenate(found)
+        evaluated.append(evaluations)
+    evaluations = Evaluations.concatenate(evaluated)
     if study.search.failed == "skip":
         pool.simulated += len(evaluations)
         pool.failed += int(evaluations.failed.sum())
@@ -161,7 +158,7 @@ def _evaluate_shared(
     study: Study,
     settings: FloatArray,
     pool: Pool,
-    done: Callable[[int], None],
+    finish: Callable[[int], None],
     verified: int,
     selection: Selection,
     begin: Callable[[], None],
@@ -170,17 +167,17 @@ def _evaluate_shared(
     shared, pool.shared = pool.shared, None
     assert shared is not None
     try:
-        known = shared.setdefault(msgspec.msgpack.encode((study, selection)), {})
+        evaluation_of = shared.setdefault(msgspec.msgpack.encode((study, selection)), {})
         rows = np.unique(settings, axis=0)
-        missing = rows[[row.tobytes() not in known for row in rows]]
-        done(len(rows) - len(missing))
-        if len(missing):
-            found = evaluate_all(study, missing, pool, done, verified, selection, begin)
-            for number, row in enumerate(missing):
-                known[row.tobytes()] = found.take([number])
+        new_rows = rows[[row.tobytes() not in evaluation_of for row in rows]]
+        finish(len(rows) - len(new_rows))
+        if len(new_rows):
+            evaluations = evaluate_all(study, new_rows, pool, finish, verified, selection, begin)
+            for number, row in enumerate(new_rows):
+                evaluation_of[row.tobytes()] = evaluations.take([number])
     finally:
         pool.shared = shared
-    return Evaluations.concatenate([known[row.tobytes()] for row in settings])
+    return Evaluations.concatenate([evaluation_of[row.tobytes()] for row in settings])
 
 
 def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:
@@ -190,8 +187,8 @@ def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:
     opened = _opened_by(study, pool)
     if cache := cache_of(study, opened):
         key = hashlib.sha256(b"original" + cache.key_of(study, opened)).digest()
-        kept = evaluations_in(cache.get(key))
-        if kept is not None and [*differences(kept.results, original.results)]:
+        cached = evaluations_in(cache.get(key))
+        if cached is not None and [*differences(cached.results, original.results)]:
             warn("does not continue: the simulator drives the original vehicle otherwise now")
             cache.forget()
         cache.put(key, content_of(original))
@@ -202,9 +199,9 @@ def repeat_first_batches(study: Study, pool: Pool) -> None:
     of `repeat_first_batch`.
     """
     if user_code_names(study):
-        each = simulations_of_setting(system_of(study))
-        most = None if pool.spare is None else pool.spare[1] // each
-        pool.everywhere(repeat_first_batch, study, most=most)
+        simulations = simulations_of_setting(system_of(study))
+        limit = pool.spare and pool.spare[1] // simulations
+        pool.everywhere(repeat_first_batch, study, limit=limit)
 
 
 def check_simulator(study: Study, pool: Pool) -> None:
@@ -219,8 +216,8 @@ def _opened_by(study: Study, pool: Pool) -> list[str]:
     a pool, whatever else of the study questions vary.
     """
     names, places = frozenset(user_code_names(study)), (study.name, *study.origin.places)
-    for (known, folders), opened in pool.opened.items():
-        if names <= known and folders == places:
+    for (checked_names, folders), opened in pool.opened.items():
+        if names <= checked_names and folders == places:
             return opened
     _refuse_other_workers(study, [], pool)
     pool.opened[names, places] = opened = check_code(study, pool)
@@ -232,7 +229,7 @@ def _simulate(
     settings: FloatArray,
     pool: Pool,
     batches: Batches,
-    done: Callable[[int], None],
+    finish: Callable[[int], None],
     sample_size: int,
 ) -> Evaluations:
     """Simulate distinct settings, shape (k, n), in batches for the workers; where recorded scenes
@@ -242,7 +239,7 @@ def _simulate(
 
     def show_ended(ended: Sequence[int]) -> None:
         for number in ended:
-            done(len(jobs[number][1]))
+            finish(len(jobs[number][1]))
 
     evaluations = Evaluations.concatenate(carry_out(evaluate_settings, jobs, pool, show_ended))
     sample_size = min(sample_size, len(settings))
@@ -279,10 +276,10 @@ class Batches(NamedTuple):
     def number(self, settings: int, pool: Pool) -> int:
         """The number of batches for so many settings."""
         per_worker = settings / pool.workers
-        least = ECONOMICAL_FRACTION * self.best
+        economical = ECONOMICAL_FRACTION * self.best
         if not self.share_steps:
-            least = min(per_worker, least)
-        size = min(self.best, max(per_worker / BATCHES_PER_WORKER, least))
+            economical = min(per_worker, economical)
+        size = min(self.best, max(per_worker / BATCHES_PER_WORKER, economical))
         return max(math.ceil(settings / math.ceil(size)), 1)
 
 
@@ -303,8 +300,9 @@ def compile_vehicle(study: Study, pool: Pool, progress: Progress) -> None:
         return
     pool.compiled.add(study.vehicle.model)
     shipped = VEHICLES.get(study.vehicle.model)
+    # It compiles nothing, and no worker needs to start to say so.
     if shipped is not None and shipped.compile is Vehicle.compile:
-        return  # it compiles nothing, and no worker needs to start to say so
+        return
     task = Task(study=study)
     if not carry_out(_compile_vehicle, [(task, True)], pool)[0]:
         progress(COMPILING, 0, 1)

@@ -113,7 +113,8 @@ class Cache:
 
     def get(self, key: bytes) -> bytes | None:
         """The content of an entry; None if there is none, or it has been altered."""
-        entries = self._entries  # which another thread may end
+        # Another thread may end the cache meanwhile.
+        entries = self._entries
         if entries is None or not self._is_read:
             return None
         entry = self._guarded(entries.get, None, key)
@@ -221,7 +222,7 @@ class CommandCache:
                 if time.time() - old.stat().st_mtime > DAY:
                     (shutil.rmtree if old.is_dir() else Path.unlink)(old)
 
-            # One process at a time; its lock ends with it.
+            # The lock of a process ends with it.
             lock_file = self._own_folder.with_suffix(".lock")
             lock = portalocker.Lock(lock_file, "a", timeout=0, fail_when_locked=True)
             lock.acquire()
@@ -230,10 +231,10 @@ class CommandCache:
             return
         if self._is_fresh:
             shutil.rmtree(self._own_folder, ignore_errors=True)
-        begun = self._own_folder.stat().st_mtime if self._own_folder.is_dir() else None
+        begin = self._own_folder.stat().st_mtime if self._own_folder.is_dir() else None
         self._own = Cache(self._own_folder, is_counted=True)
-        if begun is not None and (number := self._own.number_kept()):
-            at = time.strftime("%H:%M", time.localtime(begun))
+        if begin is not None and (number := self._own.number_kept()):
+            at = time.strftime("%H:%M", time.localtime(begin))
             warn(f"continues: {number:,} simulated at {at}")
 
 
@@ -315,15 +316,13 @@ def evaluations_in(content: bytes | None) -> Evaluations | None:
     try:
         with np.load(BytesIO(zlib.decompress(content)), allow_pickle=False) as file:
             arrays = dict(file)
-        return Evaluations(
-            **{name: arrays[name] for name in COLUMNS},
-            metrics={
-                name.removeprefix(METRIC): one
-                for name, one in arrays.items()
-                if name.startswith(METRIC)
-            },
-            worst_points=arrays.get(POINTS),
-        )
+        metrics = {
+            name.removeprefix(METRIC): values
+            for name, values in arrays.items()
+            if name.startswith(METRIC)
+        }
+        columns = {name: arrays[name] for name in COLUMNS}
+        return Evaluations(**columns, metrics=metrics, worst_points=arrays.get(POINTS))
     except (ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error):
         return None
 
@@ -345,7 +344,7 @@ def _environment() -> Any:
     """
     # A distribution may lack a name or a version.
     versions = sorted(
-        [one.metadata.get_all(field, []) for field in ("Name", "Version")]
-        for one in distributions()
+        [package.metadata.get_all("Name", []), package.metadata.get_all("Version", [])]
+        for package in distributions()
     )
     return platform.python_version(), versions, digests(files_in(PACKAGE), [str(PACKAGE)])

@@ -93,7 +93,6 @@ def run_campaign(
     SafevarError
         If a journal cannot be written, another process works on a run, or the study is at fault.
     """
-    # The directory, with the inputs of its results as they are now.
     pool.spare = None
     opened = check_code(study, pool)
     is_new = not (directory / MANIFEST).exists()
@@ -101,8 +100,8 @@ def run_campaign(
     if not system.mover.is_exact:
         read = opened if is_new else read_manifest(directory).get("files", ())
     manifest = manifest_now(study, system, read)
-    wanted = [*map(str, keys)]
-    results = ResultsDirectory(directory, study, manifest, system.measuring.scoring, wanted)
+    names = [*map(str, keys)]
+    results = ResultsDirectory(directory, study, manifest, system.measuring.scoring, names)
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
         warn(remark)
     system, engine_used, reason = choose_engine(system, engine)
@@ -111,10 +110,9 @@ def run_campaign(
     size = batch_size or settings_per_batch(system)
     task = Task(study=study, in_sumo=system.in_sumo, batch_size=size)
 
-    # What the user should know before the search begins.
-    asked = len(keys) * study.search.evaluations
-    repeated = min(asked, MAX_REPEATED) if engine_used == RECORDED else 0
-    parts = Parts(progress, [asked, SUMO_COST * repeated])
+    evaluations = len(keys) * study.search.evaluations
+    repeated = min(evaluations, MAX_REPEATED) if engine_used == RECORDED else 0
+    parts = Parts(progress, [evaluations, SUMO_COST * repeated])
     show_search = parts.begin()
     show_journals = journal_progress(study, keys, directory, show_search)
     show_journals([])
@@ -128,13 +126,12 @@ def run_campaign(
     if is_new and not system.mover.is_exact and system.repeats == 1:
         repeat_elsewhere(study, pool)
 
-    # Each worker carries out a share of the runs.
     hands = deal(keys, pool.workers, task.batch_size, study.search.population)
     about = directory.absolute(), results.manifest, original, retry_failed
     shares = [(task, Share(dealt, *about)) for dealt in hands]
     runs = [*chain.from_iterable(carry_out(carry_share, shares, pool, show_journals))]
 
-    # Solutions are written when all runs are finished; then SUMO repeats a part of the runs.
+    # A part of the runs writes no solutions, which would look like those of the whole study.
     runs.sort(key=lambda run: run.key)
     for remark in _remarks_on_discarded(study, runs):
         warn(remark)
@@ -211,29 +208,26 @@ def deal(
     """
     runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch_size / population), MAX_RUNS)
     count = min(workers * math.ceil(len(keys) / (workers * runs_at_once)), len(keys))
-    return [
-        keys[number::count] for number in range(count)
-    ]  # like cards: each share gets runs of all algorithms
+    # Like cards: each share gets runs of all algorithms.
+    return [keys[number::count] for number in range(count)]
 
 
 def choose_sample(study: Study, original: Evaluations, runs: Sequence[RunResult]) -> Evaluations:
     """What SUMO repeats of a search: its unsafe solutions, or as many of them as `UNSAFE_REPEATED`
     allows, and others that the study's seed draws.
     """
-    # Unsafe solutions, each once.
     solutions = Evaluations.concatenate([run.solutions for run in runs])
-    values = {name: float(one[0]) for name, one in original.metrics.items()}
-    rows = np.flatnonzero(Unsafe.default(values, solutions.outcome).of(solutions))
+    metrics = {name: float(values[0]) for name, values in original.metrics.items()}
+    rows = np.flatnonzero(Unsafe.default(metrics, solutions.outcome).of(solutions))
     rows = rows[np.unique(solutions.settings[rows], axis=0, return_index=True)[1]]
 
-    # Others after them, of all runs.
     rng = default_rng(study.search.seed)
-    drawn = Evaluations.concatenate([run.sample for run in runs])
-    drawn = drawn.take(rng.permutation(len(drawn)))
+    samples = Evaluations.concatenate([run.sample for run in runs])
+    samples = samples.take(rng.permutation(len(samples)))
     unsafe = solutions.take(rng.permutation(rows)[:UNSAFE_REPEATED])
-    both = Evaluations.concatenate([unsafe, drawn])
-    first = np.unique(both.settings, axis=0, return_index=True)[1]
-    return both.take(np.sort(first)[:MAX_REPEATED])
+    candidates = Evaluations.concatenate([unsafe, samples])
+    distinct = np.unique(candidates.settings, axis=0, return_index=True)[1]
+    return candidates.take(np.sort(distinct)[:MAX_REPEATED])
 
 
 def repeat_in_sumo(task: Task, sample: Evaluations, pool: Pool, progress: Progress) -> set[str]:
@@ -265,10 +259,10 @@ def journal_progress(
     ]
 
     def show(ended: Sequence[int]) -> None:
-        asked = sum(reader.asked() for reader in readers)
-        left = sum(reader.left for reader in readers)
+        evaluations = sum(reader.asked() for reader in readers)
+        total = evaluations + sum(reader.left for reader in readers)
         finished = sum(reader.is_finished for reader in readers)
-        progress(f"{study.name}: {finished} of {len(keys)} runs", asked, asked + left)
+        progress(f"{study.name}: {finished} of {len(keys)} runs", evaluations, total)
 
     return show
 

@@ -26,7 +26,8 @@ CONNECT_TIMEOUT = 10.0
 """Longest time for the scheduler to answer [s]."""
 _locks = list[portalocker.Lock]()
 """The locks of the numbers that this process has."""
-_libsumo_lock = threading.Lock()  # a process has one libsumo
+_libsumo_lock = threading.Lock()
+"""A process has one libsumo."""
 
 
 @contextmanager
@@ -42,8 +43,9 @@ def connect(address: str) -> Iterator[Any]:
         from distributed import Client
     except ImportError:
         raise missing_extra("cluster", "Dask is not installed", "cluster") from None
+    # This package reports errors itself.
     for name in ("distributed", "distributed.client"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # this package reports errors itself
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError, TypeError, RuntimeError) as error:
@@ -58,7 +60,8 @@ def everywhere(client: Any, function: Callable[..., Any], *arguments: Any) -> No
     """Carry out a function in each worker of a cluster; raises its error."""
     try:
         client.run(_carry_out, pickle.dumps((function, arguments)), "")
-    except (AttributeError, ImportError, TypeError) as error:  # it knows no such function
+    except (AttributeError, ImportError, TypeError) as error:
+        # Another version knows no such function.
         problem = f"a worker has another version of safevar_sumo: {describe_error(error)}"
         raise InputError("cluster", problem, "the same installation everywhere") from None
 
@@ -73,7 +76,7 @@ class ClusterWorker:
         self._command = client.id
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        # Dask's own serialization turns records into lists
+        # Dask's own serialization turns records into lists.
         future: Future[Any] = self._executor.submit(
             _carry_out, pickle.dumps((function, arguments)), self._command
         )
@@ -87,7 +90,8 @@ class ClusterWorker:
         return f"workers of the cluster died: {error}" if isinstance(error, KilledWorker) else ""
 
     def end(self) -> None:
-        self._executor.shutdown(wait=False)  # cancels the jobs
+        # This cancels the jobs.
+        self._executor.shutdown(wait=False)
 
 
 def _carry_out(packed_job: bytes, command: str) -> Any:
@@ -123,6 +127,7 @@ def has_caller() -> bool:
 
     try:
         worker = get_worker()
-    except ValueError:  # this process is no worker of a cluster
+    except ValueError:
+        # This process is no worker of a cluster.
         return True
     return bool(worker.state.tasks[worker.get_current_task()].state != "cancelled")

@@ -113,13 +113,13 @@ def carry_out(
     try:
         return pool.map(function, jobs, look)
 
-    # Two workers died at the same work, probably in user code.
     except WorkerLostError as error:
         task, *arguments = jobs[error.job]
-        first = next(iter(arguments), None)
-        work = f"{len(first)} settings" if isinstance(first, np.ndarray) else str(first)
         names = user_code_names(task.study)
-        work = "the check of user code" if first is None else work
+        argument = next(iter(arguments), None)
+        work = "the check of user code" if argument is None else str(argument)
+        if isinstance(argument, np.ndarray):
+            work = f"{len(argument)} settings"
         problem = f"two workers were lost at the same work, {work}: {error}"
         if names:
             where = f", probably in {' and '.join(names)}"
@@ -153,10 +153,9 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
             f"a batch cannot be computed: {str(error) or 'no memory is left'}"
         ) from None
     if len(rows) == 1:
-        # A setting that SUMO cannot simulate has an evaluation, too; an error of user code has a
-        # command.
         characteristics = CharacteristicSet.of(task.study)
-        setting = rows[:, : len(characteristics)]  # without the ADS's parameters
+        # Parameters of the ADS stand behind the characteristics.
+        setting = rows[:, : len(characteristics)]
         if isinstance(failure, UserCodeError):
             command = reproduction_command(task.study, setting[0])
             raise UserCodeError(
@@ -179,7 +178,8 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     """
     system = system_of(task.study)
     system = replace(system, in_sumo=True) if task.in_sumo else system
-    system.vehicle.compile()  # outside the time limit
+    # To compile takes longer than the time limit of a batch.
+    system.vehicle.compile()
     # Of runs that take long, each has the time limit.
     limit = end_if_longer(task.study.search.time_limit)
     with nullcontext() if system.mover.takes_long else limit:
@@ -200,13 +200,13 @@ def repeat_first_batch(study: Study) -> None:
     UserCodeError
         If a result differs: user code depends on what it has simulated before.
     """
-    first = _first_batches.pop(msgspec.msgpack.encode(study), None)
-    if first is None:
+    batch = _first_batches.pop(msgspec.msgpack.encode(study), None)
+    if batch is None:
         return
-    task, rows, before = first
-    now = evaluate_batch(task, rows)
+    task, rows, evaluations = batch
+    repeated = evaluate_batch(task, rows)
     _first_batches.clear()
-    for row, difference in differences(before.results, now.results):
+    for row, difference in differences(evaluations.results, repeated.results):
         command = reproduction_command(study, rows[row, : len(study.domains)])
         raise UserCodeError(
             f"study {study.name!r}",
@@ -219,7 +219,6 @@ def repeat_first_batch(study: Study) -> None:
 
 def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evaluations:
     """Evaluate rows of n characteristics and values of the selected parameters of the ADS."""
-    # The settings, and values of the driving system's parameters.
     selection = task.selection
     settings, values = np.split(rows, [len(system.characteristics)], axis=1)
     if not values.size:
@@ -243,9 +242,8 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
         evaluations = drive_and_score(driven, settings[group], with_originals=False)
         groups.append(replace(evaluations, settings=rows[group]))
         rows_of_groups.append(group)
-    return Evaluations.concatenate(groups).take(
-        np.argsort(np.concatenate(rows_of_groups))
-    )  # in the order of the rows
+    # The evaluations get the order of the rows.
+    return Evaluations.concatenate(groups).take(np.argsort(np.concatenate(rows_of_groups)))
 
 
 def with_parameters(study: Study, values: Mapping[str, float]) -> Study:

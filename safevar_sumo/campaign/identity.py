@@ -31,7 +31,6 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
     the inputs.
     """
     identity = {"files": files_of(study, system, used), "results": RESULTS, "platform": PLATFORM}
-    # Versions of the scenarios' simulators, and of the distributions that they name.
     versions = {}
     libraries = set[str]()
     for scenario in (point.scenario for point in system.points):
@@ -71,5 +70,5 @@ def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
     network_files = {network.path(name) for network in opened for name, _ in network.digests}
     fmus = {Path(file_beside(name, places or [os.getcwd()])) for _, name in fmus_of(study)}
     data = {file for path in data_files(study).values() for file in files_in(Path(path))}
-    known = digests(network_files | code_files(user_modules(study), places) | fmus | data, places)
-    return dict(sorted((digests_by_name(used, places) | known).items()))
+    files = network_files | code_files(user_modules(study), places) | fmus | data
+    return dict(sorted((digests_by_name(used, places) | digests(files, places)).items()))

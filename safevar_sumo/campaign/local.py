@@ -54,14 +54,17 @@ class ProcessWorker:
 
     def __init__(self, last_words: Path) -> None:
         self._last_words = last_words
-        _close_simulators()  # of this process, which have the number of a worker, too
+        # Simulators of this process have the number of a worker, too.
+        _close_simulators()
         context = multiprocessing.get_context("spawn")
-        self._mark = uuid4().hex  # of its child processes, too
+        # The worker's child processes have the mark, too.
+        self._mark = uuid4().hex
         arguments = (ImportPath.here(), last_words, self._mark)
         self._executor = ProcessPoolExecutor(1, context, _begin_work, arguments)
         variables = {MARK: self._mark, "PYTHONHASHSEED": "0"}
         with _hide_main(), _show_package(), _block_interrupts(), set_variables(variables):
-            self._executor.submit(os.getpid)  # starts the process
+            # The first job starts the process.
+            self._executor.submit(os.getpid)
         (self._process,) = self._executor._processes.values()
         # Otherwise the result of a process that dies while it sends it is waited for until the end
         # of time.
@@ -76,26 +79,23 @@ class ProcessWorker:
 
         # The last words of the worker name the line of user code.
         self._process.join()
-        words = (
-            self._last_words.read_text(encoding="utf-8", errors="replace")
-            if self._last_words.exists()
-            else ""
-        )
-        frames = [
-            (file, line)
-            for file, line in re.findall(r'File "(.+)", line (\d+) in', words)
-            if is_user_file(file)
-        ]
-        place = f" in {frames[0][0]}, line {frames[0][1]}" if frames else ""
+        words = ""
+        if self._last_words.exists():
+            words = self._last_words.read_text(encoding="utf-8", errors="replace")
+        place = ""
+        for file, line in re.findall(r'File "(.+)", line (\d+) in', words):
+            if is_user_file(file):
+                place = f" in {file}, line {line}"
+                break
         first_line = words.partition("\n")[0]
-        place += first_line if first_line.startswith(REPRODUCED_BY) else ""
+        if first_line.startswith(REPRODUCED_BY):
+            place += first_line
         if CLOSED in words:
             return f"{CLOSED}{place}"
         if TIMEOUT_MARK in words:
             return f"a batch took longer than the time limit, `search.time_limit`{place}"
-        for _ in range(
-            1000
-        ):  # the executor's thread may have waited for the process, and be about to note its code
+        # The executor's thread may have waited for the process, and be about to note its code.
+        for _ in range(1000):
             if self._process.exitcode is not None:
                 break
             time.sleep(0.001)
@@ -103,7 +103,8 @@ class ProcessWorker:
 
     def end(self) -> None:
         if CLOSING_SIGNAL is not None and self._process.pid:
-            with suppress(ProcessLookupError):  # it has died
+            # It may have died.
+            with suppress(ProcessLookupError):
                 os.kill(self._process.pid, CLOSING_SIGNAL)
                 self._process.join(CLOSING_TIME)
         self._process.kill()
@@ -117,7 +118,8 @@ def _begin_work(path: ImportPath, last_words: Path, mark: str) -> None:
         signal.signal(interrupt, signal.SIG_IGN)
     if CLOSING_SIGNAL is not None:
         signal.signal(CLOSING_SIGNAL, _end_in_order)
-    tempfile.tempdir = str(last_words.parent)  # which ends with the pool; a worker is killed
+    # This folder ends with the pool: a worker is killed, and removes nothing.
+    tempfile.tempdir = str(last_words.parent)
     file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115
     faulthandler.enable(file=file, all_threads=False)
     this_process.last_words = file
@@ -179,14 +181,16 @@ def _block_interrupts() -> Iterator[None]:
     """Block Ctrl-C and the like in this thread: a process that it starts inherits that, and does
     not end while modules load; the one that started it ends it.
     """
-    if sys.platform == "win32":  # Windows has no signal masks
+    # Windows has no signal masks.
+    if sys.platform == "win32":
         yield
         return
     from multiprocessing import resource_tracker
 
-    resource_tracker.ensure_running()  # a later start would unblock interrupts
-    previous = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
+    # A later start would unblock interrupts.
+    resource_tracker.ensure_running()
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)

@@ -110,7 +110,6 @@ class Pool:
         WorkerLostError
             If another worker dies of the same job.
         """
-        # Numbers of jobs that wait, workers without a job, and jobs under way.
         results = dict[int, Any]()
         deaths = Counter[int]()
         waiting = deque(range(len(jobs)))
@@ -118,7 +117,6 @@ class Pool:
         ended = SimpleQueue[Future[Any]]()
         under_way = dict[Future[Any], tuple[int, int]]()
         while len(results) < len(jobs):
-            # Every idle worker gets a job.
             while waiting and idle:
                 place = idle.popleft()
                 number = waiting.popleft()
@@ -126,7 +124,6 @@ class Pool:
                 under_way[future] = place, number
                 future.add_done_callback(ended.put)
 
-            # Wait for a job to end, and look around now and then.
             try:
                 future = ended.get(timeout=SECONDS_BETWEEN_LOOKS)
             except Empty:
@@ -135,7 +132,7 @@ class Pool:
             place, number = under_way.pop(future)
             idle.appendleft(place)
 
-            # A job that killed its worker waits again, a few times.
+            # The worker may have died by chance: its job waits again, a few times.
             error = future.exception()
             if error is None:
                 results[number] = future.result()
@@ -156,10 +153,10 @@ class Pool:
         return sum(len([*folder.iterdir()]) > MAX_DEATHS for folder in folders)
 
     def everywhere(
-        self, function: Callable[..., Any], *arguments: Any, most: int | None = None
+        self, function: Callable[..., Any], *arguments: Any, limit: int | None = None
     ) -> None:
         """Carry out a function in each worker that has started and lives, or in so many of them."""
-        places = [*self._started][:most]
+        places = [*self._started][:limit]
         futures = [self._begin(place, function, arguments) for place in places]
         for future in futures:
             future.result()
@@ -171,7 +168,8 @@ class Pool:
 
     def _begin(self, place: int, function: Callable[..., Any], job: tuple[Any, ...]) -> Future[Any]:
         if place in self._started:
-            with suppress(BrokenExecutor):  # its process died between two jobs
+            # Its process may have died between two jobs.
+            with suppress(BrokenExecutor):
                 return self._started[place].submit(function, *job)
             self._started.pop(place).end()
         self._started[place] = self._start(place)

@@ -71,7 +71,6 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         its parameters.
     """
     with about(study.source):
-        # Tables of parameters belong to an algorithm.
         search = study.search
         name = search.labels.get(label, label)
         key = f"search.{label}"
@@ -96,7 +95,6 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
                     "", problem, table, PYMOO_ALGORITHMS if table.startswith(PYMOO) else legal
                 )
 
-        # The class: one of pymoo, of this package, or the user's own.
         lookup = Lookup.of(study)
         if PYMOO + name in PYMOO_ALGORITHMS:
             raise InputError("", f"search.algorithms = {name!r}", f"'{PYMOO}{name}'")
@@ -108,7 +106,6 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
                 {**DESCRIPTIONS, **ALGORITHMS}, name, "search.algorithms", Algorithm
             )
 
-        # The algorithm with its parameters.
         parameters = lookup.with_paths(member, parameters_of.get(label, {}), key)
         algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key)
         return algorithm
@@ -202,9 +199,9 @@ class Run:
         """Answer the search while all that it asks is known; returns the distinct settings that are
         missing, shape (k, n), none once the search has ended.
         """
-        answer = None  # starts a generator
+        # A generator starts with None.
+        answer = None
         while not (self._missing or self._has_ended):
-            # The search gets what it asked for, and asks for more.
             if len(self._request):
                 answer = self._content.evaluations.take(
                     [self._row_of[setting.tobytes()] for setting in self._request]
@@ -218,7 +215,6 @@ class Run:
                 self._has_ended = True
                 break
 
-            # What is neither in the journal nor in memory is missing.
             for position, setting in enumerate(self._request, self._asked):
                 if setting.tobytes() not in self._row_of:
                     self._missing.setdefault(setting.tobytes(), position)
@@ -236,13 +232,13 @@ class Run:
                 "another `out`",
             )
         self._journal.append(positions, evaluations)
-        known = self._content.evaluations
+        earlier = self._content.evaluations
         self._row_of |= {
-            setting.tobytes(): row for row, setting in enumerate(evaluations.settings, len(known))
+            setting.tobytes(): row for row, setting in enumerate(evaluations.settings, len(earlier))
         }
         self._content = self._content._replace(
             positions=[*self._content.positions, *positions],
-            evaluations=Evaluations.concatenate([known, evaluations]),
+            evaluations=Evaluations.concatenate([earlier, evaluations]),
         )
 
     def finish(self, rng: Generator) -> RunResult:
@@ -252,7 +248,6 @@ class Run:
             self._journal.finish([self._content.positions[row] for row in rows], self._budget)
         self.close()
 
-        # What SUMO may repeat.
         requested = self._content.requested_within(self._budget)[1]
         simulated = np.flatnonzero(~requested.failed & ~requested.infeasible)
         number = min(math.ceil(len(simulated) / REPEATED), MAX_REPEATED)

@@ -60,9 +60,9 @@ class Share(NamedTuple):
     retry_failed: bool
 
     def __str__(self) -> str:
-        named = ", ".join(map(str, self.keys[:MAX_NAMES]))
-        more = len(self.keys) - MAX_NAMES
-        return f"runs {named}{f' and {more} more' if more > 0 else ''}"
+        names = ", ".join(map(str, self.keys[:MAX_NAMES]))
+        surplus = len(self.keys) - MAX_NAMES
+        return f"runs {names} and {surplus} more" if surplus > 0 else f"runs {names}"
 
 
 def carry_share(task: Task, share: Share) -> list[RunResult]:
@@ -87,14 +87,13 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
         runs = [stack.enter_context(closing(_begin(task, share, key))) for key in share.keys]
         # Each search goes on until it asks for settings that are in no journal; a run's settings
         # are neighbours.
-        while missing := [(run, setting) for run in runs for setting in run.look_up()]:
-            for rows in np.array_split(
-                np.arange(len(missing)), math.ceil(len(missing) / task.batch_size)
-            ):
+        while requests := [(run, setting) for run in runs for setting in run.look_up()]:
+            batches = math.ceil(len(requests) / task.batch_size)
+            for rows in np.array_split(np.arange(len(requests)), batches):
                 if not has_caller():
                     raise SafevarError("nobody waits for these runs any more")
-                owners = [missing[row][0] for row in rows]
-                evaluations = evaluate_settings(task, np.stack([missing[row][1] for row in rows]))
+                owners, settings = zip(*(requests[row] for row in rows), strict=True)
+                evaluations = evaluate_settings(task, np.stack(settings))
                 for run, rows_of_run in groupby(range(len(rows)), owners.__getitem__):
                     run.receive(evaluations.take([*rows_of_run]))
                 if task.study.search.failed == "skip":
@@ -103,7 +102,8 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
         try:
             repeat_first_batch(task.study)
         except UserCodeError:
-            for key in share.keys:  # what they hold is not repeatable, and is not continued
+            # What the journals hold is not repeatable, and is not continued.
+            for key in share.keys:
                 journal_file(share.directory, str(key)).unlink(missing_ok=True)
             raise
         # SUMO repeats the same settings whether a run was searched now or read from its journal.
@@ -117,9 +117,9 @@ def _refuse_failures(study: Study, runs: Sequence[Run]) -> None:
     if number > MAX_SKIPPED * total:
         failures = next(run.failures for run in reversed(runs) if len(run.failures))
         problem = f"search.failed = 'skip': {number} settings failed, more than 10 % of {total}"
-        last = failures.reason(len(failures) - 1)
+        reason = failures.reason(len(failures) - 1)
         legal = "a simulator that fails less often; `study --retry-failed` tries them again"
-        raise UserCodeError(f"study {study.name!r}", f"{problem}; the last one: {last}", legal)
+        raise UserCodeError(f"study {study.name!r}", f"{problem}; the last one: {reason}", legal)
 
 
 def _begin(task: Task, share: Share, key: RunKey) -> Run:

@@ -59,7 +59,8 @@ def check_code(study: Study, pool: Pool) -> list[str]:
     ((opened, pool.checked),) = carry_out(_refuse_defects, [job], pool)
     if pool.spare is not None:
         return opened
-    with suppress(OSError):  # without the marker, the next process checks again
+    # Without the marker, the next process checks again.
+    with suppress(OSError):
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.write_bytes(msgspec.json.encode(opened))
     return opened
@@ -77,13 +78,14 @@ def repeat_elsewhere(study: Study, pool: Pool) -> None:
     rows = np.concatenate([system.characteristics.original_settings, random_settings(study)])
     backwards = Selection(points=tuple(range(len(system.points)))[::-1])
     jobs = [(Task(study=study), rows), (Task(study=study, selection=backwards), rows)]
-    if pool.workers > 1:  # the second one has simulated nothing yet
-        here, there = carry_out(evaluate_settings, jobs, pool)
+    # The worker of the second job must not have simulated anything.
+    if pool.workers > 1:
+        evaluations, repeated = carry_out(evaluate_settings, jobs, pool)
     else:
-        (here,) = carry_out(evaluate_settings, jobs[:1], pool)
-        pool.close()  # its worker starts again
-        (there,) = carry_out(evaluate_settings, jobs[1:], pool)
-    for row, difference in differences(there.results, here.results):
+        (evaluations,) = carry_out(evaluate_settings, jobs[:1], pool)
+        pool.close()
+        (repeated,) = carry_out(evaluate_settings, jobs[1:], pool)
+    for row, difference in differences(repeated.results, evaluations.results):
         command = reproduction_command(study, rows[row])
         problem = f"{difference} in another process, or with points in another order"
         raise UserCodeError(study.source, f"{problem}{REPRODUCED_BY}{command}", SAME_ELSEWHERE)
@@ -113,11 +115,13 @@ def find_in_new_process(study: Study) -> list[Finding]:
         return []
     members = system.characteristics
     settings = system.region.repaired(np.stack([members.original, members.lower, members.upper]))
-    with open_pool(1) as pool:  # first, as a simulator may end its process
-        (there,) = carry_out(evaluate_settings, [(Task(study=study), settings)], pool)
-    here = drive_and_score(replace(system, points=system.points[::-1]), settings)
-    for row, difference in differences(here.results, there.results):
-        from safevar_sumo.check.trials import Finding  # slow to import, and rarely needed
+    # The new process comes first, as a simulator may end its process.
+    with open_pool(1) as pool:
+        (repeated,) = carry_out(evaluate_settings, [(Task(study=study), settings)], pool)
+    evaluations = drive_and_score(replace(system, points=system.points[::-1]), settings)
+    for row, difference in differences(evaluations.results, repeated.results):
+        # It is slow to import, and rarely needed.
+        from safevar_sumo.check.trials import Finding
 
         words = f"{difference} in a new process"
         command = reproduction_command(study, settings[row])
@@ -125,14 +129,15 @@ def find_in_new_process(study: Study) -> list[Finding]:
     return []
 
 
-def _refuse_defects(task: Task, most: int | None = None) -> tuple[list[str], int]:
+def _refuse_defects(task: Task, limit: int | None = None) -> tuple[list[str], int]:
     """The names of the files that user code opens in its check, and the number of simulations in a
     simulator.
     """
-    from safevar_sumo.check import refuse_defects  # slow to import, and rarely needed
+    # It is slow to import, and rarely needed.
+    from safevar_sumo.check import refuse_defects
 
     unload_user_modules()
-    before = KEPT.simulated
+    start = KEPT.simulated
     with record_opened(task.study.origin.places) as opened:
-        refuse_defects(task.study, most)
-    return opened, KEPT.simulated - before
+        refuse_defects(task.study, limit)
+    return opened, KEPT.simulated - start
