@@ -76,11 +76,11 @@ def study_to_check(name: str) -> Study:
         If the study or the ADS cannot be loaded.
     """
     is_ads = name in ADS or (":" in name and not name.endswith(".toml"))
-    # Data about the study's own ADS.
+    if not is_ads:
+        return read_study(name)
+    # The study has data about an ADS of its own.
     no_data: dict[str, Any] = {key: {} for key in keys_with(WHOLE, Study)}
-    return (
-        read_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data) if is_ads else read_study(name)
-    )
+    return read_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data)
 
 
 def check_study(study: Study, **how: Any) -> list[Finding]:
@@ -114,7 +114,7 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
     return [Finding("original", words, where, point, "an original vehicle that is safe")]
 
 
-def refuse_defects(study: Study, most: int | None = None) -> None:
+def refuse_defects(study: Study, limit: int | None = None) -> None:
     """Check the user code that a study names, with at most so many simulations.
 
     Raises
@@ -122,7 +122,7 @@ def refuse_defects(study: Study, most: int | None = None) -> None:
     UserCodeError
         With the first defect, the input that shows it, file and line, and advice.
     """
-    for finding in find_defects(study, most=most):
+    for finding in find_defects(study, limit=limit):
         command = f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}"
         problem = f"{finding}; to reproduce it: {command}"
         raise UserCodeError(
@@ -138,8 +138,8 @@ def find_defects(study: Study, **how: Any) -> Iterator[Finding]:
     names = user_code(study)
     simulated = {key: name for key, name in names if key != "search.algorithms"}
     yield from _first_defect(study, simulated, try_simulations(study, **how))
-    for key, name in names if how.get("most") is None else []:
-        if key == "search.algorithms":
+    for key, name in names:
+        if key == "search.algorithms" and how.get("limit") is None:
             yield from _first_defect(study, {key: name}, try_algorithm(study, name))
 
 
@@ -149,9 +149,8 @@ def _first_defect(
     """The first of the findings about user code, or the error that it raises; `names` are its names
     by their keys.
     """
-    where = (
-        " or ".join(_definition(study, key, name) for key, name in names.items()) or study.source
-    )
+    places = [_definition(study, key, name) for key, name in names.items()]
+    where = " or ".join(places) or study.source
     try:
         with about(study.source), np.errstate(all="ignore"):
             finding = next(findings, None)
@@ -169,5 +168,6 @@ def _definition(study: Study, key: str, name: str) -> str:
         return f"{key} = {name!r}"
     with substitute_traci() if study.ads.kind == "traci" else nullcontext():
         code = Lookup.of(study).find({}, name, key).code
-    assert code is not None  # its name has a colon
+    # The code of a name with a colon is a user's.
+    assert code is not None
     return code.definition() or code.name

@@ -72,7 +72,8 @@ class Finding(NamedTuple):
     def __str__(self) -> str:
         """The finding with its input and place on one line."""
         place = "" if self.where in self.finding else f" ({self.where})"
-        return f"{self.check}: {self.finding}{f', with {self.input}' if self.input else ''}{place}"
+        setting = f", with {self.input}" if self.input else ""
+        return f"{self.check}: {self.finding}{setting}{place}"
 
 
 class Extent(NamedTuple):
@@ -92,28 +93,27 @@ def try_simulations(
     vehicles: int | None = None,
     progress: Progress = show_no_progress,
     tell: Callable[[Extent], None] = lambda extent: None,
-    most: int | None = None,
+    limit: int | None = None,
 ) -> Iterator[Finding]:
     """Simulate a study with the original vehicle, the corners of the domains and random settings:
     so many `vehicles`, by default as many as the time allows, in a simulator of the user's own with
     at most so many simulations. `tell` is called with their number.
     """
-    # The settings that are tried.
     region = region_of(study)
-    many = _settings(region.characteristics, max(vehicles or 0, SIMULATED))
-    settings = region.repaired(region.characteristics.filter(many))
+    settings = _settings(region.characteristics, max(vehicles or 0, SIMULATED))
+    settings = region.repaired(region.characteristics.filter(settings))
     system = _system(study)
-    if system.mover.takes_long and most is not None:
-        # Each vehicle in four runs, and both ends of the list alone.
-        each = simulations_of_setting(system)
-        left = most - system.repeats - 2 * each
-        vehicles = left // (each * (1 if system.repeats > 1 else 4))
+    if system.mover.takes_long and limit is not None:
+        # Each vehicle is in four runs, and both ends of the list are alone in one more.
+        simulations = simulations_of_setting(system)
+        remaining_simulations = limit - system.repeats - 2 * simulations
+        vehicles = remaining_simulations // (simulations * (1 if system.repeats > 1 else 4))
         if vehicles < 1:
             return
     own_metrics = [name for name in (*study.metrics.also, *study.search.objectives) if ":" in name]
     if not system.mover.is_exact or own_metrics:
         yield from try_original(system, drive_all(system.at(system.points[0]), settings[:1]))
-    number, seconds = (1, 0.0) if most is not None else _affordable(system, settings)
+    number, seconds = (1, 0.0) if limit is not None else _affordable(system, settings)
     if vehicles is not None:
         vehicles = min(vehicles, len(settings))
         number, seconds = vehicles, seconds * vehicles / number
@@ -121,7 +121,8 @@ def try_simulations(
     all_points = len(assemble(study).points)
     tell(Extent(number, vehicles or SIMULATED, len(system.points), all_points, seconds))
 
-    if system.repeats > 1:  # the study says that its simulator is not deterministic
+    # The study says that its simulator is not deterministic.
+    if system.repeats > 1:
         drive_and_score(system, settings[:LEAST_SIMULATED])
         return
 
@@ -140,9 +141,9 @@ def try_simulations(
         try:
             verify_in_sumo(system, settings, drive_and_score(system, settings).points)
         except InputError as error:
-            found, _, setting = error.problem.partition(", with ")
+            problem, _, setting = error.problem.partition(", with ")
             reacts = "reactive_actors = True where somebody reacts to the vehicle under test"
-            yield Finding("contract", found, "", setting, reacts)
+            yield Finding("contract", problem, "", setting, reacts)
 
 
 def try_original(system: System, runs: SimulationRuns) -> Iterator[Finding]:
@@ -158,14 +159,12 @@ def try_original(system: System, runs: SimulationRuns) -> Iterator[Finding]:
         with user_errors(system.source):
             values = measure.of_runs(runs, system.metrics_table)
         for quantity in (name for name in QUANTITIES if name not in measure.quantities):
-            others = (runs.with_all(quantity, value) for value in TRIED_VALUES)
+            variants = (runs.with_all(quantity, value) for value in TRIED_VALUES)
             try:
                 with user_errors(system.source):
+                    results = (measure.of_runs(variant, system.metrics_table) for variant in variants)
                     is_read = not all(
-                        np.array_equal(
-                            values, measure.of_runs(other, system.metrics_table), equal_nan=True
-                        )
-                        for other in others
+                        np.array_equal(values, result, equal_nan=True) for result in results
                     )
             except UserCodeError:
                 is_read = True
@@ -182,15 +181,15 @@ def find_unused(study: Study) -> Iterator[Finding]:
     system = _system(study)
     number = FEW_UNUSED if system.mover.takes_long else MANY_UNUSED
     settings = system.region.repaired(_settings(system.characteristics, number))
-    tried = f"{len(settings)} vehicles: the original, and others up to the ends of the domains"
+    sample = f"{len(settings)} vehicles: the original, and others up to the ends of the domains"
     results = drive_and_score(system, settings).results
     for name in map(label_of, (*study.metrics.also, *study.search.objectives)):
         if name in results and np.isnan(results[name].astype(float)).all():
             expected = "a value in some run"
-            yield Finding("undefined", f"{name} is undefined in all runs", "", tried, expected)
+            yield Finding("undefined", f"{name} is undefined in all runs", "", sample, expected)
     if unread := sorted(unread_characteristics(system, settings)):
         expected = "a simulator that reads each characteristic of its vehicle"
-        yield Finding("unread", f"simulate never reads {', '.join(unread)}", "", tried, expected)
+        yield Finding("unread", f"simulate never reads {', '.join(unread)}", "", sample, expected)
 
 
 def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
@@ -199,7 +198,8 @@ def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
     """
     timed = settings[: 1 if system.mover.takes_long else TIMED]
     # The first simulation loads what any does, and ends a driving system that does not end.
-    if not system.mover.takes_long:  # which has simulated once
+    # A simulator of the user's own has simulated once.
+    if not system.mover.takes_long:
         short = replace(system, time_limit=min(system.time_limit, LONGEST))
         drive_and_score(short, timed[:1])
     start = time.perf_counter()
@@ -231,11 +231,11 @@ def _try(
     expected: str,
 ) -> Iterator[Finding]:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
-    # All settings at once, with code that is loaded anew for the other runs.
     run = load()
     all_rows = np.arange(len(settings))
     total = RUNS_OF_ALL * len(settings)
-    progress("vehicles", done := 0, total)
+    number = 0
+    progress("vehicles", number, total)
     outputs = run(all_rows)
     run_anew = load()
     other_runs = [
@@ -249,11 +249,10 @@ def _try(
         (run_anew, "alone", "alone", all_rows[-1:]),
     ]
     for other_run, check, circumstance, rows in other_runs:
-        progress("vehicles", done := done + len(rows), total)
-        other_outputs = other_run(rows)
-        for row, difference in differences(
-            {name: values[rows] for name, values in outputs.items()}, other_outputs
-        ):
+        number += len(rows)
+        progress("vehicles", number, total)
+        expected_outputs = {name: values[rows] for name, values in outputs.items()}
+        for row, difference in differences(expected_outputs, other_run(rows)):
             changes = _changes(characteristics, settings[rows[row]])
             yield Finding(check, f"{difference} {circumstance}", "", changes, expected)
 
@@ -297,7 +296,6 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
     """All settings that a run with the last seed, after runs with the others, requests, and then
     those that it returns; shape (k, n).
     """
-    # The algorithm, on a problem of small size.
     system = _system(study)
     lookup = Lookup.of(study)
     label = label_of(name)
@@ -314,12 +312,12 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
         scoring=system.measuring.scoring,
     )
 
-    # Runs of several seeds, of which the last one counts.
     for seed in seeds:
         algorithm = instance_of(
             member, parameters, f"search.algorithms = {name!r}", f"search.{label}"
         )
-        with user_errors(study.source):  # of a method that is no generator
+        # A method that is no generator raises its errors here.
+        with user_errors(study.source):
             search = algorithm.search(problem, default_rng(seed))
         settings = []
         try:

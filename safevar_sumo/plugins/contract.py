@@ -125,13 +125,14 @@ class Legal(NamedTuple):
     infinite: bool = False
     undefined: bool = False
     scalar: bool = False
-    kinds: str = "biuf"  # numpy's letters of the legal types
+    kinds: str = "biuf"
+    """Numpy's letters of the legal types."""
 
     def __str__(self) -> str:
         if self.kinds == "b":
             return "truth values"
         bounds = f"{'above' if self.above else 'from'} {self.lowest:g} to {self.highest:g}"
-        return f"numbers {bounds}{'' if self.infinite else ', finite'}"
+        return f"numbers {bounds}" if self.infinite else f"numbers {bounds}, finite"
 
     def holds(self, numbers: FloatArray) -> BoolArray:
         """Which numbers are legal."""
@@ -253,7 +254,6 @@ class Returned(NamedTuple):
         self, code: UserCode, method: str, result: UserValue, arguments: Sequence[Any]
     ) -> UserValue:
         """The result after the check."""
-        # One object, or a tuple of several.
         values = (result,) if len(self.parts) <= 1 else result
         if len(self.parts) > 1 and not (
             isinstance(result, tuple | list) and len(result) == len(self.parts)
@@ -261,7 +261,6 @@ class Returned(NamedTuple):
             names = " and ".join(", ".join(columns) or "memory" for columns in self.parts)
             raise code.wrong(method, quoted(result), f"a tuple of {len(self.parts)}: {names}")
 
-        # Each attribute has the shape of the argument, and legal numbers.
         shape = None if self.like is None or not self.parts else _shape_of(arguments[self.like])
         for columns, value in zip(self.parts, values, strict=False):
             for name, legal in columns.items():
@@ -271,9 +270,8 @@ class Returned(NamedTuple):
                         quoted(result),
                         f"an object with the attributes {', '.join(columns)}",
                     )
-                code.check_numbers(
-                    method, name or "values", getattr(value, name) if name else value, shape, legal
-                )
+                numbers = getattr(value, name) if name else value
+                code.check_numbers(method, name or "values", numbers, shape, legal)
         return result if self.then is None else self.then(code, method, result, *arguments)
 
 
@@ -292,10 +290,9 @@ def checked_class(code: UserCode, base: type) -> type:
 
     def checked_method(name: str, returned: Returned) -> Callable[..., UserValue]:
         def method(self: Any, *arguments: Any) -> UserValue:
-            passed = [
-                read_only(value) if i == returned.like else value
-                for i, value in enumerate(arguments)
-            ]
+            passed = [*arguments]
+            if returned.like is not None:
+                passed[returned.like] = read_only(arguments[returned.like])
             with np.errstate():
                 result = getattr(super(cls, self), name)(*passed)
             is_optional = returned.then is None and not hasattr(getattr(base, name), ABSTRACT)
@@ -305,7 +302,6 @@ def checked_class(code: UserCode, base: type) -> type:
 
         return method
 
-    # Methods that the class has of its own are checked.
     methods = {
         name: checked_method(name, returned)
         for name, returned in getattr(base, "RETURNS", {}).items()
@@ -365,17 +361,13 @@ def _methods(base: type) -> dict[str, list[str]]:
     without default and without `self`.
     """
     helpers = getattr(base, "HELPERS", ())
-    return {
-        name: [
-            parameter.name
-            for parameter in list(inspect.signature(method).parameters.values())[1:]
-            if parameter.default is parameter.empty
-        ]
-        for name, method in vars(base).items()
-        if not name.startswith("_") and name not in helpers
-        for method in [method.__func__ if isinstance(method, classmethod) else method]
-        if inspect.isfunction(method)
-    }
+    methods = {}
+    for name, attribute in vars(base).items():
+        function = attribute.__func__ if isinstance(attribute, classmethod) else attribute
+        if inspect.isfunction(function) and not name.startswith("_") and name not in helpers:
+            _, *parameters = inspect.signature(function).parameters.values()
+            methods[name] = [item.name for item in parameters if item.default is item.empty]
+    return methods
 
 
 def read_only(value: UserValue) -> Any:
@@ -392,7 +384,7 @@ def read_only(value: UserValue) -> Any:
             value, **{field.name: read_only(getattr(value, field.name)) for field in fields(value)}
         )
     if isinstance(value, Mapping):
-        return MappingProxyType({key: read_only(inner) for key, inner in value.items()})
+        return MappingProxyType({key: read_only(item) for key, item in value.items()})
     return _ReadOnlyWorld(value) if hasattr(value, "speeds") else value
 
 

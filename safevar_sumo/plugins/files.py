@@ -50,22 +50,20 @@ def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
     """
     own_folders = (*folders, os.getcwd())
     paths = set[Path]()
-    known = {PACKAGE.name, *sys.stdlib_module_names}
+    visited = {PACKAGE.name, *sys.stdlib_module_names}
     waiting = [(module, (*own_folders, *sys.path)) for module in modules]
     while waiting:
         module, search_path = waiting.pop()
         name = module.partition(".")[0]
-        if name in known:
+        if name in visited:
             continue
-        known.add(name)
-        found = next(
-            filter(None, (_files_of_module(Path(folder, name)) for folder in search_path)), set()
-        )
-        paths |= found
-        imported = (
-            other for path in found if path.suffix == ".py" for other in _imported_modules(path)
-        )
-        waiting += [(other, own_folders) for other in imported]
+        visited.add(name)
+        candidates = (_files_of_module(Path(folder, name)) for folder in search_path)
+        files = next(filter(None, candidates), set())
+        paths |= files
+        for path in files:
+            if path.suffix == ".py":
+                waiting += [(imported, own_folders) for imported in _imported_modules(path)]
     return paths
 
 
@@ -91,11 +89,11 @@ def files_in(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     files = (file for file in path.rglob("*") if file.is_file())
-    return [
-        file
-        for file in files
-        if not any(part[0] == "." or part == CACHE for part in file.relative_to(path).parts)
-    ]
+    return [file for file in files if not _is_hidden(file.relative_to(path))]
+
+
+def _is_hidden(path: Path) -> bool:
+    return any(part[0] == "." or part == CACHE for part in path.parts)
 
 
 def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:

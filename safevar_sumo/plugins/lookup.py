@@ -98,7 +98,6 @@ class Lookup:
             f"{one_of(shipped)}, or package.module:Name" if shipped else "package.module:Name"
         )
 
-        # A module, a colon and a name.
         module_name, colon, attribute = name.partition(":")
         if colon and module_name.endswith(".py"):
             dotted = module_name.removesuffix(".py").replace("/", ".")
@@ -112,7 +111,6 @@ class Lookup:
         ):
             raise InputError("", f"{key} = {name!r}{did_you_mean(name, shipped)}", expected)
 
-        # The module is loaded, and has the name.
         code = UserCode(f"{key} = {name!r}")
         module = self._import(module_name, code.name)
         module_name = module.__name__
@@ -141,15 +139,7 @@ class Lookup:
         member = self.find(shipped, name, key)
         if member.code is None:
             return member
-        target = member.target
-        near = [base for base in bases if _has_some(target, base)]
-        base = next(
-            (base for base in bases if inspect.isclass(target) and issubclass(target, base)),
-            next(
-                (base for base in bases if not violation(target, base)),
-                near[0] if len(near) == 1 else bases[-1],
-            ),
-        )
+        base = _base_of(member.target, bases)
         if reason := violation(member.target, base):
             expected = "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])])
             raise UserCodeError(
@@ -181,7 +171,8 @@ class Lookup:
             return {name: self._with_paths(item, f"{key}.{name}") for name, item in value.items()}
         if isinstance(value, list):
             return [self._with_paths(item, key) for item in value]
-        is_name = isinstance(value, str) and not key.endswith(".network")  # a network counts anyway
+        # A network counts anyway.
+        is_name = isinstance(value, str) and not key.endswith(".network")
         if is_name and value not in self.files and file_beside(value, [*self.folders, os.getcwd()]):
             problem = f"{key} = {value!r}: the study does not name this file"
             table = key.partition(".")[0]
@@ -201,7 +192,6 @@ class Lookup:
         dont_write_bytecode = sys.dont_write_bytecode
         sys.dont_write_bytecode = True
 
-        # What fails at the import is an error of user code.
         try:
             with (
                 user_errors(subject()),
@@ -236,6 +226,20 @@ def _import_beside(name: str, folders: Sequence[str]) -> ModuleType | None:
         sys.modules[own_name] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(sys.modules[own_name])
     return sys.modules[own_name]
+
+
+def _base_of(candidate: Any, bases: Sequence[type]) -> type:
+    """The first base that a class derives from; else that whose contract it meets; else the only
+    one of which it has an abstract method; else the last one.
+    """
+    for base in bases:
+        if isinstance(candidate, type) and issubclass(candidate, base):
+            return base
+    for base in bases:
+        if not violation(candidate, base):
+            return base
+    similar = [base for base in bases if _has_some(candidate, base)]
+    return similar[0] if len(similar) == 1 else bases[-1]
 
 
 def _has_some(candidate: Any, base: type) -> bool:
@@ -289,8 +293,8 @@ def only_from(folder: str) -> Iterator[None]:
     place = os.getcwd()
     path = ImportPath.here()
     modules = dict(sys.modules)
-    own = {name for name in modules if name != "__main__" and is_user_file(file_of_module(name))}
-    for name in own:
+    users = {name for name in modules if name != "__main__" and is_user_file(file_of_module(name))}
+    for name in users:
         del sys.modules[name]
     ImportPath([*filter(_is_of_libraries, path.folders), folder], []).inherit()
     os.chdir(folder)
@@ -302,7 +306,7 @@ def only_from(folder: str) -> Iterator[None]:
         for name in sys.modules.keys() - modules.keys():
             if is_user_file(file_of_module(name)):
                 del sys.modules[name]
-        sys.modules.update({name: modules[name] for name in own})
+        sys.modules.update({name: modules[name] for name in users})
 
 
 def _is_of_libraries(entry: str) -> bool:
@@ -326,9 +330,10 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> 
         If the class does not take the parameters.
     """
     with user_errors(subject()), np.errstate(), end_if_longer(member.time_limit, "`__init__`"):
-        if member.code is not None:  # a class of the package forbids what it does not have
+        # A class of the package forbids what it does not have.
+        if member.code is not None:
             accepted = inspect.signature(member.target).parameters
-            takes_any = any(one.kind is one.VAR_KEYWORD for one in accepted.values())
+            takes_any = any(item.kind is item.VAR_KEYWORD for item in accepted.values())
             for parameter in () if takes_any else parameters:
                 problem = f"{key}.{parameter}: {name} has no such parameter"
                 check_name("", problem, parameter, accepted)

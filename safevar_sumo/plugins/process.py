@@ -98,12 +98,12 @@ def note_work(text: str) -> None:
 @contextmanager
 def set_variables(values: Mapping[str, str]) -> Iterator[None]:
     """Within the block, environment variables have these values, also for child processes."""
-    before = {name: os.environ.get(name) for name in values}
+    earlier_values = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
         yield
     finally:
-        for name, value in before.items():
+        for name, value in earlier_values.items():
             if value is None:
                 os.environ.pop(name, None)
             else:
@@ -116,13 +116,13 @@ def find_damage() -> Iterator[list[str]]:
     Streams that it has replaced by None are restored; a worker without descriptors ends.
     """
     damage = list[str]()
-    before = sys.stdout, sys.stderr
+    streams = sys.stdout, sys.stderr
     try:
         yield damage
     finally:
-        if None in (sys.stdout, sys.stderr) and None not in before:
+        if None in (sys.stdout, sys.stderr) and None not in streams:
             damage.append("user code has set sys.stdout or sys.stderr to None")
-            sys.stdout, sys.stderr = before
+            sys.stdout, sys.stderr = streams
         try:
             os.fstat(this_process.descriptor)
         except OSError:
@@ -142,7 +142,8 @@ def _end_without_pipes() -> None:
 def end_children(mark: str) -> None:
     """Kill the processes that have inherited a mark, on systems that tell."""
     entry = f"{MARK}={mark}".encode()
-    for pause in (0.0, 0.02):  # what has just started tells nothing yet
+    # What has just started tells nothing yet.
+    for pause in (0.0, 0.02):
         time.sleep(pause)
         for path in Path("/proc").glob("[0-9]*/environ"):
             with suppress(OSError):
@@ -169,16 +170,18 @@ def mark_interrupts() -> Iterator[None]:
 
     # Only the main thread is interrupted, and only it may set handlers.
     is_main = threading.current_thread() is threading.main_thread()
-    found = {one: signal.getsignal(one) for one in INTERRUPTS if is_main}
-    handlers: dict[int, Any] = {one: handler for one, handler in found.items() if callable(handler)}
-    for one in handlers:
-        signal.signal(one, interrupt)
+    handlers = dict[int, Any]()
+    for number in INTERRUPTS if is_main else ():
+        if callable(handler := signal.getsignal(number)):
+            handlers[number] = handler
+            signal.signal(number, interrupt)
     try:
         yield
     finally:
-        for one, handler in handlers.items():
-            if signal.getsignal(one) is interrupt:  # user code may have set its own
-                signal.signal(one, handler)
+        for code, handler in handlers.items():
+            # User code may have set a handler of its own.
+            if signal.getsignal(code) is interrupt:
+                signal.signal(code, handler)
 
 
 @contextmanager
@@ -188,13 +191,14 @@ def defer_interrupts() -> Iterator[None]:
     """
     waiting = list[int]()
     is_main = threading.current_thread() is threading.main_thread()
-    interrupts = INTERRUPTS if is_main else ()
-    before = [signal.signal(one, lambda number, _: waiting.append(number)) for one in interrupts]
+    handlers = dict[int, Any]()
+    for interrupt in INTERRUPTS if is_main else ():
+        handlers[interrupt] = signal.signal(interrupt, lambda number, _: waiting.append(number))
     try:
         yield
     finally:
-        for one, handler in zip(interrupts, before, strict=True):
-            signal.signal(one, handler)
+        for code, handler in handlers.items():
+            signal.signal(code, handler)
         for number in waiting[:1]:
             signal.raise_signal(number)
 
@@ -207,35 +211,33 @@ def record_opened(folders: Sequence[str]) -> Iterator[list[str]]:
     `folders` are those of the study's file and of the files that it extends.
     """
     if not this_process.is_listening:
-        sys.addaudithook(_listen)  # for the life of this process
+        # A hook stays for the life of this process.
+        sys.addaudithook(_listen)
         this_process.is_listening = True
 
-    # What is loaded and opened in the block.
     start = time.time()
     names = list[str]()
-    before = set(sys.modules)
+    modules = set(sys.modules)
     opened = this_process.opened = set[str]()
     try:
         yield names
     finally:
         this_process.opened = None
-    this_process.modules |= sys.modules.keys() - before
+    this_process.modules |= sys.modules.keys() - modules
 
-    # Files of the user's, in the study's folders or elsewhere.
     own_folders = [f"{os.path.abspath(folder)}{os.sep}" for folder in (*folders, os.getcwd())]
-    caches = (
-        f"{path}{os.sep}"  # such as lists of fonts
-        for path in (platformdirs.user_cache_path(), platformdirs.user_config_path())
-    )
-    not_the_users = (*SYSTEM_FOLDERS, *caches)
+    # Libraries keep such files as lists of fonts there.
+    caches = (platformdirs.user_cache_path(), platformdirs.user_config_path())
+    not_the_users = (*SYSTEM_FOLDERS, *(f"{path}{os.sep}" for path in caches))
     data = (path for path in opened if os.path.isfile(path) and not path.endswith(".pyc"))
+    # What is newer than the block was written by the code.
     names.extend(
         sorted(
             name_of_file(Path(path), folders)
             for path in data
             if is_user_file(path)
             and f"{os.sep}{CACHE}{os.sep}" not in path
-            and os.path.getmtime(path) < start  # else the code has written it
+            and os.path.getmtime(path) < start
             and (path.startswith(tuple(own_folders)) or not path.startswith(not_the_users))
         )
     )

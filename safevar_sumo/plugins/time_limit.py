@@ -28,9 +28,9 @@ class _TimeIsUp(Interrupt):
 
 
 @contextmanager
-def end_if_longer(time_limit: float, what: str = "a simulation") -> Iterator[None]:
+def end_if_longer(time_limit: float, name: str = "a simulation") -> Iterator[None]:
     """End this process, if it is a worker, when the context takes longer than a time limit [s];
-    raise an error, which names it by `what`, in the main thread of any other process. Within such a
+    raise an error, with the context's name, in the main thread of any other process. Within such a
     context another one has no effect.
 
     Raises
@@ -49,7 +49,7 @@ def end_if_longer(time_limit: float, what: str = "a simulation") -> Iterator[Non
         return
     this_process.is_limited = True
     try:
-        with _raise_error(time_limit, what) if words is None else _end_process(time_limit, words):
+        with _raise_error(time_limit, name) if words is None else _end_process(time_limit, words):
             yield
     finally:
         this_process.is_limited = False
@@ -65,9 +65,9 @@ def _end_process(time_limit: float, last_words: IO[str]) -> Iterator[None]:
 
 
 @contextmanager
-def _raise_error(time_limit: float, what: str) -> Iterator[None]:
+def _raise_error(time_limit: float, name: str) -> Iterator[None]:
     def refuse(_signal: int, frame: FrameType | None) -> None:
-        problem = f"{what} took longer than the time limit of {time_limit:g} s"
+        problem = f"{name} took longer than the time limit of {time_limit:g} s"
         while frame is not None:
             if is_user_file(frame.f_code.co_filename):
                 place = f"{frame.f_code.co_filename}:{frame.f_lineno}"
@@ -78,7 +78,6 @@ def _raise_error(time_limit: float, what: str) -> Iterator[None]:
             frame = frame.f_back
         raise _TimeIsUp(SimulationError(f"{problem}, search.time_limit"))
 
-    # The timer and its handler are as before at the end.
     previous_handler = signal.signal(signal.SIGALRM, refuse)
     previous_timer = signal.setitimer(signal.ITIMER_REAL, time_limit)
     try:
