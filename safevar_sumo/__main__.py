@@ -28,8 +28,8 @@ def main() -> None:
 def _end_at_last(code: object) -> None:
     """End this process, and simulators, if threads or exit functions keep it from ending."""
     time.sleep(ENDING_TIME)
-    if kept := sys.modules.get("safevar_sumo.sumo.kept"):
-        kept.close_simulator()
+    if simulators := sys.modules.get("safevar_sumo.sumo.kept"):
+        simulators.close_simulator()
     os._exit(code if isinstance(code, int) else 1)
 
 

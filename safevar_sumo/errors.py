@@ -74,9 +74,8 @@ class InputError(SafevarError):
 
     def __init__(self, source: object, problem: str, legal: str = "") -> None:
         self.source = source or subject()
-        self.problem = problem.encode(
-            errors="backslashreplace"
-        ).decode()  # a user's text may have lone surrogates
+        # A user's text may have lone surrogates.
+        self.problem = problem.encode(errors="backslashreplace").decode()
         self.legal = legal
         super().__init__(self.source, self.problem, legal)
 
@@ -135,10 +134,9 @@ def describe_error(error: BaseException) -> str:
         message = " ".join(str(error).split())
     except Exception:
         message = ""
-    excerpt = (
-        message if len(message) <= MAX_MESSAGE_LENGTH else f"{message[:MAX_MESSAGE_LENGTH]}..."
-    )
-    return f"{type(error).__name__}: {excerpt}" if excerpt else type(error).__name__
+    if len(message) > MAX_MESSAGE_LENGTH:
+        message = f"{message[:MAX_MESSAGE_LENGTH]}..."
+    return f"{type(error).__name__}: {message}" if message else type(error).__name__
 
 
 def unknown_name(

@@ -39,7 +39,8 @@ def read_file(path: Path, largest: int = MAX_INPUT) -> bytes:
     for a file that is too large.
     """
     about = path.stat()
-    is_endless = not (stat.S_ISREG(about.st_mode) or path.is_dir())  # which cannot be read
+    # A folder ends, but cannot be read, which says more.
+    is_endless = not (stat.S_ISREG(about.st_mode) or path.is_dir())
     if is_endless or about.st_size > largest:
         problem = f"it is no regular file of at most {largest / 1e6:,.0f} MB"
         raise OSError(errno.EINVAL, problem, str(path))
@@ -55,14 +56,14 @@ def whole_file(path: Path, option: str = "") -> Iterator[Path]:
     left there are removed. A stream such as `/dev/stdout` is given itself. An OSError becomes an
     InputError that names `option`, if it is given.
     """
-    target = Path(os.path.realpath(path))  # a link stays a link
+    # A link stays a link.
+    target = Path(os.path.realpath(path))
     is_stream = target.exists() and not target.is_file()
-    short_stem = target.stem[:100]  # file systems limit the length of names
-    file = (
-        path
-        if is_stream
-        else target.with_name(f".{short_stem}.{secrets.token_hex(4)}.tmp{target.suffix}")
-    )
+    # File systems limit the length of names.
+    short_stem = target.stem[:100]
+    file = path
+    if not is_stream:
+        file = target.with_name(f".{short_stem}.{secrets.token_hex(4)}.tmp{target.suffix}")
     try:
         pattern = f".{escape(short_stem)}.????????.tmp{escape(target.suffix)}"
         with nullcontext() if is_stream else _owned(file, file.parent.glob(pattern)):
@@ -91,17 +92,19 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
 
 
 @contextmanager
-def _owned(file: Path, others: Iterable[Path]) -> Iterator[None]:
-    """Make a temporary file and lock it within the block; remove those of the others that nobody
-    has locked.
+def _owned(file: Path, neighbours: Iterable[Path]) -> Iterator[None]:
+    """Make a temporary file and lock it within the block; remove those of its neighbours that
+    nobody has locked.
     """
-    with open(file, "xb") as own:
-        if os.name != "nt":  # where a lock would keep out this process, too
-            for other in others:
-                if other != file:
-                    _remove_left_behind(other)
-            with suppress(portalocker.LockException):  # a disk without locks
-                portalocker.lock(own, ALONE)
+    with open(file, "xb") as stream:
+        # On Windows a lock would keep out this process, too.
+        if os.name != "nt":
+            for neighbour in neighbours:
+                if neighbour != file:
+                    _remove_left_behind(neighbour)
+            # A disk may have no locks.
+            with suppress(portalocker.LockException):
+                portalocker.lock(stream, ALONE)
         yield
 
 
@@ -146,5 +149,6 @@ def file_beside(text: str, folders: Sequence[str]) -> str:
             (os.path.abspath(path) for folder in folders if (path := Path(folder, text)).is_file()),
             "",
         )
-    except (OSError, ValueError):  # the text is no path
+    except (OSError, ValueError):
+        # The text is no path.
         return ""

@@ -57,8 +57,9 @@ class WholeTable(Table):
             self.add_row(*map(printable_text, row))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        # Rich would break a title where its table ends.
         if self._title_line:
-            yield self._title_line  # rich breaks a title where its table ends
+            yield self._title_line
 
         # Widths that columns need for their longest word and for all text.
         sizes = []
@@ -69,26 +70,21 @@ class WholeTable(Table):
                 Measurement.get(console, options.update(width=UNLIMITED_WIDTH), cell)
                 for cell in cells
             ]
-            sizes.append(
-                (
-                    max(measure.minimum for measure in measures),
-                    max(measure.maximum for measure in measures),
-                )
-            )
+            sizes.append(tuple(map(max, zip(*measures, strict=True))))
             column.overflow = "fold"
 
-        # If not all fits, the space is shared.
-        words, whole = (sum(size) for size in zip(*sizes, strict=True))
-        space = options.max_width - count - 1  # beside the lines
-        if whole + 2 * count > space:
-            if words + 2 * count > space:
+        # If not all fits, the space beside the lines is shared.
+        words, texts = map(sum, zip(*sizes, strict=True))
+        space = options.max_width - count - 1
+        if texts + 2 * count > space:
+            spare = space - words - 2 * count
+            if spare < 0:
                 self.padding = 0
-            spare = space - words - (0 if words + 2 * count > space else 2 * count)
+                spare += 2 * count
             for column, (longest_word, full_width) in zip(self.columns, sizes, strict=True):
                 if spare >= 0:
-                    column.width = longest_word + (full_width - longest_word) * spare // max(
-                        whole - words, 1
-                    )
+                    share = (full_width - longest_word) * spare // max(texts - words, 1)
+                    column.width = longest_word + share
         yield from super().__rich_console__(console, options)
 
 
@@ -96,13 +92,13 @@ def printable_text(text: object, style: str = "") -> Text:
     """Make text printable by rich: white space becomes a space, any other unprintable character a
     question mark.
     """
-    return Text(
-        "".join(
-            letter if letter.isprintable() else " " if letter.isspace() else "?"
-            for letter in str(text)
-        ),
-        style,
-    )
+    return Text("".join(map(_printable_letter, str(text))), style)
+
+
+def _printable_letter(letter: str) -> str:
+    if letter.isprintable():
+        return letter
+    return " " if letter.isspace() else "?"
 
 
 def print_text(console: Console, text: str) -> None:
@@ -110,7 +106,7 @@ def print_text(console: Console, text: str) -> None:
     console.print(printable(text), soft_wrap=True, markup=False, highlight=False)
 
 
-def show_no_progress(phase: str, done: int, total: int) -> None:
+def show_no_progress(phase: str, number: int, total: int) -> None:
     """Show no progress."""
 
 
@@ -131,12 +127,12 @@ class Parts:
         expected = self._whole = self._expected.pop(0) if self._expected else 0
         later = sum(self._expected)
 
-        def show_part(phase: str, done: int, total: int) -> None:
+        def show_part(phase: str, number: int, total: int) -> None:
             # What costs more than its simulations, such as workers that start, is spread over them.
             self._whole = max(total, expected)
-            done_of_whole = self._whole * done // max(total, 1)
+            number = self._whole * number // max(total, 1)
             phase = f"{name}: {phase}" if name else phase
-            self._show(phase, self._before + done_of_whole, self._before + self._whole + later)
+            self._show(phase, self._before + number, self._before + self._whole + later)
 
         return show_part
 
@@ -150,14 +146,14 @@ class Pace:
         self._begin = 0.0
         self._left = 0
 
-    def update(self, done: int, total: int) -> None:
+    def update(self, number: int, total: int) -> None:
         """Note what is done now, and how much there is in all."""
         now = time.monotonic()
-        if not self._marks or done < self._marks[-1][1]:
+        if not self._marks or number < self._marks[-1][1]:
             self._marks.clear()
             self._begin = now
-        self._marks.append((now, done))
-        self._left = total - done
+        self._marks.append((now, number))
+        self._left = total - number
         while len(self._marks) > 2 and self._marks[1][0] < now - MEASURED_SHARE * (
             now - self._begin
         ):
@@ -167,11 +163,11 @@ class Pace:
         """The time left [s]; None before anything is done."""
         if not self._marks:
             return None
-        (start, before), (last, done) = self._marks[0], self._marks[-1]
-        since = time.monotonic() - last
-        if done == before:
+        (start, number_at_start), (end, number) = self._marks[0], self._marks[-1]
+        since = time.monotonic() - end
+        if number == number_at_start:
             return None
-        seconds = self._left * (last - start) / (done - before)
+        seconds = self._left * (end - start) / (number - number_at_start)
         return max(seconds - since, STALLED_SHARE * since)
 
 
@@ -194,27 +190,28 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
         yield progress or show_no_progress
         return
 
-    # A bar on a terminal, lines elsewhere.
     console = console or Console(stderr=True)
     pace = Pace()
-    left = _TimeLeft(pace)
+    time_left = _TimeLeft(pace)
     ended = Event()
     line = "searching"
 
-    def show(phase: str, done: int, total: int) -> None:
+    def show(phase: str, number: int, total: int) -> None:
         nonlocal line
-        pace.update(done, total)
-        count = f"{done:,} of {total:,}" if total else ""
-        line = f"{phase}: {count}" if total else phase
-        bar.update(task, description=phase, completed=done, total=total or None, count=count)
+        pace.update(number, total)
+        line, count = phase, ""
+        if total:
+            count = f"{number:,} of {total:,}"
+            line = f"{phase}: {count}"
+        bar.update(task, description=phase, completed=number, total=total or None, count=count)
 
     def print_lines() -> None:
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
-            print_text(console, ", ".join(filter(None, (line, str(left.render())))))
+            print_text(console, ", ".join(filter(None, (line, str(time_left.render())))))
 
     text = TextColumn("{task.description}", markup=False)
     count = TextColumn("{task.fields[count]}", markup=False)
-    columns = (text, BarColumn(bar_width=None), count, left)
+    columns = (text, BarColumn(bar_width=None), count, time_left)
     lines = Thread(target=print_lines, name="progress", daemon=True)
     with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(line, total=None, count="")

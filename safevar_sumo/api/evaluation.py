@@ -89,7 +89,6 @@ def evaluate(
     loaded_study, system = load_and_assemble(study)
     characteristics = system.characteristics
 
-    # Settings that may be simulated, as they are given or as a search would filter them.
     requested, index = _read_settings(settings, characteristics, beyond)
     simulated = characteristics.filter(requested) if filtered else requested
     if not beyond:
@@ -98,8 +97,8 @@ def evaluate(
     with open_progress(progress) as report_progress:
         evaluations = evaluate_with_workers(loaded_study, simulated, pool, jobs, report_progress)
 
-    # A row for each setting, with the index of the user's rows.
-    groups = [(("", 0), evaluations)]  # one group, of no algorithm and run
+    # The evaluations are of no algorithm and run.
+    groups = [(("", 0), evaluations)]
     frame = evaluations_frame(characteristics.names, groups).drop(columns=["algorithm", "run"])
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
     if (scoring := system.measuring.scoring).safe_original is not None:
@@ -134,7 +133,6 @@ def _read_settings(
 
     names = list(characteristics.names)
     if isinstance(settings, Sequence):
-        # Several settings as a table.
         settings = plain_values(settings)
     if isinstance(settings, Sequence) and all(isinstance(setting, Mapping) for setting in settings):
         settings = pd.DataFrame(list(settings), index=range(len(settings)))
@@ -158,12 +156,11 @@ def _read_settings(
         kind = type(settings).__name__
         raise InputError("settings", f"a {kind}: {error}", SETTINGS_FORMAT) from None
 
-    # The first illegal value is refused.
     is_legal = [
         row.is_legal(values, beyond=beyond)
         for row, values in zip(characteristics, array.T, strict=True)
     ]
-    for row, column in np.argwhere(~np.column_stack(is_legal))[:1]:  # the first illegal value
+    for row, column in np.argwhere(~np.column_stack(is_legal))[:1]:
         with about(f"settings, row {row}"):
             characteristics.members[column].check(float(array[row, column]), beyond=beyond)
     return array, index

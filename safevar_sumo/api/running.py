@@ -66,7 +66,6 @@ def run(
         If nothing can be computed, a file cannot be written, or another process works on one of the
         runs.
     """
-    # The runs that are to be done.
     loaded_study, system = load_for_search(study)
     keys = all_runs(loaded_study)
     if only is not None:
@@ -79,12 +78,11 @@ def run(
                 )
         keys = [RunKey(*key) for key in only]
 
-    # Where results go.
     directory = Path("results") / loaded_study.name if out is None else Path(check_text("out", out))
     if out == "":
         raise InputError("out", "''", "a directory")
 
-    # The search; a pool that the user gave stays open.
+    # A pool that the user gave stays open.
     pool_context = open_pool(jobs, cluster) if pool is None else nullcontext(pool)
     with pool_context as workers, open_progress(progress) as show:
         run_campaign(

@@ -63,9 +63,9 @@ def trace_frame(
     the obstacle's true position; the columns that begin with "seen" hold what the ADS observed.
     `ttc` is empty while no gap closes or the vehicle stands, `gap` while no obstacle is ahead.
     """
-    import pandas as pd  # takes longer to load than the simulation
+    # It takes longer to load than the simulation.
+    import pandas as pd
 
-    # What the simulation logged.
     trace = runs.trace
     ttc = np.where(trace.speed > STANDSTILL, runs.time_to_collision, np.inf)
     columns = {
@@ -81,24 +81,18 @@ def trace_frame(
         "lateral speed [m/s]": trace.lateral_speed,
     }
 
-    # Until the end of this vehicle's run.
     active = trace.active[:, 0]
-    frame = pd.DataFrame(
-        {
-            "time [s]": trace.time[active],
-            **{name: column[active, 0] for name, column in columns.items()},
-        }
-    )
+    frame = pd.DataFrame({"time [s]": trace.time[active]})
+    for name, column in columns.items():
+        frame[name] = column[active, 0]
 
-    # What its driving system saw at the same times; one of a simulator of the user's own is inside.
+    # The driving system of a simulator of the user's own is inside, and says nothing.
     if not observations:
         return frame.replace([np.inf, -np.inf], np.nan).dropna(axis="columns", how="all")
-    seen: dict[str, list[float]] = {
-        head: [float(getattr(one, name)[row]) for one in observations]
-        for name, head in OBSERVATION_HEADS.items()
-    }
-    seen["time [s]"] = [round(float(one.time), TIME_DECIMALS) for one in observations]
-    observed = pd.DataFrame(seen)
+    times = [round(float(observation.time), TIME_DECIMALS) for observation in observations]
+    observed = pd.DataFrame({"time [s]": times})
+    for name, head in OBSERVATION_HEADS.items():
+        observed[head] = [float(getattr(observation, name)[row]) for observation in observations]
     return frame.merge(observed, how="left", on="time [s]").replace([np.inf, -np.inf], np.nan)
 
 
@@ -197,15 +191,11 @@ class Simulation:
     @property
     def units(self) -> dict[str, str]:
         """The unit of every number of `to_dict`, by its name."""
+        # Metrics may be objectives, too.
+        measures = (*self.scoring.metrics, *self.scoring.objectives)
         return {
             "collision_speed": "m/s",
-            **{metric.name: metric.unit for metric in self.scoring.metrics},
-            # for objectives that are metrics
-            **{
-                objective.name: objective.unit
-                for objective in self.scoring.objectives
-                if objective.name in self.metrics
-            },
+            **{measure.name: measure.unit for measure in measures if measure.name in self.metrics},
             "gap": "m",
             "f_safe": "m, or -m/s",
             "f_diff": "fraction",
@@ -250,8 +240,9 @@ class Simulation:
         if self.outcome is Outcome.COLLISION:
             return collision_in_words(-safety_degree, self.collision_speed, self._digits)
         distance = distance_in_words(safety_degree, self.runs.middles_apart, self._digits)
-        return OUTCOME_VERBS[self.outcome] + (
-            "" if np.isnan(safety_degree) else f", with a safety degree of {distance}"
+        ending = OUTCOME_VERBS[self.outcome]
+        return (
+            ending if np.isnan(safety_degree) else f"{ending}, with a safety degree of {distance}"
         )
 
     @property
@@ -313,10 +304,9 @@ def simulate(
         If SUMO fails.
     """
     loaded_study, system = load_and_assemble(study)
+    names = () if changes is None else [*changes]
     with about("changes"):
-        loaded_study, system = with_set_axes(
-            loaded_study, system, () if changes is None else [*changes]
-        )
+        loaded_study, system = with_set_axes(loaded_study, system, names)
     setting = changed_setting(system, changes, filtered, beyond)
     return simulate_with_original(
         loaded_study, where_met(system, setting), setting, filtered=filtered
@@ -367,28 +357,27 @@ def simulate_with_original(
     characteristics = system.characteristics
     filtered_setting = characteristics.filter(requested)
 
-    # Both drive at the setting's worst point, unless it is the original vehicle.
     setting = filtered_setting if filtered else requested
     original = characteristics.with_original_vehicle(setting)
-    settings = np.stack([original] if np.array_equal(original, setting) else [original, setting])
+    is_original = np.array_equal(original, setting)
+    settings = np.stack([original] if is_original else [original, setting])
     point = worst_point(system, setting)
     at_point = system.at(point)
     observations = list[Observation]()
     runs = drive_all(
         replace(at_point, in_sumo=True),
         settings,
-        lambda seen: observations.append(Observation._make(map(np.copy, seen))),
+        lambda values: observations.append(Observation._make(map(np.copy, values))),
     )
     pair = Pair(point, at_point, runs, score(at_point, settings, runs), observations)
 
-    # With the values that the filter resets.
     values = zip(characteristics.names, requested.tolist(), filtered_setting.tolist(), strict=True)
     return Simulation(
         study=study,
         pair=pair,
         row=len(pair.evaluations) - 1,
         no_verdict=why_no_verdict(system),
-        reset_values={name: value for name, value, kept in values if value != kept},
+        reset_values={name: value for name, value, result in values if value != result},
     )
 
 

@@ -170,18 +170,17 @@ def study(
     if status:
         return summarise(load(directory))
 
-    # The study as it is searched.
     changed = _with_options(as_written, algorithms, runs=runs, evaluations=evaluations, seed=seed)
     loaded, system = load_for_search(changed)
+    # What no study has is refused before the search.
     if unsafe is not None:
-        study_by(loaded, unsafe)  # refuses what no study has, before the search
+        study_by(loaded, unsafe)
     for remark in dict.fromkeys(without_effect(system)):
         warn(remark)
     if system.mover.takes_long:
-        fewer = f"{PROGRAM_COMMAND} explain {loaded.words}"
-        warn(f"{fewer} --simulations N looks for the smallest changes with N simulations alone")
+        command = f"{PROGRAM_COMMAND} explain {loaded.words}"
+        warn(f"{command} --simulations N looks for the smallest changes with N simulations alone")
 
-    # The search, and what it found.
     try:
         with open_progress(not quiet) as show:
             parts = Parts(show, [0, FEW if system.mover.takes_long else VERDICT_COST])
@@ -215,21 +214,21 @@ def _found(
     (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
     criterion = "" if unsafe is None else f" --unsafe {quote(str(unsafe))}"
     directory = quote(str(results.directory))
-    asked = f"explain {study}", f"explain {directory}", f"tolerance {directory}"
-    following = ", ".join(f"{PROGRAM_COMMAND} {one}{criterion}" for one in asked)
+    questions = f"explain {study}", f"explain {directory}", f"tolerance {directory}"
+    advice = ", ".join(f"{PROGRAM_COMMAND} {question}{criterion}" for question in questions)
 
     # Questions refuse an original encounter in which the original vehicle is not safe.
     demanded = results.case.scoring.safe_original
     if demanded is not None and results.original[ORIGINAL_DEGREE] < demanded:
-        following = (
+        advice = (
             "a smaller scenario.margin, or original values of the axes with which the"
             " original vehicle is safe, as questions demand"
         )
     changes: Rows = []
     if system.meets_nobody and not (unsafe or results.study.unsafe.criterion):
-        following = ""
+        advice = ""
     if breach := _breach_of_original(case):
-        sentence, following = f"{breach}: no change is needed.", ""
+        sentence, advice = f"{breach}: no change is needed.", ""
     else:
         sentence, changes = _verdict(results, case, jobs)
     tables = answer.tables
@@ -239,7 +238,7 @@ def _found(
     return replace(
         answer,
         verdict=reason or sentence,
-        next=following,
+        next=advice,
         numbers={"driven": not reason, **answer.numbers},
         tables=tables,
     )
@@ -280,26 +279,24 @@ def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, Rows]
     """How many solutions of a case of the results are unsafe, and how few changes are enough; and
     the rows of `CHANGES` of a vehicle with these.
     """
-    # The solution with the fewest changes, of which as many as possible are undone.
     members = case.characteristics
     solutions = case.different_solutions
     if solutions.empty:
         return f"The search found no solution: {case.why_no_solution}.", []
     number = int(case.unsafe.rows(solutions).sum())
-    counts = (
+    sentences = [
         f"The search found {number_of(len(solutions), 'different solution')};"
         f" of them {case.unsafe.number_in_words(number)}."
-    )
-    remarks = filter(None, [case.unsafe.remark])
-    failed = len(case.failures)
-    skipped = [f"{number_of(failed, 'setting')} could not be simulated."] if failed else []
-    counts = " ".join([counts, *skipped, *demanded_in_words(results.study), *remarks])
-    found = fewest_changes(case, jobs)
-    if found is None:
+    ]
+    if failed := len(case.failures):
+        sentences.append(f"{number_of(failed, 'setting')} could not be simulated.")
+    sentences += [*demanded_in_words(results.study), case.unsafe.remark]
+    counts = " ".join(filter(None, sentences))
+    fewest = fewest_changes(case, jobs)
+    if fewest is None:
         return counts, []
 
-    # What is left, and the command that simulates it.
-    values = members.named(found.settings[0])
+    values = members.named(fewest.settings[0])
     changed = [item for item in members if values[item.name] != item.original]
     texts = change_texts(members.vehicle, values, are_printed=True)
     where = encounter_in_words(members, values, are_printed=True)
@@ -307,7 +304,7 @@ def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, Rows]
     listed = "" if not 0 < len(texts) <= MAX_LISTED else f": {', '.join(texts)}"
     return (
         f"{counts} With {number_of(len(texts), 'change')}, the fewest that were found, the vehicle"
-        f" {case.unsafe.breach_in_words(found)}{where}{listed}. It is simulated by"
+        f" {case.unsafe.breach_in_words(fewest)}{where}{listed}. It is simulated by"
         f" {replay_command(str(results.directory))}{options}.",
         [(item.name, item.unit, item.original, values[item.name]) for item in changed],
     )
@@ -328,7 +325,6 @@ def summarise(results: Results) -> Answer:
         problem = "holds imported solutions, which have no runs"
         raise InputError(results.directory, problem, "results of the command `study`")
 
-    # A row for each algorithm: what was simulated, and its solutions.
     finished = Counter(name for name, _ in results.finished)
     rows = []
     for name in study.search.labels:
@@ -343,7 +339,6 @@ def summarise(results: Results) -> Answer:
         ends = (collisions, *counts, feasible["f_safe"].min(), len(solutions))
         rows.append((name, finished[name], study.search.runs, len(simulated), *ends, *means))
 
-    # The study's metrics are columns, too.
     metrics = {
         metric.name: Column(metric.unit, "mean over solutions", ".2f", is_detail=True)
         for metric in case.scoring.metrics

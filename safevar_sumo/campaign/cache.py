@@ -321,8 +321,11 @@ def evaluations_in(content: bytes | None) -> Evaluations | None:
             for name, values in arrays.items()
             if name.startswith(METRIC)
         }
-        columns = {name: arrays[name] for name in COLUMNS}
-        return Evaluations(**columns, metrics=metrics, worst_points=arrays.get(POINTS))
+        return Evaluations(
+            **{name: arrays[name] for name in COLUMNS},
+            metrics=metrics,
+            worst_points=arrays.get(POINTS),
+        )
     except (ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error):
         return None
 

@@ -162,9 +162,11 @@ def try_original(system: System, runs: SimulationRuns) -> Iterator[Finding]:
             variants = (runs.with_all(quantity, value) for value in TRIED_VALUES)
             try:
                 with user_errors(system.source):
-                    results = (measure.of_runs(variant, system.metrics_table) for variant in variants)
                     is_read = not all(
-                        np.array_equal(values, result, equal_nan=True) for result in results
+                        np.array_equal(
+                            values, measure.of_runs(variant, system.metrics_table), equal_nan=True
+                        )
+                        for variant in variants
                     )
             except UserCodeError:
                 is_read = True

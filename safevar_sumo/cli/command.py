@@ -71,38 +71,38 @@ class _Command(click.Command):
             super().format_options(ctx, formatter)
             return
 
-        # Options that the command has with a meaning of its own are explained.
         options = {
             option.name: option
             for option in self.get_params(ctx)
             if isinstance(option, click.Option)
         }
+        # An option that means something else in this command is explained, too.
         meanings = {option.name: option.meaning for option in COMMON_OPTIONS}
-        common = {
-            title: [
+        lines = []
+        for title, names in COMMON_NAMES.items():
+            flags = [
                 options.pop(name).opts[0]
                 for name in names
                 if name in options and str(options[name].help).startswith(meanings.get(name, ""))
             ]
-            for title, names in COMMON_NAMES.items()
-        }
+            if flags:
+                lines.append((title, ", ".join(flags)))
         records = (option.get_help_record(ctx) for option in options.values())
         with formatter.section("Options"):
-            formatter.write_dl([record for record in records if record], col_max=16)
+            formatter.write_dl([*filter(None, records)], col_max=16)
 
-        # All others are named.
-        if lines := [(title, ", ".join(flags)) for title, flags in common.items() if flags]:
+        if lines:
             with formatter.section("Options of many commands (--help-all explains them)"):
                 formatter.write_dl(lines)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        given = Counter(word.partition("=")[0] for word in args)
-        for word in given:
+        counts = Counter(word.partition("=")[0] for word in args)
+        for word in counts:
             if instead := ENDED_OPTIONS.get(f"{self.name} {word}"):
                 raise InputError(word, "is an option of releases before 0.5", instead)
         for option in self.params:
             takes_one = isinstance(option, click.Option) and not (option.multiple or option.is_flag)
-            if takes_one and given[option.opts[0]] > 1:
+            if takes_one and counts[option.opts[0]] > 1:
                 raise InputError(option.opts[0], "is given twice", "it once")
         return super().parse_args(ctx, args)
 
@@ -181,7 +181,6 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     An answer is printed, and the exit code is 3 if one of the user's limits is not kept, or a
     condition of --fail-if holds, and 1 if its number `passed` is false. A text is printed, too.
     """
-    # Arguments and options as the signature has them.
     signature = inspect.signature(function)
     positional = [
         parameter
@@ -205,17 +204,15 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     def print_text(**values: Any) -> None:
         click.echo(call(**values))
 
-    # The command, with the options of every answer.
-    gives_answer = "Answer" in str(signature.return_annotation)
+    flags = [_flag(option) for option in options if option.name != "table"]
+    callback: Callable[..., None] = print_text
+    if "Answer" in str(signature.return_annotation):
+        flags += map(_flag, options_of(_give_answer))
+        callback = partial(_give_answer, call, contents_of(function))
     return _Command(
         name,
-        params=[
-            *map(_argument, positional),
-            *(_flag(option) for option in options if option.name != "table"),
-            *map(_flag, options_of(_give_answer) if gives_answer else ()),
-            HELP_ALL,
-        ],
-        callback=partial(_give_answer, call, contents_of(function)) if gives_answer else print_text,
+        params=[*map(_argument, positional), *flags, HELP_ALL],
+        callback=callback,
         help=inspect.cleandoc(function.__doc__ or "").partition("\nParameters\n")[0],
     )
 
@@ -224,7 +221,8 @@ def _check_names(
     declared: Contents, values: Mapping[str, Any], keys: Sequence[str], table: str | None
 ) -> None:
     """Refuse keys of conditions, and a table, that no answer of the command has."""
-    names_study = keys and ... in declared.numbers  # as `simulate`
+    # Answers such as that of `simulate` have the metrics of their study.
+    names_study = keys and ... in declared.numbers
     named = declared.in_study(names_in_study(values)) if names_study else declared
     for key in keys:
         named.check_key(key)
@@ -236,21 +234,24 @@ def _exit_on_failures(answer: Answer, conditions: Sequence[tuple[str, str, float
     """End with an exit code if a limit is not kept, a condition holds, a check has findings, or a
     person has to decide; the verdict's reasons are not said again.
     """
-    failures = [
-        *answer.failures,
-        *(text for condition in conditions for text in _fulfilments(answer, *condition)),
-    ]
+    failures = [*answer.failures]
+    for condition in conditions:
+        failures += _fulfilments(answer, *condition)
     for sentence in failures:
         if sentence.removeprefix("limit of ") not in answer.verdict:
             click.echo(f"failed: {sentence}", err=True)
-    code = DECIDE_EXIT_CODE if answer.numbers.get("decision") == "decide" else 0
-    code = 1 if answer.numbers.get("passed") is False else code
+    code = 0
+    if answer.numbers.get("decision") == "decide":
+        code = DECIDE_EXIT_CODE
+    if answer.numbers.get("passed") is False:
+        code = 1
     click.get_current_context().exit(GATE_EXIT_CODE if failures else code)
 
 
 def names_in_study(values: Mapping[str, Any]) -> list[str]:
     """Names of what the study of a simulation measures."""
-    from safevar_sumo.sumo import assemble  # takes long to load
+    # It takes long to load.
+    from safevar_sumo.sumo import assemble
 
     study = study_in(study_or_case(values["source"], as_it_is_now=values["as_it_is_now"]))
     return [*assemble(study).measuring.measures]
@@ -301,25 +302,22 @@ class _Path(click.Path):
 
 
 def _flag(option: Option) -> click.Option:
+    kind: Any = option.kind
+    if option.choices:
+        kind = click.Choice(option.choices)
+    elif kind is Path:
+        kind = _Path(path_type=Path)
+    is_required = option.default is inspect.Parameter.empty
+    ending = f"  [{option.limits}]" if option.limits else ""
     return click.Option(
         [f"--{option.name.replace('_', '-')}", option.name],
-        type=(
-            click.Choice(option.choices)
-            if option.choices
-            else _Path(path_type=Path)
-            if option.kind is Path
-            else option.kind
-        ),
+        type=kind,
         is_flag=option.kind is bool,
         multiple=option.is_repeated,
         show_default=option.default not in (None, (), False, "", inspect.Parameter.empty),
         metavar=option.metavar,
-        help=option.meaning + (f"  [{option.limits}]" if option.limits else ""),
-        **(
-            {"required": True}
-            if option.default is inspect.Parameter.empty
-            else {"default": option.default}
-        ),
+        help=option.meaning + ending,
+        **({"required": True} if is_required else {"default": option.default}),
     )
 
 
@@ -328,15 +326,15 @@ def _print(answer: Answer, form: str, table: str | None, *, details: bool) -> No
     taken long.
     """
     try:
-        shown = answer.only(table) if table else answer
+        part = answer.only(table) if table else answer
     except InputError:
         _print(answer, "json" if form == "csv" else form, None, details=True)
         raise
     if form == "text":
         width = None if sys.stdout.isatty() or os.environ.get("COLUMNS") else WIDTH
-        shown.print(Console(width=width), details=details)
+        part.print(Console(width=width), details=details)
     else:
-        click.echo(shown.render(form), nl=False)
+        click.echo(part.render(form), nl=False)
 
 
 def _parse(text: str) -> tuple[str, str, float]:
@@ -354,12 +352,12 @@ def _fulfilments(answer: Answer, key: str, sign: str, limit: float) -> Iterator[
     """
     values = answer.values(key)
     if None in values or not values:
-        click.echo(
-            f"note: --fail-if: {key} is {'undefined' if values else 'in no row'} here", err=True
-        )
+        state = "undefined" if values else "in no row"
+        click.echo(f"note: --fail-if: {key} is {state} here", err=True)
     rows = [""] * len(values)
     table = key.rpartition(".")[0]
-    if table in answer.tables:  # a row by its first column
+    # The first column says which row it is.
+    if table in answer.tables:
         rows = [f" in the row {row}" for row in answer.tables[table].iloc[:, 0]]
     for value, row in zip(values, rows, strict=True):
         if isinstance(value, bool) or not isinstance(value, int | float | None):

@@ -80,7 +80,8 @@ class LazyCommands(click.Group):
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         with _exit_on_interrupt():
-            if ":" in name:  # a question of the user's
+            # A question of the user's is module:Name.
+            if ":" in name:
                 from safevar_sumo.questions.ask import find_question
 
                 function: Callable[..., Any] = find_question(name)
@@ -117,7 +118,8 @@ class LazyCommands(click.Group):
                 for option in parameters
                 if isinstance(option, click.Option)
             }
-            if isinstance(error.source, str):  # only a text may name an argument
+            # Only a text may name an argument.
+            if isinstance(error.source, str):
                 error.source = long_flags.get(error.source, error.source)
             to_flag = partial(_to_flag, long_flags)
             error.problem = ARGUMENT.sub(to_flag, error.problem)
@@ -160,9 +162,8 @@ def _to_flag(flags: dict[str, str], argument: re.Match[str]) -> str:
     name, value = argument.groups()
     if name not in flags:
         return argument[0]
-    return (
-        flags[name] if value in (None, "True") else f"{flags[name]} {value}"
-    )  # `beyond=True` is --beyond
+    # `beyond=True` is --beyond.
+    return flags[name] if value in (None, "True") else f"{flags[name]} {value}"
 
 
 @click.group(cls=LazyCommands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -190,10 +191,10 @@ def run_command_line() -> None:
     )
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with suppress(AttributeError, OSError, ValueError):  # standard error is no file
-        faulthandler.enable()  # if compiled code crashes, its line is printed
+    # If compiled code crashes, its line is printed; standard error may be no file.
+    with suppress(AttributeError, OSError, ValueError):
+        faulthandler.enable()
 
-    # Every error is one or two lines and an exit code.
     try:
         code = commands.main(standalone_mode=False, prog_name=PROGRAM)
         sys.stdout.flush()
@@ -234,21 +235,21 @@ def _exit_on_interrupt() -> Iterator[None]:
         os.write(2, f"{PROGRAM}: interrupted\n".encode())
         os._exit(INTERRUPT_EXIT_CODE)
 
-    previous = {}
+    handlers = {}
     if threading.current_thread() is threading.main_thread():
         for interrupt in INTERRUPTS:
-            previous[interrupt] = signal.signal(interrupt, exit_at_once)
+            handlers[interrupt] = signal.signal(interrupt, exit_at_once)
     try:
         yield
     finally:
-        for interrupt, handler in previous.items():
-            signal.signal(
-                interrupt, handler or signal.default_int_handler
-            )  # None: not set from Python
+        for interrupt, handler in handlers.items():
+            # None is a handler that Python has not set.
+            signal.signal(interrupt, handler or signal.default_int_handler)
 
 
 def _exit_with_error(message: str, code: int) -> NoReturn:
-    for interrupt in INTERRUPTS:  # another Ctrl-C must change neither exit code nor message
+    # Another Ctrl-C must change neither exit code nor message.
+    for interrupt in INTERRUPTS:
         signal.signal(interrupt, signal.SIG_IGN)
     click.echo(f"{PROGRAM}: {printable(message)}", err=True)
     sys.exit(code)

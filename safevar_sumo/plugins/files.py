@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,6 +22,8 @@ Files = dict[str, str]
 """Digests of files by the names that `digests` gives them."""
 CACHE = "__pycache__"
 """Name of Python's cache folders."""
+HIDDEN = re.compile(rf"(^|/)(\.|{CACHE}(/|\Z))")
+"""A hidden file or folder, or a cache, in a path."""
 LIBRARY_FOLDERS = ("site-packages", "dist-packages")
 """Names of folders of installed libraries; such folders may be anywhere."""
 KNOWN_FOLDERS = tuple(
@@ -89,11 +92,7 @@ def files_in(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     files = (file for file in path.rglob("*") if file.is_file())
-    return [file for file in files if not _is_hidden(file.relative_to(path))]
-
-
-def _is_hidden(path: Path) -> bool:
-    return any(part[0] == "." or part == CACHE for part in path.parts)
+    return [file for file in files if not HIDDEN.search(file.relative_to(path).as_posix())]
 
 
 def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:

@@ -265,8 +265,7 @@ def _choose_view(bodies: Sequence[DrawnBody]) -> tuple[FloatArray, float, float,
     """The left ends of the part of the road that is shown, shape (T,), its length, and its lower
     and upper end [m].
     """
-    x = np.array([body.x for body in bodies])
-    y = np.array([body.y for body in bodies])
+    x, y = np.stack([(body.x, body.y) for body in bodies], axis=1)
     sizes = np.array([(body.length, body.width / 2) for body in bodies])
     length, half_width = sizes.T[:, :, np.newaxis]
     rear, front = np.nanmin(x - length) - MARGIN, np.nanmax(x + length) + MARGIN

@@ -102,8 +102,9 @@ class Poses(NamedTuple):
         """
         x = self.x - distance * np.cos(self.heading)
         y = self.y - distance * np.sin(self.heading)
-        columns = (values.tolist() for values in (self.time, x, y, self.heading))
-        return list(zip(*columns, strict=True))
+        return list(
+            zip(self.time.tolist(), x.tolist(), y.tolist(), self.heading.tolist(), strict=True)
+        )
 
 
 def poses_of(comparison: Comparison) -> list[Poses]:

@@ -112,13 +112,11 @@ def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId
     simulated = simulation.numbers
     units = {"outcome": "", **simulation.units}
     results = [(name, unit, original[name], simulated[name]) for name, unit in units.items()]
-    tables = {
-        "characteristics": _characteristics(simulation),
-        "results": _without_repetition(tabulate("Results", RESULTS, results), simulation),
-    }
-    names = tables["results"]["result"]
-    tables["results"].attrs["words"] = {name: name.replace("_", " ") for name in names}
-    tables["results"].attrs["lead_rows"] = np.flatnonzero(~names.isin(OF_SEARCH)).tolist()
+    frame = _without_repetition(tabulate("Results", RESULTS, results), simulation)
+    names = frame["result"]
+    frame.attrs["words"] = {name: name.replace("_", " ") for name in names}
+    frame.attrs["lead_rows"] = np.flatnonzero(~names.isin(OF_SEARCH)).tolist()
+    tables = {"characteristics": _characteristics(simulation), "results": frame}
 
     verdict = [simulation.no_verdict, *_verdict(simulation, len(system.matrix))]
     if system.matrix:

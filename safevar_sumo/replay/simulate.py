@@ -117,13 +117,12 @@ def show_simulation(
         versions. Default: an error.
     """
     target = load_target(source, solution, as_it_is_now, point, ranges=ranges, up_to=up_to)
-    target = target._replace(study=_with_set(target.study, fit))
-    system = assemble(target.study)
+    study = _with_set(target.study, fit)
+    system = assemble(study)
     changes = set
     with about("set"):
         names = [change.partition("=")[0].strip() for change in changes]
-        study, system = with_set_axes(target.study, system, names)
-        target = target._replace(study=study)
+        study, system = with_set_axes(study, system, names)
         values = read_changes(changes, system.characteristics, beyond=beyond)
         if PHASE in values:
             values[PHASE] = round(values[PHASE], PHASE_DECIMALS)
@@ -142,7 +141,7 @@ def show_simulation(
         check_writable(animate, "animate", animation.ENDINGS, but=SOLUTIONS)
 
     system = _where_met(system, requested)
-    simulation = simulate_with_original(target.study, system, requested, filtered=False)
+    simulation = simulate_with_original(study, system, requested, filtered=False)
     # Results belong to the whole matrix.
     if target.row and "outcome" in target.row and not changes and point is None:
         _warn_of_differences(target, target.row, simulation)

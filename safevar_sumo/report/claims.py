@@ -228,7 +228,11 @@ class Packed:
             answer = answer_about(
                 question,
                 values,
-                *([case], [self._directory], None, self._jobs, self._progress),
+                [case],
+                [self._directory],
+                None,
+                self._jobs,
+                self._progress,
                 is_asked=text in {*self.packed.questions} - {*usual_questions(judged)},
                 pool=self.pool,
                 questions=len(self.packed.questions) + 1,

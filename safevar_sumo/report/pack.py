@@ -151,7 +151,6 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         zipfile.BadZipFile,
         ValueError,
         RuntimeError,
-        NotImplementedError,
         EOFError,
         zlib.error,
         lzma.LZMAError,
