@@ -81,7 +81,9 @@ class InputError(SafevarError):
 
     def __str__(self) -> str:
         message = f"{self.source}: {self.problem}"
-        return f"{message}\nexpected: {self.legal}" if self.legal else message
+        if self.legal:
+            return f"{message}\nexpected: {self.legal}"
+        return message
 
 
 def missing_extra(source: object, problem: str, extra: str) -> InputError:
@@ -136,7 +138,9 @@ def describe_error(error: BaseException) -> str:
         message = ""
     if len(message) > MAX_MESSAGE_LENGTH:
         message = f"{message[:MAX_MESSAGE_LENGTH]}..."
-    return f"{type(error).__name__}: {message}" if message else type(error).__name__
+    if message:
+        return f"{type(error).__name__}: {message}"
+    return type(error).__name__
 
 
 def unknown_name(
@@ -183,7 +187,9 @@ def did_you_mean(name: object, names: Iterable[str]) -> str:
     """
     names_in_lower_case = {known_name.lower(): known_name for known_name in names}
     matches = get_close_matches(str(name).lower(), names_in_lower_case, n=1)
-    return f"; did you mean {names_in_lower_case[matches[0]]!r}?" if matches else ""
+    if matches:
+        return f"; did you mean {names_in_lower_case[matches[0]]!r}?"
+    return ""
 
 
 def one_of(names: Iterable[str]) -> str:

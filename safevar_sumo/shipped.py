@@ -18,7 +18,9 @@ PROGRAM_COMMAND = "python -m safevar_sumo"
 def _find_folder(name: str) -> Path:
     """Find a data folder in the installed package or, in a checkout, beside it."""
     installed_folder = PACKAGE / name
-    return installed_folder if installed_folder.is_dir() else PACKAGE.parent / name
+    if installed_folder.is_dir():
+        return installed_folder
+    return PACKAGE.parent / name
 
 
 def shipped_table(path: str) -> dict[str, Any]:

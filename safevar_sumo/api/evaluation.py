@@ -89,8 +89,9 @@ def evaluate(
     loaded_study, system = load_and_assemble(study)
     characteristics = system.characteristics
 
-    requested, index = _read_settings(settings, characteristics, beyond)
-    simulated = characteristics.filter(requested) if filtered else requested
+    simulated, index = _read_settings(settings, characteristics, beyond)
+    if filtered:
+        simulated = characteristics.filter(simulated)
     if not beyond:
         with about("settings"):
             system.region.check(simulated, otherwise=", or any with beyond=True")

@@ -141,7 +141,9 @@ class Simulation:
         """The simulation of the original vehicle in the same encounter, at the same point of a
         matrix; for the original vehicle, the simulation itself.
         """
-        return self if self.row == 0 else replace(self, row=0, reset_values={})
+        if self.row == 0:
+            return self
+        return replace(self, row=0, reset_values={})
 
     @property
     def setting(self) -> dict[str, float]:
@@ -241,15 +243,17 @@ class Simulation:
             return collision_in_words(-safety_degree, self.collision_speed, self._digits)
         distance = distance_in_words(safety_degree, self.runs.middles_apart, self._digits)
         ending = OUTCOME_VERBS[self.outcome]
-        return (
-            ending if np.isnan(safety_degree) else f"{ending}, with a safety degree of {distance}"
-        )
+        if np.isnan(safety_degree):
+            return ending
+        return f"{ending}, with a safety degree of {distance}"
 
     @property
     def _digits(self) -> int:
         """Decimals of a safety degree: 2, or as many more as make both of the pair differ."""
         difference = np.ptp(self.pair.evaluations.column(SAFETY_DEGREE))
-        return max(2, math.ceil(-math.log10(difference))) if difference > 0 else 2
+        if difference > 0:
+            return max(2, math.ceil(-math.log10(difference)))
+        return 2
 
     def to_dict(self) -> JsonObject:
         """Study, setting (vcs: vehicle characteristics), outcome and all numbers as plain

@@ -121,7 +121,9 @@ class Cache:
         if not isinstance(entry, bytes):
             return None
         content = entry[DIGEST_SIZE:]
-        return content if entry[:DIGEST_SIZE] == _digest(key, content) else None
+        if entry[:DIGEST_SIZE] == _digest(key, content):
+            return content
+        return None
 
     def put(self, key: bytes, content: bytes, settings: int = 0) -> None:
         """Keep an entry, with the results of so many settings."""
@@ -247,7 +249,9 @@ def cache_folder() -> Path | None:
     named = os.environ.get(FOLDER_VARIABLE, "")
     if named == OFF:
         return None
-    return Path(named) if named else platformdirs.user_cache_path("safevar_sumo") / "simulations"
+    if named:
+        return Path(named)
+    return platformdirs.user_cache_path("safevar_sumo") / "simulations"
 
 
 @contextmanager
@@ -287,7 +291,9 @@ def cache_of(study: Study, opened: Sequence[str]) -> Cache | None:
     the names of the files that its user code opens.
     """
     cache = _cache.get()
-    return cache.of(study, opened) if cache else None
+    if cache:
+        return cache.of(study, opened)
+    return None
 
 
 def key_of_settings(study_key: bytes, selection: Selection, settings: FloatArray) -> bytes:

@@ -87,7 +87,9 @@ class ClusterWorker:
 
         if isinstance(error, CancelledError):
             raise SafevarError("the cluster does not answer any more") from None
-        return f"workers of the cluster died: {error}" if isinstance(error, KilledWorker) else ""
+        if isinstance(error, KilledWorker):
+            return f"workers of the cluster died: {error}"
+        return ""
 
     def end(self) -> None:
         # This cancels the jobs.

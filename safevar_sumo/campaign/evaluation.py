@@ -177,7 +177,8 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     than the study's time limit ends.
     """
     system = system_of(task.study)
-    system = replace(system, in_sumo=True) if task.in_sumo else system
+    if task.in_sumo:
+        system = replace(system, in_sumo=True)
     # To compile takes longer than the time limit of a batch.
     system.vehicle.compile()
     # Of runs that take long, each has the time limit.

@@ -62,7 +62,9 @@ class Share(NamedTuple):
     def __str__(self) -> str:
         names = ", ".join(map(str, self.keys[:MAX_NAMES]))
         surplus = len(self.keys) - MAX_NAMES
-        return f"runs {names} and {surplus} more" if surplus > 0 else f"runs {names}"
+        if surplus > 0:
+            return f"runs {names} and {surplus} more"
+        return f"runs {names}"
 
 
 def carry_share(task: Task, share: Share) -> list[RunResult]:

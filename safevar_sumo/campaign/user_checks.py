@@ -54,7 +54,7 @@ def check_code(study: Study, pool: Pool) -> list[str]:
     marker = platformdirs.user_cache_path("safevar_sumo") / "checks" / f"{digest}.json"
     with suppress(OSError, msgspec.MsgspecError):
         return msgspec.json.decode(marker.read_bytes(), type=list[str])
-    job = Task(study=study), None if pool.spare is None else pool.spare[0]
+    job = Task(study=study), pool.spare and pool.spare[0]
     opened: list[str]
     ((opened, pool.checked),) = carry_out(_refuse_defects, [job], pool)
     if pool.spare is not None:

@@ -163,11 +163,12 @@ def _give_answer(
         check_writable(plot, "plot", PICTURE_ENDINGS)
 
     # Only the answer goes to standard output.
-    form = "json" if json else format
-    with nullcontext() if form == "text" else prints_to_standard_error():
+    if json:
+        format = "json"
+    with nullcontext() if format == "text" else prints_to_standard_error():
         answer = call(table=table, **values)
-    if form != "text" or table or not values.get("quiet"):
-        _print(answer, form, table, details=details)
+    if format != "text" or table or not values.get("quiet"):
+        _print(answer, format, table, details=details)
     if plot is not None:
         from safevar_sumo.questions.figures import save
 
@@ -222,12 +223,12 @@ def _check_names(
 ) -> None:
     """Refuse keys of conditions, and a table, that no answer of the command has."""
     # Answers such as that of `simulate` have the metrics of their study.
-    names_study = keys and ... in declared.numbers
-    named = declared.in_study(names_in_study(values)) if names_study else declared
+    if keys and ... in declared.numbers:
+        declared = declared.in_study(names_in_study(values))
     for key in keys:
-        named.check_key(key)
+        declared.check_key(key)
     if table is not None:
-        check_name("table", f"there is no table {table!r}", table, named.tables)
+        check_name("table", f"there is no table {table!r}", table, declared.tables)
 
 
 def _exit_on_failures(answer: Answer, conditions: Sequence[tuple[str, str, float]]) -> None:
@@ -326,15 +327,16 @@ def _print(answer: Answer, form: str, table: str | None, *, details: bool) -> No
     taken long.
     """
     try:
-        part = answer.only(table) if table else answer
+        if table:
+            answer = answer.only(table)
     except InputError:
         _print(answer, "json" if form == "csv" else form, None, details=True)
         raise
     if form == "text":
         width = None if sys.stdout.isatty() or os.environ.get("COLUMNS") else WIDTH
-        part.print(Console(width=width), details=details)
+        answer.print(Console(width=width), details=details)
     else:
-        click.echo(part.render(form), nl=False)
+        click.echo(answer.render(form), nl=False)
 
 
 def _parse(text: str) -> tuple[str, str, float]:

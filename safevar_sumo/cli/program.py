@@ -163,7 +163,9 @@ def _to_flag(flags: dict[str, str], argument: re.Match[str]) -> str:
     if name not in flags:
         return argument[0]
     # `beyond=True` is --beyond.
-    return flags[name] if value in (None, "True") else f"{flags[name]} {value}"
+    if value in (None, "True"):
+        return flags[name]
+    return f"{flags[name]} {value}"
 
 
 @click.group(cls=LazyCommands, context_settings={"help_option_names": ["-h", "--help"]})

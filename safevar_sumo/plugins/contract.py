@@ -132,7 +132,9 @@ class Legal(NamedTuple):
         if self.kinds == "b":
             return "truth values"
         bounds = f"{'above' if self.above else 'from'} {self.lowest:g} to {self.highest:g}"
-        return f"numbers {bounds}" if self.infinite else f"numbers {bounds}, finite"
+        if self.infinite:
+            return f"numbers {bounds}"
+        return f"numbers {bounds}, finite"
 
     def holds(self, numbers: FloatArray) -> BoolArray:
         """Which numbers are legal."""
@@ -254,10 +256,10 @@ class Returned(NamedTuple):
         self, code: UserCode, method: str, result: UserValue, arguments: Sequence[Any]
     ) -> UserValue:
         """The result after the check."""
-        values = (result,) if len(self.parts) <= 1 else result
-        if len(self.parts) > 1 and not (
-            isinstance(result, tuple | list) and len(result) == len(self.parts)
-        ):
+        values = result
+        if len(self.parts) <= 1:
+            values = (result,)
+        elif not (isinstance(result, tuple | list) and len(result) == len(self.parts)):
             names = " and ".join(", ".join(columns) or "memory" for columns in self.parts)
             raise code.wrong(method, quoted(result), f"a tuple of {len(self.parts)}: {names}")
 
@@ -272,7 +274,9 @@ class Returned(NamedTuple):
                     )
                 numbers = getattr(value, name) if name else value
                 code.check_numbers(method, name or "values", numbers, shape, legal)
-        return result if self.then is None else self.then(code, method, result, *arguments)
+        if self.then is None:
+            return result
+        return self.then(code, method, result, *arguments)
 
 
 def _shape_of(argument: Any) -> tuple[int, ...]:
@@ -378,14 +382,18 @@ def read_only(value: UserValue) -> Any:
         return view
     if isinstance(value, tuple):
         views = map(read_only, value)
-        return type(value)(*views) if hasattr(value, "_fields") else tuple(views)
+        if hasattr(value, "_fields"):
+            return type(value)(*views)
+        return tuple(views)
     if is_dataclass(value) and not isinstance(value, type):
         return replace(
             value, **{field.name: read_only(getattr(value, field.name)) for field in fields(value)}
         )
     if isinstance(value, Mapping):
         return MappingProxyType({key: read_only(item) for key, item in value.items()})
-    return _ReadOnlyWorld(value) if hasattr(value, "speeds") else value
+    if hasattr(value, "speeds"):
+        return _ReadOnlyWorld(value)
+    return value
 
 
 class _ReadOnlyWorld:
@@ -404,4 +412,6 @@ def quoted(value: object) -> str:
     if isinstance(value, np.ndarray) and value.size > MAX_QUOTED_ELEMENTS:
         return f"an array of {value.dtype}, shape {value.shape}"
     text = " ".join(repr(value).split())
-    return text if len(text) <= MAX_QUOTE else f"a {type(value).__name__}"
+    if len(text) <= MAX_QUOTE:
+        return text
+    return f"a {type(value).__name__}"

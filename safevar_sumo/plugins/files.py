@@ -76,7 +76,9 @@ def _files_of_module(path: Path) -> set[Path]:
     """
     if path.with_suffix(".py").is_file():
         return {path.with_suffix(".py")}
-    return set(files_in(path)) if any(path.rglob("*.py")) else set()
+    if any(path.rglob("*.py")):
+        return set(files_in(path))
+    return set()
 
 
 def _imported_modules(path: Path) -> Iterator[str]:
@@ -120,7 +122,9 @@ def name_of_file(path: Path, folders: Sequence[str]) -> str:
     folder = next(
         (folder for folder in _naming_folders(folders) if path.is_relative_to(folder)), path.anchor
     )
-    return path.relative_to(folder).as_posix() if folder != path.anchor else path.as_posix()
+    if folder != path.anchor:
+        return path.relative_to(folder).as_posix()
+    return path.as_posix()
 
 
 def file_by_name(name: str, folders: Sequence[str]) -> str:

@@ -177,7 +177,9 @@ class Lookup:
             problem = f"{key} = {value!r}: the study does not name this file"
             table = key.partition(".")[0]
             raise InputError("", problem, f"files = [{value!r}] in its table [{table}]")
-        return self.files.get(value, value) if is_name else value
+        if is_name:
+            return self.files.get(value, value)
+        return value
 
     def _import(self, name: str, key: str) -> ModuleType:
         if name.partition(".")[0] == "__main__":
@@ -239,7 +241,9 @@ def _base_of(candidate: Any, bases: Sequence[type]) -> type:
         if not violation(candidate, base):
             return base
     similar = [base for base in bases if _has_some(candidate, base)]
-    return similar[0] if len(similar) == 1 else bases[-1]
+    if len(similar) == 1:
+        return similar[0]
+    return bases[-1]
 
 
 def _has_some(candidate: Any, base: type) -> bool:
@@ -263,8 +267,8 @@ def add_import_folders(folders: Iterable[str]) -> None:
     sys.path[:] = [folder for folder in sys.path if folder not in this_process.added_folders]
     added = [folder for folder in dict.fromkeys((*folders, os.getcwd())) if folder not in sys.path]
     this_process.added_folders = added
-    indices = [i for i, folder in enumerate(sys.path) if folder in ("", os.getcwd())]
-    start = indices[0] if indices else len(sys.path)
+    indices = (i for i, folder in enumerate(sys.path) if folder in ("", os.getcwd()))
+    start = next(indices, len(sys.path))
     sys.path[start:start] = added
 
 
@@ -333,10 +337,10 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> 
         # A class of the package forbids what it does not have.
         if member.code is not None:
             accepted = inspect.signature(member.target).parameters
-            takes_any = any(item.kind is item.VAR_KEYWORD for item in accepted.values())
-            for parameter in () if takes_any else parameters:
-                problem = f"{key}.{parameter}: {name} has no such parameter"
-                check_name("", problem, parameter, accepted)
+            if not any(item.kind is item.VAR_KEYWORD for item in accepted.values()):
+                for parameter in parameters:
+                    problem = f"{key}.{parameter}: {name} has no such parameter"
+                    check_name("", problem, parameter, accepted)
         if issubclass(member.target, msgspec.Struct):
             return convert_table(parameters, member.target, key)
         try:

@@ -263,9 +263,11 @@ def _listen(event: str, arguments: tuple[Any, ...]) -> None:
 
 def _database(name: Any) -> Any:
     """The file of a database, which sqlite3 calls by its path or as `file:PATH?OPTIONS`."""
-    path = os.fspath(name) if isinstance(name, os.PathLike) else name
-    is_uri = isinstance(path, str) and path.startswith("file:")
-    return path[len("file:") :].partition("?")[0] if is_uri else path
+    if isinstance(name, os.PathLike):
+        name = os.fspath(name)
+    if isinstance(name, str) and name.startswith("file:"):
+        return name.removeprefix("file:").partition("?")[0]
+    return name
 
 
 def _is_from_user_code() -> bool:

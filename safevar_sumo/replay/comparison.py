@@ -54,7 +54,9 @@ class Moments(NamedTuple):
     @property
     def decided(self) -> int:
         """The sample from which on it is known how the run ends."""
-        return self.end if self.nearest is None else self.nearest
+        if self.nearest is None:
+            return self.end
+        return self.nearest
 
 
 ORIGINAL, CHANGED = 0, 1

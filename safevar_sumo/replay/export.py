@@ -94,7 +94,9 @@ class Poses(NamedTuple):
         """Distance of the rear axle behind the middle [m]; OpenSCENARIO places a vehicle by this
         axle, a person by its middle.
         """
-        return 0.0 if self.kind == "pedestrian" else self.length * WHEELBASE / 2
+        if self.kind == "pedestrian":
+            return 0.0
+        return self.length * WHEELBASE / 2
 
     def places(self, distance: float = 0.0) -> list[tuple[float, float, float, float]]:
         """Time [s], x, y [m] and heading [rad] of the point at this distance behind the middle

@@ -182,7 +182,9 @@ def find_divergence(runs: SimulationRuns) -> int | None:
     """
     trace = runs.trace
     have_diverged = trace.active.all(axis=1) & (np.ptp(trace.speed, axis=1) > MIN_DIVERGENCE)
-    return int(np.argmax(have_diverged)) if have_diverged.any() else None
+    if have_diverged.any():
+        return int(np.argmax(have_diverged))
+    return None
 
 
 def _heading(comparison: Comparison) -> str:

@@ -355,7 +355,9 @@ class Packed:
 def list_in(text: str) -> str:
     """The list of cars that a question names; empty without one."""
     words = split(text)
-    return words[words.index(flag_of(CARS)) + 1] if flag_of(CARS) in words else ""
+    if flag_of(CARS) in words:
+        return words[words.index(flag_of(CARS)) + 1]
+    return ""
 
 
 def with_list(text: str, path: str) -> str:
@@ -433,4 +435,6 @@ def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
 
 def _shown(line: str, counterpart: str) -> str:
     """A line without spaces around it, unless its counterpart differs in them alone."""
-    return repr(line) if line.strip() in ("", counterpart.strip()) else line.strip()
+    if line.strip() in ("", counterpart.strip()):
+        return repr(line)
+    return line.strip()

@@ -342,7 +342,9 @@ def _not_compared(description: Description, studies: Iterable[Packed], unchecked
     ]
     repeats = "how many simulations had which outcome (--search repeats them)"
     sentence = f" {unchecked} unchecked: {repeats}." if unchecked else ""
-    return f" Not compared: {'; '.join(parts)}.{sentence}" if parts else sentence
+    if parts:
+        return f" Not compared: {'; '.join(parts)}.{sentence}"
+    return sentence
 
 
 def _unpack(

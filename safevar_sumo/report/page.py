@@ -187,7 +187,9 @@ def _simulated(cases: Sequence[Case], point: str | None, *, quick: bool) -> list
     """
     if point is not None:
         cases = [case_at(case, point) for case in cases]
-    return [*map(with_own_set, cases)] if quick else [*cases]
+    if quick:
+        return [*map(with_own_set, cases)]
+    return [*cases]
 
 
 def _budgets(
@@ -237,7 +239,9 @@ def with_speed_part(questions: Sequence[str], case: Case) -> list[str]:
     their page has it.
     """
     has_sheet = any(text.startswith("tolerance") for text in questions)
-    return [*questions, SPEED] if has_sheet and speeds_of(case) else [*questions]
+    if has_sheet and speeds_of(case):
+        return [*questions, SPEED]
+    return [*questions]
 
 
 def _joint_questions(ask: Sequence[str], results: int) -> list[str]:

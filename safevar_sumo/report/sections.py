@@ -250,7 +250,9 @@ def _search(study: ReportedStudy) -> str:
 
 def name_and_sentence(models: Mapping[str, type], name: str) -> str:
     """A model's name with its description; user code has the name alone."""
-    return f"{name} ({description_of(models[name]).rstrip('.')})" if name in models else name
+    if name in models:
+        return f"{name} ({description_of(models[name]).rstrip('.')})"
+    return name
 
 
 def trust(study: ReportedStudy) -> Answer:

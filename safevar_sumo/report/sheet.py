@@ -215,7 +215,9 @@ def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
     ]
     if vague:
         return undecidable_in_words(vague)
-    return "" if measured else "The study names no item that a workshop can measure."
+    if measured:
+        return ""
+    return "The study names no item that a workshop can measure."
 
 
 def _together(item: Characteristic, row: Mapping[Any, Any] | None) -> tuple[float, float]:
