@@ -231,14 +231,16 @@ class Simulation:
         is_breach = (
             self.pair.system.criterion.of(self.evaluation)[0] and self.evaluation.collided[0]
         )
-        return f"{self._ending}{', unsafe' if runs and not is_breach else ''}{runs}"
+        if runs and not is_breach:
+            return f"{self._ending}, unsafe{runs}"
+        return f"{self._ending}{runs}"
 
     @property
     def _ending(self) -> str:
         safety_degree = self.metrics[SAFETY_DEGREE]
         if self.outcome is Outcome.COLLISION and IMPACT_EXCESS.name in self.metrics:
-            impact = (self.metrics[name] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
-            return f"has an {impact_in_words(*impact)}"
+            speed, excess = self.metrics[IMPACT_SPEED.name], self.metrics[IMPACT_EXCESS.name]
+            return f"has an {impact_in_words(speed, excess)}"
         if self.outcome is Outcome.COLLISION:
             return collision_in_words(-safety_degree, self.collision_speed, self._digits)
         distance = distance_in_words(safety_degree, self.runs.middles_apart, self._digits)

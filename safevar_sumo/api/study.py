@@ -301,10 +301,11 @@ def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, Rows]
     texts = change_texts(members.vehicle, values, are_printed=True)
     where = encounter_in_words(members, values, are_printed=True)
     options = "".join(f" --set {item.name}={values[item.name]:{EXACT}}" for item in changed)
-    listed = "" if not 0 < len(texts) <= MAX_LISTED else f": {', '.join(texts)}"
+    if 0 < len(texts) <= MAX_LISTED:
+        where += f": {', '.join(texts)}"
     return (
         f"{counts} With {number_of(len(texts), 'change')}, the fewest that were found, the vehicle"
-        f" {case.unsafe.breach_in_words(fewest)}{where}{listed}. It is simulated by"
+        f" {case.unsafe.breach_in_words(fewest)}{where}. It is simulated by"
         f" {replay_command(str(results.directory))}{options}.",
         [(item.name, item.unit, item.original, values[item.name]) for item in changed],
     )
@@ -333,7 +334,7 @@ def summarise(results: Results) -> Answer:
         )
         outcomes = Counter(simulated["outcome"])
         feasible = simulated[case.scoring.feasible_rows(simulated)]
-        counts = [outcomes[kind] for kind in (Outcome.INVALID_TEST, Outcome.SIMULATOR_ERROR)]
+        counts = outcomes[Outcome.INVALID_TEST], outcomes[Outcome.SIMULATOR_ERROR]
         means = solutions[[metric.name for metric in case.scoring.metrics]].mean()
         collisions = int(are_collisions(feasible).sum())
         ends = (collisions, *counts, feasible["f_safe"].min(), len(solutions))

@@ -148,8 +148,9 @@ def evaluate_all(
         if pool.failed > MAX_SKIPPED * max(pool.simulated, FEW_SKIPPED):
             failures = evaluations.take(evaluations.failed)
             numbers = f"{pool.failed} of {pool.simulated} settings failed, more than 10 %"
-            reason = f": {failures.reason(0)}" if len(failures) else ""
-            problem = f"search.failed = 'skip': {numbers}{reason}"
+            problem = f"search.failed = 'skip': {numbers}"
+            if len(failures):
+                problem += f": {failures.reason(0)}"
             raise UserCodeError(study.source, problem, "a simulator that fails less often")
     return evaluations.take(row_of.ravel())
 

@@ -244,8 +244,11 @@ class Run:
     def finish(self, rng: Generator) -> RunResult:
         """Journal the result of a search that has ended, and close the journal."""
         if not self.is_finished:
-            rows = [self._row_of[setting.tobytes()] for setting in self.solutions.settings]
-            self._journal.finish([self._content.positions[row] for row in rows], self._budget)
+            positions = [
+                self._content.positions[self._row_of[setting.tobytes()]]
+                for setting in self.solutions.settings
+            ]
+            self._journal.finish(positions, self._budget)
         self.close()
 
         requested = self._content.requested_within(self._budget)[1]

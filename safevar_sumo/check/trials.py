@@ -71,9 +71,12 @@ class Finding(NamedTuple):
 
     def __str__(self) -> str:
         """The finding with its input and place on one line."""
-        place = "" if self.where in self.finding else f" ({self.where})"
-        setting = f", with {self.input}" if self.input else ""
-        return f"{self.check}: {self.finding}{setting}{place}"
+        line = f"{self.check}: {self.finding}"
+        if self.input:
+            line += f", with {self.input}"
+        if self.where not in self.finding:
+            line += f" ({self.where})"
+        return line
 
 
 class Extent(NamedTuple):

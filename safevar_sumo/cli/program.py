@@ -210,8 +210,10 @@ def run_command_line() -> None:
     except (KeyboardInterrupt, click.exceptions.Abort):
         _exit_with_error("interrupted", INTERRUPT_EXIT_CODE)
     except OSError as error:
-        where = f": {error.filename}" if error.filename else ""
-        _exit_with_error(f"{error.strerror or error}{where}", 1)
+        message = str(error.strerror or error)
+        if error.filename:
+            message += f": {error.filename}"
+        _exit_with_error(message, 1)
     except ValueError:
         if not sys.stdout.closed:
             raise

@@ -168,7 +168,9 @@ class UserCode(NamedTuple):
     def wrong(self, method: str, result: str, expected: str) -> UserCodeError:
         """The error for a wrong result of a method."""
         place = self.definition(method)
-        problem = f"{self.name} returned {result} from {method}{f' ({place})' if place else ''}"
+        problem = f"{self.name} returned {result} from {method}"
+        if place:
+            problem += f" ({place})"
         return UserCodeError("", problem, expected, place)
 
     def call(self, method: str, function: Callable[..., Any], *arguments: Any) -> Any:

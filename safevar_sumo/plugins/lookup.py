@@ -248,8 +248,10 @@ def _base_of(candidate: Any, bases: Sequence[type]) -> type:
 
 def _has_some(candidate: Any, base: type) -> bool:
     """Whether a class has a method that is abstract in a base."""
-    abstract = (name for name, method in vars(base).items() if hasattr(method, ABSTRACT))
-    return any(hasattr(candidate, name) for name in abstract)
+    return any(
+        hasattr(method, ABSTRACT) and hasattr(candidate, name)
+        for name, method in vars(base).items()
+    )
 
 
 def unload_user_modules() -> None:

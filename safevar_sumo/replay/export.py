@@ -133,8 +133,8 @@ def poses_of(comparison: Comparison) -> list[Poses]:
         x = x - to_middle * np.cos(heading)
         y = y - to_middle * np.sin(heading)
 
-        time_of, x, y, heading = (values[is_present] for values in (time, x, y, heading))
-        actor = Poses(name, kind, track.length, track.width, time_of, x, y, heading)
+        samples = np.stack([time, x, y, heading])[:, is_present]
+        actor = Poses(name, kind, track.length, track.width, *samples)
         if name == VUT:
             actor = actor._replace(name=EGO, start_speed=float(comparison.runs.trace.speed[0, row]))
         actors.append(actor)

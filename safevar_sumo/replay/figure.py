@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from safevar_sumo.records import STANDSTILL, JsonObject, SimulationRuns
+from safevar_sumo.records import STANDSTILL, SimulationRuns
 from safevar_sumo.replay.comparison import COLOURS, Comparison
 
 if TYPE_CHECKING:
@@ -151,28 +151,23 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
     """Draw the legend: vehicles, marks, and lines."""
     from matplotlib.lines import Line2D
 
-    entries: JsonObject = {
-        f"{comparison.name(row)} vehicle: {comparison.verdict(row)}": {
-            "color": COLOURS[row],
-            "linestyle": LINES[row],
-        }
-        for row in comparison.rows
-    }
+    handles = []
 
+    def add(label: str, **style: Any) -> None:
+        handles.append(Line2D([], [], label=label, **{"color": "0.35", **style}))
+
+    for row in comparison.rows:
+        label = f"{comparison.name(row)} vehicle: {comparison.verdict(row)}"
+        add(label, color=COLOURS[row], linestyle=LINES[row])
     marks = {"begins to brake": BRAKING_MARK, "nearest": NEAREST_MARK}
     if np.isfinite(comparison.runs.collision_speed).any():
         marks["impact"] = IMPACT_MARK
-    entries |= {
-        label: {"marker": mark, "linestyle": "", "markersize": 7} for label, mark in marks.items()
-    }
+    for label, mark in marks.items():
+        add(label, marker=mark, linestyle="", markersize=7)
     if divergence_time is not None:
-        entries["speeds diverge (by 0.1 m/s)"] = {"linestyle": "-.", "linewidth": 0.9}
+        add("speeds diverge (by 0.1 m/s)", linestyle="-.", linewidth=0.9)
     threshold = f"TTC* = {comparison.system.metrics_table.ttc_threshold:g} s: critical below"
-    entries[threshold] = {"color": "0.4", "linestyle": ":", "linewidth": 0.9}
-    handles = [
-        Line2D([], [], label=label, **{"color": "0.35", **style})
-        for label, style in entries.items()
-    ]
+    add(threshold, color="0.4", linestyle=":", linewidth=0.9)
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
 
 

@@ -71,7 +71,9 @@ def _meets(system: System, setting: FloatArray) -> list[str]:
         for item in system.characteristics.scenario
         if item.name != PHASE and values[item.name] != item.original
     ]
-    sentences = [f"The encounter has {join_phrases(places)}."] if places else []
+    sentences = []
+    if places:
+        sentences.append(f"The encounter has {join_phrases(places)}.")
     if phase := values.get(PHASE):
         sentences.append(f"The encounter begins {phase:g} steps of the driving system later.")
     return sentences

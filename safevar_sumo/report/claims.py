@@ -342,8 +342,11 @@ class Packed:
         """
         study = self.case.study
         prefix = f"{CODE}/"
-        names = [name for name in self.files if not name.endswith(".csv")]
-        files = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+        files = [
+            name.removeprefix(prefix)
+            for name in self.files
+            if name.startswith(prefix) and not name.endswith(".csv")
+        ]
         named = [
             name
             for name in (*study.search.algorithms, *self.packed.questions)

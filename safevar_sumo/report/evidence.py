@@ -341,10 +341,12 @@ def _not_compared(description: Description, studies: Iterable[Packed], unchecked
         for key, stated, present in changed_values(*versions)
     ]
     repeats = "how many simulations had which outcome (--search repeats them)"
-    sentence = f" {unchecked} unchecked: {repeats}." if unchecked else ""
+    sentences = ""
     if parts:
-        return f" Not compared: {'; '.join(parts)}.{sentence}"
-    return sentence
+        sentences += f" Not compared: {'; '.join(parts)}."
+    if unchecked:
+        sentences += f" {unchecked} unchecked: {repeats}."
+    return sentences
 
 
 def _unpack(

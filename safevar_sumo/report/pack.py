@@ -12,7 +12,6 @@ import zlib
 from collections.abc import Mapping
 from hashlib import file_digest, sha256
 from importlib.metadata import version
-from itertools import accumulate
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, NoReturn
 
@@ -210,12 +209,16 @@ def _check_layout(path: Path, entries: list[zipfile.ZipInfo]) -> None:
     """Refuse an archive with bytes that belong to no file: before, between or behind the files, or
     in comments.
     """
-    headers = [len(entry.FileHeader()) for entry in entries]
-    sizes = [size + entry.compress_size for size, entry in zip(headers, entries, strict=True)]
-    *places, end = accumulate(sizes, initial=0)
-    end += sum(headers) + MORE_IN_DIRECTORY * len(headers) + DIRECTORY_END
-    if [entry.header_offset for entry in entries] != places or path.stat().st_size != end:
-        _refuse(path, "holds bytes that belong to no file")
+    problem = "holds bytes that belong to no file"
+    end, directory = 0, DIRECTORY_END
+    for entry in entries:
+        if entry.header_offset != end:
+            _refuse(path, problem)
+        header = len(entry.FileHeader())
+        end += header + entry.compress_size
+        directory += header + MORE_IN_DIRECTORY
+    if path.stat().st_size != end + directory:
+        _refuse(path, problem)
 
 
 def _refuse(path: Path, problem: str) -> NoReturn:

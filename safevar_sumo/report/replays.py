@@ -46,9 +46,12 @@ def replays(study: ReportedStudy, progress: Progress, start: int = 0) -> Iterato
                 frame.get(CHANGES, ()), frame.get(ENCOUNTER, repeat({})), strict=False
             ):
                 changes.setdefault(tuple(sorted(row)), (row, encounter))
-    for row, encounter in islice((pair for pair in changes.values() if pair[0]), MAX_CAUSES):
-        ending = ", in its encounter" if encounter else ""
-        name = f"Only {', '.join(row)}{ending}"
+    # A failure without a change has no cause.
+    changes.pop((), None)
+    for row, encounter in islice(changes.values(), MAX_CAUSES):
+        name = f"Only {', '.join(row)}"
+        if encounter:
+            name += ", in its encounter"
         settings[name] = characteristics.setting({**row, **encounter}, beyond=True)
 
     # A replay also simulates the original vehicle, and all points of a matrix to know the worst.

@@ -215,8 +215,10 @@ def _conditions(study: ReportedStudy) -> str:
             " again"
         )
     if not study.system.mover.has("weather"):
-        where = f", in {number_of(len(points), 'test case')}" if points else ""
-        return f"the simulator of the scenario moves and drives the vehicle{where}"
+        words = "the simulator of the scenario moves and drives the vehicle"
+        if points:
+            words += f", in {number_of(len(points), 'test case')}"
+        return words
     weather = study.case.weather
     if not points and equals_clear(weather):
         return (

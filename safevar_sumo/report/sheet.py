@@ -70,8 +70,11 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     *tests, road = claim.numbers.get("scope", "").split("; ")
     rows = {} if problem else _rows_of(limits)
     items = study.case.characteristics.vehicle
-    measured = [item for item in items if item.is_for_workshop and not problem]
-    parts = [_row_of_part(item, rows.get(item.name)) for item in measured]
+    parts = [
+        _row_of_part(item, rows.get(item.name))
+        for item in items
+        if item.is_for_workshop and not problem
+    ]
     # The greatest speed holds for the values that the study states of what no workshop measures.
     stated = study.case.study.unmeasured_values if up_to else {}
     unmeasured = [
