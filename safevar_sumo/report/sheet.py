@@ -140,8 +140,8 @@ def speed_values(study: ReportedStudy) -> JsonObject:
 def with_answers(
     study: ReportedStudy, questions: Sequence[str], ask: Callable[..., Answer]
 ) -> ReportedStudy:
-    """A study with the answers to questions; the last one, if it has a sheet, is about the speed of
-    this: the sheet is about the limits of that question, whatever else was asked.
+    """A study with the answers to questions and, if it has a sheet, with that about its speed as
+    the last one: the sheet is about the limits of that question, whatever else was asked.
     """
     study = replace(study, answers=[*map(ask, questions)])
     values = speed_values(study)
