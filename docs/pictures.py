@@ -36,8 +36,8 @@ COMMANDS = {
     "rain_nsga2_half.png": f"{PROGRAM} validate rain {PUBLISHED}/rain_nsga2_half.csv --plot {{}}",
     "lgsvl.png": f"{PROGRAM} validate lgsvl {PUBLISHED}/lgsvl_rs.csv --plot {{}}",
     "report.png": (
-        f"{PROGRAM} study autoware_july --runs 1 --evaluations 100 --quiet && "
-        f"{PROGRAM} report results/autoware_july --ask tolerance --out page.html && "
+        f"{PROGRAM} study native --runs 1 --evaluations 100 --quiet && "
+        f"{PROGRAM} report results/native --ask tolerance --out page.html && "
         f"chromium {SCREEN} --screenshot={{}} file://$PWD/page.html 2>/dev/null"
     ),
 }

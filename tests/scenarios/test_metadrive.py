@@ -21,8 +21,8 @@ if os.environ.get("SAFEVAR_METADRIVE") != "required":
 @pytest.fixture
 def page(in_tmp: Path) -> str:
     """The text below the class of the page, whose files are in the working directory."""
-    for name in ("my_metadrive.py", "curve.toml"):
-        Path(name).write_text(files_of(PAGE)[name])
+    Path("curve.toml").write_text(files_of(PAGE)["curve.toml"])
+    Path("my_metadrive.py").write_text((ROOT / "docs" / "my_metadrive.py").read_text())
     return (ROOT / PAGE).read_text().partition("<!-- learned driver -->")[2]
 
 
@@ -44,7 +44,7 @@ def test_the_calls_of_the_page_fit_the_client_of_carla(in_tmp: Path) -> None:
     """Of all calls only that is a fault which is misspelt here."""
     carla = pytest.importorskip("carla")
     Path("carla").symlink_to(Path(carla.__file__).parent)  # which does not say that it has types
-    source = files_of(PAGE)["my_carla.py"]
+    source = (ROOT / "docs" / "my_carla.py").read_text()
     Path("my_carla.py").write_text(source.replace(".load_world(", ".load_wurld("))
     printed = api.run(["--strict", "--config-file=", "my_carla.py"])[0]
     faults = re.findall("^my_carla.*error: (.*?);", printed, re.M)

@@ -92,7 +92,7 @@ def permit(
         Find the highest safe value of this speed, such as target_speed. Default: the speed of the
         vehicle.
     step
-        Difference between two tested speeds, of which the answer is a multiple.
+        Difference between two tested speeds. The answer is a multiple of it.
     margin
         Clearance to keep between bumpers, in metres. Default: the value of the study, else 0.3 m.
     unsafe
