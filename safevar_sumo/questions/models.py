@@ -16,7 +16,6 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import Judge
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.words import join_phrases
@@ -108,23 +107,6 @@ class Model(NamedTuple):
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
         """Which of M settings are unsafe, shape (M,)."""
         return self.robustness(settings, stage) < 0
-
-    def at_worst_points(self, settings: FloatArray, stage: str) -> Model:
-        """The model at the points of the study's matrix at which settings are worst; without a
-        matrix, and where encounters are ranges, as it is.
-        """
-        if len(self.characteristics.scenario):
-            return self
-        worst = self.evaluate(settings, stage).worst_points
-        if worst is None:
-            return self
-        numbers = np.unique(worst).tolist()
-        return self._replace(points=tuple(self.numbers_of_points[number] for number in numbers))
-
-
-def judges_of(models: Sequence[Model], stage: str) -> list[Judge]:
-    """What falsifies a claim in some models; progress is shown for `stage`."""
-    return [partial(model.robustness, stage=stage) for model in models]
 
 
 class Models(NamedTuple):
