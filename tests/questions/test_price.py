@@ -62,7 +62,7 @@ def test_joint_limits_of_few_simulations_are_safe_by_the_formula(rig: str) -> No
 
 def test_few_simulations_say_nothing_of_parts_that_were_not_asked_about(rig: str) -> None:
     answer = sv.tolerance(rig, characteristics=["decel"], simulations=100, pool=InlinePool())
-    assert "decel can make it unsafe alone." in answer.verdict
+    assert "decel can make the vehicle unsafe on its own." in answer.verdict
     assert "delay" not in answer.verdict
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import FURTHER_DIGITS, Failure, describe
 from safevar_sumo.questions.models import Model
@@ -88,9 +89,19 @@ class Told:
 
     @cached_property
     def box(self) -> Box | None:
-        """The joint limits."""
+        """The joint limits; none of few simulations if they leave a characteristic no room."""
         sides = self.limits.sides
-        return None if sides is None else self.box_of(sides)
+        is_of_use = sides is not None and (self.has_scan or not self.without_room)
+        return self.box_of(sides) if sides is not None and is_of_use else None
+
+    @property
+    def without_room(self) -> list[str]:
+        """The characteristics that could not change at all in the box that was found."""
+        boxes, sides = self.limits.boxes, self.limits.sides
+        if sides is None:
+            return []
+        is_closed = boxes.is_free.any(axis=0) & (sides.sum(axis=0) == 0)
+        return [self.members[column].name for column in np.flatnonzero(is_closed).tolist()]
 
     def box_of(self, sides: FloatArray) -> Box:
         """A box of vehicles as it is printed."""
@@ -138,8 +149,19 @@ class Told:
         if not (self.is_safe and self.has_scan):
             return None, None
         alone = self.limits.alone
-        ends = (float(alone.lower[column]), float(alone.upper[column]))
-        return self.members[column].rounded_inwards(ends)
+        low, high = (self._feasible(column, ends[column]) for ends in (alone.lower, alone.upper))
+        return self.members[column].rounded_inwards((low, high))
+
+    def _feasible(self, column: int, end: float) -> float:
+        """The last value on the way to a limit alone that satisfies the study's constraints."""
+        region = self.own.evaluator.region
+        start = region.characteristics.original_settings
+        setting = start.copy()
+        setting[0, column] = end
+        if region.feasible(setting)[0]:
+            return float(end)
+        line = find_boundaries(start, setting, lambda rows: ~region.feasible(rows))
+        return float(line.safe[0, column])
 
     def given(self, column: int) -> tuple[float | None, float | None]:
         """The specified limit."""

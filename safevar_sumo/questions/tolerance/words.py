@@ -157,19 +157,21 @@ def _box_in_words(told: Told) -> Iterator[str]:
             "The limits were computed with one parameter set of the vehicle model; the study's"
             " other sets were not tried."
         )
-    is_closed = (told.asked.domain > 0).any(axis=0) & (told.box.lower == told.box.upper)[
-        : len(told.members)
-    ]
-    is_closed &= found.boxes.is_free.any(axis=0)
-    if is_closed.any():
-        names = [told.members[column].name for column in np.flatnonzero(is_closed).tolist()]
-        yield f"No room was found for {join_phrases(names)}: they stay as in the original."
+    if told.without_room:
+        names = join_phrases(told.without_room)
+        yield f"No room was found for {names}: they stay as in the original."
 
 
 def _no_box_in_words(told: Told) -> Iterator[str]:
     """That no joint limits were found."""
     if not np.isnan(told.asked.given).all() and not told.is_rough:
         yield "The specified limits hold with all other characteristics as in the original."
+    if told.without_room:
+        yield (
+            "The simulations found no joint limits of use, because no safe change of"
+            f" {join_phrases(told.without_room)} was found beside the others."
+        )
+        return
     boxes = number_of(told.limits.known.boxes, "operating range")
     if told.limits.known.boxes:
         yield (
