@@ -22,7 +22,7 @@ from safevar_sumo.questions.pairs import SIDES
 from safevar_sumo.questions.repair.price import benign_scenes, drive_new_cars, needless_braking
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
-from safevar_sumo.questions.tolerance.asked import asked_of
+from safevar_sumo.questions.tolerance.asked import Asked, asked_of
 from safevar_sumo.questions.tolerance.search import alone_with_own_set
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
@@ -128,10 +128,13 @@ def limits_of_both(
     """The table of limits alone with the study's own set, as in `tolerance`, within the user's
     limits; no interval where the original is unsafe.
     """
-    alone = [
-        _safe_alone(side, unsafe, at_tests=at_tests)
+    asked = [
+        _asked_alone(side, unsafe, at_tests=at_tests)
         for side, unsafe in zip(evaluators, criteria, strict=True)
     ]
+    # Few simulations search both alike: what the first one takes does not shrink the second.
+    effort = min((one.effort for one in asked), key=lambda effort: effort.own)
+    alone = [_safe_alone(one._replace(effort=effort)) for one in asked]
     rows = []
     vehicles = [side.characteristics.vehicle for side in evaluators]
     for a, b, *safe in zip(*vehicles, *alone, strict=True):
@@ -150,16 +153,21 @@ def limits_of_both(
     )
 
 
-def _safe_alone(evaluator: Evaluator, unsafe: Unsafe, *, at_tests: bool) -> list[Interval | None]:
-    """What is safe of each characteristic alone, rounded inwards; None if the original is not."""
-    members = evaluator.characteristics
+def _asked_alone(evaluator: Evaluator, unsafe: Unsafe, *, at_tests: bool) -> Asked:
+    """The limits alone that are sought in a system."""
     models = Models((Model(0, evaluator, unsafe),), ())
-    if unsafe.of(evaluator.evaluate(members.original_settings, "original vehicle"))[0]:
-        return [None] * len(members.vehicle)
-    asked = asked_of(models, unsafe, range(len(members.vehicle)), {}, at_tests=at_tests)
+    columns = range(len(evaluator.characteristics.vehicle))
+    return asked_of(models, unsafe, columns, {}, at_tests=at_tests)
+
+
+def _safe_alone(asked: Asked) -> list[Interval | None]:
+    """What is safe of each characteristic alone, rounded inwards; None if the original is not."""
+    own, members = asked.oracle.own, asked.oracle.vehicle.members
+    if own.are_unsafe(own.characteristics.original_settings, "original vehicle")[0]:
+        return [None] * len(members)
     alone = alone_with_own_set(asked)
     ends = zip(alone.lower.tolist(), alone.upper.tolist(), strict=True)
-    return [item.rounded_inwards(end) for item, end in zip(members.vehicle, ends, strict=True)]
+    return [item.rounded_inwards(end) for item, end in zip(members, ends, strict=True)]
 
 
 def _within(safe: Interval | None, ends: Interval) -> Interval | None:

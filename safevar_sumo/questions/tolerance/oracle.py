@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.between import MovingTest, moving_tests
 from safevar_sumo.questions.models import Model
@@ -22,7 +23,7 @@ from safevar_sumo.sumo.simulators import simulations_of_setting
 STAGE = "limits"
 
 
-class Exhausted(Exception):
+class Exhausted(InputError):
     """Fewer simulations may follow than are asked for."""
 
 
@@ -124,7 +125,8 @@ class Oracle:
         """What each of M cases leaves; NaN where it could not be simulated."""
         # Simulations of the original vehicle may follow.
         if (1 + self._tries_originals) * len(cases) > self.available:
-            raise Exhausted
+            problem = "too few are left for the limits"
+            raise Exhausted("simulations", problem, "a larger number")
         n = len(self.vehicle)
         robustness = np.full(len(cases), np.inf)
         numbers = np.floor(cases[:, n]).astype(int)
