@@ -14,7 +14,6 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.between import MovingTest, moving_tests
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.scope import points_of_tests
 from safevar_sumo.questions.tolerance.cases import Space
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import PHASE
@@ -221,18 +220,14 @@ def worlds_of(model: Model, new_car: Unsafe, *, between: bool) -> list[CaseWorld
     """The worlds of a parameter set: each test that moves, and all other points together. A test
     moves only with a study that is not rated.
     """
-    evaluator = model.evaluator
     moving = moving_tests(model, new_car) if between else []
     worlds = [CaseWorld(test.model.in_phases or test.model, test) for test in moving]
     names = {test.test.name for test in moving}
-    standing = list[int]()
-    first = 0
-    for test, points in points_of_tests(evaluator.study, evaluator.system.points):
-        if test is None or test.name not in names:
-            standing += range(first, first + len(points))
-        first += len(points)
-    if standing:
-        is_whole = len(standing) == first
-        rest = model._replace(points=None if is_whole else tuple(standing))
-        worlds.append(CaseWorld(rest.in_phases or rest))
+    evaluator = model.evaluator
+    standing = [test for test in evaluator.study.tests if test.name not in names]
+    if moving and standing:
+        study = evaluator.study.with_tests(standing)
+        model = model._replace(evaluator=evaluator.for_study(study, verified=0))
+    if standing or not moving:
+        worlds.append(CaseWorld(model.in_phases or model))
     return worlds
