@@ -188,13 +188,9 @@ def tolerance(
         up_to=up_to,
         tests_left_out=names_left_out(whole.study, study),
     )
-    ranges = None
-    if is_safe and not told.is_rough:
-        with evaluator.phases.stage(RANGES_STAGE):
-            ranges = _in_ranges(asked, evaluator, found)
-    nearest = None
-    if told.broken and is_safe and not is_few:
-        nearest = nearest_limits(last, found)
+    ranges = _in_ranges(asked, evaluator, found) if is_safe and not told.is_rough else None
+    has_nearest = told.broken and is_safe and not is_few
+    nearest = nearest_limits(last, found) if has_nearest else None
     return answer_limits(told, nearest, ranges)
 
 
@@ -284,10 +280,11 @@ def _in_ranges(asked: LimitsQuestion, evaluator: Evaluator, limits: FoundLimits)
     there = _asked_of(asked._replace(unsafe=unsafe, subject=study, whole=other), other)
     rngs = [Stream.WIDER_SCOPE.generator(other.seed, fit) for fit in there.fits]
     space = there.boxes(there.domain).cases_in(sides)
-    attacks = [
-        there.search(fit, there.budget(fit), rng)(space, there.nothing)
-        for fit, rng in zip(there.fits, rngs, strict=True)
-    ]
+    with evaluator.phases.stage(RANGES_STAGE):
+        attacks = [
+            there.search(fit, there.budget(fit), rng)(space, there.nothing)
+            for fit, rng in zip(there.fits, rngs, strict=True)
+        ]
     return InRanges(there, unsafe, attacks)
 
 
