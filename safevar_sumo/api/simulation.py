@@ -15,7 +15,7 @@ import numpy as np
 
 from safevar_sumo.errors import about
 from safevar_sumo.metrics import IMPACT_EXCESS, IMPACT_SPEED, Scoring, impact_in_words
-from safevar_sumo.metrics.unsafe import runs_in_words
+from safevar_sumo.metrics.words import runs_in_words
 from safevar_sumo.questions.between import with_set_axes
 from safevar_sumo.questions.words import OUTCOME_VERBS, collision_in_words
 from safevar_sumo.records import (

@@ -29,9 +29,9 @@ from safevar_sumo.metrics.measures import (
 from safevar_sumo.metrics.unsafe import (
     CriterionLike as CriterionLike,
     Unsafe as Unsafe,
-    impact_in_words as impact_in_words,
     margin_of as margin_of,
 )
+from safevar_sumo.metrics.words import impact_in_words as impact_in_words
 
 METRICS = {metric.name: metric for metric in (SAFETY_DEGREE_METRIC, TET, TIT, AVE_DECE)}
 OPTIONAL_METRICS = {

@@ -28,8 +28,8 @@ def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatAr
     end = np.argmax(is_pressed, axis=0)
     samples = np.clip([end - 1, end, end + 1], 0, len(pedal) - 1)
 
-    # Its share with brake force: 1 unless the pedal has a part of the first command there and all
-    # of it a step later. Where the tyres limit the force, the loss of speed says more.
+    # The share of this step with brake force is 1 unless the pedal has a part of the first command
+    # there and all of it a step later. The loss of speed says more where tyres limit the force.
     first_command = trace.brake[
         np.argmax(trace.brake > pedal[0] + PEDAL_ROUNDING, axis=0), vehicles
     ]

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
@@ -16,15 +16,14 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import F_SAFE
 from safevar_sumo.metrics.legal import IMPACT_EXCESS, IMPACT_SPEED
 from safevar_sumo.metrics.measures import UNSAFE_SHARE
-from safevar_sumo.records import (
-    KMH_PER_MS,
-    BoolArray,
-    Evaluations,
-    FloatArray,
-    Outcome,
-    Quantity,
-    TextArray,
+from safevar_sumo.metrics.words import (
+    degree_in_words,
+    impact_in_words,
+    runs_in_words,
+    unit_of_degree,
+    value_on_side,
 )
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome, Quantity, TextArray
 from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.study.schema import Tables
 
@@ -52,8 +51,6 @@ SHARE_DECIMALS = 9
 """Decimals of a sum of shares."""
 LEAST = 1e-9
 """The least by which what is unsafe is beyond a limit, in its unit."""
-ALLOWED_ROUNDING = 0.01
-"""Allowed speed of an impact below which none is allowed [km/h]."""
 
 
 class MetricBound(NamedTuple):
@@ -70,15 +67,27 @@ class MetricBound(NamedTuple):
     def worst_is_largest(self) -> bool:
         return self.comparison.startswith(">")
 
+    @property
+    def sign(self) -> int:
+        """1 where small values are unsafe, -1 where large ones are."""
+        return 1 - 2 * self.worst_is_largest
+
 
 @dataclass(frozen=True)
 class Unsafe:
     """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with
     `below`, a collision, or a clearance below this limit [m]; with a `degree`, a safety degree of
     the study below this limit [m, or -m/s]; with a `bound`, another metric beyond a limit, or a
-    collision.
+    collision. Each of these kinds is a class of its own.
 
     `contact` is the safety degree at which bodies touch [m]: 0, or how far middles are apart then.
+
+    Examples
+    --------
+    >>> Unsafe(below=0.3).description
+    'collision, or clearance below 0.3 m'
+    >>> Unsafe.parse("drac > 6").description
+    'drac > 6, or a collision'
     """
 
     below: float | None = None
@@ -89,100 +98,64 @@ class Unsafe:
     is_half: bool = field(default=False, compare=False, repr=False)
     """Whether `degree` is half of the original's safety degree, the default if nothing collides."""
 
+    is_collision = True
+    """Whether a collision alone, or less distance than `keep`, is unsafe."""
+    verbs = "collides", "collide"
+    """What an unsafe vehicle does, and what several do, in short."""
+    option = "--margin"
+    """The option by which a user asks for less."""
+    is_of_impacts = False
+    """Whether a bound on the impact decides, which may be allowed."""
+
+    def __new__(cls, below: float | None = None, **fields: Any) -> Self:
+        """An object of the class of its kind."""
+        kind: type = cls
+        if bound := fields.get("bound"):
+            kind = METRIC_KINDS.get(bound.measure, UnsafeMetric)
+        elif fields.get("degree") is not None:
+            kind = UnsafeDegree
+        elif below is not None:
+            kind = UnsafeClearance
+        return object.__new__(kind)
+
     def __str__(self) -> str:
-        if self.bound is not None:
-            return str(self.bound)
-        if self.degree is not None:
-            return f"{SAFETY_DEGREE} < {self.degree!r}"
-        if self.below is not None:
-            return f"below={self.below!r}"
         return COLLISION
 
     @property
     def measure(self) -> str:
         """The column that decides: a metric, or the safety degree."""
-        if self.bound is None:
-            return F_SAFE.name
-        return self.bound.measure
-
-    @property
-    def is_collision(self) -> bool:
-        """Whether a collision alone, or less distance than `keep`, is unsafe."""
-        return self.below is None and self.degree is None and self.bound is None
+        return F_SAFE.name
 
     @property
     def distance(self) -> float:
         """The clearance below which a vehicle is unsafe [m], between bumpers; 0 if a collision
         alone is.
         """
-        if self.below is None:
-            return self.keep
-        return self.below
+        return self.keep
 
     @property
     def limit(self) -> float:
         """What is limited: a safety degree, or the value of a metric."""
-        if self.bound is not None:
-            return self.bound.limit
-        if self.degree is not None:
-            return self.degree
         return self.contact + self.distance
-
-    @property
-    def is_of_impacts(self) -> bool:
-        """Whether a bound on the impact decides, which may be allowed."""
-        return self.measure == IMPACT_EXCESS.name
-
-    @property
-    def _stands_alone(self) -> bool:
-        """Whether a collision is not unsafe in itself."""
-        return self.is_of_impacts or self._is_of_shares
-
-    @property
-    def _is_of_shares(self) -> bool:
-        """Whether a bound on the share of unsafe runs decides."""
-        return self.measure == UNSAFE_SHARE.name
 
     @property
     def worst(self) -> Callable[..., float]:
         """Which of several values is the worst: `min`, or `max` where a bound forbids large
         ones.
         """
-        if self._worst_is_largest:
-            return max
         return min
-
-    @property
-    def _worst_is_largest(self) -> bool:
-        return self.bound is not None and self.bound.worst_is_largest
 
     @property
     def description(self) -> str:
         """The criterion in words, rounded: `collision, or clearance below 0.3 m`, `safety degree
         below 1.4 m, half of the original's`, `drac > 6, or a collision`.
         """
-        if self._stands_alone:
-            return str(self.bound)
-        if self.bound is not None:
-            return f"{self.bound}, or a collision"
-        if self.degree is not None:
-            words = f"safety degree below {_degree_in_words(self.degree)}"
-            if self.is_half:
-                words += ", half of the original's"
-            return words
         if not self.distance:
             return COLLISION
-        words = f"collision, or clearance below {self.distance:g} m"
+        clearance = f"collision, or clearance below {self.distance:g} m"
         if self.contact:
-            words += ", from bumper to bumper"
-        return words
-
-    @property
-    def verbs(self) -> tuple[str, str]:
-        """What an unsafe vehicle does, and what several do, in short."""
-        if self.is_collision:
-            return "collides", "collide"
-        return "is unsafe", "are unsafe"
+            clearance += ", from bumper to bumper"
+        return clearance
 
     def number_in_words(self, number: float) -> str:
         """How many vehicles are unsafe: `1,234 collide`, `none is unsafe (drac > 6, or a
@@ -195,18 +168,12 @@ class Unsafe:
             counted = f"{number:,.1f}"
         if self.is_collision and not self.keep:
             return f"{counted} {self.verbs[number > 1]}"
-        verb = ("is", "are")[number > 1]
-        return f"{counted} {verb} unsafe ({self.description})"
+        return f"{counted} {UnsafeStated.verbs[number > 1]} ({self.description})"
 
     @property
     def remark(self) -> str:
         """What to know of a screening limit, in a sentence; empty for any other criterion."""
-        if not self.is_half:
-            return ""
-        return (
-            "Remark: No vehicle collided, so this limit stands in for a collision; --unsafe"
-            " collision counts collisions alone."
-        )
+        return ""
 
     def smaller_demand(self, original: Evaluations) -> str:
         """What to do where the original does not meet the criterion; "" if it collides, and a
@@ -214,21 +181,7 @@ class Unsafe:
         """
         if self.is_collision and (not self.keep or original.collided[0]):
             return ""
-        option = "--unsafe"
-        if self.is_collision:
-            option = "--margin"
-        return f"Ask again with a weaker criterion ({option})."
-
-    @property
-    def in_words(self) -> str:
-        """What an unsafe vehicle does: `collides`, `has drac > 6`."""
-        if self.bound is not None:
-            return f"has {self.bound}"
-        if self.below is not None:
-            return f"keeps less than {self.below:.3g} m of clearance"
-        if self.degree is not None:
-            return f"has a safety degree below {self.degree:.3g}"
-        return "collides"
+        return f"Ask again with a weaker criterion ({self.option})."
 
     def of(self, evaluations: Evaluations) -> BoolArray:
         """Which evaluations are unsafe; shape (M,). An undefined measure is not, a collision is by
@@ -244,8 +197,6 @@ class Unsafe:
         return np.stack([self._holds(repeat.outcome, repeat.column) for repeat in rounds])
 
     def _rounds(self, evaluations: Evaluations) -> list[Evaluations]:
-        if self._is_of_shares:
-            return [evaluations]
         return evaluations.rounds or [evaluations]
 
     def number(self, evaluations: Evaluations) -> float:
@@ -262,15 +213,7 @@ class Unsafe:
         return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
 
     def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
-        if self.degree is not None:
-            return column(F_SAFE.name) < self.degree
         collides = outcome == COLLISION
-        if self.bound is not None:
-            name, comparison, limit = self.bound
-            is_beyond = COMPARISONS[comparison](column(name), limit)
-            if self._stands_alone:
-                return is_beyond
-            return collides | is_beyond
         if not self.distance:
             return collides
         return collides | (column(F_SAFE.name) < self.limit)
@@ -278,40 +221,29 @@ class Unsafe:
     def robustness(self, evaluations: Evaluations) -> FloatArray:
         """How far evaluations are from the limit, in its unit, shape (M,): below 0 where they are
         unsafe; infinite where the measure is undefined; on a collision by a bound, minus the speed
-        of the collision.
+        of the collision. Of repeats the worst counts.
         """
         rounds = self._rounds(evaluations)
         return np.asarray(np.min([self._robustness(repeat) for repeat in rounds], axis=0))
 
     def _robustness(self, evaluations: Evaluations) -> FloatArray:
-        if self.bound is None:
-            robustness = evaluations.f_safe - self.limit
-        else:
-            robustness = evaluations.column(self.bound.measure) - self.limit
-            if self._worst_is_largest:
-                robustness = -robustness
-            if not self._stands_alone:
-                robustness = np.where(evaluations.collided, evaluations.f_safe, robustness)
+        robustness = self._excess(evaluations)
         robustness = np.where(np.isnan(robustness), np.inf, robustness)
         is_unsafe = self._holds(evaluations.outcome, evaluations.column)
         return np.where(is_unsafe, np.minimum(robustness, -LEAST), np.maximum(robustness, 0.0))
+
+    def _excess(self, evaluations: Evaluations) -> FloatArray:
+        """By how much evaluations are on the safe side of the limit; NaN where undefined."""
+        return evaluations.f_safe - self.limit
 
     def value(self, robustness: float) -> float:
         """What has a robustness: a distance between bumpers [m], or the value that is
         limited.
         """
-        if self._worst_is_largest:
-            return self.limit - robustness
-        if self.bound is None and self.degree is None:
-            return self.distance + robustness
-        return self.limit + robustness
+        return self.distance + robustness
 
     def value_in_words(self, value: float) -> str:
         """What a safe vehicle has: `keeps 0.31 m of clearance`, `has drac 5.9`."""
-        if self.bound is not None:
-            return f"has {self.bound.measure} {value:.3g}"
-        if self.degree is not None:
-            return f"has a safety degree of {_degree_in_words(value)}"
         return f"keeps {value:.2f} m of clearance"
 
     def breach_in_words(self, vehicle: Evaluations) -> str:
@@ -322,23 +254,9 @@ class Unsafe:
 
     def _breach_in_words(self, vehicle: Evaluations) -> str:
         degree = float(vehicle.f_safe[0])
-
-        if self.is_of_impacts and vehicle.collided[0]:
-            columns = (vehicle.column(name)[0] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
-            return f"has an {impact_in_words(*columns)}"
-        if self.bound is not None:
-            measure, comparison, limit = self.bound
-            value = float(vehicle.column(measure)[0])
-            if COMPARISONS[comparison](value, limit):
-                text = _on_its_side(value, limit, "g", 3)
-                return f"has {measure} {text} {comparison} {limit:.12g}"
-        if self.degree is not None and (degree >= 0 or self.degree < 0):
-            unit = _unit_of(degree)
-            text = _on_its_side(degree, self.degree, "g", 3)
-            return f"has a safety degree of {text} {unit}, below {self.degree:.3g} {unit}"
         if vehicle.collided[0]:
             return f"collides at {abs(degree):.2f} m/s"
-        clearance = _on_its_side(degree - self.contact, self.distance, "f", 2)
+        clearance = value_on_side(degree - self.contact, self.distance, "f", 2)
         return f"keeps {clearance} m of clearance, less than {self.distance:g} m"
 
     @classmethod
@@ -355,7 +273,6 @@ class Unsafe:
             return criterion
         if criterion == COLLISION:
             return cls()
-
         text = str(criterion)
         if isinstance(criterion, float | int):
             text = f"below={float(criterion)!r}"
@@ -421,50 +338,168 @@ class Unsafe:
         return unsafe
 
 
-def runs_in_words(fails: BoolArray) -> str:
-    """In how many runs of a setting it is unsafe, shape (R,), with the exact interval (Clopper and
-    Pearson) of their share; "" if there is a single run.
-    """
-    # This module takes a second to load.
-    import scipy
+class UnsafeStated(Unsafe):
+    """A criterion that a user states."""
 
-    if len(fails) < 2:
-        return ""
-    count = int(fails.sum())
-    low, high = scipy.stats.binomtest(count, len(fails)).proportion_ci(method="exact")
-    interval = f"95 % confidence interval {100 * low:.0f} to {100 * high:.0f} %"
-    return f" in {count} of {len(fails)} runs ({interval})"
+    is_collision = False
+    verbs = "is unsafe", "are unsafe"
+    option = "--unsafe"
 
 
-def impact_in_words(speed: float, excess: float) -> str:
-    """An impact [m/s] and its excess, such as `impact at 12 km/h where 15 is allowed`."""
-    allowed_speed = KMH_PER_MS * (speed - excess)
-    words = "none"
-    if allowed_speed >= ALLOWED_ROUNDING:
-        words = f"{allowed_speed:.3g}"
-    return f"impact at {KMH_PER_MS * speed:.3g} km/h where {words} is allowed"
+class UnsafeClearance(UnsafeStated):
+    """A collision, or a clearance below a limit."""
+
+    below: float
+
+    def __str__(self) -> str:
+        return f"below={self.below!r}"
+
+    @property
+    def distance(self) -> float:
+        """The limit [m]."""
+        return self.below
 
 
-def _unit_of(degree: float) -> str:
-    """The unit of a safety degree, which is minus a speed on a collision."""
-    if degree >= 0:
-        return "m"
-    return "m/s"
+class UnsafeDegree(UnsafeStated):
+    """A safety degree below a limit."""
+
+    degree: float
+
+    def __str__(self) -> str:
+        return f"{SAFETY_DEGREE} < {self.degree!r}"
+
+    @property
+    def limit(self) -> float:
+        """The limit [m, or -m/s]."""
+        return self.degree
+
+    @property
+    def description(self) -> str:
+        """Such as `safety degree below 1.4 m, half of the original's`."""
+        words = f"safety degree below {degree_in_words(self.degree)}"
+        if self.is_half:
+            words += ", half of the original's"
+        return words
+
+    @property
+    def remark(self) -> str:
+        """What to know of a screening limit."""
+        if not self.is_half:
+            return ""
+        return (
+            "Remark: No vehicle collided, so this limit stands in for a collision; --unsafe"
+            " collision counts collisions alone."
+        )
+
+    def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
+        return column(F_SAFE.name) < self.degree
+
+    def value(self, robustness: float) -> float:
+        """The safety degree that has a robustness [m, or -m/s]."""
+        return self.degree + robustness
+
+    def value_in_words(self, value: float) -> str:
+        """Such as `has a safety degree of 1.5 m`."""
+        return f"has a safety degree of {degree_in_words(value)}"
+
+    def _breach_in_words(self, vehicle: Evaluations) -> str:
+        degree = float(vehicle.f_safe[0])
+        # A collision is below a limit that is a distance whatever its speed.
+        if degree < 0 <= self.degree:
+            return super()._breach_in_words(vehicle)
+        unit = unit_of_degree(degree)
+        text = value_on_side(degree, self.degree, "g", 3)
+        return f"has a safety degree of {text} {unit}, below {self.degree:.3g} {unit}"
 
 
-def _degree_in_words(degree: float) -> str:
-    """A safety degree with its unit."""
-    return f"{degree:.3g} {_unit_of(degree)}"
+class UnsafeMetric(UnsafeStated):
+    """A metric beyond a limit, or a collision."""
+
+    bound: MetricBound
+    stands_alone = False
+    """Whether a collision is not unsafe in itself."""
+
+    def __str__(self) -> str:
+        return str(self.bound)
+
+    @property
+    def measure(self) -> str:
+        """The metric."""
+        return self.bound.measure
+
+    @property
+    def limit(self) -> float:
+        """The limit, in the unit of the metric."""
+        return self.bound.limit
+
+    @property
+    def worst(self) -> Callable[..., float]:
+        """`max` where large values are unsafe, else `min`."""
+        if self.bound.worst_is_largest:
+            return max
+        return min
+
+    @property
+    def description(self) -> str:
+        """Such as `drac > 6, or a collision`."""
+        if self.stands_alone:
+            return str(self.bound)
+        return f"{self.bound}, or a collision"
+
+    def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
+        if self.stands_alone:
+            return self._is_beyond(column)
+        return (outcome == COLLISION) | self._is_beyond(column)
+
+    def _is_beyond(self, column: Callable[[str], Quantity]) -> Quantity:
+        measure, comparison, limit = self.bound
+        return COMPARISONS[comparison](column(measure), limit)
+
+    def _excess(self, evaluations: Evaluations) -> FloatArray:
+        excess = self.bound.sign * (evaluations.column(self.measure) - self.limit)
+        if self.stands_alone:
+            return excess
+        return np.where(evaluations.collided, evaluations.f_safe, excess)
+
+    def value(self, robustness: float) -> float:
+        """The value of the metric that has a robustness."""
+        return self.limit + self.bound.sign * robustness
+
+    def value_in_words(self, value: float) -> str:
+        """Such as `has drac 5.9`."""
+        return f"has {self.measure} {value:.3g}"
+
+    def _breach_in_words(self, vehicle: Evaluations) -> str:
+        if not self._is_beyond(vehicle.column)[0]:
+            return super()._breach_in_words(vehicle)
+        measure, comparison, limit = self.bound
+        value = value_on_side(float(vehicle.column(measure)[0]), limit, "g", 3)
+        return f"has {measure} {value} {comparison} {limit:.12g}"
 
 
-def _on_its_side(value: float, limit: float, kind: str, digits: int) -> str:
-    """A value with so many digits, or as few more as keep it on its side of a limit."""
-    side = np.sign(value - limit)
-    for number in range(digits, 17):
-        text = f"{value:.{number}{kind}}"
-        if np.sign(float(text) - limit) == side:
-            return text
-    return repr(value)
+class UnsafeImpact(UnsafeMetric):
+    """A bound on the impact, which may be allowed."""
+
+    is_of_impacts = stands_alone = True
+
+    def _breach_in_words(self, vehicle: Evaluations) -> str:
+        if not vehicle.collided[0]:
+            return super()._breach_in_words(vehicle)
+        columns = (vehicle.column(name)[0] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
+        return f"has an {impact_in_words(*columns)}"
+
+
+class UnsafeShare(UnsafeMetric):
+    """A bound on the share of unsafe runs."""
+
+    stands_alone = True
+
+    def _rounds(self, evaluations: Evaluations) -> list[Evaluations]:
+        return [evaluations]
+
+
+METRIC_KINDS = {IMPACT_EXCESS.name: UnsafeImpact, UNSAFE_SHARE.name: UnsafeShare}
+"""The classes of criteria by a metric that are not `UnsafeMetric`."""
 
 
 def margin_of(study: Study, margin: float | None) -> float:

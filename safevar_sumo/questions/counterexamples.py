@@ -153,7 +153,8 @@ def as_printed(
 
 def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     """How those of M settings fail that are unsafe, by their row."""
-    points = model.evaluator.system.points
+    everywhere = model.evaluator.system.points
+    points = [everywhere[number] for number in model.numbers_of_points]
     members = model.characteristics
     runs = model.evaluate(settings, STAGE)
     is_unsafe = model.evaluator.region.feasible(settings) & (model.robustness_by(runs) < 0)
@@ -162,6 +163,8 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     for row in np.flatnonzero(is_unsafe).tolist():
         point = points[runs.points[row]]
         values = members.scenario.named(settings[row, ~members.of_vehicle])
+        if runs.settings.shape[1] > len(members):
+            values[PHASE] = float(runs.settings[row, -1])
         scenario = encounter(point, values).scenario
         how = _failure_in_words(
             scenario, model.unsafe, bool(runs.collided[row]), float(runs.f_safe[row])
@@ -191,6 +194,8 @@ def _command(model: Model, setting: FloatArray, point: Point, values: Mapping[st
         for name, value in point.parameters
         if name in searchable_in(point.scenario) and isinstance(value, int | float)
     }
+    if PHASE in values and PHASE not in members.names:
+        axes[PHASE] = values[PHASE]
     words = [system.command, members.options(setting)]
     words += [f"--set {name}={value!r}" for name, value in axes.items()]
     words += [f"--fit {model.fit}"] * (model.fit > 0)
@@ -238,7 +243,7 @@ def texts_of(point: Point, values: JsonObject) -> dict[str, str]:
 def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:
     """A failure at a safety degree, such as `the car hits a pedestrian at 12 km/h`."""
     if unsafe.bound is not None and not collided:
-        return f"the car {unsafe.in_words}"
+        return f"the car has {unsafe.bound}"
     if collided:
         impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
         impact = "" if impact_speed < 1 else f" at {float(f'{impact_speed:.2g}'):g} km/h"

@@ -115,8 +115,11 @@ class Evaluations:
                 for name in self.metrics
                 if f"{name}{end}" in self.metrics
             }
-            safe_outcome = np.where(self.collided, "", self.outcome)
-            outcome = np.where(metrics[SAFETY_DEGREE] < 0, Outcome.COLLISION.value, safe_outcome)
+            outcome = np.where(
+                metrics[SAFETY_DEGREE] < 0,
+                Outcome.COLLISION.value,
+                np.where(self.collided, "", self.outcome),
+            )
             rounds.append(replace(self, outcome=outcome, metrics={**self.metrics, **metrics}))
         return rounds
 

@@ -282,7 +282,7 @@ class SimulationRuns:
         gap_before = trace.gap[sample_before, vehicles]
         gap_after = trace.gap[last_sample, vehicles]
 
-        # Contact within the step, at the speed that an even deceleration leads to there.
+        # A gap that closes within the step leads to contact at the speed of an even deceleration.
         gap_closes = (
             (gap_before > -TOUCH_OVERLAP)
             & np.isfinite(gap_before)

@@ -92,9 +92,12 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         without a number in range.
     """
     try:
-        file = BytesIO(read_file(path))
         lines = pd.read_csv(
-            file, dtype=str, skipinitialspace=True, skip_blank_lines=False, encoding="utf-8-sig"
+            BytesIO(read_file(path)),
+            dtype=str,
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            encoding="utf-8-sig",
         )
         if not isinstance(lines.index, pd.RangeIndex):
             raise ValueError("rows have more values than the header has columns")

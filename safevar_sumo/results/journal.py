@@ -114,16 +114,12 @@ class Journal:
         self.path = path
         self._characteristics = head["characteristics"]
         self._file = open_and_lock(path)
-
-        # What the journal has, without a torn end.
         try:
             with disk_errors(path, "read"):
                 self._file.seek(0)
                 self.content = _read(self._file.read(), path, head, until_failure=retry_failed)
                 self._file.truncate(self.content.size)
             self._checksum = self.content.checksum
-
-            # A new journal begins with its head.
             if not self.content.size:
                 text = msgspec.json.encode(head)
                 self._checksum = zlib.crc32(text)

@@ -83,8 +83,11 @@ def load_runs(directory: str | Path) -> StoredResults:
     study = manifest["study"]
     characteristics = [*convert_table(study, Study).domains]
     if "imported" in manifest:
-        no_evaluations = evaluations_frame(characteristics, []).assign(evaluation=0)
-        return StoredResults(manifest, no_evaluations, read_imported(folder, characteristics))
+        return StoredResults(
+            manifest,
+            evaluations_frame(characteristics, []).assign(evaluation=0),
+            read_imported(folder, characteristics),
+        )
 
     evaluations_of_runs = []
     solutions_of_runs = []

@@ -105,8 +105,13 @@ def weather_of(choice: str | Weather) -> Weather:
         return choice
     # A simulator of the user's own has no weather.
     choice = choice or "clear"
-    fields = ", ".join(Weather.__struct_fields__)
-    check_name("", f"weather = {choice!r}", choice, WEATHERS, f", or a table with {fields}")
+    check_name(
+        "",
+        f"weather = {choice!r}",
+        choice,
+        WEATHERS,
+        f", or a table with {', '.join(Weather.__struct_fields__)}",
+    )
     return WEATHERS[choice]
 
 

@@ -315,8 +315,6 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         """
         closing_speed = self.test_speed - self._target_speed
         gap = self.gap
-
-        # A target at constant speed.
         if not self._target_brakes:
             if np.any(closing_speed <= 0):
                 raise InputError(
@@ -326,7 +324,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
                 )
             return gap / closing_speed
 
-        # A target that brakes: what is left of the gap, before, in and after braking.
+        # The gap may end before the target brakes, while it does, or after it has braked.
         gap_at_braking = gap - closing_speed * self.brakes_at
         b = self.target_deceleration
         speed_lost = self._target_speed - self.target_speed_at(math.inf)
@@ -335,8 +333,6 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         after_braking = (
             self.brakes_at + speed_lost / b + gap_after_braking / (closing_speed + speed_lost)
         )
-
-        # The time to impact in the phase in which the gap ends.
         root = np.sqrt(closing_speed * closing_speed + 2 * b * gap_at_braking)
         in_braking = self.brakes_at + (root - closing_speed) / b
         braking = np.where(gap_at_braking > closed_by_braking, after_braking, in_braking)

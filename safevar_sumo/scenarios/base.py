@@ -105,8 +105,6 @@ def check_fields(code: UserCode, scenario: Any, **further: Legal) -> None:
             quoted(scenario),
             "an object with the attribute network, a folder's name or path",
         )
-
-    # What a scenario may state.
     legal = {
         "duration": Legal(0.0, MAX_DURATION, above=True),
         "grade": Legal(-MAX_GRADE, MAX_GRADE),

@@ -95,7 +95,6 @@ class _Start(NamedTuple):
         InputError
             If the target cannot reach the impact location in time.
         """
-        # The target's side, speed and place of impact.
         lateral_start = test.parameter("lateral_start")
         speed = test.parameter("target_speed") * KMH
         side, direction = -1.0, FROM_LEFT
@@ -103,8 +102,6 @@ class _Start(NamedTuple):
             side, direction = 1.0, FROM_RIGHT
         direction = direction.turned(test.heading)
         impact_lateral = lateral_offset(test.impact_location, test.vut_width)
-
-        # A target that starts at its speed, or accelerates from standstill.
         if lateral_start is None:
             if test.acceleration_distance is not None:
                 raise InputError(
@@ -123,8 +120,6 @@ class _Start(NamedTuple):
                 TIME_TO_IMPACT, np.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP
             )
             profile = TargetProfile.with_arrival(distance, time - test.lead, speed, run_up)
-
-        # Where it meets the vehicle.
         extent = direction.extent(BODIES[test.parameter("target")])
         return cls(side, direction, extent, side * impact_lateral, distance, time, profile)
 
@@ -256,7 +251,6 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """The target, which moves past the place of the impact, and the parked cars, if any."""
-        # The target's way over time; on foot it stops beyond the path.
         start = _Start.of(self)
         target = self.parameter("target")
         way = start.profile.travelled(times)
@@ -265,8 +259,6 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             end = start.distance_to_impact + self.stop - start.side * start.impact_left
         path = np.minimum(way, end) - start.distance_to_impact
         speed = np.where(way < end, start.profile.speed_at(times), 0.0)
-
-        # Where it meets the front of the vehicle.
         impact = self.start_speed * start.time_to_impact + start.extent.length / 2
         x = impact + start.direction.along * path
         y = start.impact_left + start.direction.left * path

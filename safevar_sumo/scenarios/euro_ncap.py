@@ -122,8 +122,6 @@ class TargetProfile(NamedTuple):
                 f"acceleration_distance = {run_up:g} m is longer than the distance of"
                 f" {np.min(distance):g} m",
             )
-
-        # It starts so that it arrives in time.
         shortest_time = (distance + run_up) / speed
         begin = time - shortest_time
         if np.any(begin < 0):

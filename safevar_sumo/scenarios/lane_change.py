@@ -57,8 +57,9 @@ class LaneChange(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle under test, with the next lane at the side where it is needed."""
         changes = super().actors(roads)
-        lane = f"{self.sign < 0:d}"
-        return {**changes, DEPARTURE: {**(changes[DEPARTURE] or {}), "departLane": lane}}
+        # The lane to the right has the number 0.
+        departure = {**(changes[DEPARTURE] or {}), "departLane": f"{self.sign < 0:d}"}
+        return {**changes, DEPARTURE: departure}
 
     def benign(self) -> NamedScenarios:
         """A car stays in the next lane."""

@@ -216,8 +216,6 @@ class PedestrianCrossing(
             vehicle_positions
         )
         lateral_speed = (lateral - memory.last_lateral) / step
-
-        # He turns round once.
         if self.turns_after is not None:
             turns_now = ~memory.has_turned & (
                 lateral + step * lateral_speed > self.turns_after + ROUNDING
@@ -225,8 +223,6 @@ class PedestrianCrossing(
             if turns_now.any():
                 world.turn_back(PEDESTRIAN, np.flatnonzero(turns_now).tolist())
                 memory = memory._replace(has_turned=memory.has_turned | turns_now)
-
-        # The run is over when he has left the lane, or the vehicle has passed.
         front = memory.frame.along(vehicle_positions)
         moves_away = lateral * lateral_speed > 0
         over = ((np.abs(lateral) > self.lane_width / 2) & moves_away) | (front > memory.clear_point)

@@ -153,7 +153,7 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
                 f"the columns {', '.join(COLUMNS)}",
             )
 
-    # Numbers; of a name its length.
+    # The length of a name stands for it, so that an empty one is no legal number.
     values = table[COLUMNS].assign(name=table["name"].str.len())
     values = values.apply(pd.to_numeric, errors="coerce").astype(float)
     legal = np.isfinite(values)

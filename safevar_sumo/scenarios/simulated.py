@@ -176,7 +176,7 @@ def unit_contradiction(trace: Trace) -> str:
         if is_apart and max(way, driven) > FACTOR * min(way, driven):
             return f"speed and {name} disagree: {driven:.3g} m and {way:.3g} m of way"
 
-    # The first step, also towards somebody who moves.
+    # Towards somebody who moves, the first step alone tells the factor.
     closing = speed - obstacle_speed
     for name, rate, column in (("position", speed, position), ("gap", closing, -gap)):
         (way,), (low, *_, high) = np.diff(column[:2]), np.sort(rate[:2]) * trace.step

@@ -268,12 +268,12 @@ class TrackScenario(Scenario):
         # Before its encounter each body keeps its first velocity.
         early = np.minimum(since, 0.0)
         way = self.start_speed * later
-        begun = list[Track]()
+        late_tracks = list[Track]()
         for track in tracks:
             along, lateral, speed = (np.atleast_2d(column)[:1] for column in track[6:])
             x = track.x + way + speed * along * early
-            begun.append(track._replace(x=x, y=track.y + speed * lateral * early))
-        return begun
+            late_tracks.append(track._replace(x=x, y=track.y + speed * lateral * early))
+        return late_tracks
 
     def actors(self, roads: Roads) -> XmlChanges:
         """The vehicle under test, at its speed."""

@@ -112,8 +112,13 @@ def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int
     if not is_matrix or output.shape[1] != len(characteristics) or not 1 <= len(output) <= budget:
         raise code.wrong("search", f"settings = {quoted(output)}", f"an array of {shape}")
     for characteristic, values in zip(characteristics, output.T, strict=True):
-        legal = Legal(characteristic.lower, characteristic.upper)
-        code.check_numbers("search", characteristic.name, values, (len(output),), legal)
+        code.check_numbers(
+            "search",
+            characteristic.name,
+            values,
+            (len(output),),
+            Legal(characteristic.lower, characteristic.upper),
+        )
 
     settings: FloatArray = output.astype(float)
     if (characteristics.filter(settings) != settings).any():
@@ -121,11 +126,13 @@ def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int
             "search", "unfiltered settings", "problem.characteristics.filter(settings)"
         )
     if problem.region:
-        advice = (
-            f", for every setting that {code.name} yields:"
-            " problem.characteristics.filter(problem.repaired(settings))"
+        problem.region.check(
+            settings,
+            otherwise=(
+                f", for every setting that {code.name} yields:"
+                " problem.characteristics.filter(problem.repaired(settings))"
+            ),
         )
-        problem.region.check(settings, otherwise=advice)
     return settings
 
 

@@ -90,8 +90,6 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
             if used >= self.warm_up and len(generations) % self.generations_between_updates == 0:
                 ranges.narrow(Evaluations.concatenate(generations[last_update:]))
                 last_update = len(generations)
-
-        # The best settings of all generations.
         best = np.argsort(np.concatenate(scores), kind="stable")[: self.kept]
         solutions = Evaluations.concatenate(generations).take(best)
         return solutions.take(problem.scoring.valid(solutions))

@@ -213,8 +213,9 @@ def select_survivors(individuals: list[Individual], number: int) -> list[Individ
     infeasible = sorted(filter(by_violation, individuals), key=by_violation)
     for place, individual in enumerate(infeasible):
         individual.standing = len(individuals) + place, 0.0
-    feasible = filterfalse(by_violation, individuals)
-    best_first = sorted(feasible, key=attrgetter("fitness.wvalues"), reverse=True)
+    best_first = sorted(
+        filterfalse(by_violation, individuals), key=attrgetter("fitness.wvalues"), reverse=True
+    )
     best = []
     for rank, front in enumerate(sort_into_fronts(best_first)):
         tools.emo.assignCrowdingDist(front)

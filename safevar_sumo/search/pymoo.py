@@ -194,8 +194,13 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         lower = problem.characteristics.lower
         upper = problem.characteristics.upper
         # MOEAD refuses constraints.
-        constraints = int(not self.name.endswith("MOEAD"))
-        task = PymooProblem(len(lower), objectives, n_ieq_constr=constraints, xl=lower, xu=upper)
+        task = PymooProblem(
+            len(lower),
+            objectives,
+            n_ieq_constr=int(not self.name.endswith("MOEAD")),
+            xl=lower,
+            xu=upper,
+        )
         # Without a copy, runs would share the defaults of pymoo's classes.
         algorithm = copy.deepcopy(_class_of(self.name)(**arguments))
         return algorithm.setup(task, termination=("n_eval", problem.evaluations), seed=seed)

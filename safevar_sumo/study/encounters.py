@@ -291,7 +291,7 @@ class Encounters(Table, frozen=True, kw_only=True):
     @property
     def axes(self) -> set[str]:
         """The names of the axes that a test has."""
-        return {name for name, _ in self._named_axes}
+        return {*dict(self._named_axes)}
 
     @property
     def _named_axes(self) -> list[tuple[str, AxisTable]]:
@@ -330,7 +330,7 @@ class Encounters(Table, frozen=True, kw_only=True):
     @property
     def states_ranges(self) -> bool:
         """Whether an axis has a range beside or without listed values."""
-        return any(axis.range for _, axis in self._named_axes)
+        return bool(_ranges_of(self._named_axes))
 
     @property
     def ranges(self) -> dict[str, Domain]:

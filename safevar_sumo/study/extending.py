@@ -36,7 +36,7 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     """Override a study's tables, but for those that the new study does not inherit: their marks in
     the records say when; of another weather not the axes of its parameters.
     """
-    # Keys about this one study, and keys about its scenario, if the overrides name another one.
+    # Keys about the scenario of the base say nothing of another scenario.
     inherited = dict(base.tables)
     own_keys = keys_with(OF_STUDY, Study)
     if _names_scenario(overrides, base.tables):
@@ -48,7 +48,7 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
         inherited["scenario"] = _with_axes_for(overrides, scenario)
     tables = _merge(inherited, overrides)
 
-    # Keys about the parts of the system that differ now.
+    # Keys about a system say nothing of one in which these parts differ.
     parts = [
         key
         for key in keys_with(PART_OF_SYSTEM, Study)
@@ -75,8 +75,8 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
         for key, value in base.tables.items()
         if isinstance(value, dict) and key not in named_keys
     ]
-    names = _scenario_parameters(base.tables) - _scenario_parameters(tables)
-    dropped += [f"{name} of [scenario]" for name in sorted(names)]
+    for name in sorted(_scenario_parameters(base.tables) - _scenario_parameters(tables)):
+        dropped.append(f"{name} of [scenario]")
     if parts and dropped:
         differences = " and a different ".join(parts).replace("ads", "ADS")
         of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"

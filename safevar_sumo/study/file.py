@@ -126,6 +126,7 @@ def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
 def _refuse_ended(tables: Tables) -> None:
     """Refuse keys of earlier releases, with what to write instead."""
     for key, legal in ENDED_KEYS.items():
+        # A key without a dot stands in the study itself, here the table "".
         table, _, name = key.rpartition(".")
         if name in table_in({"": tables, **tables}, table):
             raise InputError("", f"{key} is a key of releases before 0.5", legal)
@@ -169,8 +170,6 @@ def checked_study(raw: StudyTables) -> Study:
     search = table_in(tables, "search")
     if search and table_in(tables, "scenario").get("repeats", 1) != 1:
         tables["search"] = {"objectives": ["unsafe_share", *OBJECTIVES[1:]], **search}
-
-    # Records, and what concerns several of them.
     study = convert_table(tables, Study)
     study.check_axes(study.vehicle.characteristics)
     for name in study.spread:
@@ -235,8 +234,9 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
 
     origin = Origin()
     if path.parent != STUDIES:
-        folder = str(path.resolve().parent)
-        origin = Origin(called=str(path), places=(folder,), files=(os.path.abspath(path),))
+        origin = Origin(
+            called=str(path), places=(str(path.resolve().parent),), files=(os.path.abspath(path),)
+        )
     return _with_base(StudyTables(path, tables, origin), path, visited_paths)
 
 

@@ -53,7 +53,6 @@ def with_effect(value: Any, kind: Any) -> Any:
     """A value of a type, as plain tables, without the keys on which no evaluation depends, and with
     the order of the keys of tables whose order has an effect.
     """
-    # A container by the type of what it holds, and an optional table by its record.
     inner_kinds = get_args(kind)
     if get_origin(kind) is Annotated:
         return with_effect(value, inner_kinds[0])

@@ -20,8 +20,9 @@ def user_code_names(study: Study) -> list[str]:
 
 def without_skipping(study: Study) -> Study:
     """A study that stops where its simulator fails."""
-    search = msgspec.structs.replace(study.search, failed="stop")
-    return msgspec.structs.replace(study, search=search)
+    return msgspec.structs.replace(
+        study, search=msgspec.structs.replace(study.search, failed="stop")
+    )
 
 
 def fmus_of(study: Study) -> list[tuple[str, str]]:
