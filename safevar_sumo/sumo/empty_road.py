@@ -68,12 +68,13 @@ def find_problems(system: System) -> dict[str, EmptyRoadFault]:
     members = system.characteristics
     values = members.scenario.columns(members.scenario.original_settings)
     points = [encounter(point, values) for point in system.points]
-    return {
-        point.name: problem
-        for point, result in zip(points, results, strict=True)
-        if not point.scenario.brakes_fully
-        and (problem := _problem(result.runs, result.point.scenario.test_speed))
-    }
+    problems = {}
+    for point, result in zip(points, results, strict=True):
+        if not point.scenario.brakes_fully:
+            problem = _problem(result.runs, result.point.scenario.test_speed)
+            if problem is not None:
+                problems[point.name] = problem
+    return problems
 
 
 def sentence_on(problems: dict[str, EmptyRoadFault], n_points: int) -> str:
@@ -100,12 +101,16 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     # The sample after the last active one ended the run.
     trace = runs.trace
     end = int(np.count_nonzero(trace.active)) + 1
-    gap, speed, brake, position = (
-        values[:end, 0] for values in (trace.gap, trace.speed, trace.brake, trace.position)
-    )
-    obstacle_speed, obstacle_width = (
+    gap, speed, brake, position, obstacle_speed, obstacle_width = (
         np.broadcast_to(values, trace.gap.shape)[:end, 0]
-        for values in (trace.obstacle_speed, trace.obstacle_width)
+        for values in (
+            trace.gap,
+            trace.speed,
+            trace.brake,
+            trace.position,
+            trace.obstacle_speed,
+            trace.obstacle_width,
+        )
     )
 
     # Cruise controls brake to hold a speed, but take little off it.

@@ -188,17 +188,18 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
     """
     # In the order of names, so that ties do not depend on the order of the file.
     order = np.argsort([point.name for point in system.points])
-    in_order = [at_points[k] for k in order]
-    safety_degrees = np.stack([evaluations.f_safe for evaluations in in_order])
-    safety_degrees[np.isnan(safety_degrees)] = np.inf
-    is_invalid = np.stack([evaluations.outcome == Outcome.INVALID_TEST for evaluations in in_order])
-    has_collided = np.stack([evaluations.collided for evaluations in in_order]).any(axis=0)
+    evaluations = Evaluations.concatenate([at_points[k] for k in order])
+    shape = (len(order), -1)
+    safety_degrees = evaluations.f_safe.reshape(shape)
+    safety_degrees = np.where(np.isnan(safety_degrees), np.inf, safety_degrees)
+    is_invalid = (evaluations.outcome == Outcome.INVALID_TEST).reshape(shape)
+    has_collided = evaluations.collided.reshape(shape).any(axis=0)
     values = safety_degrees
 
     if system.aggregate != WORST:
         # Such as "drac >".
         name, direction = system.aggregate.split()
-        measures = np.stack([evaluations.column(name) for evaluations in in_order])
+        measures = evaluations.column(name).reshape(shape)
         if direction == ">":
             measures = -measures
         measures = np.where(np.isnan(measures), np.inf, measures)

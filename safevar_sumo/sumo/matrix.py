@@ -98,17 +98,17 @@ def vehicle_remarks(system: System) -> list[str]:
     to.
     """
     fitted_speed = system.vehicle.FITTED_UP_TO
-    speeds = [point.scenario.test_speed or 0.0 for point in system.points]
-    if max(speeds) <= fitted_speed:
+    test_speed = max(point.scenario.test_speed or 0.0 for point in system.points)
+    if test_speed <= fitted_speed:
         return []
 
     # The drag shows how far the model is off there.
     tables = system.nominal.tables()
-    speed = min(max(speeds), float(tables.speeds[-1]))
+    speed = min(test_speed, float(tables.speeds[-1]))
     drag = np.interp(speed, tables.speeds, tables.coasting)
     return [
         f"The vehicle was fitted to drives of up to {fitted_speed / KMH:.0f} km/h, and is tested at"
-        f" up to {max(speeds) / KMH:.0f} km/h. Beyond its fit the model extrapolates: with the"
+        f" up to {test_speed / KMH:.0f} km/h. Beyond its fit the model extrapolates: with the"
         f" accelerator released, it loses {drag:.1f} m/s^2 at {speed / KMH:.0f} km/h."
     ]
 

@@ -85,15 +85,15 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         named.computed.setdefault(bound.measure, measures[bound.measure])
 
     shipped = {**metrics, **OBJECTIVES}
-    objectives = [
-        named.look_up(name, OBJECTIVES_KEY, shipped).facts for name in study.search.objectives
-    ]
+    objectives = []
+    texts = dict[str, list[str]]()
+    for text in study.search.objectives:
+        objective = named.look_up(text, OBJECTIVES_KEY, shipped).facts
+        objectives.append(objective)
+        texts.setdefault(objective.name, []).append(repr(text))
     if IMPACT_EXCESS.name in named.computed:
         # Sentences state both.
         named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)
-    texts = dict[str, list[str]]()
-    for objective, text in zip(objectives, study.search.objectives, strict=True):
-        texts.setdefault(objective.name, []).append(repr(text))
     for names in texts.values():
         if len(names) > 1:
             problem = f"{OBJECTIVES_KEY}: {' and '.join(names)} are the same objective"

@@ -127,19 +127,15 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
 
     network = open_network(name)
     file = network.path(TRAFFIC_FILE)
-    unused_attributes = [
-        f"{attribute} = {value}"
-        for element in parse_xml(file).findall(f"*[@id='{VUT}']")
-        for attribute, value in element.items()
-        if attribute not in acting
-        and (attribute in SETTING_ATTRIBUTES or DRIVER_ATTRIBUTES.fullmatch(attribute))
-        and value != NO_EFFECT.get(attribute)
-    ]
+    unused_attributes = dict[str, None]()
+    for element in parse_xml(file).findall(f"*[@id='{VUT}']"):
+        for attribute, value in element.items():
+            is_replaced = attribute in SETTING_ATTRIBUTES or DRIVER_ATTRIBUTES.fullmatch(attribute)
+            if is_replaced and attribute not in acting and value != NO_EFFECT.get(attribute):
+                unused_attributes[f"{attribute} = {value}"] = None
     remarks = []
     if unused_attributes:
-        unused = (
-            f"{file}: no effect on vehicle {VUT!r}: {', '.join(dict.fromkeys(unused_attributes))}"
-        )
+        unused = f"{file}: no effect on vehicle {VUT!r}: {', '.join(unused_attributes)}"
         remarks.append(f"{unused}; the study's vehicle and ADS determine how it drives")
 
     # SUMO's driver drives beside a controller.

@@ -59,10 +59,9 @@ class Perception:
             self._lines.append((slice(None), DelayLine.by(float(delays), step)))
             return
         steps, fractions = DelayLine.parts(delays, step)
-        groups = [np.flatnonzero(steps == count) for count in np.unique(steps)]
-        self._lines += [
-            (group, DelayLine(int(steps[group[0]]), fractions[group])) for group in groups
-        ]
+        for count in np.unique(steps):
+            group = np.flatnonzero(steps == count)
+            self._lines.append((group, DelayLine(int(count), fractions[group])))
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
         """The observation at this step; must be called in every step.

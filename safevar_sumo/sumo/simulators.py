@@ -328,12 +328,10 @@ def joined(evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION
     is_unsafe = (COLLISION if is_of_shares else criterion).of(evaluations)
     metrics[UNSAFE_SHARE.name] = mean(is_unsafe.astype(float))
     means_alone = {*METRICS, UNSAFE_SHARE.name} - {SAFETY_DEGREE}
-    rounds = {
-        f"{name}_{k + 1}": values
-        for name in evaluations.metrics
-        if name not in means_alone
-        for k, values in enumerate(evaluations.metrics[name].reshape(repeats, n))
-    }
+    rounds = dict[str, FloatArray]()
+    for name, values in evaluations.metrics.items():
+        if name not in means_alone:
+            rounds |= {f"{name}_{k + 1}": row for k, row in enumerate(values.reshape(repeats, n))}
     return replace(
         evaluations.take(columns),
         outcome=outcomes[np.argmin(severity, axis=0), columns],

@@ -223,7 +223,7 @@ def _assemble(study: Study) -> System:
     has_stops = any(member.brakes_fully for member in scenarios)
     measuring = measuring_of(study, lookup, has_stops=has_stops)
     _check_metrics(study, measuring)
-    for network in dict.fromkeys([scenario.network, *(point.scenario.network for point in matrix)]):
+    for network in dict.fromkeys(member.network for member in scenarios):
         if network:
             check_network(network)
     if not (matrix or study.ranges):

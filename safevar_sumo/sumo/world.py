@@ -192,9 +192,12 @@ class SumoWorld:
         return self._pairs([(copy, self._struck_ids[copy]) for copy in vehicles])
 
     def bodies_around(self, vehicles: Sequence[int]) -> BodyPairs:
-        ids = [id_ for domain in (self.api.vehicle, self.api.person) for id_ in domain.getIDList()]
-        pairs = [(copy_and_name(id_)[0], id_) for id_ in ids if id_ not in self._copy_of]
-        return self._pairs([(copy, id_) for copy, id_ in pairs if copy in vehicles])
+        pairs = []
+        for id_ in (*self.api.vehicle.getIDList(), *self.api.person.getIDList()):
+            copy, _ = copy_and_name(id_)
+            if copy in vehicles and id_ not in self._copy_of:
+                pairs.append((copy, id_))
+        return self._pairs(pairs)
 
     def _pairs(self, pairs: Sequence[tuple[int, str]]) -> BodyPairs:
         """Vehicles under test by their copy, each with an actor by its id."""
