@@ -272,7 +272,8 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         cruise = cruise or cruise_at(nominal, observation, self.cruise_speed)
         cruise_speed, cruise_trim = cruise
         distance = self.distance(observation.speed, observation.obstacle_speed)
-        is_near = is_in_the_way(observation, self.corridor) & (observation.gap < distance)
+        is_blocked = is_in_the_way(observation, self.corridor)
+        is_near = is_blocked & (observation.gap < distance)
         decision_time = np.where(
             decision_time >= 0, decision_time + step, np.where(is_near, 0.0, -1.0)
         )

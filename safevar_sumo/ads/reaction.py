@@ -175,8 +175,8 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         is_led = is_in_way & is_same & (memory.leader_speed > 0)
         deceleration = np.where(is_led, (memory.leader_speed - speed) / memory.step, 0.0)
         memory = memory._replace(leader_speed=speed, leader_deceleration=deceleration)
-        has_braked = is_in_way & (memory.leader_has_braked & is_same | memory.leader_brakes)
-        return memory._replace(leader_has_braked=has_braked)
+        has_braked = memory.leader_has_braked & is_same | memory.leader_brakes
+        return memory._replace(leader_has_braked=is_in_way & has_braked)
 
     def react(
         self, observation: Observation, memory: Reaction, danger: Danger, start: StartThrottle = ()

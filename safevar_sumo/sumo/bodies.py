@@ -233,9 +233,8 @@ class FirstContacts:
         if not len(around.vehicles):
             return
         depth = find_overlaps(around.body, around.obstacle)
-        is_missed = (depth > TOUCH_OVERLAP) & (
-            find_touches(around.body, around.obstacle).side == FRONT
-        )
+        touches = find_touches(around.body, around.obstacle)
+        is_missed = (depth > TOUCH_OVERLAP) & (touches.side == FRONT)
         if is_missed.any():
             inside = (
                 f"the front of the vehicle under test is {depth[is_missed].max():.2f} m inside a"

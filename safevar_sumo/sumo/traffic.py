@@ -141,9 +141,8 @@ class Traffic:
             body = self._bodies[k]
             gap = self._row(body.edge) - front
             closing = speed - self._row(body.vx)
-            is_passed = (self._row(body.far_end) < front - self.length) & (
-                speed >= self._row(body.most_vx)
-            )
+            is_behind = self._row(body.far_end) < front - self.length
+            is_passed = is_behind & (speed >= self._row(body.most_vx))
             ended = np.asarray(is_passed | self._row(body.is_cleared))
             if self._is_avoidable[k]:
                 self._approached[k] = self._approached[k] | (closing > APPROACH_SPEED)

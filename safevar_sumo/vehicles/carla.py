@@ -317,9 +317,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         # root^3 = 1 - force / grip; see `tyre_force`.
         for _ in range(NEWTON_STEPS):
             root = root - (root * root * root - 1 + grip_share) / (3 * root * root)
-        driving_rim = (p.slip_stiffness * speed + self.slip_offset * (1 - root)) / (
-            p.slip_stiffness - 1 + root
-        )
+        stiff_speed = p.slip_stiffness * speed + self.slip_offset * (1 - root)
+        driving_rim = stiff_speed / (p.slip_stiffness - 1 + root)
         braking_rim = speed - (speed + self.slip_offset) * (1 - root) / p.slip_stiffness
         return np.where(force < 0, braking_rim, driving_rim), force
 
