@@ -197,8 +197,7 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         still_blocks = (
             is_ahead(observation) & (closing_speed > 0) & blocks_the_way(observation, self.corridor)
         )
-        is_standing = speed <= 0
-        return np.where(still_blocks | is_standing, np.maximum(stage, memory.stage), stage)
+        return np.where(still_blocks | (speed <= 0), np.maximum(stage, memory.stage), stage)
 
 
 class _AutowareMemory(NamedTuple):

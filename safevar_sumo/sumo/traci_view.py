@@ -227,9 +227,13 @@ class TraciView:
         if leader is not None:
             name, gap = leader
             id_ = copied_id(self._copy, name)
-            leader_speed = actors["vehicle"][name]["getSpeed"]
             follow_speed = vehicle.getFollowSpeed(
-                vut, speed, gap, leader_speed, vehicle.getApparentDecel(id_), id_
+                vut,
+                speed,
+                gap,
+                actors["vehicle"][name]["getSpeed"],
+                vehicle.getApparentDecel(id_),
+                id_,
             )
             sumo_speed = min(sumo_speed, follow_speed)
         return float(sumo_speed)
