@@ -22,6 +22,7 @@ from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
+from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import EVERY_STUDY, InlinePool, inline_worker, searched
 
@@ -113,17 +114,19 @@ def worker_processes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Questions scan 21 values of a characteristic, and their indices come from 64 points: enough
+    """Questions scan 20 values of a characteristic, and their indices come from 64 points: enough
     where a test is about what is said, and with which settings.
     """
-    monkeypatch.setattr("safevar_sumo.questions.tolerance.scans.SCAN_VALUES", 21)
     monkeypatch.setattr("safevar_sumo.questions.indices.BASE_POINTS", 64)
+    monkeypatch.setattr(asked, "USUAL", asked.USUAL._replace(values=10))
 
 
 @pytest.fixture
 def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     """Claims are falsified with the fewest simulations that are enough to print them."""
     monkeypatch.setattr(falsify, "USUAL_BUDGET", falsify.LEAST_SIMULATIONS)
+    few = asked.USUAL._replace(own=falsify.LEAST_SIMULATIONS, alone=falsify.LEAST_SIMULATIONS)
+    monkeypatch.setattr(asked, "USUAL", few)
 
 
 @pytest.fixture(params=EVERY_STUDY)

@@ -35,6 +35,7 @@ from click.testing import CliRunner
 
 from safevar_sumo.cli.program import commands
 from safevar_sumo.questions import falsify
+from safevar_sumo.questions.tolerance import asked
 from tests.manual import PROGRAM, ROOT, Block, blocks
 
 PAGES = [
@@ -119,7 +120,10 @@ def run_page(page: str, options_of_tests: bool) -> Iterator[tuple[Block, str]]:
             added = ""
             with pytest.MonkeyPatch.context() as patch:
                 if is_shortened and (options_of_tests or not is_shown):
-                    patch.setattr(falsify, "USUAL_BUDGET", falsify.LEAST_SIMULATIONS)
+                    least = falsify.LEAST_SIMULATIONS
+                    patch.setattr(falsify, "USUAL_BUDGET", least)
+                    few = asked.USUAL._replace(own=least, alone=least)
+                    patch.setattr(asked, "USUAL", few)
                     added = block.comment.removeprefix("in tests").replace(":", "", 1)
                 printed = "".join(_run(line, added, code) for line in block.text.splitlines())
         else:

@@ -11,8 +11,6 @@ from safevar_sumo.records import BoolArray, FloatArray
 
 PARTS = (8, 8, 8, 8)
 """Number of equal parts into which each round divides what is left of a line."""
-NEAREST = 8
-"""Number of failures, those nearest to a safe value, before which the last safe value is sought."""
 
 
 class Boundaries(NamedTuple):
@@ -67,40 +65,3 @@ def on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) -> FloatA
     start = starts[:, np.newaxis]
     end = ends[:, np.newaxis]
     return np.where(factors >= 1, end, start + factors * (end - start))
-
-
-class Failing(NamedTuple):
-    """Failures, shape (K, n), and a safe value of one of their columns."""
-
-    column: int
-    safe: float
-    failures: FloatArray
-
-
-def last_safe_values(
-    groups: Sequence[Failing], are_unsafe: Callable[[FloatArray], BoolArray]
-) -> list[tuple[float, FloatArray]]:
-    """For each group the last value before its failures that is safe in the encounters of the
-    `NEAREST` of them, and the failure just beyond it, shape (n,).
-    """
-    # Every failure ends a line on which its column alone changes, from the safe value on.
-    ends = [_nearest(group) for group in groups]
-    starts = [rows.copy() for rows in ends]
-    for group, rows in zip(groups, starts, strict=True):
-        rows[:, group.column] = group.safe
-    found = find_boundaries(np.concatenate(starts), np.concatenate(ends), are_unsafe)
-    # Of each group the nearest boundary counts.
-    last = np.cumsum([len(rows) for rows in ends])[:-1]
-    values = list[tuple[float, FloatArray]]()
-    for group, safe, unsafe in zip(
-        groups, np.split(found.safe, last), np.split(found.unsafe, last), strict=True
-    ):
-        nearest = np.argmin(np.abs(unsafe[:, group.column] - group.safe))
-        column = safe[:, group.column]
-        values.append((float(column[np.argmin(np.abs(column - group.safe))]), unsafe[nearest]))
-    return values
-
-
-def _nearest(group: Failing) -> FloatArray:
-    distances = np.abs(group.failures[:, group.column] - group.safe)
-    return group.failures[np.argsort(distances, kind="stable")[:NEAREST]]

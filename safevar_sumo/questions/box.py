@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.random import Generator, default_rng
 
-from safevar_sumo.questions.sampling import CONFIDENCE, Stream, sobol_points
+from safevar_sumo.questions.sampling import CONFIDENCE, Stream
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import FeasibleRegion
 
@@ -66,22 +66,6 @@ class Box:
         return self.region.draw_feasible(
             lambda count: self.at(rng.random((count, len(self.lower)))), number
         )
-
-    def with_ends(self, number: int, rng: Generator) -> FloatArray:
-        """Random settings with half of their values at ends, shape (number, n); fewer where not all
-        are feasible.
-        """
-        points = rng.random((number, len(self.lower)))
-        settings = self.at(np.where(rng.random(points.shape) < 0.5, np.round(points), points))
-        return np.asarray(settings[self.region.feasible(settings)])
-
-    def spread_and_corners(self, number: int, seed: int) -> FloatArray:
-        """Settings at Sobol points, and at as many corners, where all changes of the vehicle add
-        up.
-        """
-        points = sobol_points(number, len(self.lower), seed)
-        corners = np.where(self.region.characteristics.of_vehicle, np.round(points), points)
-        return self.at(np.concatenate([points, corners]))
 
     def corners(self, seed: int, attempt: int) -> FloatArray:
         """Settings at all corners; at `MAX_CORNERS` random ones if it has more.

@@ -153,8 +153,7 @@ def as_printed(
 
 def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     """How those of M settings fail that are unsafe, by their row."""
-    everywhere = model.evaluator.system.points
-    points = [everywhere[number] for number in model.numbers_of_points]
+    points = model.evaluator.system.points
     members = model.characteristics
     runs = model.evaluate(settings, STAGE)
     is_unsafe = model.evaluator.region.feasible(settings) & (model.robustness_by(runs) < 0)
@@ -163,8 +162,6 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     for row in np.flatnonzero(is_unsafe).tolist():
         point = points[runs.points[row]]
         values = members.scenario.named(settings[row, ~members.of_vehicle])
-        if runs.settings.shape[1] > len(members):
-            values[PHASE] = float(runs.settings[row, -1])
         scenario = encounter(point, values).scenario
         how = _failure_in_words(
             scenario, model.unsafe, bool(runs.collided[row]), float(runs.f_safe[row])
@@ -194,8 +191,6 @@ def _command(model: Model, setting: FloatArray, point: Point, values: Mapping[st
         for name, value in point.parameters
         if name in searchable_in(point.scenario) and isinstance(value, int | float)
     }
-    if PHASE in values and PHASE not in members.names:
-        axes[PHASE] = values[PHASE]
     words = [system.command, members.options(setting)]
     words += [f"--set {name}={value!r}" for name, value in axes.items()]
     words += [f"--fit {model.fit}"] * (model.fit > 0)

@@ -6,19 +6,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe, margin_of
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import Judge
 from safevar_sumo.questions.model_spread import other_sets
-from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
@@ -37,20 +33,14 @@ class Model(NamedTuple):
     ----------
     fit
         Its number among the sets of [spread]; the study's own is 0.
-    points
-        Numbers of the points of the study's matrix that count; None for all.
     new_car
         What the original must not be in an encounter that counts, beside the rule of the study.
-    at_worst_phase
-        Whether each setting meets its encounter at the worst phase, where encounters have one.
     """
 
     fit: int
     evaluator: Evaluator
     unsafe: Unsafe
-    points: tuple[int, ...] | None = None
     new_car: Unsafe | None = None
-    at_worst_phase: bool = False
 
     @property
     def characteristics(self) -> CharacteristicSet:
@@ -58,31 +48,14 @@ class Model(NamedTuple):
         return self.evaluator.characteristics
 
     @property
-    def numbers_of_points(self) -> Sequence[int]:
-        """Numbers of the points that count."""
-        if self.points is None:
-            return range(len(self.evaluator.system.points))
-        return self.points
-
-    @property
     def in_phases(self) -> Model | None:
         """The model of settings that end with the phase of their encounter; None without phases."""
         evaluator = self.evaluator.in_phases
-        if evaluator is None:
-            return None
-        return self._replace(evaluator=evaluator, at_worst_phase=False)
+        return None if evaluator is None else self._replace(evaluator=evaluator)
 
     def evaluate(self, settings: FloatArray, stage: str) -> Evaluations:
-        """The evaluations of M settings, shape (M, n), at the points that count; at their worst
-        phases of settings that end with them.
-        """
-        claim = self.in_phases if self.at_worst_phase else None
-        if claim is not None:
-            judge = partial(claim.robustness, stage=stage)
-            return claim.evaluate(at_worst_phases(claim, judge, settings)[0], stage)
-        if self.points is None:
-            return self.evaluator.evaluate(settings, stage)
-        return self.evaluator.evaluate_selection(settings, Selection(points=self.points), stage)
+        """The evaluations of M settings, shape (M, n)."""
+        return self.evaluator.evaluate(settings, stage)
 
     def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
         """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite
@@ -108,23 +81,6 @@ class Model(NamedTuple):
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
         """Which of M settings are unsafe, shape (M,)."""
         return self.robustness(settings, stage) < 0
-
-    def at_worst_points(self, settings: FloatArray, stage: str) -> Model:
-        """The model at the points of the study's matrix at which settings are worst; without a
-        matrix, and where encounters are ranges, as it is.
-        """
-        if len(self.characteristics.scenario):
-            return self
-        worst = self.evaluate(settings, stage).worst_points
-        if worst is None:
-            return self
-        numbers = np.unique(worst).tolist()
-        return self._replace(points=tuple(self.numbers_of_points[number] for number in numbers))
-
-
-def judges_of(models: Sequence[Model], stage: str) -> list[Judge]:
-    """What falsifies a claim in some models; progress is shown for `stage`."""
-    return [partial(model.robustness, stage=stage) for model in models]
 
 
 class Models(NamedTuple):

@@ -102,7 +102,7 @@ def _lengths_of_step(model: Model, settings: FloatArray) -> FloatArray:
         return np.full(len(settings), np.inf)
     system = model.evaluator.system
     values = system.characteristics.scenario.columns(system.split(settings)[1])
-    points = (encounter(system.points[number], values) for number in model.numbers_of_points)
+    points = (encounter(point, values) for point in system.points)
     speeds = [np.zeros(len(settings)) + point.scenario.start_speed for point in points]
     return np.asarray(system.step * np.maximum.reduce(speeds))
 

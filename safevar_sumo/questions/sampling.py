@@ -26,7 +26,6 @@ class Stream(IntEnum):
     LARGER_BOXES = 2  # steps from the largest safe box that is known to larger ones
     ENCOUNTERS_AT_CORNERS = 3  # encounters that the corners of a box meet
     JOINT_LIMITS = 4  # falsification of joint limits
-    TESTS_BETWEEN = 5  # test cases between those of a matrix
     LIMITS_ALONE = 6  # falsification of the limits of one characteristic alone
     REPAIRED_BOUND = 7  # vehicles within the required range, for the bound of a repair
     NEAREST_LIMIT = 8  # falsification of a limit in place of a specified one that does not hold

@@ -140,9 +140,9 @@ def unread_characteristics(system: System, settings: FloatArray) -> set[str]:
 
 def simulations_of_setting(system: System) -> int:
     """How many simulations a setting takes: at each point, as often as it is repeated, and beside
-    the original vehicle where encounters are ranges.
+    the original vehicle where encounters count only if that is safe.
     """
-    has_pairs = len(system.characteristics.scenario) > 0
+    has_pairs = system.measuring.scoring.safe_original is not None
     return len(system.points) * system.repeats * (1 + has_pairs)
 
 

@@ -4,7 +4,7 @@ unsafe region is known.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,9 @@ from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.questions import between, by_criterion, evaluator, scope
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.tolerance.scans import scan
-from safevar_sumo.questions.tolerance.together import JointSearch, LimitsTogether
+from safevar_sumo.questions.models import Model
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
-from safevar_sumo.study import CharacteristicTable, Limit, Study
+from safevar_sumo.study import CharacteristicTable, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool, searched
@@ -167,36 +165,3 @@ def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 def model_of(study: Study, **unsafe: float) -> Model:
     """Its own model, which is simulated here."""
     return Model(0, Evaluator(study, InlinePool(), verified=0), Unsafe(**unsafe))
-
-
-def box_of(
-    n: int,
-    region: Region,
-    limits: dict[str, Limit],
-    others: Sequence[Region] = (),
-    outer: LimitsTogether | None = None,
-) -> LimitsTogether:
-    """The box of a planted region, and of those of further fits, within an outer one."""
-    study = made_up_study(n)
-    fits = [
-        Model(number, Evaluator(study, Plant(study, each)), Unsafe())
-        for number, each in enumerate([region, *others])
-    ]
-    evaluator = fits[0].evaluator
-    columns = list(range(n))
-    scans = scan(evaluator, columns, Unsafe())
-    ends = [
-        {one.characteristic.name: end}
-        for one in scans
-        for interval in one.of_state("unsafe")
-        for end in interval
-    ]
-    known = np.array([evaluator.characteristics.setting(end) for end in ends]).reshape(-1, n)
-    nothing = known[:0]
-    search = JointSearch(
-        Models(tuple(fits), ()), dict.fromkeys(range(len(fits)), ()), columns, limits, 2000, outer
-    )
-    search.find(scans, known)
-    for model in fits[1:]:
-        search.cut(model, nothing)
-    return search.found

@@ -13,14 +13,12 @@ from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.between import meeting, moving_tests
-from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance import tolerance
+from safevar_sumo.questions.tolerance.cases import SearchPlan, search_cases
+from safevar_sumo.questions.tolerance.oracle import Oracle, product_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
@@ -44,41 +42,32 @@ AT_TESTS_ALONE = {
 """Limits of `wear` that hold at its tests; between them, at 59 km/h, a car keeps 0.25 m."""
 
 
-def box_within(model: Model, ends: dict[str, float]) -> Box:
-    members = model.evaluator.characteristics
-    end = members.setting(ends)
-    low, high = np.minimum(members.original, end), np.maximum(members.original, end)
-    return Box(model.evaluator.region, low, high)
-
-
-def test_a_falsification_between_the_tests_finds_what_no_test_shows(ahead: Study) -> None:
+def test_a_search_between_the_tests_finds_what_no_test_shows(ahead: Study) -> None:
     own = model_of(ahead, keep=0.3)
-    box = box_within(own, AT_TESTS_ALONE)
-    corners = box.corners(0, 0)
-    assert own.robustness(corners, "").min() >= 0
-    (test,) = moving_tests(own, own.unsafe)
-    assert test.model.characteristics.scenario.names == ("speed",)
-    rng = default_rng(1)
-    worst = corners[np.argsort(own.robustness(corners, ""))[:64]]
-    judges = [lambda rows: test.robustness(rows, "")]
-    found = falsify(test.box(box), judges, [test.spread(worst, rng)], 2000, rng)
-    (failing,) = found.failures.values()
-    there, vehicles = test.as_tests(failing)
-    assert there.are_unsafe(vehicles, "").all(), "as points of a matrix"
-    speeds = [dict(point.parameters)["speed"] for point in there.evaluator.system.points]
-    assert all(50 < speed < 60 and speed == round(speed, 2) for speed in speeds)
-    with_them = meeting(own, there.evaluator.study.matrix.tests)
-    assert len(with_them.evaluator.system.points) == 2 + len(speeds)
-    assert with_them.are_unsafe(vehicles, "").all()
+    oracle = Oracle([own], own.unsafe, between=True)
+    vehicle = oracle.vehicle
+    end = vehicle.setting(AT_TESTS_ALONE)
+    ends = np.minimum(vehicle.original, end), np.maximum(vehicle.original, end)
+    space = oracle.space(0, *ends, phases=False)
+    corners = default_rng(0).random((512, len(vehicle))) < 0.5
+    vehicles = np.where(corners, *ends)
+    assert oracle(product_of(vehicles, oracle.listed())).min() >= 0
+    nothing = space.lower[np.newaxis][:0]
+    met = search_cases(oracle, space, nothing, SearchPlan(5000), default_rng(1))
+    assert met.least < 0
+    model, setting = oracle.setting(met.unsafe[0])
+    speed = dict(zip(model.characteristics.names, setting, strict=True))["speed"]
+    assert 50 < speed < 60
+    assert speed == round(speed, 2)
 
 
 def test_an_encounter_between_counts_only_where_the_original_is_safe(ahead: Study) -> None:
     own = model_of(ahead, keep=0.3)
-    worn = own.evaluator.characteristics.setting({"sensorLatency": 0.4})[np.newaxis]
+    worn = own.characteristics.setting({"sensorLatency": 0.4})
     for new_car, counts in ((own.unsafe, True), (Unsafe(keep=99.0), False)):
-        (test,) = moving_tests(own, new_car)
-        left = test.robustness(test.spread(worn, default_rng(0)), "")
-        assert np.isfinite(left[left < np.inf]).any() == counts
+        oracle = Oracle([own], new_car, between=True)
+        left = oracle(oracle.space(0, worn, worn).draw(64, default_rng(0)))
+        assert (left < 0).any() == counts
 
 
 @pytest.mark.parametrize(
@@ -137,9 +126,8 @@ def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]], fits: int) -
     (test,) = study.matrix.tests
     speeds = {"speed": [float(speed) for speed in range(50, 61)]}
     for number, of_set in enumerate(studies_of_sets(study)[:fits]):
-        model = Model(number, Evaluator(of_set, InlinePool(), verified=0), Unsafe())
-        denser = meeting(model, [msgspec.structs.replace(test, over=speeds)])
-        for result in simulate_all_points(denser.evaluator.system, cars):
+        denser = of_set.with_tests([msgspec.structs.replace(test, over=speeds)])
+        for result in simulate_all_points(assemble(denser), cars):
             least = 0.0 if number else 0.3
             kept = result.evaluations.f_safe
             assert kept[0] < least or kept.min() >= least, (number, result.point.name)

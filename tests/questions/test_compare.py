@@ -19,7 +19,7 @@ from safevar_sumo.questions.compare.coverage import missing_in_words, missing_pa
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.research_questions.statistics import compare_samples
 from safevar_sumo.questions.tables import cell_text
-from safevar_sumo.questions.tolerance import scans
+from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, json_of, refused, run, searched
@@ -41,7 +41,7 @@ POOL = InlinePool()
 
 @pytest.fixture(autouse=True)
 def _coarse_scans_and_no_benign_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scans, "SCAN_VALUES", 21)
+    monkeypatch.setattr(asked, "USUAL", asked.USUAL._replace(values=10, alone=256))
     nothing = {"a_needless_braking": None, "b_needless_braking": None, "benign_scenes": 0}
     monkeypatch.setattr(
         "safevar_sumo.questions.compare.differences._needless_braking", lambda a, b: nothing
@@ -241,7 +241,7 @@ def test_none_of_four_worse_versions_is_released(
     """
     changes, decision, words = VERSIONS[version]
     monkeypatch.undo()
-    monkeypatch.setattr(scans, "SCAN_VALUES", 21)
+    monkeypatch.setattr(asked, "USUAL", asked.USUAL._replace(values=10, alone=256))
     monkeypatch.chdir(in_tmp)
     Path("late.py").write_text(LATE)
     study = {"extends": "wear", "name": version, **ONE_TEST, **changes}

@@ -1,25 +1,18 @@
-"""Printed counterexamples fail as printed, and values up to which a claim holds are rounded."""
+"""Printed counterexamples fail as printed."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import cast
-
 import numpy as np
-import pytest
 
 from safevar_sumo import tolerance
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
-from safevar_sumo.questions.models import judges_of
-from safevar_sumo.questions.reach import falsify_limits, reach, rounded_towards
 from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.vehicles import Characteristic, region_of
+from safevar_sumo.vehicles import region_of
 from tests.in_process import SLOW, InlinePool, json_of, numbers_of, refused
-from tests.questions.conftest import made_up_model, made_up_study, nowhere
+from tests.questions.conftest import made_up_model, made_up_study
 
 
 def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_out() -> None:
@@ -42,56 +35,6 @@ def test_a_described_setting_stays_within_the_limits_that_it_breaks() -> None:
     within = Box(region_of(study), np.array([5.0, 5.0]), np.array([7.1234, 5.0]))
     found = describe(model, {"": np.array([7.12339, 5.0])}, within)
     assert within.holds(found[""].setting[np.newaxis])[0]
-
-
-@pytest.mark.parametrize("side", [-1, 1])
-@pytest.mark.parametrize("edge", [1.0, 2.77, 4.99, 0.0, -0.1])
-def test_a_reach_ends_just_before_a_planted_boundary_at_its_start_or_nowhere(
-    edge: float, side: int
-) -> None:
-    """Unsafe is a beyond `edge` from the original, on either side, where b is within 0.4 of 8: a
-    narrow pocket.
-    """
-
-    def pocket(rows: FloatArray) -> BoolArray:
-        return (side * (rows[:, 0] - 5) > edge) & (np.abs(rows[:, 1] - 8) < 0.4)
-
-    model = made_up_model(2, pocket)
-    ends = np.sort([[5.0, 0.0], [5.0 + 5 * side, 10.0]], axis=0)
-    judges = judges_of([model], "reach")
-    found = reach(
-        Box(model.evaluator.region, *ends), (int(side > 0), 0), 5.0, judges, LEAST_SIMULATIONS, (1,)
-    )
-    if edge < 0:
-        assert found is None
-        return
-    assert edge - 0.11 <= side * (found - 5) <= edge
-    assert edge == 0 or model.evaluator.simulated >= LEAST_SIMULATIONS
-
-
-def test_a_falsification_names_the_model_that_fails() -> None:
-    models = [made_up_model(2, nowhere), made_up_model(2, lambda rows: rows[:, 1] > 9.5, 1)]
-    box = Box(models[0].evaluator.region, np.zeros(2), np.full(2, 10.0))
-    found = falsify_limits(box, judges_of(models, "falsification"), 2000, (1,))
-    assert [*found.failures] == [1]
-    assert (found.failures[1][:, 1] > 9.5).all()
-
-
-@pytest.mark.parametrize(
-    ("start", "value", "unit", "expected"),
-    [
-        (10, 48.97, "km/h", 48.9),
-        (10, 48.9, "km/h", 48.9),
-        (0, 0.127, "s", 0.12),
-        (0.5, 0.121, "s", 0.13),
-        (0.125, 0.127, "s", 0.125),
-    ],
-)
-def test_values_are_rounded_towards_the_start_as_they_are_printed(
-    start: float, value: float, unit: str, expected: float
-) -> None:
-    item = SimpleNamespace(digits=2, unit=unit)
-    assert rounded_towards(start, value, cast(Characteristic, item)) == expected
 
 
 def test_a_margin_that_the_original_does_not_keep_ends_the_question() -> None:

@@ -19,7 +19,7 @@ from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.tolerance import scans
+from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.results.identity import identity_digest, manifest_of
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, json_of, refused, run, searched
@@ -74,7 +74,7 @@ def case(folder: Path) -> Case:
 @pytest.fixture(autouse=True)
 def _few_encounters(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(scans, "SCAN_VALUES", 11)
+    monkeypatch.setattr(asked, "USUAL", asked.USUAL._replace(values=10, alone=256))
     monkeypatch.setattr(evaluator, "ENCOUNTERS", 4)
     monkeypatch.setattr(evaluator, "CANDIDATES", 64)
 

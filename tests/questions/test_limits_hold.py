@@ -19,7 +19,6 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.by_criterion import study_by
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.tolerance.together import MAX_SIMULATIONS
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points
@@ -83,7 +82,7 @@ CLAIMS: dict[str, tuple[str, dict[str, Any], dict[str, Any], int, str]] = {
         {"encounters": "ranges"},
         {"fits": 0, "characteristics": ("tireFric,maxBrakeTorque,dampRateZeroT_CE",)},
         4000,
-        "All corner cases in 32,768 encounters",
+        "All corner cases",
     ),
 }
 """By what is special: study, what is changed of it, what is asked, simulations of the other
@@ -154,7 +153,6 @@ def test_another_optimiser_finds_nothing_unsafe_within_joint_limits(
     evaluator = Evaluator(study, InlinePool(), verified=0)
     answer = tolerance.compute(study, evaluator, **options)
     numbers, members = answer.numbers, CharacteristicSet.of(study)
-    assert evaluator.simulated < 2 * MAX_SIMULATIONS
     assert numbers["box"]
     assert numbers["kept"] or not options.get("limits")
     sets = studies_of_sets(study)[: numbers["fits_tried"]] if study.spread else [study]

@@ -9,10 +9,14 @@ from typing import Any
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.ask import find_question
+from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.part import at_point
+from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, json_of, numbers_of
+from tests.questions.conftest import model_of
 
 
 @SLOW
@@ -39,6 +43,19 @@ def test_limits_are_attacked_in_the_ranges_of_their_study_by_a_car_that_can_be_s
     command = row["simulate"]
     assert {"--ranges", "CPNCO", f"speed={row['fails_at']['speed']}"} <= {*command.split()}
     assert numbers_of(command)["f_safe"] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("point", "scope"),
+    [
+        ("CPNA, speed 40, impact_location 25, wet", "crossing (CPNA) at 40 km/h, impact location"),
+        ("CPLA, speed 60, wet", "along (CPLA) at 60 km/h; weather wet"),
+    ],
+)
+def test_limits_at_one_point_of_a_matrix_claim_nothing_beyond_it(point: str, scope: str) -> None:
+    study = at_point(sv.load_study("wear"), point)
+    assert scope_of(study).startswith(scope)
+    assert moving_tests(model_of(study), Unsafe()) == []
 
 
 def test_a_study_at_one_of_its_points_has_no_constraint_of_its_ranges() -> None:

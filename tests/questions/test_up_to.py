@@ -18,8 +18,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.models import SEARCHED_MARGIN
 from safevar_sumo.questions.part import names_left_out, smaller_cuts, study_up_to
-from safevar_sumo.questions.tolerance.asked import Asked
-from safevar_sumo.records import FloatArray
+from safevar_sumo.questions.tolerance import _unsafe_solutions, tell
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
@@ -118,13 +117,12 @@ def test_solutions_of_results_in_encounters_above_the_value_do_not_limit() -> No
     frame = pd.DataFrame(settings, columns=[*members.names])
     frame = frame.assign(outcome="collision", safety_degree=-1.0)
     subject: Any = SimpleNamespace(solutions=frame)
-    options: dict[str, Any] = {"limits": {}, "unsafe": Unsafe(), "criterion": None, "margin": None}
     columns = [*range(len(members.vehicle))]
-    original = plant.evaluate(members.original_settings)
-    asked = Asked(subject, evaluator, columns, original=original, fits=0, budget=1000, **options)
-    known: FloatArray = asked._replace(up_to="speed=40").unsafe_solutions
-    assert known.tolist() == [settings[0].tolist()]
-    assert len(asked.unsafe_solutions) == 3, "those of results about the whole study all count"
+    options: dict[str, Any] = {"subject": subject, "unsafe": Unsafe(), "columns": columns}
+    known = _unsafe_solutions(SimpleNamespace(**options, whole=None), evaluator)  # type: ignore[arg-type]
+    assert known.tolist() == [settings[0, : len(columns)].tolist()]
+    whole = _unsafe_solutions(SimpleNamespace(**options, whole=evaluator), evaluator)  # type: ignore[arg-type]
+    assert len(whole) == 3, "those of results about the whole study all count"
 
 
 def test_limits_up_to_a_value_lie_within_those_up_to_smaller_ones(ahead: Study) -> None:
@@ -163,4 +161,4 @@ def test_a_vehicle_that_is_said_to_fail_fails_and_a_rough_answer_keeps_nothing(
     assert drive_and_score(system, setting).f_safe[0] < SEARCHED_MARGIN
     answer = tolerance(study, **options, limits=("tireFric >= 3.4",))
     assert answer.numbers["kept"] is None
-    assert answer.failures == ("with --quick, no limit is called kept: ask without it",)
+    assert answer.failures == (tell.ROUGH,)

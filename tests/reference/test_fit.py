@@ -15,15 +15,13 @@ from numpy.random import default_rng
 
 from calibration import fit
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import (
     compute_model_spreads,
     prediction_band,
     value_of,
     with_values,
 )
-from safevar_sumo.questions.tolerance import scans, tolerance
+from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.reference.rows import COLUMNS, ReferenceData
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -216,20 +214,19 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
 
 @SLOW
 @pytest.mark.usefixtures("few_simulations")
-def test_the_ends_over_fits_are_those_of_each_fitted_study(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scans, "SCAN_VALUES", 21)
+def test_the_ends_over_fits_are_those_of_each_fitted_study() -> None:
     gap = "ads.parameters.brake_gap"
     gaps = [6.8978, 6.4, 7.4]
     study = load_study("sun", spread={gap: gaps}, ads={"parameters": {"brake_gap": gaps[0]}})
 
+    asked = {"characteristics": ["tireFric"], "unsafe": "below=1.5", "pool": InlinePool()}
+
     def low_end(one: Study) -> float:
-        friction = list(one.vehicle.characteristics).index("tireFric")
-        (alone,) = scans.scan(Evaluator(one, InlinePool()), [friction], Unsafe(below=1.5))
-        return alone.safe[0] if alone.safe else np.nan
+        (end,) = tolerance(one, fits=0, **asked).values("limits.alone_low")
+        return np.nan if end is None else end
 
     of_each = np.array([low_end(with_values(study, {gap: value})) for value in gaps])
     assert len({*of_each}) > 1, "the fits differ"
-    asked = {"characteristics": ["tireFric"], "unsafe": "below=1.5", "pool": InlinePool()}
     answer = tolerance(study, **asked)
     (row,) = answer.to_dict()["tables"]["limits"]["rows"]
     assert 0 <= row["alone_low"] - np.nanmax(of_each) <= 0.03, (

@@ -18,7 +18,8 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.permit.rows import CARS
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.tolerance.in_ranges import IN_RANGES, study_in_ranges
+from safevar_sumo.questions.tolerance import study_in_ranges
+from safevar_sumo.questions.tolerance.tell import IN_RANGES
 from safevar_sumo.replay.animation import template_environment
 from safevar_sumo.report.page import TEMPLATE_FOLDER
 from safevar_sumo.report.sections import ReportedStudy

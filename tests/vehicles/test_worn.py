@@ -23,7 +23,9 @@ from safevar_sumo.ads.base import is_in_the_way
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.tolerance.scans import scan
+from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.tolerance.asked import asked_of
+from safevar_sumo.questions.tolerance.search import alone_with_own_set
 from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray, Observation
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
@@ -257,11 +259,15 @@ def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(assumptio
     )
     columns = [list(evaluator.characteristics.names).index(name) for name in LIMITED]
     cells = []
-    for found in scan(evaluator, columns, Unsafe(keep=0.3)):
-        item = found.characteristic
-        end, worst = (
-            ends[item.name in LATE] for ends in (found.safe or (0.0, 0.0), (item.lower, item.upper))
-        )
+    unsafe = Unsafe(keep=0.3)
+    models = Models((Model(0, evaluator, unsafe),), ())
+    asked = asked_of(models, unsafe, columns, {}, at_tests=True)
+    alone = alone_with_own_set(asked._replace(effort=asked.effort._replace(alone=0)))
+    for column in columns:
+        item = evaluator.characteristics.members[column]
+        end, worst = (alone.lower[column], item.lower)
+        if item.name in LATE:
+            end, worst = (alone.upper[column], item.upper)
         cells.append("whole" if end == worst else f"{end:.{LIMITED[item.name]}f}")
     assert f"|{assumption}|{'|'.join(cells)}|" in PAGE
 

@@ -65,7 +65,8 @@ from safevar_sumo.questions.research_questions.statistics import (
     signed_rank_test,
 )
 from safevar_sumo.questions.subject import study_in
-from safevar_sumo.questions.tolerance.scans import SCAN_STAGE, SCAN_VALUES
+from safevar_sumo.questions.tolerance.asked import usual_alone
+from safevar_sumo.questions.tolerance.oracle import STAGE
 from safevar_sumo.questions.words import counted_in_words, join_phrases
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import limits_of
@@ -131,7 +132,7 @@ def compare(
     """
     # Both studies, in one common domain and by one criterion.
     study = evaluator.study
-    evaluator.begin({BOTH_STAGE: 2 * samples, SCAN_STAGE: 2 * SCAN_VALUES * len(study.domains)})
+    evaluator.begin({BOTH_STAGE: 2 * samples, STAGE: 2 * usual_alone(evaluator)})
     second = evaluator.for_study(in_order_of(study, study_in(other)))
     evaluators = (evaluator, second)
     with about("limits"):

@@ -13,18 +13,17 @@ import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Column, Columns, tabulate, with_interval
-from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.compare.coverage import TestCase, cases_of
 from safevar_sumo.questions.compare.settings import within
 from safevar_sumo.questions.counterexamples import where_in_words
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.pairs import SIDES
 from safevar_sumo.questions.repair.price import benign_scenes, drive_new_cars, needless_braking
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
-from safevar_sumo.questions.tolerance.alone import AloneLimit, AloneSearch
-from safevar_sumo.questions.tolerance.scans import SCAN_VALUES, scan
+from safevar_sumo.questions.tolerance.asked import Asked, asked_of
+from safevar_sumo.questions.tolerance.search import alone_with_own_set
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import Point
@@ -129,35 +128,46 @@ def limits_of_both(
     """The table of limits alone with the study's own set, as in `tolerance`, within the user's
     limits; no interval where the original is unsafe.
     """
-    # Limits of each characteristic alone, in both.
-    columns = np.flatnonzero(evaluators[0].characteristics.of_vehicle).tolist()
-    alone = list[Sequence[AloneLimit]]()
-    is_rough = evaluators[0].left is not None
-    # Of few simulations the scans of both systems together take a sixth of what is left.
-    number = evaluators[0].at_most(SCAN_VALUES, 12 * len(columns))
-    for side, unsafe in zip(evaluators, criteria, strict=True):
-        own = Model(0, side, unsafe)
-        search = AloneSearch(scan(side, columns, unsafe, number=number), columns, own)
-        if tests := [] if at_tests or is_rough else moving_tests(own, unsafe):
-            search.add(own, tests)
-        alone.append(search.limits())
-    domains = [side.study.domains for side in evaluators]
+    asked = [
+        _asked_alone(side, unsafe, at_tests=at_tests)
+        for side, unsafe in zip(evaluators, criteria, strict=True)
+    ]
+    # Few simulations search both alike: what the first one takes does not shrink the second.
+    effort = min((one.effort for one in asked), key=lambda effort: effort.own)
+    alone = [_safe_alone(one._replace(effort=effort)) for one in asked]
     rows = []
-    for a, b in zip(*alone, strict=True):
-        name = a.characteristic.name
+    vehicles = [side.characteristics.vehicle for side in evaluators]
+    for a, b, *safe in zip(*vehicles, *alone, strict=True):
         in_a, in_b = (
-            _within(limit_of_side.safe, within(limits, name, of[name]))
-            for limit_of_side, of in zip((a, b), domains, strict=True)
+            _within(interval, within(limits, a.name, side.study.domains[a.name]))
+            for interval, side in zip(safe, evaluators, strict=True)
         )
-        ends_in_a = (a.characteristic.original, *(in_a or UNDEFINED))
-        ends_in_b = (b.characteristic.original, *(in_b or UNDEFINED))
-        rows.append((name, a.characteristic.unit, *ends_in_a, *ends_in_b, _change_of(in_a, in_b)))
+        ends_in_a = (a.original, *(in_a or UNDEFINED))
+        ends_in_b = (b.original, *(in_b or UNDEFINED))
+        rows.append((a.name, a.unit, *ends_in_a, *ends_in_b, _change_of(in_a, in_b)))
     where = " at the points of the tests alone" if at_tests else ""
     return tabulate(
         f"Limits of each characteristic alone {OF_OWN_FIT}{where}, rounded to the safe side",
         LIMIT_COLUMNS,
         rows,
     )
+
+
+def _asked_alone(evaluator: Evaluator, unsafe: Unsafe, *, at_tests: bool) -> Asked:
+    """The limits alone that are sought in a system."""
+    models = Models((Model(0, evaluator, unsafe),), ())
+    columns = range(len(evaluator.characteristics.vehicle))
+    return asked_of(models, unsafe, columns, {}, at_tests=at_tests)
+
+
+def _safe_alone(asked: Asked) -> list[Interval | None]:
+    """What is safe of each characteristic alone, rounded inwards; None if the original is not."""
+    own, members = asked.oracle.own, asked.oracle.vehicle.members
+    if own.are_unsafe(own.characteristics.original_settings, "original vehicle")[0]:
+        return [None] * len(members)
+    alone = alone_with_own_set(asked)
+    ends = zip(alone.lower.tolist(), alone.upper.tolist(), strict=True)
+    return [item.rounded_inwards(end) for item, end in zip(members, ends, strict=True)]
 
 
 def _within(safe: Interval | None, ends: Interval) -> Interval | None:

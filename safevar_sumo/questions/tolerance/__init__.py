@@ -5,39 +5,96 @@ The filter of small changes is not applied, as the question is about the vehicle
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from typing import Annotated, NamedTuple
 
+import numpy as np
+
+from safevar_sumo.errors import InputError, warn
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
-from safevar_sumo.questions.cause_limits import settings_of_line
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import budget_of
-from safevar_sumo.questions.models import limit_criterion
+from safevar_sumo.questions.model_spread import other_sets
+from safevar_sumo.questions.models import limit_criterion, models_of
 from safevar_sumo.questions.options import Fits, LimitTexts, Margin
 from safevar_sumo.questions.part import names_left_out, smaller_cuts, study_up_to
-from safevar_sumo.questions.tolerance.asked import Asked, columns_of, specified_limits
-from safevar_sumo.questions.tolerance.frugal import PARTS, answer_roughly
-from safevar_sumo.questions.tolerance.in_ranges import IN_RANGES
-from safevar_sumo.questions.tolerance.limits import (
-    FITS,
-    INTERVALS,
-    NEAREST,
-    OF_BOX,
-    answer_limits,
-    phases_of,
+from safevar_sumo.questions.sampling import Stream
+from safevar_sumo.questions.tolerance.asked import (
+    CASES,
+    CASES_OF_SET,
+    LEAST_VALUES,
+    USUAL,
+    Asked,
+    asked_of,
+    columns_of,
+    specified_limits,
+    usual_alone,
 )
-from safevar_sumo.questions.tolerance.rows import LIMITS, UNCERTAINTY
+from safevar_sumo.questions.tolerance.search import (
+    OTHER_SETS_STAGE,
+    OWN_SET_STAGE,
+    FoundLimits,
+    find_limits,
+    nearest_limits,
+    no_limits,
+)
+from safevar_sumo.questions.tolerance.tell import (
+    FITS,
+    IN_RANGES,
+    LIMITS,
+    NEAREST,
+    NUMBERS,
+    answer_limits,
+)
+from safevar_sumo.questions.tolerance.told import InRanges, Told
+from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.scenarios.declared import with_ranges
+from safevar_sumo.study import Limit, Study
+from safevar_sumo.vehicles.region import REJECTIONS
+
+RANGES_STAGE = "counterexamples in the ranges"
+
+
+class LimitsQuestion(NamedTuple):
+    """What the user asks.
+
+    Attributes
+    ----------
+    whole
+        The evaluator of the whole study.
+    unsafe
+        What is unsafe, with the distance to keep.
+    stated, margin
+        The options from which it comes.
+    columns
+        The columns of the characteristics that vary.
+    limits
+        The specified limits, by name.
+    """
+
+    subject: Subject
+    whole: Evaluator
+    unsafe: Unsafe
+    stated: Unsafe | None
+    margin: float | None
+    columns: Sequence[int]
+    limits: Mapping[str, Limit]
+    fits: int | None
+    at_tests: bool
+
+    def is_unsafe(self, original: Evaluations) -> bool:
+        """Whether an original vehicle is unsafe, or drives in no encounter that counts."""
+        return bool(not original.valid[0] or self.unsafe.of(original)[0])
 
 
 @question
 @contents(
-    *("unsafe", "margin", "kept", "rough", "scope", "up_to", "boxes", *OF_BOX),
+    *NUMBERS,
     lead="limits",
     next="report",
     limits=LIMITS,
-    intervals=INTERVALS,
-    uncertainty=UNCERTAINTY,
     fits=FITS,
     nearest=NEAREST,
     ranges=IN_RANGES,
@@ -94,36 +151,143 @@ def tolerance(
         evaluator = whole.for_study(study_up_to(whole.study, up_to))
     study = evaluator.study
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
-    smaller = [*map(whole.for_study, smaller_cuts(whole.study, up_to))]
-    phases = phases_of(evaluator, len(columns), fits)
-    planned = {name: (1 + len(smaller)) * cost for name, cost in phases.items()}
-    evaluator.begin(planned, least=1 + 2 * len(columns) * (1 + settings_of_line(PARTS)))
+    smaller = smaller_cuts(whole.study, up_to)
+    usual = _usual_settings(evaluator, len(columns), fits)
+    planned = {name: (1 + len(smaller)) * number for name, number in usual.items()}
+    evaluator.begin(planned, least=1 + 2 * len(columns) * LEAST_VALUES)
     specified = specified_limits(study, limits, columns)
-    original = evaluator.evaluate_original()
+    _check_drawable(evaluator)
+
     # The criterion is that of the whole study: up to a smaller value nothing stricter counts.
-    of_whole = original
-    if up_to is not None:
-        of_whole = whole.evaluate(whole.characteristics.original_settings, "original vehicle")
-    asked = Asked(
-        subject=subject,
-        evaluator=evaluator,
-        columns=columns,
-        limits=specified,
-        unsafe=limit_criterion(
-            whole, subject, unsafe, margin, of_whole if of_whole.valid[0] else original
-        ),
+    original = evaluator.evaluate_original()
+    of_whole = original if up_to is None else _original_of(whole)
+    reference = of_whole if of_whole.valid[0] else original
+    criterion = limit_criterion(whole, subject, unsafe, margin, reference)
+    asked = LimitsQuestion(
+        subject, whole, criterion, unsafe, margin, columns, specified, fits, at_tests
+    )
+
+    # Limits up to a value lie within those up to each smaller one.
+    outer = None
+    for cut in map(whole.for_study, smaller):
+        if not asked.is_unsafe(_original_of(cut)):
+            outer = find_limits(_asked_of(asked, cut), outer)
+    is_safe = not asked.is_unsafe(original)
+    last = _asked_of(asked if is_safe else asked._replace(fits=0), evaluator)
+    found = find_limits(last, outer) if is_safe else no_limits(last)
+    is_few = evaluator.left is not None
+    told = Told(
+        asked=last,
+        limits=found,
+        unsafe=criterion,
         original=original,
-        criterion=unsafe,
-        margin=margin,
-        fits=fits,
-        budget=budget_of(evaluator),
-        is_quick=quick,
+        columns=columns,
+        is_rough=quick or is_few,
+        has_scan=not is_few,
         at_tests=at_tests,
         up_to=up_to,
-        left_out=names_left_out(whole.study, study),
-        smaller=smaller,
+        tests_left_out=names_left_out(whole.study, study),
     )
-    is_safe = not asked.unsafe.of(original)[0]
-    if evaluator.left is None or not is_safe:
-        return answer_limits(asked)
-    return answer_roughly(asked)
+    ranges = _in_ranges(asked, evaluator, found) if is_safe and not told.is_rough else None
+    has_nearest = told.broken and is_safe and not is_few
+    nearest = nearest_limits(last, found) if has_nearest else None
+    return answer_limits(told, nearest, ranges)
+
+
+def _original_of(evaluator: Evaluator) -> Evaluations:
+    """The evaluation of the original vehicle of a part of a study."""
+    return evaluator.evaluate(evaluator.characteristics.original_settings, "original vehicle")
+
+
+def _usual_settings(evaluator: Evaluator, columns: int, fits: int | None) -> dict[str, float]:
+    """The phases of progress, each with the number of settings that it usually simulates."""
+    study = evaluator.study
+    points = len(evaluator.system.points)
+    sets = len(other_sets(study, fits))
+    scaled = evaluator.scaled
+    phases = {
+        OWN_SET_STAGE: usual_alone(evaluator, columns) + scaled(CASES) / points,
+        OTHER_SETS_STAGE: scaled(CASES_OF_SET * sets) / points,
+    }
+    if study.states_ranges and not study.ranges:
+        phases[RANGES_STAGE] = scaled(USUAL.own + USUAL.other * sets) / points
+    return phases
+
+
+def _asked_of(asked: LimitsQuestion, evaluator: Evaluator) -> Asked:
+    """The limits that are sought in a part of the study."""
+    models = models_of(evaluator, asked.unsafe, asked.fits)
+    sought = asked_of(models, asked.unsafe, asked.columns, asked.limits, at_tests=asked.at_tests)
+    return sought._replace(avoided=_unsafe_solutions(asked, evaluator))
+
+
+def _unsafe_solutions(asked: LimitsQuestion, evaluator: Evaluator) -> FloatArray:
+    """The vehicles of unsafe solutions of results that change no others than what varies, shape (K,
+    n).
+    """
+    members = evaluator.characteristics
+    subject, vehicle = asked.subject, members.vehicle
+    if isinstance(subject, Study):
+        return np.zeros((0, len(vehicle)))
+    frame = subject.solutions[asked.unsafe.rows(subject.solutions)]
+    settings = frame[list(members.names)].to_numpy(dtype=float)
+    is_original = settings[:, : len(vehicle)] == vehicle.original
+    varies = np.isin(range(len(vehicle)), asked.columns)
+    settings = np.unique(settings[is_original[:, ~varies].all(axis=1)], axis=0)
+    if evaluator is not asked.whole and len(settings):
+        # They are unsafe in the whole study; those in encounters above the value do not count.
+        is_inside = (settings >= members.lower) & (settings <= members.upper)
+        settings = settings[is_inside.all(axis=1)]
+        runs = evaluator.evaluate(settings, "unsafe solutions")
+        settings = settings[runs.valid & asked.unsafe.of(runs)]
+    return np.asarray(settings[:, : len(vehicle)])
+
+
+def _check_drawable(evaluator: Evaluator) -> None:
+    """Refuse a study of which hardly any setting is feasible, before the long scans."""
+    region = evaluator.region
+    members = region.characteristics
+    rng = np.random.default_rng(evaluator.seed)
+    width = members.upper - members.lower
+
+    def draw(number: int) -> FloatArray:
+        return members.lower + rng.random((number, len(members))) * width
+
+    if not len(region.draw_feasible(draw, 1)):
+        problem = (
+            f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no"
+            f" box to test: {region}"
+        )
+        legal = "characteristics that the constraints do not tie to each other"
+        raise InputError(evaluator.study.source, problem, legal)
+
+
+def _in_ranges(asked: LimitsQuestion, evaluator: Evaluator, limits: FoundLimits) -> InRanges | None:
+    """What a search for counterexamples to the limits finds in the ranges that a study states
+    beside its tests; to the specified ones without joint limits.
+    """
+    study = study_in_ranges(evaluator.study)
+    sides = limits.specified if limits.sides is None else limits.sides
+    if study is None or not sides.any():
+        return None
+    other = evaluator.for_study(study)
+    try:
+        original = other.evaluate_original()
+    except InputError as error:
+        warn(f"the limits are not tried in the ranges of the study: {error.problem}")
+        return None
+    unsafe = limit_criterion(other, study, asked.stated, asked.margin, original)
+    there = _asked_of(asked._replace(unsafe=unsafe, subject=study, whole=other), other)
+    rngs = [Stream.WIDER_SCOPE.generator(other.seed, fit) for fit in there.fits]
+    space = there.boxes(there.domain).cases_in(sides)
+    with evaluator.phases.stage(RANGES_STAGE):
+        attacks = [
+            there.search(fit, there.budget(fit), rng)(space, there.nothing)
+            for fit, rng in zip(there.fits, rngs, strict=True)
+        ]
+    return InRanges(there, unsafe, attacks)
+
+
+def study_in_ranges(study: Study) -> Study | None:
+    """The study in its ranges; None if it states none beside its listed encounters."""
+    return None if study.ranges or not study.states_ranges else with_ranges(study)

@@ -1,88 +1,269 @@
-"""What is asked about limits: the characteristics, the specified limits, and the criterion."""
+"""What is asked about limits: which characteristics vary, in which worlds, and how much is
+searched.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 
 from safevar_sumo.errors import InputError, about, check_name
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.case import Subject
+from safevar_sumo.questions.box import MAX_CORNERS
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.tolerance.boxes import BoxEffort, Boxes
+from safevar_sumo.questions.tolerance.cases import (
+    CaseSearch,
+    Counterexamples,
+    SearchPlan,
+    Space,
+    search_cases,
+)
+from safevar_sumo.questions.tolerance.oracle import Oracle
+from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Limit, Study, limits_of
 
+MAX_UNSAFE_SHARE = 0.003
+"""Upper bound of a box's unsafe share, with 95 % confidence, if every sampled vehicle is safe."""
+CASES_ALONE, CASES, CASES_OF_SET = 5_000, 80_000, 4_000
+"""Usual numbers of cases: for each limit alone, for the joint limits with the study's own parameter
+set, and with each other one.
+"""
+LEAST_VALUES = 8
+"""Least number of values between the original and each end with which a limit alone is stated."""
+FEW_ALONE, FEW_OWN = 0.15, 0.1
+"""Shares of few simulations that seek limits alone, and that search the box that is printed."""
+FEW_PARTS = 4, 4
+"""Into how many parts the way to something unsafe is divided with few simulations."""
+FEW_GENERATION = 24
+"""Cases of a generation of such a search."""
+FEW_FARTHEST = 0.8
+"""How far they keep off at most, as a share of the change that failed."""
+LEAST_CASES = 20
+"""Fewest cases of each of three searches of joint limits: if all were drawn at random, at most 5 %
+of such cases are unsafe, with 95 % confidence.
+"""
+FEW_RETREAT, FURTHER_RETREAT = 0.5, 200.0
+"""How much farther limits keep off failures after each box that failed, in `LEAST_MOVE`; and what
+is added, times the number of cases: the fewer they are, the fewer boxes can be searched.
+"""
 
-class Asked(NamedTuple):
-    """A question about limits.
+
+class Effort(NamedTuple):
+    """How much is searched.
 
     Attributes
     ----------
-    columns
-        The columns of the characteristics that vary.
-    limits
-        The specified limits, by name.
-    unsafe
-        What is unsafe, with the distance to keep.
-    original
-        The evaluation of the original vehicle.
-    criterion, margin
-        The options from which `unsafe` comes.
-    fits
-        Number of parameter sets in which the limits hold; None for all.
-    budget
-        Number of simulations that search for a counterexample.
-    is_quick
-        Whether the answer is rough, so that no limit is called kept.
-    at_tests
-        Whether limits hold at the points of the study's tests alone, and not between them.
-    up_to
-        The parameter and the value at which the study was cut, as `NAME=V`; None if it was not.
-    left_out
-        The names of the tests that are above this value.
-    smaller
-        The evaluators of the study cut at smaller values, in ascending order: its limits lie within
-        those of each.
+    encounters, values
+        Listed encounters in which limits alone are sought, and values between the original and each
+        end.
+    alone, own, other
+        Cases that search for a counterexample to limits alone, and to a box with the study's own
+        parameter set, and with another one.
+    generation, more
+        Cases of a generation of such a search, and generations that follow the first with an unsafe
+        case.
+    box
+        How much boxes are searched.
+    corners
+        Corners of a box that meet all listed encounters.
+    confirmations
+        Further searches of the box that is to be printed.
+    share
+        Upper bound of its unsafe share; nothing is proved from 1 on.
     """
 
-    subject: Subject
-    evaluator: Evaluator
-    columns: list[int]
-    limits: dict[str, Limit]
-    unsafe: Unsafe
-    original: Evaluations
-    criterion: Unsafe | None
-    margin: float | None
-    fits: int | None
-    budget: int
-    is_quick: bool = False
-    at_tests: bool = False
-    up_to: str | None = None
-    left_out: Sequence[str] = ()
-    smaller: Sequence[Evaluator] = ()
+    encounters: float = math.inf
+    values: int = 100
+    alone: int = 2000
+    own: int = 5000
+    other: int = 1000
+    generation: int = 512
+    more: int = 2
+    box: BoxEffort = BoxEffort()
+    corners: int = MAX_CORNERS
+    confirmations: int = 3
+    share: float = MAX_UNSAFE_SHARE
+
+    def plan(self, budget: int) -> SearchPlan:
+        """A search for a counterexample."""
+        return SearchPlan(budget, self.generation, self.more)
+
+
+USUAL = Effort()
+"""How much is searched by default."""
+
+
+class Asked(NamedTuple):
+    """What is asked.
+
+    Attributes
+    ----------
+    fits
+        The numbers of the parameter sets, the study's own first.
+    lower, upper
+        The domains of the vehicle's values, shape (n,); the original where a value does not vary.
+    given
+        The specified limits, shape (2, n); NaN where there are none.
+    avoided
+        Vehicles that no box may hold, shape (K, n).
+    left_out
+        The models in which the original itself is unsafe.
+    """
+
+    oracle: Oracle
+    fits: tuple[int, ...]
+    lower: FloatArray
+    upper: FloatArray
+    given: FloatArray
+    avoided: FloatArray
+    effort: Effort
+    seed: int
+    left_out: tuple[Model, ...] = ()
 
     @property
-    def unsafe_solutions(self) -> FloatArray:
-        """The distinct unsafe solutions of results that change no other characteristics than those
-        that vary, and parameters of the scenario; shape (K, n).
-        """
-        members = self.evaluator.characteristics
-        if isinstance(self.subject, Study):
-            return np.zeros((0, len(members)))
-        frame = self.subject.solutions[self.unsafe.rows(self.subject.solutions)]
-        settings = frame[list(members.names)].to_numpy(dtype=float)
-        varies = ~members.of_vehicle
-        varies[self.columns] = True
-        is_original = (settings == members.original)[:, ~varies].all(axis=1)
-        settings = np.unique(settings[is_original], axis=0)
-        if self.up_to is None or not len(settings):
-            return settings
-        # They are unsafe in the whole study; those in encounters above the value do not count.
-        settings = settings[((settings >= members.lower) & (settings <= members.upper)).all(axis=1)]
-        evaluations = self.evaluator.evaluate(settings, "unsafe solutions")
-        return np.asarray(settings[evaluations.valid & self.unsafe.of(evaluations)])
+    def original(self) -> FloatArray:
+        """The values of the original vehicle."""
+        return self.oracle.vehicle.original
+
+    @property
+    def domain(self) -> FloatArray:
+        """How far the domains reach below and above the original, shape (2, n)."""
+        return np.stack([self.original - self.lower, self.upper - self.original])
+
+    @property
+    def star(self) -> Space:
+        """The cases of vehicles that differ from the original in one value."""
+        space = self.oracle.space(0, self.lower, self.upper)
+        return space._replace(center=self.original)
+
+    @property
+    def nothing(self) -> FloatArray:
+        """No cases."""
+        return self.star.lower[np.newaxis][:0]
+
+    def search(self, fit: int, budget: int, rng: Generator, *, phases: bool = True) -> CaseSearch:
+        """A search for unsafe cases with a parameter set."""
+        oracle, plan = self.oracle, self.effort.plan(budget)
+
+        def search(space: Space, known: FloatArray) -> Counterexamples:
+            n = space.size
+            there = oracle.space(fit, space.lower[:n], space.upper[:n], phases=phases)
+            there = there._replace(center=space.center)
+            return search_cases(oracle, there, known, plan, rng)
+
+        return search
+
+    def budget(self, fit: int) -> int:
+        """The cases that search for a counterexample to a box with a parameter set."""
+        return self.effort.other if fit else self.effort.own
+
+    def boxes(self, longest: FloatArray) -> Boxes:
+        """Boxes with the specified limits, whose other sides are at most so long."""
+        is_given = ~np.isnan(self.given)
+        longest = np.where(is_given, np.abs(self.given - self.original), longest)
+
+        def printed(sides: FloatArray) -> FloatArray:
+            """Sides as they are printed; ends of domains and specified limits stay."""
+            rounded = sides.copy()
+            for column, item in enumerate(self.oracle.vehicle):
+                low = item.rounded(item.original - sides[0, column], upwards=True)
+                high = item.rounded(item.original + sides[1, column], upwards=False)
+                rounded[:, column] = item.original - low, high - item.original
+            return np.where((sides >= self.domain) | is_given, sides, rounded)
+
+        is_free = (self.domain > 0) & ~is_given
+        space = self.oracle.space(0, self.lower, self.upper)
+        effort = self.effort.box
+        return Boxes(self.oracle, space, self.original, longest, is_free, printed, effort)
+
+
+def asked_of(
+    models: Models,
+    new_car: Unsafe,
+    columns: Sequence[int],
+    limits: Mapping[str, Limit],
+    *,
+    at_tests: bool,
+) -> Asked:
+    """The limits of some characteristics that are sought in some models; an encounter between the
+    values of a test counts unless the original is unsafe by `new_car` in it.
+    """
+    evaluator = models.own.evaluator
+    oracle = Oracle(models.members, new_car, between=not at_tests)
+    vehicle = oracle.vehicle
+    varies = np.isin(range(len(vehicle)), columns)
+    ends = np.stack([vehicle.lower, vehicle.upper])
+    lower, upper = np.where(varies, ends, vehicle.original)
+    given = np.full_like(ends, np.nan)
+    for name, limit in limits.items():
+        given[:, vehicle.names.index(name)] = limit.at_least, limit.at_most
+    return Asked(
+        oracle=oracle,
+        fits=models.fits,
+        lower=lower,
+        upper=upper,
+        given=given,
+        avoided=np.zeros((0, len(vehicle))),
+        effort=effort_of(evaluator, oracle.available, len(columns)),
+        seed=evaluator.seed,
+        left_out=models.left_out,
+    )
+
+
+def usual_alone(evaluator: Evaluator, columns: int | None = None) -> float:
+    """The usual number of settings that seek the limits of so many characteristics alone, by
+    default of all.
+    """
+    number = len(evaluator.characteristics.vehicle) if columns is None else columns
+    return evaluator.scaled(CASES_ALONE * number) / len(evaluator.system.points)
+
+
+def effort_of(evaluator: Evaluator, cases: float, varied: int) -> Effort:
+    """How much is searched, with at most so many cases."""
+    usual = USUAL
+    if math.isfinite(cases):
+        return _effort_of_few(int(cases), varied)
+    names = ("values", "alone", "own", "other", "corners", "confirmations")
+    scaled = {name: evaluator.scaled(getattr(usual, name)) for name in names}
+    scaled["values"] = max(scaled["values"], LEAST_VALUES)
+    growths = evaluator.scaled(usual.box.growths)
+    share = usual.share / evaluator.account.effort
+    return usual._replace(**scaled, share=share, box=usual.box._replace(growths=growths))
+
+
+def _effort_of_few(cases: int, varied: int) -> Effort:
+    """How much is searched with few simulations: without other parameter sets, and without limits
+    alone that lie beyond what a scan of fewer than `LEAST_VALUES` values shows.
+    """
+    of_line = int(FEW_ALONE * cases / (2 * max(varied, 1)))
+    values = min(max(of_line, 1), LEAST_VALUES)
+    box = BoxEffort(
+        parts=FEW_PARTS,
+        explored=0,
+        growths=0,
+        learnt=1,
+        places=4,
+        retreat=FEW_RETREAT + FURTHER_RETREAT / cases,
+        farthest=FEW_FARTHEST,
+    )
+    return Effort(
+        encounters=max(of_line // (values + sum(FEW_PARTS)), 1),
+        values=values,
+        alone=0,
+        own=int(FEW_OWN * cases),
+        generation=FEW_GENERATION,
+        more=0,
+        box=box,
+        corners=0,
+        confirmations=2,
+        share=1.0,
+    )
 
 
 def columns_of(names: Sequence[str], characteristics: Sequence[str]) -> list[int]:
@@ -104,8 +285,5 @@ def specified_limits(
     with about("limits"):
         for name in limits_of(texts, rows):
             check_name("", f"{name} does not vary with these --characteristics", name, varied)
-        return {
-            name: limit
-            for name, limit in limits_of(texts, rows, study.limits).items()
-            if name in varied
-        }
+        limits = limits_of(texts, rows, study.limits)
+    return {name: limit for name, limit in limits.items() if name in varied}

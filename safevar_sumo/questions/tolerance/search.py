@@ -1,365 +1,350 @@
-"""The search for the largest box in which characteristics may vary together, with limits that the
-user specifies.
+"""The limits that a question asks for: of each characteristic alone, and of all at the same time,
+in one parameter set of the vehicle model after another.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
-from itertools import islice
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.boundary import find_boundaries
-from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.box import Judgement, Proof, prove
 from safevar_sumo.questions.sampling import Stream
-from safevar_sumo.questions.tolerance.sides import BoxGeometry, Step
-from safevar_sumo.records import BoolArray, FloatArray
-from safevar_sumo.study import Limit
+from safevar_sumo.questions.tolerance.alone import (
+    Alone,
+    Side,
+    limits_before,
+    scan_alone,
+    search_alone,
+)
+from safevar_sumo.questions.tolerance.asked import LEAST_CASES, Asked
+from safevar_sumo.questions.tolerance.boxes import (
+    LEAST_MOVE,
+    Boxes,
+    Known,
+    Settled,
+    find_largest_box,
+    learn,
+    settle,
+)
+from safevar_sumo.questions.tolerance.cases import CaseSearch, Counterexamples, Space
+from safevar_sumo.questions.tolerance.oracle import Exhausted, product_of
+from safevar_sumo.records import FloatArray
 
-SHRINKING = (8, 8, 8)
-"""Number of parts into which each round divides the sizes between a safe and an unsafe box."""
-WIDENING = 0.02
-"""Share of its domain by which a side of the box is widened in search of something unsafe."""
-SEARCH_POINTS = 256
-"""Number of Sobol points, and of corners, at which a box is searched for something unsafe."""
-SLAB_POINTS = 64
-"""Number of Sobol points, and of corners, at which the room beside a box is searched."""
-SEARCHED_MODELS = 4
-"""Number of models in which a box is searched at once."""
-MAX_ATTEMPTS = 40
-"""Maximum number of boxes that are searched for something unsafe, and of tests."""
-DEVIATIONS = tuple(0.35 * 0.7**k for k in range(9))
-"""Standard deviations of the steps by which a random search changes a box, round by round, as
-shares of the domain.
-"""
-PROPOSALS = 4096
-"""Number of boxes that a round of the random search proposes."""
-BATCH, LEAST_BATCH = 512, 64
-"""Simulations, at all points of a study's matrix, that cost hardly more than one; fewest settings
-of a batch.
-"""
-LEAST_GAIN = 0.01
-"""Least gain in the logarithm of the volume for which a proposed box is simulated."""
-UNDONE_AT_ONCE = 4
-"""Number of changes of a setting of which all combinations are undone in one batch, in search of
-its causes.
-"""
-SEARCH_STAGE = "search of the limits together"
+MOST_PROOFS = 20
+"""Largest number of boxes that random vehicles meet."""
+NEAR = 0.05
+"""How much farther a limit that would hold keeps off failures after each value that failed."""
+QUICK = 2
+"""Generations of a search that only teaches where failures are."""
+OWN_SET_STAGE = "limits with the study's own parameter set"
+OTHER_SETS_STAGE = "limits in each further parameter set"
+"""Phases of progress; the second has a round for each set."""
 
 
-class BoxSearch(BoxGeometry):
-    """The search for a box that is safe in some models.
+class Attack(NamedTuple):
+    """The cases that searched the limits in a parameter set, and the least that they leave."""
+
+    simulated: int
+    least: float
+
+
+class FoundLimits(NamedTuple):
+    """The limits that were found.
 
     Attributes
     ----------
-    models
-        Fits of the vehicle, at points of the study, in which a box has to be safe; more may `join`.
-    unsafe_settings
-        Settings that no box may hold.
-    corners
-        Corners that were unsafe in some box: for each characteristic -1, the lower end of the box,
-        0, the original, or 1, the upper end; for each parameter of the scenario its place between
-        original and end.
-    batch
-        Number of settings that are simulated at once.
+    broken
+        By the number of each parameter set in which the specified limits are unsafe, a case.
+    specified, sides
+        The boxes of the specified limits, and of the joint ones; None if there are none.
+    known
+        What failed while the joint limits were sought.
+    attacks
+        By the number of each parameter set, how the joint limits were searched.
+    proof, proofs
+        The upper bound of their unsafe share, and how often one was sought.
+    beyond
+        By side, an unsafe case just beyond a joint limit.
     """
 
-    def __init__(
-        self,
-        model: Model,
-        columns: Sequence[int],
-        limits: Mapping[str, Limit],
-        unsafe_settings: FloatArray,
-    ) -> None:
-        super().__init__(model.evaluator.region, columns, limits)
-        self.models = [model]
-        self.unsafe_settings = unsafe_settings
-        self.corners = list[FloatArray]()
-        self.search_count = 0
-        self.seed = model.evaluator.seed
-        self._attempts = model.evaluator.scaled(MAX_ATTEMPTS)
-        self._points = model.evaluator.scaled(SEARCH_POINTS)
-        self.batch = max(BATCH // len(model.numbers_of_points), LEAST_BATCH)
+    alone: Alone
+    broken: Mapping[int, FloatArray]
+    boxes: Boxes
+    specified: FloatArray
+    known: Known
+    sides: FloatArray | None = None
+    attacks: Mapping[int, Attack] = {}
+    proof: Proof | None = None
+    proofs: int = 0
+    beyond: Mapping[Side, FloatArray] = {}
 
-    def join(self, model: Model) -> None:
-        """Take a model into the search, or more points of one that is in it."""
-        for number, member in enumerate(self.models):
-            is_same = member.at_worst_phase == model.at_worst_phase
-            if member.evaluator is model.evaluator and is_same:
-                if member.points is None or model.points is None:
-                    model = member._replace(points=None)
-                else:
-                    points = {*member.points, *model.points}
-                    model = member._replace(points=tuple(sorted(points)))
-                del self.models[number]
-                break
-        self.models.insert(0, model)
 
-    def know(self, *settings: FloatArray) -> None:
-        """Know unsafe settings, each of shape (K, n): no later box holds one of them."""
-        self.unsafe_settings = np.concatenate([self.unsafe_settings, *settings])
+def find_limits(asked: Asked, outer: FoundLimits | None = None) -> FoundLimits:
+    """The limits in all parameter sets, within outer ones: those of the study's own, which each
+    other one in turn cuts, so that more sets never widen them.
+    """
+    phases = asked.oracle.phases
+    with phases.stage(OWN_SET_STAGE):
+        limits = _with_own_set(asked, outer)
+    with phases.stage(OTHER_SETS_STAGE):
+        for number, fit in enumerate(asked.fits[1:], 1):
+            phases.begin_round(number, len(asked.fits) - 1, is_known=True)
+            limits = _with_set(asked, limits, fit)
+    if limits.sides is None or asked.effort.share >= 1:
+        return limits
+    return limits._replace(beyond=_beyond(asked, limits))
 
-    @property
-    def first_models(self) -> list[Model]:
-        """The models in which a box is searched: those in which something failed last. Its test
-        meets them all.
-        """
-        return self.models[:SEARCHED_MODELS]
 
-    @property
-    def failures_alone(self) -> FloatArray:
-        """The known unsafe settings in which one characteristic of the vehicle is changed, shape
-        (K, n).
-        """
-        is_changed = (self.unsafe_settings != self.original) & self.characteristics.of_vehicle
-        return np.asarray(self.unsafe_settings[np.count_nonzero(is_changed, axis=1) == 1])
+def no_limits(asked: Asked) -> FoundLimits:
+    """No limits, around an unsafe original."""
+    boxes = asked.boxes(asked.domain)
+    alone = Alone(asked.original, asked.original)
+    return FoundLimits(alone, {}, boxes, boxes.fixed, Known(asked.nothing, asked.nothing))
 
-    def unsafe_inside(self, sides: FloatArray) -> FloatArray:
-        """The known unsafe settings that a box holds."""
-        extents = self.extents(self.unsafe_settings)
-        return np.asarray(self.unsafe_settings[(extents <= sides).all(axis=(1, 2))])
 
-    def holds_failure(self, box: Box) -> bool:
-        """Whether a box holds a known unsafe setting."""
-        return len(self.unsafe_inside(self.sides_of(box))) > 0
+def _with_own_set(asked: Asked, outer: FoundLimits | None) -> FoundLimits:
+    """The limits with the study's own parameter set."""
+    alone = alone_with_own_set(asked, None if outer is None else outer.alone)
+    longest = _sides_of(asked, alone)
+    broken: Mapping[int, FloatArray] = {}
+    if outer is not None:
+        longest = np.minimum(longest, outer.boxes.fixed if outer.sides is None else outer.sides)
+        broken = outer.broken
+    boxes = asked.boxes(longest)
+    encounter = np.tile(asked.star.lower[boxes.space.size :], (len(asked.avoided), 1))
+    known = Known(np.hstack([asked.avoided, encounter]), asked.nothing)
+    limits = FoundLimits(alone, broken, boxes, boxes.fixed, known)
+    if asked.effort.own < LEAST_CASES:
+        return limits
+    try:
+        limits = _with_broken(asked, limits, 0)
+        return limits if 0 in limits.broken else _with_largest_box(asked, limits)
+    except Exhausted:
+        return limits
 
-    def are_unsafe(self, settings: FloatArray) -> BoolArray:
-        """Simulate settings, shape (..., n), and remember the unsafe ones: no later box holds one
-        of them.
-        """
-        rows = settings.reshape(-1, 1, len(self.original))
-        return self.have_unsafe(rows).reshape(settings.shape[:-1])
 
-    def have_unsafe(self, groups: FloatArray) -> BoolArray:
-        """Which of G groups of settings, shape (G, K, n), hold an unsafe one; unsafe ones are
-        remembered.
+def alone_with_own_set(asked: Asked, outer: Alone | None = None) -> Alone:
+    """The limits of each characteristic alone, within outer ones; they end before what cannot be
+    simulated, too.
+    """
+    oracle, effort, star = asked.oracle, asked.effort, asked.star
+    limits = outer or Alone(asked.lower, asked.upper)
+    hardest = oracle.hardest(effort.encounters)
+    parts = effort.box.parts
+    limits = scan_alone(oracle.with_failed, star, limits, hardest, effort.values, parts)
+    if effort.alone:
+        rng = Stream.LIMITS_ALONE.generator(asked.seed, 0)
+        search = asked.search(0, effort.alone, rng, phases=False)
+        limits = search_alone(oracle, star, limits, search, parts)
+    cases = np.array([*limits.beyond.values()]).reshape(-1, asked.nothing.shape[1])
+    is_unsafe = oracle(cases) < 0
+    pairs = zip(limits.beyond.items(), is_unsafe, strict=True)
+    return limits._replace(beyond=dict(pair for pair, fails in pairs if fails))
 
-        A group is simulated in one model after another until one is unsafe; the model that last
-        found some is the first.
-        """
-        has_unsafe = np.zeros(len(groups), dtype=bool)
-        for model in self.first_models:
-            waiting = np.flatnonzero(~has_unsafe)
-            rows = groups[waiting].reshape(-1, len(self.original))
-            if not len(rows):
-                break
-            is_unsafe = model.are_unsafe(rows, SEARCH_STAGE)
-            if is_unsafe.any():
-                self.models.remove(model)
-                self.models.insert(0, model)
-            self.know(rows[is_unsafe])
-            has_unsafe[waiting] = is_unsafe.reshape(len(waiting), -1).any(axis=1)
-        return has_unsafe
 
-    def corner_settings(self, boxes: FloatArray) -> FloatArray:
-        """Settings at the C known corners of B boxes, shape (B, C, n)."""
-        corners = np.array(self.corners)
-        return self.original + corners * np.where(
-            corners > 0, boxes[:, 1:], boxes[:, :1]
-        )  # a corner of 0 is the original
+def _with_broken(asked: Asked, limits: FoundLimits, fit: int) -> FoundLimits:
+    """Limits with a case in which the specified ones are unsafe in a parameter set, all others as
+    in the original.
+    """
+    if not limits.specified.any() or fit in limits.broken:
+        return limits
+    rng = Stream.SPECIFIED_BETWEEN.generator(asked.seed, fit)
+    search = asked.search(fit, asked.budget(fit), rng)
+    unsafe = search(limits.boxes.cases_in(limits.specified), asked.nothing).unsafe
+    return limits._replace(broken={**limits.broken, fit: unsafe[0]}) if len(unsafe) else limits
 
-    def points(self, sides: FloatArray, number: int) -> FloatArray:
-        """New Sobol points and corners of a box."""
-        self.search_count += 1
-        return self.box(sides).spread_and_corners(number, self.seed + self.search_count)
 
-    def failures_in(self, sides: FloatArray) -> FloatArray:
-        """Unsafe settings of a box: the known ones; without any, those that a new search finds."""
-        known = self.unsafe_inside(sides)
-        if len(known):
-            return known
-        points = self.points(sides, self._points)
-        return points[self.are_unsafe(points)]
+def _with_largest_box(asked: Asked, limits: FoundLimits) -> FoundLimits:
+    """Limits with the largest box that passes all searches and random vehicles.
 
-    def learn(self, settings: FloatArray, model: Model | None = None) -> FloatArray:
-        """Add corners that are unsafe, from some settings that are unsafe in a model, or in any;
-        their causes, shape (K, n).
+    The random search knows phase 0 alone, as a place with its phase says little of the next box,
+    whose worst phase is another.
+    """
+    effort, boxes, seed = asked.effort, limits.boxes, asked.seed
+    rng = Stream.JOINT_LIMITS.generator(seed)
+    quick = asked.search(0, QUICK * effort.generation, rng, phases=False)
+    thorough = asked.search(0, effort.own, rng, phases=False)
+    steps = Stream.LARGER_BOXES.generator(seed)
+    settled = Settled(boxes.longest, limits.known)
+    if boxes.effort.explored:
+        settled = find_largest_box(boxes, limits.known, quick, thorough, steps)
+    own = asked.search(0, effort.own, Stream.VALIDATION.generator(seed))
+    searches = [own, *[_corner_search(asked, boxes)] * (effort.corners > 0)]
+    searches += [own] * effort.confirmations
+    return _with_settled(asked, limits, settled, searches, 0)
 
-        One by one, as many changes of a setting as possible are undone while it stays unsafe; the
-        directions of the remaining changes are the corner. All combinations of the next few are
-        simulated at once.
-        """
-        number = min(len(settings), self.batch // 2**UNDONE_AT_ONCE)
-        causes = self._causes(settings[:: len(settings) // number][:number], model)
-        known = {corner.tobytes(): corner for corner in [*self.corners, *self._corners_of(causes)]}
-        self.corners = list(known.values())
-        self._keep_causes(causes)
-        return causes
 
-    def approach(self, causes: FloatArray, model: Model) -> FloatArray:
-        """Know, for each change of K causes, the value nearest to the original from which on it is
-        unsafe with the others: the settings in which all changes have these values, shape (K, n).
-        """
-        rows, columns = np.nonzero((causes != self.original) & self.is_free.any(axis=0))
-        ends = causes[rows]
-        starts = ends.copy()
-        starts[np.arange(len(rows)), columns] = self.original[columns]
-        found = find_boundaries(starts, ends, partial(model.are_unsafe, stage=SEARCH_STAGE))
-        self.know(found.unsafe)
-        nearest = causes.copy()
-        nearest[rows, columns] = found.unsafe[np.arange(len(rows)), columns]
-        return nearest
+def _with_set(asked: Asked, limits: FoundLimits, fit: int) -> FoundLimits:
+    """Limits that hold in a further parameter set, too."""
+    effort, seed = asked.effort, asked.seed
+    rng = Stream.LIMITS_ALONE.generator(seed, fit)
+    search = asked.search(fit, effort.alone, rng, phases=False)
+    alone = search_alone(asked.oracle, asked.star, limits.alone, search, effort.box.parts)
+    limits = _with_broken(asked, limits._replace(alone=alone), fit)
+    if limits.sides is None or fit in limits.broken:
+        return limits
+    settled = Settled(_within_alone(asked, limits), limits.known)
+    search = asked.search(fit, effort.other, Stream.VALIDATION.generator(seed, fit))
+    return _with_settled(asked, limits, settled, [search], fit)
 
-    def _corners_of(self, causes: FloatArray) -> FloatArray:
-        """The directions of the changes of K causes, shape (K, n); of a scenario's parameter its
-        place.
-        """
-        changes = causes - self.original
-        sides = np.where(changes > 0, self.domain[1], self.domain[0])
-        shares = np.divide(changes, sides, out=np.zeros_like(changes), where=sides > 0)
-        return np.where(self.characteristics.of_vehicle, np.sign(changes), shares)
 
-    def _keep_causes(self, causes: FloatArray) -> None:
-        """Know K causes, and forget settings with more than a cause's changes: a box that holds one
-        holds the cause.
-        """
-        needs = np.maximum(self.extents(self.unsafe_settings), 0.0)
-        for cause in np.maximum(self.extents(causes), 0.0):
-            is_kept = ~(needs >= cause).all(axis=(1, 2))
-            needs = needs[is_kept]
-            self.unsafe_settings = self.unsafe_settings[is_kept]
-        self.know(np.unique(causes, axis=0))
+def _with_settled(
+    asked: Asked, limits: FoundLimits, settled: Settled, searches: list[CaseSearch], fit: int
+) -> FoundLimits:
+    """Limits with the box within another one that passes searches with a parameter set and, where
+    it became smaller, random vehicles.
+    """
+    boxes = limits.boxes
+    before = limits.sides
+    proofs = limits.proofs
+    proof = limits.proof
+    while settled.sides is not None and proofs < MOST_PROOFS:
+        settled = settle(boxes, settled.known, settled.sides, searches)
+        if settled.sides is None:
+            break
+        limits = limits._replace(known=settled.known)
+        limits = limits._replace(alone=_alone_before(asked, limits))
+        sides = _within_alone(asked, limits._replace(sides=settled.sides))
+        is_same = before is not None and np.array_equal(before, sides)
+        if is_same or asked.effort.share >= 1:
+            return _passed(limits, sides, settled, fit)
+        proofs += 1
+        proof, unsafe = _prove(asked, boxes.cases_in(sides), proofs)
+        if not len(unsafe):
+            return _passed(limits._replace(proof=proof, proofs=proofs), sides, settled, fit)
+        known = learn(boxes, settled.known, unsafe, sides)
+        settled = settled._replace(known=known)
+    return limits._replace(sides=None, known=settled.known, proof=None)
 
-    def _causes(self, settings: FloatArray, model: Model | None) -> FloatArray:
-        """Unsafe settings with as few changes as possible, from K that are unsafe in a model, or in
-        any.
-        """
-        causes = settings.copy()
-        columns = np.flatnonzero(self.is_free.any(axis=0))
-        for start in range(0, len(columns), UNDONE_AT_ONCE):
-            group = columns[start : start + UNDONE_AT_ONCE]
-            bits = 1 << np.arange(len(group))
-            is_undone = np.zeros((2 ** len(group), len(self.original)), dtype=bool)
-            is_undone[:, group] = np.arange(2 ** len(group))[:, np.newaxis] & bits
-            variants = np.where(is_undone, self.original, causes[:, np.newaxis])
-            if model is None:
-                are_unsafe = self.are_unsafe(variants)
-            else:
-                rows = variants.reshape(-1, len(self.original))
-                are_unsafe = model.are_unsafe(rows, SEARCH_STAGE).reshape(variants.shape[:-1])
-            for cause, of_cause, is_unsafe in zip(causes, variants, are_unsafe, strict=True):
-                chosen = 0
-                for bit in bits:
-                    chosen += bit * is_unsafe[chosen + bit]
-                cause[:] = of_cause[chosen]
-        return causes
 
-    def are_safe(self, boxes: FloatArray) -> BoolArray:
-        """Which of B boxes, shape (B, 2, n), are safe at the known corners."""
-        return ~self.have_unsafe(self.corner_settings(boxes))
+def _passed(limits: FoundLimits, sides: FloatArray, settled: Settled, fit: int) -> FoundLimits:
+    """Limits with a box that passed; none if it leaves no characteristic room."""
+    is_free = limits.boxes.is_free
+    if is_free.any() and not sides[is_free].any():
+        return limits._replace(sides=None, proof=None)
+    attack = Attack(settled.attacked, settled.least)
+    return limits._replace(sides=sides, attacks={**limits.attacks, fit: attack})
 
-    def shrunk(self, sides: FloatArray, start: FloatArray) -> FloatArray:
-        """A box whose free sides are the largest share of `sides` with which it is safe."""
-        whole = np.where(self.is_free, sides, start).reshape(1, -1)
-        if not self._are_unsafe_boxes(whole)[0]:
-            return whole.reshape(start.shape)
-        least = np.where(self.is_free, 0.0, start).reshape(1, -1)
-        found = find_boundaries(least, whole, self._are_unsafe_boxes, SHRINKING)
-        return found.safe.reshape(start.shape)
 
-    def _are_unsafe_boxes(self, rows: FloatArray) -> BoolArray:
-        """Which of B boxes, a row of sides each, are unsafe at known corners, or hold a known
-        failure.
-        """
-        boxes = rows.reshape(-1, *self.domain.shape)
-        needs = self.extents(self.unsafe_settings)
-        holds_failure = [(needs <= box).all(axis=(1, 2)).any() for box in boxes]
-        return np.asarray(~self.are_safe(boxes) | holds_failure)
+def _alone_before(asked: Asked, limits: FoundLimits) -> Alone:
+    """The limits alone, before what the search for joint limits met with one change."""
+    alone = limits.alone
+    vehicles = limits.known.cases[:, : len(asked.original)]
+    is_single = np.count_nonzero(vehicles != asked.original, axis=1) == 1
+    is_inside = ((vehicles >= alone.lower) & (vehicles <= alone.upper)).all(axis=1)
+    cases = limits.known.cases[is_single & is_inside]
+    return limits_before(asked.oracle, asked.star, alone, cases, asked.effort.box.parts)
 
-    def largest(self, sides: FloatArray, start: FloatArray) -> FloatArray:
-        """A box within `start` that is safe at the known corners, and keeps off known unsafe
-        settings, as large as a random search makes it.
 
-        `sides` first shrink as a whole until they are safe. Larger boxes nearby are then simulated
-        at their corners.
-        """
-        rng = Stream.LARGER_BOXES.generator(self.seed)
-        best = self.shrunk(sides, start)
-        for deviation in DEVIATIONS:
-            larger = self._larger(best, start, deviation, rng)
-            tried = [
-                *islice(
-                    self._without_known_failures(larger), max(self.batch // len(self.corners), 1)
-                )
-            ]
-            if tried:
-                boxes = np.array(tried)
-                best = max(boxes[self.are_safe(boxes)], key=self.log_volume, default=best)
-        return best
+def _sides_of(asked: Asked, alone: Alone) -> FloatArray:
+    """The sides of limits alone."""
+    return np.stack([asked.original - alone.lower, alone.upper - asked.original])
 
-    def _larger(
-        self, best: FloatArray, start: FloatArray, deviation: float, rng: np.random.Generator
-    ) -> FloatArray:
-        """Larger boxes near to the best one, within `start`, shape (B, 2, n): random steps of a
-        random share of the sides.
-        """
-        shape = (PROPOSALS, *start.shape)
-        is_moved = rng.random(shape) < rng.random((PROPOSALS, 1, 1))
-        steps = rng.normal(0.0, deviation, shape) * is_moved
-        boxes = np.where(self.is_free, np.clip(best + steps * self.width, 0.0, start), start)
-        return np.asarray(boxes[self.log_volume(boxes) > self.log_volume(best) + LEAST_GAIN])
 
-    def _without_known_failures(self, boxes: FloatArray) -> Iterator[FloatArray]:
-        """Those of B boxes, shape (B, 2, n), that no known failure forbids."""
-        needs = self.extents(self.unsafe_settings)
-        needs = needs[(needs <= boxes.max(axis=0, initial=0.0)).all(axis=(1, 2))]
-        columns = np.ascontiguousarray(
-            needs.reshape(-1, self.domain.size).T
-        )  # a side in a row: compared without copies
-        for box in boxes:
-            if not np.logical_and.reduce(columns <= box.reshape(-1, 1), axis=0).any():
-                yield box
+def _within_alone(asked: Asked, limits: FoundLimits) -> FloatArray:
+    """The sides of joint limits, none longer than what is safe alone."""
+    assert limits.sides is not None
+    boxes = limits.boxes
+    shorter = np.minimum(limits.sides, _sides_of(asked, limits.alone))
+    return boxes.printed(np.where(boxes.is_free, shorter, limits.sides))
 
-    def widened(self, sides: FloatArray) -> FloatArray:
-        """Move the free sides of a box outwards in steps, until something unsafe is in the next
-        step of each or the domain ends. Sides move together where their steps together are safe,
-        too.
-        """
-        steps: list[Step] = [*np.argwhere(self.is_free & (sides < self.longest)).tolist()]
-        while steps := self.safe_steps(sides, [[step] for step in steps]):
-            sides = self.wider(sides, self.safe_steps(sides, [steps]) or steps[:1], WIDENING)
-            steps = [step for step in steps if sides[*step] < self.longest[*step]]
-        return sides
 
-    def safe_steps(self, sides: FloatArray, groups: Sequence[Sequence[Step]]) -> list[Step]:
-        """The steps outwards in which nothing unsafe is found; those of a group are made
-        together.
-        """
+def _corner_search(asked: Asked, boxes: Boxes) -> CaseSearch:
+    """A search of the corners of a box, each in all listed encounters."""
+    listed = asked.oracle.listed()
+    most = asked.effort.corners
+    rng = Stream.FIRST_CORNERS.generator(asked.seed)
 
-        def is_open(box: FloatArray, step: Step) -> bool:
-            side, column = step
-            known = self.unsafe_inside(box)
-            return not (self.extents(known)[:, side, column] > sides[side, column]).any()
+    def search(space: Space, known: FloatArray) -> Counterexamples:
+        n = space.size
+        lower, upper = space.lower[:n], space.upper[:n]
+        is_open = np.flatnonzero(lower < upper)
+        size = len(is_open)
+        numbers = np.arange(2**size)
+        if 2**size > most:
+            numbers = rng.integers(2**size, size=most)
+        is_high = np.zeros((len(numbers), n), dtype=bool)
+        is_high[:, is_open] = numbers[:, np.newaxis] >> np.arange(size) & 1
+        vehicles = np.where(is_high, upper, lower)
+        cases = product_of(vehicles, listed)
+        met = Counterexamples(known[:0], np.zeros(0)).after(cases, asked.oracle(cases))
+        return met._replace(simulated=0)
 
-        boxes = [(self.wider(sides, group, WIDENING), group) for group in groups]
-        steps = [(box, step) for box, group in boxes for step in group if is_open(box, step)]
-        if steps:
-            self.have_unsafe(np.array([self.settings_at_end(box, step) for box, step in steps]))
-        return [step for box, step in steps if is_open(box, step)]
+    return search
 
-    def settings_at_end(self, sides: FloatArray, step: Step) -> FloatArray:
-        """Settings at the end of one side of a box, all other values in the box."""
-        side, column = step
-        settings = np.concatenate(
-            [self.corner_settings(sides[np.newaxis])[0], self.points(sides, SLAB_POINTS)]
-        )
-        settings[:, column] = self.box(sides).end(side, column)
-        return settings
 
-    def best(self, start: FloatArray) -> FloatArray:
-        """The largest box within `start` in which no search finds anything unsafe, moved out as far
-        as it can be, or the last of `MAX_ATTEMPTS` boxes.
-        """
-        sides = start
-        for _ in range(self._attempts):
-            sides = self.largest(sides, start)
-            found = self.failures_in(sides)
-            if not len(found):
-                sides = self.widened(sides)
-                found = self.failures_in(sides)
-            if not len(found):
-                break
-            self.learn(found)
-        return sides
+def _prove(asked: Asked, space: Space, number: int) -> tuple[Proof, FloatArray]:
+    """The upper bound of the unsafe share of a box's vehicles in the listed encounters, and its
+    unsafe cases.
+    """
+    listed = asked.oracle.listed()
+    n = space.size
+    low, width = space.lower[:n], (space.upper - space.lower)[:n]
+    rng = Stream.CONFIDENCE_BOUND.generator(asked.seed, number)
+    unsafe = list[FloatArray]()
+
+    def judge(vehicles: FloatArray) -> Judgement:
+        cases = product_of(vehicles, listed)
+        robustness = asked.oracle.measure(cases)
+        unsafe.append(cases[robustness < 0])
+        of_vehicle = robustness.reshape(len(vehicles), -1)
+        is_unsafe = np.any(of_vehicle < 0, axis=1)
+        has_failed = np.any(np.isnan(of_vehicle), axis=1) & ~is_unsafe
+        counts = ~np.all(np.isposinf(of_vehicle), axis=1)
+        return Judgement(np.asarray(is_unsafe), np.asarray(has_failed), np.asarray(counts))
+
+    def draw(count: int) -> FloatArray:
+        return asked.oracle.feasible(lambda more: low + rng.random((more, n)) * width, count)
+
+    proof, _ = prove(draw, judge, asked.effort.share, number)
+    return proof, unsafe[0]
+
+
+def _beyond(asked: Asked, limits: FoundLimits) -> dict[Side, FloatArray]:
+    """For each joint limit an unsafe case just beyond it, all other values within theirs."""
+    boxes, known, sides = limits.boxes, limits.known, limits.sides
+    assert sides is not None
+    rng = Stream.EXTENSION.generator(asked.seed)
+    search = asked.search(0, QUICK * asked.effort.generation, rng)
+    beyond = dict[Side, FloatArray]()
+    for side, column in np.argwhere((asked.domain > 0) & (sides < asked.domain)).tolist():
+        item = asked.oracle.vehicle.members[column]
+        move = max(LEAST_MOVE * boxes.width[column], 10.0**-item.digits)
+        wider = sides.copy()
+        wider[side, column] = min(sides[side, column] + move, asked.domain[side, column])
+        cases = known.inside(boxes, wider)
+        if not len(cases):
+            # A slice of the wider box: this value at its end.
+            space = boxes.cases_in(wider)
+            lower, upper = space.lower.copy(), space.upper.copy()
+            end = (lower, upper)[side][column]
+            lower[column] = upper[column] = end
+            slice_ = space._replace(lower=lower, upper=upper)
+            cases = search(slice_, known.at_places(boxes, wider)).unsafe
+        if len(cases):
+            beyond[side, column] = cases[0]
+    return beyond
+
+
+def nearest_limits(asked: Asked, limits: FoundLimits) -> FloatArray:
+    """The furthest values of each specified limit with which all hold, the others as specified,
+    shape (2, n); NaN where there is none.
+    """
+    nearest = np.full_like(asked.given, np.nan)
+    known = Known(asked.nothing, asked.nothing)
+    rngs = [Stream.NEAREST_LIMIT.generator(asked.seed, fit) for fit in asked.fits]
+    pairs = zip(asked.fits, rngs, strict=True)
+    searches = [asked.search(fit, asked.effort.other, rng) for fit, rng in pairs]
+    for side, column in np.argwhere(~np.isnan(asked.given)).tolist():
+        is_free = np.zeros_like(limits.boxes.is_free)
+        is_free[side, column] = True
+        item = asked.oracle.vehicle.members[column]
+        effort = limits.boxes.effort._replace(retreat=NEAR)
+        boxes = limits.boxes._replace(is_free=is_free, effort=effort)
+        sides = settle(boxes, known, limits.specified, searches).sides
+        if sides is not None:
+            end = boxes.ends(sides)[side][column]
+            nearest[side, column] = item.rounded(float(end), upwards=side == 0)
+    return nearest

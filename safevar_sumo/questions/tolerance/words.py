@@ -1,21 +1,18 @@
-"""The verdict on limits in words: the decision, how sure it is, in how many parameter sets, and in
-which scope.
-"""
+"""The verdict on limits in words: the decision, what would do instead, and the scope."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+
+import numpy as np
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.box import MET_BY_CORNERS
-from safevar_sumo.questions.counterexamples import describe
-from safevar_sumo.questions.models import Model, Models, fit_names
+from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.counterexamples import describe, limit_text
+from safevar_sumo.questions.models import fit_names
 from safevar_sumo.questions.phases import remark_on_phases
-from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Rows
-from safevar_sumo.questions.tolerance.alone import AloneLimit
-from safevar_sumo.questions.tolerance.asked import Asked
-from safevar_sumo.questions.tolerance.together import LimitsTogether
+from safevar_sumo.questions.tolerance.told import Told
 from safevar_sumo.questions.words import (
     bound_in_words,
     join_phrases,
@@ -26,143 +23,163 @@ from safevar_sumo.questions.words import (
 from safevar_sumo.study import unit_text
 
 
-def verdict_sentences(
-    models: Models,
-    alone: Sequence[AloneLimit],
-    together: LimitsTogether | None,
-    asked: Asked,
-    broken: Sequence[str],
-    nearest: Rows,
-    in_ranges: Rows,
-    refusal: str,
-) -> Iterator[str]:
+def refusal_in_words(told: Told) -> str:
+    """Why no limit can be kept."""
+    breach = told.unsafe.breach_in_words(told.original)
+    return f"the original vehicle itself {breach}: no limit can be kept"
+
+
+def verdict_sentences(told: Told, nearest: Rows, in_ranges: Rows) -> Iterator[str]:
     """The sentences of the verdict: the decision, what decides it, what would do instead, and the
-    scope. A `refusal` says why no limit can be kept.
+    scope.
     """
-    unsafe = models.own.unsafe
-    study = models.own.evaluator.study
-    if refusal:
-        yield f"{refusal[:1].upper()}{refusal[1:]}"
+    if not told.is_safe:
+        refusal = refusal_in_words(told)
+        yield f"{refusal[:1].upper()}{refusal[1:]}."
+        demand = told.unsafe.smaller_demand(told.original)
+        if demand:
+            yield demand
         return
-
-    # The decision, and how sure it is.
-    if broken:
-        yield f"Do not release: {'; '.join(broken)}."
-    if together is not None:
-        yield from _fits_in_words(models, together)
-        yield from _nearest_in_words(nearest)
-        yield from _box_in_words(models, together, asked)
-        box = together.box
-        vague = [
-            item
-            for column, item in enumerate(models.own.evaluator.characteristics.vehicle)
-            if box and not item.is_decidable(float(box.lower[column]), float(box.upper[column]))
-        ]
-        if vague:
-            yield undecidable_in_words(vague)
-
-    # What is unsafe elsewhere.
-    for _, _, verdict, *_ in in_ranges:
-        yield f"In the ranges of the study {verdict}"
-    names = [each.characteristic.name for each in alone if each.scan.of_state("unsafe")]
-    if len(names) > 1:
-        yield f"{join_phrases(names)} can each make the vehicle unsafe on their own."
-    elif names:
-        yield f"{names[0]} can make the vehicle unsafe on its own."
-    else:
-        yield "No single characteristic makes the vehicle unsafe on its own."
-    if unsafe.remark:
-        yield unsafe.remark
-    if asked.left_out:
-        tests = join_phrases(asked.left_out)
-        yield f"Left out, as all their values are above {asked.up_to}: {tests}."
-    if asked.at_tests:
+    if told.broken:
+        yield f"Do not release: {'; '.join(broken_in_words(told))}."
+    yield from _sets_in_words(told)
+    yield from _nearest_in_words(nearest)
+    yield from _box_in_words(told)
+    yield from _vague_in_words(told)
+    for row in in_ranges:
+        yield f"In the ranges of the study {row[2]}"
+    yield from _alone_in_words(told)
+    if told.unsafe.remark:
+        yield told.unsafe.remark
+    if told.tests_left_out:
+        tests = join_phrases(told.tests_left_out)
+        yield f"Left out, as all their values are above {told.up_to}: {tests}."
+    if told.at_tests:
         yield "Nothing was simulated between the values of the tests (--at-tests)."
-    yield f"Scope: {scope_of(study, between=not asked.at_tests)}."
+    yield f"Scope: {told.scope}."
 
 
-def tested_sentences(models: Models, together: LimitsTogether | None) -> Iterator[str]:
-    """How joint limits were tested; nothing without such limits."""
-    study = models.own.evaluator.study
-    if together is not None and study.ranges:
-        share = share_in_words(models.own.evaluator.share_left_out)
-        yield (
-            f"Of the encounters over the domain {share} do not count, because the original vehicle"
-            f" itself keeps less than {study.scenario.margin or 0:g} m in them."
-        )
-    if together is not None and together.box is not None:
-        yield validation_in_words(together)
-        if together.proof is not None:
-            bound = bound_in_words(together.proof.at_most).capitalize()
-            yield f"{bound} of uniformly sampled vehicles within the limits are unsafe."
-        if remark := remark_on_phases(models.own.in_phases):
-            yield remark
+def broken_in_words(told: Told) -> list[str]:
+    """What is wrong with the specified limits: of each that is not safe alone, else of all
+    together.
+    """
+    outside = [column for column in told.broken if told.outside(column) > 0]
+    if outside:
+        return [_outside_in_words(told, column) for column in outside]
+    items = [told.members[column] for column in told.broken]
+    texts = [
+        f"{item.name} {limit_text(item, end)}"
+        for item, column in zip(items, told.broken, strict=True)
+        for end in told.given(column)
+        if end is not None
+    ]
+    case = next(iter(told.limits.broken.values()))
+    failure = told.failure(case, told.box_of(told.limits.specified))
+    words = "the car is unsafe" if failure is None else failure.words
+    return [f"{join_phrases(texts)}: with all specified limits, {words}"]
 
 
-def _fits_in_words(models: Models, together: LimitsTogether) -> Iterator[str]:
+def _outside_in_words(told: Told, column: int) -> str:
+    """What is wrong with a limit: `brakeTorque 0.5: the car hits a pedestrian (outside by 0.08)`.
+
+    At the specified value itself the vehicle may be safe; then what fails beyond the limit is said.
+    """
+    item = told.members[column]
+    low, high = told.given(column)
+    outside = limit_text(item, round(told.outside(column), 9))
+    for side, end in enumerate((low, high)):
+        beyond = told.limits.alone.beyond.get((side, column))
+        if end is None or beyond is None:
+            continue
+        at_end = beyond.copy()
+        at_end[column] = end
+        vehicle = at_end[: len(told.members)]
+        point = Box(told.own.evaluator.region, vehicle, vehicle)
+        for failure in (told.failure(at_end, point), told.failure(beyond)):
+            if failure is not None:
+                value = limit_text(item, float(failure.setting[column]))
+                return f"{item.name} {value}: {failure.words} (outside by {outside})"
+    end = low if high is None else high
+    assert end is not None
+    return f"{item.name} {limit_text(item, end)}: the car is unsafe (outside by {outside})"
+
+
+def _sets_in_words(told: Told) -> Iterator[str]:
     """In which parameter sets the specified limits do not hold."""
-    if together.broken and len(models.members) > 1:
-        kept = f"{len(together.members)} of {len(models.members)}"
-        fits = fit_names(sorted(together.broken))
-        yield f"The specified limits hold in {kept} parameter sets of the vehicle, not in {fits}."
+    broken = sorted(told.limits.broken)
+    tried = len(told.asked.fits)
+    if broken and tried > 1:
+        kept = f"{tried - len(broken)} of {tried}"
+        yield (
+            f"The specified limits hold in {kept} parameter sets of the vehicle, not in"
+            f" {fit_names(broken)}."
+        )
 
 
 def _nearest_in_words(nearest: Rows) -> Iterator[str]:
     """Which values would hold in place of the specified limits."""
-    would_do = [(name, unit, value) for name, unit, _, value in nearest if value is not None]
-    if would_do:
-        values = " or ".join(
-            f"{name} {value:.10g}{unit_text(unit)}" for name, unit, value in would_do
-        )
+    values = [
+        f"{name} {value:.10g}{unit_text(unit)}"
+        for name, unit, _, value in nearest
+        if value is not None
+    ]
+    if values:
         others = ", if the other specified limits stay" if len(nearest) > 1 else ""
-        yield f"A limit that would hold instead: {values}{others}."
+        yield f"A limit that would hold instead: {' or '.join(values)}{others}."
     elif nearest:
         yield "No other value of a single specified limit would hold."
 
 
-def _box_in_words(models: Models, together: LimitsTogether, asked: Asked) -> Iterator[str]:
+def _box_in_words(told: Told) -> Iterator[str]:
     """The joint limits, and what was found within them."""
-    unsafe = models.own.unsafe
-    count = len(together.members)
-    if together.box is None:
-        if together.boxes:
-            kept = (
-                "The specified limits hold with all other characteristics as in the original. "
-                if asked.limits
-                else ""
-            )
-            tested = number_of(together.boxes, "operating range")
-            yield (
-                f"{kept}No joint limits were found ({unsafe.description}): the search tested"
-                f" {tested}, and found an unsafe vehicle in each. That is no proof that there are"
-                " none."
-            )
+    found = told.limits
+    is_stated = not np.isnan(told.asked.given).all()
+    if told.box is None:
+        if 0 not in found.broken:
+            yield from _no_box_in_words(told)
         return
     where = ""
-    if len(models.members) > 1:
-        where = f" in {count} of {len(models.members)} parameter sets of the vehicle model"
+    tried = len(told.asked.fits)
+    held = tried - len(found.broken)
+    if tried > 1:
+        where = f" in {held} of {tried} parameter sets of the vehicle model"
     decision = "All joint limits hold at the same time"
-    if asked.limits:
-        decision = "The joint limits below hold" if together.broken else "All limits hold"
-    yield f"{decision}{where}: {tested_in_words(unsafe, count)}."
-    for model in models.left_out:
+    if is_stated:
+        decision = "The joint limits below hold" if found.broken else "All limits hold"
+    yield f"{decision}{where}: {tested_in_words(told.unsafe, held)}."
+    for model in told.asked.left_out:
         # Its words name the test and the parameter set.
         described = describe(model, {"": model.characteristics.original})
         words = described[""].words if described else f"parameter set {model.fit} is unsafe"
         yield f"With the original vehicle itself {words}: there no limit is claimed."
-    if not asked.is_quick:
-        yield from one_set_in_words(models.members, models.left_out)
-    if names := _without_room(models, together):
-        yield f"No room was found for {join_phrases(names)}: they stay as in the original."
-
-
-def one_set_in_words(members: Sequence[Model], left_out: Sequence[Model]) -> Iterator[str]:
-    """That limits hold in one parameter set alone though the study has others, in a sentence."""
-    if len(members) == 1 and not left_out and members[0].evaluator.study.spread:
+    if tried == 1 and not told.asked.left_out and told.study.spread and not told.is_rough:
         yield (
             "The limits were computed with one parameter set of the vehicle model; the study's"
             " other sets were not tried."
         )
+    if told.without_room:
+        names = join_phrases(told.without_room)
+        yield f"No room was found for {names}: they stay as in the original."
+
+
+def _no_box_in_words(told: Told) -> Iterator[str]:
+    """That no joint limits were found."""
+    if not np.isnan(told.asked.given).all() and not told.is_rough:
+        yield "The specified limits hold with all other characteristics as in the original."
+    if told.without_room:
+        yield (
+            "The simulations found no joint limits of use, because no safe change of"
+            f" {join_phrases(told.without_room)} was found beside the others."
+        )
+        return
+    boxes = number_of(told.limits.known.boxes, "operating range")
+    if told.limits.known.boxes:
+        yield (
+            f"No joint limits were found ({told.unsafe.description}): the search tested {boxes},"
+            " and found an unsafe vehicle in each. That is no proof that there are none."
+        )
+    else:
+        yield "The simulations did not suffice to search joint limits."
 
 
 def tested_in_words(unsafe: Unsafe, fits: int) -> str:
@@ -182,66 +199,58 @@ def tested_in_words(unsafe: Unsafe, fits: int) -> str:
     return f"{every} keeps at least {unsafe.keep:.3g} m of clearance{others}"
 
 
-def validation_in_words(together: LimitsTogether) -> str:
-    """What joint limits were tested with: corner cases, simulations that search for a
-    counterexample, and random vehicles.
-    """
-    evaluator = together.members[0].evaluator
-    searched = len(evaluator.characteristics.scenario) > 0
-    met = f" in {MET_BY_CORNERS:,} encounters" if searched else ""
-    falsification = _falsification_in_words(together)
-    number = "All" if evaluator.account.effort >= 1 else "Some"
-    return f"{number} corner cases{met}; {falsification}; {_sampled_in_words(together)}."
-
-
-def _falsification_in_words(together: LimitsTogether) -> str:
-    """The falsification: `20,000 simulations that search for a counterexample (smallest clearance
-    0.36 m)`.
-    """
-    passed = [*together.validations.values()]
-    number = sum(each.attacked for each in passed)
-    at_all_points = sum(each.at_all_points for each in passed)
-    simulated = f"{number:,} simulations that search for a counterexample"
-    if at_all_points < number:
-        simulated += (
-            f", {at_all_points:,} of them at all points and the others at those that were the worst"
-            " for some vehicle"
-        )
-    between = sum(each.between for each in passed)
-    if between:
-        simulated += f", and {between:,} between the points of the tests"
-    least, own = together.least
-    unsafe = together.members[0].unsafe
-    if not abs(least) < float("inf"):
-        return f"{simulated}, of which none met an encounter that counts"
-
-    # The worst of them, over all parameter sets and with the study's own.
-    worst = unsafe.value_in_words(least)
-    of_own = ""
-    if own == own and unsafe.value_in_words(own) != worst:
-        of_own = (
-            f", {unsafe.value_in_words(own).partition(' ')[2]} with the study's own parameter set"
-        )
-    return f"{simulated} (the worst {worst}{of_own})"
-
-
-def _sampled_in_words(together: LimitsTogether) -> str:
-    proof = together.proof
-    if proof is None:
-        return "no random vehicles"
-    failed = f", {proof.not_simulated} could not be simulated" if proof.not_simulated else ""
-    unsafe = "none" if not proof.failures else f"{proof.failures}"
-    return f"{proof.samples:,} random vehicles, {unsafe} unsafe{failed}"
-
-
-def _without_room(models: Models, together: LimitsTogether) -> list[str]:
-    """The characteristics that stay as in the original, beside limits that leave others room."""
-    box = together.box
-    assert box is not None
-    return [
-        item.name
-        for item, low, high, last in zip(
-            models.own.characteristics, box.lower, box.upper, together.room, strict=True
-        )
-        if low == high and last and not item.is_scenario
+def _vague_in_words(told: Told) -> Iterator[str]:
+    """Which limits a workshop cannot decide."""
+    box = told.box
+    if box is None:
+        return
+    vague = [
+        item
+        for column, item in enumerate(told.members)
+        if not item.is_decidable(float(box.lower[column]), float(box.upper[column]))
     ]
+    if vague:
+        yield undecidable_in_words(vague)
+
+
+def _alone_in_words(told: Told) -> Iterator[str]:
+    """Which characteristics can make the vehicle unsafe on their own, of those that were asked
+    about.
+    """
+    limited = {column for _, column in told.limits.alone.beyond}
+    names = [told.members[column].name for column in told.columns if column in limited]
+    if len(names) > 1:
+        yield f"{join_phrases(names)} can each make the vehicle unsafe on their own."
+    elif names:
+        yield f"{names[0]} can make the vehicle unsafe on its own."
+    elif told.has_scan:
+        yield "No single characteristic makes the vehicle unsafe on its own."
+
+
+def tested_sentences(told: Told) -> Iterator[str]:
+    """How joint limits were tested; nothing without such limits."""
+    found, evaluator = told.limits, told.own.evaluator
+    if told.study.ranges and told.is_safe:
+        share = share_in_words(evaluator.share_left_out)
+        yield (
+            f"Of the encounters over the domain {share} do not count, because the original vehicle"
+            f" itself keeps less than {told.study.scenario.margin or 0:g} m in them."
+        )
+    if told.box is None:
+        return
+    attacked = sum(attack.simulated for attack in found.attacks.values())
+    searched = f"{attacked:,} simulations that search for a counterexample"
+    least = told.least
+    worst = "of which none met an encounter that counts"
+    if least is not None:
+        worst = f"the worst {told.unsafe.value_in_words(least)}"
+    corners = "All corner cases; " if told.asked.effort.corners else ""
+    yield f"{corners}{searched} ({worst})."
+    proof = found.proof
+    if proof is not None:
+        failed = f", {proof.not_simulated} could not be simulated" if proof.not_simulated else ""
+        bound = bound_in_words(proof.at_most).capitalize()
+        yield f"{proof.samples:,} random vehicles, none unsafe{failed}."
+        yield f"{bound} of uniformly sampled vehicles within the limits are unsafe."
+    if remark := remark_on_phases(told.own.in_phases):
+        yield remark

@@ -1,0 +1,233 @@
+"""What cases leave to the limit: the worlds in which vehicles drive, one for each test and each
+parameter set of the vehicle model, and their simulations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from safevar_sumo.errors import InputError
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.between import MovingTest, moving_tests
+from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.tolerance.cases import Space
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import PHASE
+from safevar_sumo.sumo.simulators import simulations_of_setting
+
+STAGE = "limits"
+
+
+class Exhausted(InputError):
+    """Fewer simulations may follow than are asked for."""
+
+
+class CaseWorld(NamedTuple):
+    """Encounters with one parameter set: a model in which the axes of encounters are parameters,
+    the phase last if they have one; and the test of the matrix, if it moves.
+    """
+
+    model: Model
+    test: MovingTest | None = None
+
+    @property
+    def has_phase(self) -> bool:
+        """Whether an encounter has a phase."""
+        return PHASE in self.model.characteristics.scenario.names
+
+    @property
+    def places(self) -> int:
+        """The number of places of a case: the phase, then each other axis."""
+        return 1 + len(self.model.characteristics.scenario) - self.has_phase
+
+    def settings(self, vehicles: FloatArray, places: FloatArray) -> FloatArray:
+        """Vehicles, shape (M, n), at places, shape (M, k), as they are printed."""
+        members = self.model.characteristics
+        axes = members.scenario
+        phases, shares = places[:, :1], places[:, 1 : self.places]
+        if self.has_phase:
+            shares = np.hstack([shares, phases])
+        values = axes.lower + shares * (axes.upper - axes.lower)
+        return members.with_printed_encounters(np.hstack([vehicles, values]))
+
+    def listed(self) -> FloatArray:
+        """The places of its listed encounters, shape (E, k), at phase 0; of ranges, those at which
+        the original vehicle leaves least.
+        """
+        axes = self.model.characteristics.scenario
+        if self.test is not None:
+            lists = self.test.test.axes
+            values = [[0.0] if name == PHASE else lists[name].at for name in axes.names]
+            rows = np.array([*product(*values)]).reshape(-1, len(axes))
+        else:
+            evaluator = self.model.evaluator
+            of_vehicle = evaluator.characteristics.of_vehicle
+            rows = np.vstack([axes.original, evaluator.critical_encounters[:, ~of_vehicle]])
+        shares = (rows - axes.lower) / (axes.upper - axes.lower)
+        return np.hstack([np.zeros((len(shares), 1)), shares[:, : self.places - 1]])
+
+
+class Oracle:
+    """What cases leave to the limit.
+
+    Attributes
+    ----------
+    worlds
+        Those of the study's own parameter set, then of each other one.
+    fits
+        The number of the parameter set of each world.
+    places
+        The number of places of a case.
+    own
+        The model with the study's own parameter set.
+    phases
+        The progress of the question.
+    """
+
+    def __init__(self, models: Sequence[Model], new_car: Unsafe, *, between: bool) -> None:
+        self.worlds = [
+            world for model in models for world in worlds_of(model, new_car, between=between)
+        ]
+        self.fits = [world.model.fit for world in self.worlds]
+        self.vehicle = models[0].characteristics.vehicle
+        self.places = max(world.places for world in self.worlds)
+        self.own = models[0]
+        evaluator = self.own.evaluator
+        self.phases = evaluator.phases
+        self._region = evaluator.region
+        self._account = evaluator.account
+        systems = [world.model.evaluator.system for world in self.worlds]
+        self._simulations = max(map(simulations_of_setting, systems))
+        self._tries_originals = any(world.model.new_car is not None for world in self.worlds)
+        self._counts = dict[bytes, bool]()
+
+    @property
+    def available(self) -> float:
+        """The number of cases that may follow; infinite without a limit."""
+        return self._account.left // self._simulations
+
+    def __call__(self, cases: FloatArray) -> FloatArray:
+        """What each of M cases leaves, shape (M,): below 0 it is unsafe, infinite where it does not
+        count, or could not be simulated.
+        """
+        return np.nan_to_num(self.measure(cases), nan=np.inf, posinf=np.inf, neginf=-np.inf)
+
+    def with_failed(self, cases: FloatArray) -> FloatArray:
+        """What each of M cases leaves; minus infinity where it could not be simulated."""
+        return np.nan_to_num(self.measure(cases), nan=-np.inf, posinf=np.inf, neginf=-np.inf)
+
+    def measure(self, cases: FloatArray) -> FloatArray:
+        """What each of M cases leaves; NaN where it could not be simulated."""
+        # Simulations of the original vehicle may follow.
+        if (1 + self._tries_originals) * len(cases) > self.available:
+            problem = "too few are left for the limits"
+            raise Exhausted("simulations", problem, "a larger number")
+        n = len(self.vehicle)
+        robustness = np.full(len(cases), np.inf)
+        numbers = np.floor(cases[:, n]).astype(int)
+        for number in np.unique(numbers).tolist():
+            rows = np.flatnonzero(numbers == number)
+            robustness[rows] = self._measure_in(self.worlds[number], cases[rows])
+        return robustness
+
+    def _measure_in(self, world: CaseWorld, cases: FloatArray) -> FloatArray:
+        """What cases of one world leave."""
+        n = len(self.vehicle)
+        settings = world.settings(cases[:, :n], cases[:, n + 1 :])
+        runs = world.model.evaluate(settings, STAGE)
+        robustness = world.model.robustness_by(runs)
+        robustness[~runs.valid & ~runs.infeasible] = np.nan
+        robustness[~world.model.evaluator.region.feasible(settings)] = np.inf
+        unsafe = np.flatnonzero(robustness < 0)
+        does_count = self._do_count(world, cases[unsafe])
+        robustness[unsafe[~does_count]] = np.inf
+        return robustness
+
+    def _do_count(self, world: CaseWorld, cases: FloatArray) -> BoolArray:
+        """Which cases of a world are encounters that count: in which the original is safe, too."""
+        new_car = world.model.new_car
+        if new_car is None or not len(cases):
+            return np.ones(len(cases), dtype=bool)
+        n = len(self.vehicle)
+        keys = [case.tobytes() for case in cases[:, n:]]
+        new = {key: row for row, key in enumerate(keys) if key not in self._counts}
+        if new:
+            places = cases[[*new.values()], n + 1 :]
+            originals = np.tile(self.vehicle.original, (len(new), 1))
+            runs = world.model.evaluate(world.settings(originals, places), STAGE)
+            does_count = runs.valid & ~new_car.of(runs)
+            self._counts |= dict(zip(new, does_count.tolist(), strict=True))
+        return np.array([self._counts[key] for key in keys])
+
+    def feasible(self, draw: Callable[[int], FloatArray], number: int) -> FloatArray:
+        """So many drawn vehicles that satisfy the study's constraints."""
+        n = len(self.vehicle)
+        original = self._region.characteristics.original[n:]
+
+        def draw_settings(count: int) -> FloatArray:
+            vehicles = draw(count)
+            return np.hstack([vehicles, np.tile(original, (count, 1))])
+
+        return self._region.draw_feasible(draw_settings, number)[:, :n]
+
+    def setting(self, case: FloatArray) -> tuple[Model, FloatArray]:
+        """The model of a case, and its setting there."""
+        n = len(self.vehicle)
+        world = self.worlds[int(case[n])]
+        (setting,) = world.settings(case[np.newaxis, :n], case[np.newaxis, n + 1 :])
+        return world.model._replace(new_car=None), setting
+
+    def space(
+        self, fit: int, lower: FloatArray, upper: FloatArray, *, phases: bool = True
+    ) -> Space:
+        """The cases of vehicles between two ends with a parameter set, at all phases or phase 0."""
+        numbers = [number for number, own in enumerate(self.fits) if own == fit]
+        first = [numbers[0], *np.zeros(self.places)]
+        past_last = np.nextafter(numbers[-1] + 1, 0)
+        last = [past_last, float(phases), *np.ones(self.places - 1)]
+        return Space(np.append(lower, first), np.append(upper, last), len(lower))
+
+    def listed(self) -> FloatArray:
+        """The listed encounters with the study's own parameter set: worlds and places, shape (E,
+        1 + k).
+        """
+        rows = []
+        for number, world in enumerate(self.worlds):
+            for place in world.listed() if world.model.fit == 0 else ():
+                rows.append([number, *place, *[0.0] * (self.places - len(place))])
+        return np.array(rows)
+
+    def hardest(self, number: float) -> FloatArray:
+        """So many of the listed encounters: those in which the original vehicle leaves least."""
+        encounters = self.listed()
+        if number >= len(encounters):
+            return encounters
+        robustness = self(product_of(self.vehicle.original[np.newaxis], encounters))
+        return encounters[np.argsort(robustness, kind="stable")[: int(number)]]
+
+
+def product_of(vehicles: FloatArray, encounters: FloatArray) -> FloatArray:
+    """Each vehicle in each encounter."""
+    repeated = np.repeat(vehicles, len(encounters), axis=0)
+    return np.hstack([repeated, np.tile(encounters, (len(vehicles), 1))])
+
+
+def worlds_of(model: Model, new_car: Unsafe, *, between: bool) -> list[CaseWorld]:
+    """The worlds of a parameter set: each test that moves, and all other points together. A test
+    moves only with a study that is not rated.
+    """
+    moving = moving_tests(model, new_car) if between else []
+    worlds = [CaseWorld(test.model.in_phases or test.model, test) for test in moving]
+    names = {test.test.name for test in moving}
+    evaluator = model.evaluator
+    standing = [test for test in evaluator.study.tests if test.name not in names]
+    if moving and standing:
+        study = evaluator.study.with_tests(standing)
+        model = model._replace(evaluator=evaluator.for_study(study, verified=0))
+    if standing or not moving:
+        worlds.append(CaseWorld(model.in_phases or model))
+    return worlds
