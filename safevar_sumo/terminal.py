@@ -163,7 +163,8 @@ class Pace:
         """The time left [s]; None before anything is done."""
         if not self._marks:
             return None
-        (start, number_at_start), (end, number) = self._marks[0], self._marks[-1]
+        start, number_at_start = self._marks[0]
+        end, number = self._marks[-1]
         since = time.monotonic() - end
         if number == number_at_start:
             return None
@@ -199,7 +200,8 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
     def show(phase: str, number: int, total: int) -> None:
         nonlocal line
         pace.update(number, total)
-        line, count = phase, ""
+        line = phase
+        count = ""
         if total:
             count = f"{number:,} of {total:,}"
             line = f"{phase}: {count}"

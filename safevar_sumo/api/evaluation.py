@@ -169,6 +169,8 @@ def _read_settings(
 
 def _check_numbers(name: str, column: pd.Series) -> None:
     """Refuse a value of a column that is neither a number nor missing, such as a list or a text."""
-    for row, value in enumerate(column if column.dtype.kind not in "fiu" else ()):
+    if column.dtype.kind in "fiu":
+        return
+    for row, value in enumerate(column):
         if not isinstance(value, Real | None):
             raise InputError(f"settings, row {row}", f"{name} = {value!r}", "a number, or None")

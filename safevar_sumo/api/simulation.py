@@ -239,7 +239,8 @@ class Simulation:
     def _ending(self) -> str:
         safety_degree = self.metrics[SAFETY_DEGREE]
         if self.outcome is Outcome.COLLISION and IMPACT_EXCESS.name in self.metrics:
-            speed, excess = self.metrics[IMPACT_SPEED.name], self.metrics[IMPACT_EXCESS.name]
+            speed = self.metrics[IMPACT_SPEED.name]
+            excess = self.metrics[IMPACT_EXCESS.name]
             return f"has an {impact_in_words(speed, excess)}"
         if self.outcome is Outcome.COLLISION:
             return collision_in_words(-safety_degree, self.collision_speed, self._digits)

@@ -228,7 +228,8 @@ def _found(
     if system.meets_nobody and not (unsafe or results.study.unsafe.criterion):
         advice = ""
     if breach := _breach_of_original(case):
-        sentence, advice = f"{breach}: no change is needed.", ""
+        sentence = f"{breach}: no change is needed."
+        advice = ""
     else:
         sentence, changes = _verdict(results, case, jobs)
     tables = answer.tables

@@ -165,7 +165,8 @@ def _evaluate_shared(
     begin: Callable[[], None],
 ) -> Evaluations:
     """As `evaluate_all`, with what other questions of a page have simulated."""
-    shared, pool.shared = pool.shared, None
+    shared = pool.shared
+    pool.shared = None
     assert shared is not None
     try:
         evaluation_of = shared.setdefault(msgspec.msgpack.encode((study, selection)), {})
@@ -216,7 +217,8 @@ def _opened_by(study: Study, pool: Pool) -> list[str]:
     """The names of the files that the user code of a study opens. A study's code is checked once in
     a pool, whatever else of the study questions vary.
     """
-    names, places = frozenset(user_code_names(study)), (study.name, *study.origin.places)
+    names = frozenset(user_code_names(study))
+    places = (study.name, *study.origin.places)
     for (checked_names, folders), opened in pool.opened.items():
         if names <= checked_names and folders == places:
             return opened

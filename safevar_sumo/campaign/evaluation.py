@@ -179,7 +179,7 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     system = system_of(task.study)
     if task.in_sumo:
         system = replace(system, in_sumo=True)
-    # To compile takes longer than the time limit of a batch.
+    # To compile may take longer than a batch may.
     system.vehicle.compile()
     # Of runs that take long, each has the time limit.
     limit = end_if_longer(task.study.search.time_limit)

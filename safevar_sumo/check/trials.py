@@ -119,7 +119,8 @@ def try_simulations(
     number, seconds = (1, 0.0) if limit is not None else _affordable(system, settings)
     if vehicles is not None:
         vehicles = min(vehicles, len(settings))
-        number, seconds = vehicles, seconds * vehicles / number
+        seconds = seconds * vehicles / number
+        number = vehicles
     settings = settings[:number]
     all_points = len(assemble(study).points)
     tell(Extent(number, vehicles or SIMULATED, len(system.points), all_points, seconds))
@@ -202,8 +203,8 @@ def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
     one in a simulator of the user's own; and the time that they take [s].
     """
     timed = settings[: 1 if system.mover.takes_long else TIMED]
-    # The first simulation loads what any does, and ends a driving system that does not end.
-    # A simulator of the user's own has simulated once.
+    # The first simulation loads what any does, and ends a driving system that does not end; a
+    # simulator of the user's own has simulated once.
     if not system.mover.takes_long:
         short = replace(system, time_limit=min(system.time_limit, LONGEST))
         drive_and_score(short, timed[:1])

@@ -246,7 +246,9 @@ def _exit_on_failures(answer: Answer, conditions: Sequence[tuple[str, str, float
         code = DECIDE_EXIT_CODE
     if answer.numbers.get("passed") is False:
         code = 1
-    click.get_current_context().exit(GATE_EXIT_CODE if failures else code)
+    if failures:
+        code = GATE_EXIT_CODE
+    click.get_current_context().exit(code)
 
 
 def names_in_study(values: Mapping[str, Any]) -> list[str]:
@@ -309,7 +311,9 @@ def _flag(option: Option) -> click.Option:
     elif kind is Path:
         kind = _Path(path_type=Path)
     is_required = option.default is inspect.Parameter.empty
-    ending = f"  [{option.limits}]" if option.limits else ""
+    meaning = option.meaning
+    if option.limits:
+        meaning += f"  [{option.limits}]"
     return click.Option(
         [f"--{option.name.replace('_', '-')}", option.name],
         type=kind,
@@ -317,7 +321,7 @@ def _flag(option: Option) -> click.Option:
         multiple=option.is_repeated,
         show_default=option.default not in (None, (), False, "", inspect.Parameter.empty),
         metavar=option.metavar,
-        help=option.meaning + ending,
+        help=meaning,
         **({"required": True} if is_required else {"default": option.default}),
     )
 

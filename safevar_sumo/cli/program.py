@@ -112,12 +112,10 @@ class LazyCommands(click.Group):
             return super().invoke(ctx)
         except InputError as error:
             command = self.get_command(ctx, str(ctx.invoked_subcommand))
-            parameters = command.params if command else []
-            long_flags = {
-                option.name: option.opts[-1]
-                for option in parameters
-                if isinstance(option, click.Option)
-            }
+            long_flags = {}
+            for option in command.params if command else ():
+                if isinstance(option, click.Option):
+                    long_flags[option.name] = option.opts[-1]
             # Only a text may name an argument.
             if isinstance(error.source, str):
                 error.source = long_flags.get(error.source, error.source)
@@ -147,7 +145,9 @@ def first_paragraph(function: str) -> str:
     module, _, name = function.partition(":")
     path = Path(__file__).parents[1] / module.replace(".", "/")
     file = path.with_suffix(".py")
-    source = (file if file.exists() else path / "__init__.py").read_text(encoding="utf-8")
+    if not file.exists():
+        file = path / "__init__.py"
+    source = file.read_text(encoding="utf-8")
     docstring = re.search(
         rf'^def {name}\(.*?"""(.*?)(?:\n\n|""")', source, re.DOTALL | re.MULTILINE
     )

@@ -68,16 +68,14 @@ def user_error_of(error: BaseException) -> UserCodeError | None:
     """The error with the innermost line of user code that raised an exception; None if there is no
     such line.
     """
-    frames = [
-        (frame.filename, frame.lineno, frame.name)
-        for frame in traceback.extract_tb(error.__traceback__)
-    ]
+    frames = traceback.extract_tb(error.__traceback__)
     if isinstance(error, SyntaxError) and error.filename:
-        frames.append((error.filename, error.lineno, "import"))
-    for file, line, name in reversed(frames):
+        frames.append(traceback.FrameSummary(error.filename, error.lineno, "import"))
+    for frame in reversed(frames):
+        file = frame.filename
         if is_user_file(file) or file in this_process.named_files:
-            method = name.replace("<module>", "import")
-            place = f"{file}:{line}"
+            method = frame.name.replace("<module>", "import")
+            place = f"{file}:{frame.lineno}"
             reason, legal = _reason_of(error)
             return UserCodeError(
                 "", f"user code raised in {method}: {reason} ({place})", legal, place

@@ -215,7 +215,8 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
     def show(sample: int) -> list[Patch]:
         axis.set_xlim(left_ends[sample], left_ends[sample] + width)
         for body, patch in zip(bodies, patches, strict=True):
-            x, y = body.x[sample], body.y[sample]
+            x = body.x[sample]
+            y = body.y[sample]
             pose = Affine2D().rotate(body.heading[sample]).translate(x, y)
             patch.set_transform(pose + axis.transData)
             patch.set_visible(bool(np.isfinite(x)))
@@ -268,8 +269,10 @@ def _choose_view(bodies: Sequence[DrawnBody]) -> tuple[FloatArray, float, float,
     x, y = np.stack([(body.x, body.y) for body in bodies], axis=1)
     sizes = np.array([(body.length, body.width / 2) for body in bodies])
     length, half_width = sizes.T[:, :, np.newaxis]
-    rear, front = np.nanmin(x - length) - MARGIN, np.nanmax(x + length) + MARGIN
-    bottom, top = np.nanmin(y - half_width) - MARGIN, np.nanmax(y + half_width) + MARGIN
+    rear = np.nanmin(x - length) - MARGIN
+    front = np.nanmax(x + length) + MARGIN
+    bottom = np.nanmin(y - half_width) - MARGIN
+    top = np.nanmax(y + half_width) + MARGIN
     padding = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
 
     # A camera follows the vehicles where a view of all bodies is too long.
@@ -325,7 +328,9 @@ def reading(comparison: Comparison, row: int, sample: int) -> str:
     trace = comparison.runs.trace
     moments = comparison.moments[row]
     index = min(sample, moments.end)
-    ending = "brakes" if trace.brake[index, row] > 0 else ""
+    ending = ""
+    if trace.brake[index, row] > 0:
+        ending = "brakes"
     if sample >= moments.decided:
         ending = comparison.verdict(row)
     gap = trace.gap[index, row]

@@ -132,12 +132,14 @@ def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId
     if texts := change_texts(system.characteristics.vehicle, system.characteristics.named(setting)):
         verdict.append(f"Changed: {', '.join(texts)}.")
     verdict += _meets(system, setting)
-    solution = {} if handle is None else {"solution": str(handle)}
+    numbers = simulation.numbers
+    if handle is not None:
+        numbers = {"solution": str(handle), **numbers}
     return Answer(
         question="simulate",
         study=study,
         verdict=" ".join(filter(None, verdict)),
-        numbers={**solution, **simulation.numbers},
+        numbers=numbers,
         tables=tables,
         lead="points" if "points" in tables else "results",
     )

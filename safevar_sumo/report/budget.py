@@ -29,7 +29,9 @@ def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str,
     InputError
         If the simulations do not suffice for all questions.
     """
-    costly, free, samples = list[str](), list[str](), set[tuple[str, ...]]()
+    costly = list[str]()
+    free = list[str]()
+    samples = set[tuple[str, ...]]()
     replays = simulations // PART_OF_REPLAYS if system.mover.takes_long else 0
     remaining_simulations = simulations - replays
     for text in dict.fromkeys(texts):

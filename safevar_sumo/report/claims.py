@@ -301,7 +301,8 @@ class Packed:
     @property
     def versions(self) -> tuple[JsonObject, JsonObject]:
         """Versions and platform with which the study was searched, and those here."""
-        packed = {key: self.manifest[key] for key in ("versions", "platform")}
+        manifest = self.manifest
+        packed = {"versions": manifest["versions"], "platform": manifest["platform"]}
         versions = manifest_of(self.case.study, {})["versions"]
         return packed, {"versions": versions, "platform": PLATFORM}
 
@@ -428,7 +429,8 @@ def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
     lines = claim.packed.decode().splitlines(keepends=True)
     pairs = zip_longest(lines, computed.decode().splitlines(keepends=True), fillvalue="nothing")
     pair = next(pair for pair in pairs if len(set(pair)) > 1)
-    line, counterpart = _shown(*pair), _shown(*pair[::-1])
+    line = _shown(*pair)
+    counterpart = _shown(*pair[::-1])
     letters = enumerate(zip_longest(line, counterpart))
     index = next(index for index, pair in letters if len(set(pair)) > 1)
     start = max(index - CONTEXT, 0) if max(len(line), len(counterpart)) > SHOWN else 0

@@ -177,7 +177,8 @@ def _pack_study(
         system = assemble(judged.study)
         spent = len(case.settings) * (judged.study != case.study) * simulations_of_setting(system)
         parts = divided(with_speed_part(questions, case), simulations - spent, system)
-    outcomes, solutions = count_outcomes(case), count_solutions(case.solutions, runs)
+    outcomes = count_outcomes(case)
+    solutions = count_solutions(case.solutions, runs)
     described = PackedStudy(
         folder, questions, runs, outcomes, solutions, str(unsafe) if unsafe else None, parts
     )
@@ -229,7 +230,7 @@ def _files_of_user(
         problem = "lies outside the study's folders, so that no pack can hold it"
         raise InputError(name, problem, "a copy beside the study, which then names the copy")
 
-    # Views without which SUMO does not start.
+    # SUMO does not start without the views that a network names.
     for name in [name for name in names if Path(name).name == OPTIONS_FILE]:
         if view := options_in(Path(file_by_name(name, places))).get("gui-settings-file"):
             names.append(str(Path(name).with_name(view)))
@@ -281,12 +282,10 @@ def verify(
     path = Path(pack).absolute()
     description, files = read_pack(path)
     with temporary_folder() as folder, open_progress(progress) as show, simulate_anew():
-        studies = {
-            Path(folder, str(number)): _unpack(
-                path, described, files, Path(folder, str(number)), jobs, show
-            )
-            for number, described in enumerate(description.studies)
-        }
+        studies = {}
+        for number, described in enumerate(description.studies):
+            place = Path(folder, str(number))
+            studies[place] = _unpack(path, described, files, place, jobs, show)
         names_of_studies = {
             f"{packed.packed.folder}/{name}" for packed in studies.values() for name in packed.files
         }
@@ -373,7 +372,7 @@ def _unpack(
     code = {name: content for name, content in own_files.items() if name.startswith(f"{CODE}/")}
     lists = {name for name in own_files if name.startswith(f"{LISTS}/")}
 
-    # Exactly the files of a study, readable, as the description says.
+    # Anybody may have edited a pack: its files are checked before one of them is used.
     try:
         for name in sorted(FILES ^ (own_files.keys() - code.keys() - lists)):
             problem = "belongs to no claim" if name in own_files else "is missing"

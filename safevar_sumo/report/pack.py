@@ -167,7 +167,7 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         _refuse(path, f"{name} {problem}")
 
     # Results of other versions may differ.
-    present = {name: version(name) for name in ("safevar_sumo", "libsumo")}
+    present = {"safevar_sumo": version("safevar_sumo"), "libsumo": version("libsumo")}
     changed = [
         f"{name} {described.versions.get(name)}"
         for name in present
@@ -210,7 +210,8 @@ def _check_layout(path: Path, entries: list[zipfile.ZipInfo]) -> None:
     in comments.
     """
     problem = "holds bytes that belong to no file"
-    end, directory = 0, DIRECTORY_END
+    end = 0
+    directory = DIRECTORY_END
     for entry in entries:
         if entry.header_offset != end:
             _refuse(path, problem)

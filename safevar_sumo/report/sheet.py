@@ -61,7 +61,9 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     ranges = []
     if not problem and "ranges" in limits.tables:
         ranges = _records(limits.tables["ranges"])
-    claim, up_to, reasons = limits, "", [limits.verdict, *limits.failures]
+    claim = limits
+    up_to = ""
+    reasons = [limits.verdict, *limits.failures]
     if study.speed is not None:
         claim = study.speed
         up_to, problem = _greatest_speed(study, claim, ranges)
@@ -120,7 +122,8 @@ def speed_values(study: ReportedStudy) -> JsonObject:
     limits = _limits_of(study)
     if limits is None or study.point or _why_no_limits(study, limits) or not speeds_of(study.case):
         return {}
-    unsafe, margin = Unsafe.parse(limits.numbers["unsafe"]), limits.numbers["margin"]
+    unsafe = Unsafe.parse(limits.numbers["unsafe"])
+    margin = limits.numbers["margin"]
     if _is_relative(study.case, unsafe):
         return {}
 
