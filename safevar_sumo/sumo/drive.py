@@ -116,8 +116,8 @@ def drive(
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace()
-    outcomes.ended = outcomes.classify()
     encounter = observer.encounter(trace)
+    outcomes.ended = outcomes.classify()
     return _runs(points, outcomes, robot, contacts, trace=trace, encounter=encounter)
 
 
