@@ -10,21 +10,21 @@ import re
 from collections.abc import Iterator
 
 MOST_WORDS = 22
-LABELS = re.compile(
+LABELS = (
     r"^((Valid for|Tested|(Rough|Unsafe|Safe) means|Required wear|Criterion|Not simulated|Changed"
     r"|Remark|Note|Expected|Default|Next|More|Examples?|Rough answer|No verdict|DO NOT RELEASE"
     r"|RELEASE|DECIDE|warning|note|failed|expected|The price|Range|Bar): )+"
 )
 """What may stand before a sentence."""
-LISTS = re.compile("(Valid for|Not simulated|Changed|Required wear|Criterion|Bar|Range): ")
+LISTS = "(Valid for|Not simulated|Changed|Required wear|Criterion|Bar|Range): "
 """What is a list as a whole."""
 VERBS = (
     "is|are|was|were|has|have|had|can|could|may|might|must|will|would|does|do|did|collides?|keeps?"
     "|found|contains?|holds?|needs?|means|makes?|gives?|says?|shows?|takes?|begins?|fails?|causes?"
     "|counts?|drives?"
 )
-UNITS = re.compile(r"\b\d[\d,.]*(?: ?%| (?:kg m\^2/s|km/h|m/s\^2|m/s|N m|mm|kg|ms|m|s|N)\b)")
-SERIES = re.compile(
+UNITS = r"\b\d[\d,.]*(?: ?%| (?:kg m\^2/s|km/h|m/s\^2|m/s|N m|mm|kg|ms|m|s|N)\b)"
+SERIES = (
     r"(?<![\w^/.-])(?:[\w^/.-]+ ){0,3}[\w^/.-]+(?:, [\w^/.-]+(?: [\w^/.-]+){0,3}){2,} (?:and|or) "
 )
 """Three and more values, which count as one word."""
@@ -65,16 +65,16 @@ IN_LISTS = {
 def words_in(sentence: str) -> int:
     """The number of words that count: not brackets, commands, or a list behind a colon."""
     text = re.sub(r"\([^()]*\)|\[[^\[\]]*\]", " ", sentence)
-    text = UNITS.sub("X", re.sub(r"python3? -m .*", " ", text))
+    text = re.sub(UNITS, "X", re.sub(r"python3? -m .*", " ", text))
     beginning, colon, rest = text.partition(": ")
     if colon and not re.search(rf"\b({VERBS})\b", rest):
         text = beginning
-    return len(re.findall(r"[\w%][\w'.,/^%-]*", SERIES.sub("X ", text)))
+    return len(re.findall(r"[\w%][\w'.,/^%-]*", re.sub(SERIES, "X ", text)))
 
 
 def broken_rules(sentence: str) -> list[str]:
     """Why a sentence breaks rules."""
-    bare = LABELS.sub("", sentence)
+    bare = re.sub(LABELS, "", sentence)
     if bare != sentence:
         bare = bare[:1].upper() + bare[1:]
     # Quotes and commands keep keys, and brackets explain.
@@ -82,7 +82,7 @@ def broken_rules(sentence: str) -> list[str]:
     outside = re.sub(r" ?\((?:[^()]|\([^()]*\))*\)", "", text)
     reasons = [why for pattern, why in EVERYWHERE.items() if re.search(pattern, text)]
     rules = OUTSIDE_BRACKETS
-    if not LISTS.match(sentence):
+    if not re.match(LISTS, sentence):
         rules = {**OUTSIDE_BRACKETS, **IN_LISTS}
         number = words_in(bare)
         reasons += [f"{number} words"] if number > MOST_WORDS else []

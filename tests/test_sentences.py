@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import click
 import pytest
@@ -12,14 +13,32 @@ from safevar_sumo.cli.program import COMMANDS, commands
 from tests.manual import written
 from tests.pages import PAGES
 from tests.sentences import broken_rules, sentences_in, split
+from tests.size import sources_of
 
-MAX_WORDS = 30_000
-"""Largest number of words of all pages, beside lists that the code makes."""
+SOURCES = sources_of("safevar_sumo")
+BROKEN = {
+    *("api/study.py", "questions/explain/words.py", "questions/words.py"),
+    *("questions/tolerance/tell.py", "questions/tolerance/words.py"),
+}
+"""Modules with sentences that may still break rules."""
 
 
 def found(sentences: Iterable[str]) -> list[tuple[str, list[str]]]:
     """The sentences that break rules, with the reasons."""
     return [(one, broken) for one in sentences if (broken := broken_rules(one))]
+
+
+def texts_in(source: str) -> Iterator[str]:
+    """The whole sentences and the meanings of columns in a module; a slot is X."""
+    yield from re.findall(r'Column\(\s*"[^"]*",\s*"([^"]+)"', source)
+    tree = ast.parse(source)
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant | ast.JoinedStr) and id(node) not in docstrings:
+            text = re.sub("(?<=[a-z]){.*?}", "", ast.unparse(node).strip("f'\""))
+            for sentence in split(re.sub("{.*?}", "X", text)):
+                if re.match("[A-Z].*[.]$", sentence):
+                    yield sentence
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -35,27 +54,21 @@ def test_the_help_of_a_command_keeps_the_rules(name: str) -> None:
         assert not found(split(re.sub(r"  \[.*", "", plain)))
 
 
+@pytest.mark.parametrize("path", sorted(SOURCES.keys() - BROKEN))
+def test_the_templates_and_the_meanings_of_columns_of_a_module_keep_the_rules(path: str) -> None:
+    assert not found(texts_in(SOURCES[path]))
+
+
 def test_all_pages_together_are_short_enough_to_be_read() -> None:
-    words = [word for page in PAGES for word in written(page).split() if re.search(r"\w", word)]
-    assert len(words) <= MAX_WORDS
+    """Beside lists that the code makes."""
+    words = re.findall(r"\S*\w\S*", " ".join(map(written, PAGES)))
+    assert len(words) <= 30_000
 
 
-@pytest.mark.parametrize(
-    ("sentence", "reason"),
-    [
-        ("Of the 264 pairs, 12 were simulated.", "a count stands before its verb"),
-        ("It collides in 14 of 20 parameter sets.", "no noun at the beginning"),
-        ("These are the limits of the car.", "no noun beside it"),
-        ("Nearly all of them collide, as the brakes are weak.", "which number, of what?"),
-        ("The value of tireFric is 1.", "a key in a sentence"),
-        ("Left out, as it is above the limit.", "because, so, although"),
-        ("The limit holds; the car keeps 0.3 m.", "a semicolon: two sentences"),
-        ("The vehicle " + "and the car " * 8 + "collide.", "27 words"),
-    ],
-)
-def test_a_broken_rule_is_found(sentence: str, reason: str) -> None:
-    assert reason in broken_rules(sentence)
+def test_a_broken_rule_is_found() -> None:
+    broken = (
+        "Nearly all of them collide, as the value of tireFric is 1; it keeps 0.3 m of clearance."
+    )
+    page = f"# A head of five words\n\n```\nIt is not read.\n```\n- {broken}\n- {'and ' * 23}."
+    assert [len(reasons) for _, reasons in found(sentences_in(page))] == [4, 1]
     assert not broken_rules("Valid for: the tests CPFA, CPNA and CPNCO at 10 to 60 km/h; by day.")
-    assert [*sentences_in(f"# A head of five words\n\n```\n{sentence}\n```\n- {sentence}")] == [
-        sentence
-    ]

@@ -52,8 +52,7 @@ STOPPING_DISTANCE = Measure(
     function=stopping_distance,
     needs=("speed", "position", "brake", "pedal"),
     description=(
-        "Distance from the first brake force to standstill; every study of the scenario stop"
-        " has it."
+        "Distance from the first brake force to standstill (in every study of the scenario stop)."
     ),
 )
 
@@ -150,7 +149,7 @@ IMPACT_EXCESS = Measure(
     more_is_unsafe=True,
     function=impact_excess,
     description=(
-        "Relative speed at contact above the allowed_impact_speed of the test case [m/s], or"
-        " without a contact minus the clearance [m]; every study with it has impact_speed, too."
+        "Relative speed at contact above the allowed speed of the test case [m/s], or minus the"
+        " clearance [m] without a contact."
     ),
 )

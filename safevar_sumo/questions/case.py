@@ -224,15 +224,15 @@ class Case:
         planned = self.study.search.runs
         labels = self.study.search.labels if self.has_runs else ()
         unfinished = [
-            f"{name} {finished[name]} of {planned} runs"
+            f"{finished[name]} of {planned} runs of {name}"
             for name in labels
             if finished[name] < planned
         ]
         if not unfinished:
             return ""
         return (
-            f"{self.name}: unfinished, {', '.join(unfinished)}; only solutions of finished runs"
-            " count."
+            f"The results of {self.name} are incomplete: {', '.join(unfinished)} are finished. Only"
+            " solutions of finished runs count."
         )
 
     @property
@@ -241,15 +241,15 @@ class Case:
         remarks = [self.shortfall] if self.shortfall else []
         if not self.has_runs:
             remarks.append(
-                f"{self.name}: imported solutions, without runs; the original vehicle's metrics are"
-                " published or supplied."
+                f"The solutions of {self.name} are imported and belong to no run. The metrics of"
+                " the original vehicle were published or supplied with these solutions."
             )
         if self.failures:
             remarks.append(
-                f"{self.name}: {len(self.failures)} settings could not be simulated"
+                f"{len(self.failures)} vehicles of {self.name} could not be simulated"
                 " (simulator-error) and are in no result:"
-                f" {'; '.join(failure_lines(self.failures))}. `study --retry-failed` simulates them"
-                " again."
+                f" {'; '.join(failure_lines(self.failures))}. The command study --retry-failed"
+                " simulates these vehicles again."
             )
         return remarks
 

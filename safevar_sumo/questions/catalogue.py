@@ -203,8 +203,8 @@ def _list_cache() -> Answer:
         entries, size = simulations.Cache(folder).extent() if folder.is_dir() else (0, 0)
         rows = [(str(folder), entries, size / 1e6, limit)]
         verdict = (
-            f"What questions have simulated is kept in {folder}: {size / 1e6:.1f} MB of at most"
-            f" {limit:,.0f} MB. {variable} names another folder; this one may be deleted."
+            f"The folder {folder} keeps earlier simulations ({size / 1e6:.1f} MB of at most"
+            f" {limit:,.0f} MB). You may delete it, and {variable} names another folder."
         )
     no_study: Any = None
     return Answer(

@@ -25,11 +25,14 @@ NEAR = 3.0
 """Ways of a step up to which a phase can take clearance away: what the vehicle covers in a step."""
 PARTS, ROUNDS = 10, 3
 """Into how many parts an interval of phases is divided, and how often: to 0.1 % of a step."""
-AT_ONE_PHASE = "Encounters were met at one phase of the driving system's steps."
+AT_ONE_PHASE = (
+    "Every encounter began at the same moment of a step (the time between two decisions of the"
+    " driving system)."
+)
 """What to know of encounters without phases."""
 COUNTS_STEPS = (
-    "An encounter that begins a whole step later ends otherwise here: the driving system or a"
-    " sensor counts its steps, and only encounters that begin within one of them were met."
+    "In this study, an encounter that begins one step later ends differently, because the driving"
+    " system or a sensor counts steps. Only encounters that begin within one step were simulated."
 )
 """What to know of a driving system whose cycle is longer than a step."""
 SAME = 1e-6

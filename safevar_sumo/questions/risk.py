@@ -51,7 +51,8 @@ MAX_RIVALS = 3
 """Largest number of characteristics that the verdict names beside the one with the largest share.
 """
 NO_PROBABILITY = (
-    " This is no probability in traffic: the study does not say how vehicles vary (`[variation]`)."
+    " This share is no probability in traffic, because the study does not state how vehicles vary"
+    " ([variation])."
 )
 COLUMNS = [
     "characteristic",

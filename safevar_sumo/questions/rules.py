@@ -212,10 +212,10 @@ def _boxes(
     if min(is_unsafe.sum(), (~is_unsafe).sum()) >= MIN_SETTINGS:
         return _find_boxes(settings, is_unsafe, characteristics), ""
     remark = (
-        f" A region cannot be found: of the {len(settings):,} vehicles that are used for this,"
-        f" {int(is_unsafe.sum()):,} are unsafe, and at least {MIN_SETTINGS} unsafe and"
-        f" {MIN_SETTINGS} safe ones are necessary. Ask for more with"
-        " --samples, or with --simulations where that is given."
+        f" No region can be found: only {int(is_unsafe.sum()):,} of the {len(settings):,} vehicles"
+        f" in the search are unsafe. At least {MIN_SETTINGS} unsafe and {MIN_SETTINGS} safe"
+        " vehicles are needed. Ask for more vehicles by --samples, or by --simulations if you"
+        " stated it."
     )
     return [], remark
 

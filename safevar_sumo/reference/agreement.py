@@ -37,8 +37,10 @@ COLUMNS: Columns = {
     ),
     "unit": "unit of the metric and of its errors",
     "spearman": Column("-", "Spearman's rank correlation", ".3f"),
-    "mean_absolute_error": Column("as in column unit", "mean of |here - reference|", ".3f"),
-    "bias": Column("as in column unit", "mean of here - reference", ".3f"),
+    "mean_absolute_error": Column(
+        "as in column unit", "mean absolute difference from the published value", ".3f"
+    ),
+    "bias": Column("as in column unit", "mean difference (here minus published)", ".3f"),
 }
 STAGE = "settings"
 """The phase of progress."""
@@ -82,10 +84,10 @@ def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
     ]
     order, error, bias = map(two_decimals, measures.to_numpy(float)[0])
     verdict = (
-        f"Over {numbers['rows']} vehicles the safety degree has a rank correlation of {order} with"
-        f" the reference, a mean error of {error} m and a bias of {bias} m; of"
-        f" {numbers['collisions_reference']} collisions in the reference"
-        f" {numbers['collisions_both']} happen here."
+        f"The safety degrees of {numbers['rows']} vehicles have a rank correlation of {order} with"
+        f" the published data (mean error {error} m, bias {bias} m)."
+        f" {numbers['collisions_both']} of {numbers['collisions_reference']} published collisions"
+        " happen here, too."
     )
     return Answer(
         question="validate",

@@ -42,12 +42,10 @@ NO_RESULT = {
 }
 """Outcomes of settings about which nothing is known."""
 GENERAL_LIMITS = (
-    "A search that finds no failure proves nothing about the settings that it did not simulate.",
+    "A search that finds no failure proves nothing about vehicles that it did not simulate.",
     (
-        "The simulation has one vehicle that keeps its lane. Unless the study says otherwise, it"
-        " has"
-        " no separate wheels and axles, no suspension, no wind, no sensor noise, and no"
-        " traffic beyond that of the scenario."
+        "The simulation has one vehicle that keeps its lane. Unless the study says otherwise, the"
+        " model leaves out single wheels, suspension, wind, sensor noise and other traffic."
     ),
     (
         "The driving system and the vehicle are models. Where published data exist, this section"
@@ -61,14 +59,14 @@ CHARACTERISTICS: Columns = {
     "lowest": Column("as in column unit", "lower end of its domain"),
     "highest": Column("as in column unit", "upper end of its domain"),
     "threshold": Column("as in column unit", "a change smaller than this is undone"),
-    "meaning": "what it is",
+    "meaning": "full name",
 }
 AGREEMENT: Columns = {
     "file": "published data",
     "rows": "vehicles",
     "spearman": Column("-", "Spearman's rank correlation of the safety degrees", ".2f"),
-    "mean_absolute_error": Column("m", "mean of |here - published| safety degrees", ".2f"),
-    "bias": Column("m", "mean of here - published safety degrees", ".2f"),
+    "mean_absolute_error": Column("m", "mean of the absolute differences", ".2f"),
+    "bias": Column("m", "mean difference (here minus published)", ".2f"),
     "collisions_here": "vehicles that collide here",
     "collisions_reference": "vehicles that collide in the published data",
     "collisions_both": "vehicles that collide in both",
@@ -79,7 +77,7 @@ SPREAD: Columns = {
         SAFETY_DEGREE,
         Column(
             "m or -m/s",
-            "here; the interval has 90 % of parameter sets and repeats, and the model's error",
+            "simulated value, with the interval of 90 % of parameter sets and the model's error",
             ".2f",
         ),
     ),
@@ -243,9 +241,9 @@ def _search(study: ReportedStudy) -> str:
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)
     names = [f"{case.title_of(name)} ({number_of(count, 'run')})" for name, count in runs.items()]
     return (
-        f"Search: {', '.join(names) or 'no finished run'}; each run has at most"
-        f" {search.evaluations} simulations. All runs together simulated"
-        f" {len(case.evaluations)} different vehicles. The seed is {search.seed}; the versions are"
+        f"The search has {', '.join(names) or 'no finished run'}, with at most"
+        f" {search.evaluations} simulations in a run. All runs together simulated"
+        f" {len(case.evaluations)} different vehicles. The seed is {search.seed}. The versions are"
         f" {versions}."
     )
 
@@ -263,10 +261,10 @@ def trust(study: ReportedStudy) -> Answer:
     """
     case = study.case
     tables = dict[str, pd.DataFrame]()
-    fitted = "Published data were used to fit the vehicle; the " if case.study.spread else "The "
+    fitted = "Published data were used to fit the vehicle. " if case.study.spread else ""
     verdict = (
-        f"{fitted}simulations of this study were not compared with published ones: whether another"
-        " simulator or a real vehicle behaves in the same way is unknown."
+        f"{fitted}The simulations of this study were not compared with published ones. Nobody knows"
+        " whether another simulator or a real vehicle behaves in the same way."
     )
     agreement = shipped_agreement(case.study)
     if len(agreement):
@@ -278,7 +276,7 @@ def trust(study: ReportedStudy) -> Answer:
         ending = f" to {highest:.2f}" if lowest != highest else ""
         verdict = (
             f"The safety degrees were compared with {number_of(len(agreement), 'file')} of"
-            f" published simulations. Their rank correlation is {lowest:.2f}{ending}. Nothing was"
+            f" published simulations. The rank correlation is {lowest:.2f}{ending}. Nothing was"
             " compared with a real car."
         )
 
@@ -304,7 +302,7 @@ def trust(study: ReportedStudy) -> Answer:
 
     counts = Counter(case.evaluations["outcome"])
     remarks = [
-        f"{counts[outcome]} of {len(case.evaluations)} settings {words}."
+        f"{counts[outcome]} of {len(case.evaluations)} vehicles {words}."
         for outcome, words in NO_RESULT.items()
         if counts[outcome]
     ]

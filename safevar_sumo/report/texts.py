@@ -113,7 +113,7 @@ def answer_about(
     except InputError as error:
         if is_asked:
             raise
-        verdict = f"No answer: {error.problem}; expected: {error.legal}."
+        verdict = f"No answer: {error.problem} (expected: {error.legal})."
         study = cases[0].study
         return Answer(question=question.name, study=study, verdict=verdict, numbers={}, tables={})
     return replace(answer, command=command + answer.command)

@@ -14,9 +14,8 @@ from safevar_sumo.vehicles import STEP
 from safevar_sumo.vehicles.base import Prepared
 
 UNKNOWN_TO_DRIVER = (
-    "SUMO's driver, who drives without a command and limits commanded speeds, plans with the decel"
-    " and minGap of the traffic file. He knows neither the delays of the vehicle and its sensors"
-    " nor its brakes: that can make him collide"
+    "SUMO's driver plans with the deceleration and the smallest gap of the traffic file. This"
+    " driver knows neither the delays nor the brakes of the vehicle, and may therefore collide"
 )
 """Remark on a controller written for TraCI."""
 DECEL = "decel"

@@ -65,7 +65,6 @@ def test_every_command_and_each_of_its_options_has_a_whole_sentence_of_help(comm
         assert one.opts[0] in short
         assert " ".join(str(one.help).split()) in " ".join(full.split())
         assert str(one.help).endswith((".", "]")), one.name
-    assert "\n\nExample" in str(found.help)
 
 
 def test_there_are_at_most_20_commands_and_110_different_options() -> None:

@@ -130,7 +130,7 @@ def test_what_is_assumed_is_named_with_its_value_and_where_that_is_from() -> Non
     own = "brakeTorque 1, brakeResponse 0.2 s, payload 75 kg, payloadCentre 2.6 m"
     assert cells == [f"{own}, sensorLatency 0.1 s", f"treadDepth 8 mm, {own}, sensorLatency 0.1 s"]
     assert assumed_in_words(JOINT, vehicle, fleet) == (
-        "Assumed, as not measured: brakeTorque 1 (relative brake torque, as in a new car),"
+        "Assumed, because not measured: brakeTorque 1 (relative brake torque, as in a new car),"
         " brakeResponse 0.2 s (brake actuator delay, by [unmeasured]), payload 75 kg (payload, as"
         " in a new car), payloadCentre 2.6 m (longitudinal position of the payload, by"
         " [unmeasured]), sensorLatency 0.1 s (perception latency, by [unmeasured]) and values in 1"

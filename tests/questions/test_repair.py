@@ -344,7 +344,7 @@ def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(
     worst = kept.numbers["worst_today"]
     assert worst == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
     words = f"{worst:.2f} m from centre to centre (gap {worst - 4.7:.2f} m)"
-    assert f"The worst of them has a safety degree of {words}." in kept.verdict
+    assert f"The worst vehicle has a safety degree of {words}." in kept.verdict
     assert "Of 5 worn vehicles that were sampled afterwards none is unsafe" in kept.tested
     table = pd.DataFrame({"parameters": [{"standing_gap": 3.25}]})
     # A study that results alone hold has no file to extend.

@@ -224,7 +224,7 @@ def test_nothing_everything_and_too_little() -> None:
     few = rules_of(lambda settings: (settings > 9.5).all(axis=1), n=2, samples=400)
     assert few.tables["rules"].empty
     assert few.verdict.endswith(
-        "Ask for more with --samples, or with --simulations where that is given."
+        "Ask for more vehicles by --samples, or by --simulations if you stated it."
     )
 
 

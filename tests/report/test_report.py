@@ -242,7 +242,7 @@ def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path
     )
     page = page_of(tmp_path / "begun", ask=["rules --samples 20"], jobs=1)
     assert "There is no solution to replay" in page
-    assert "slippery: unfinished, nsga2 0 of " in page
+    assert "The results of slippery are incomplete: 0 of " in page
     assert '<section class="front" ' in page, "nothing is unsafe"
     assert Outline(page).open == []
 

@@ -99,7 +99,7 @@ def test_who_returns_the_five_worst_is_not_rewarded_by_the_common_rule(
     assert found["effect_size"] == np.mean(won), "of all that it has evaluated, whoever returns it"
     assert len(common) == len(over_runs) + 2
     remarks = " ".join(answer.only("rq2-runs").tables["remarks"]["remark"])
-    assert "by different rules. Those of FiveWorst, NSGA-II are not all" in remarks
+    assert "The solutions of FiveWorst, NSGA-II are not all" in remarks
 
 
 def test_the_table_has_the_median_and_quartiles_of_the_hypervolume_of_all_so_far(

@@ -152,12 +152,12 @@ def test_rq2_and_a_table_say_how_many_settings_each_algorithm_simulated() -> Non
     assert table[["evaluations", "baseline_evaluations"]].drop_duplicates().to_numpy().tolist() == [
         [46, 40]
     ]
-    note = "NSGA-II 46 of 100 (equal settings are simulated once); RS 40 of 100 (it ended early)."
+    note = "NSGA-II 46 of 100 (equal vehicles are simulated once); RS 40 of 100 (it ended early)."
     assert any(note in remark for remark in answer.tables["remarks"]["remark"])
     assert "46" in answer.render("text", "evaluations")
     imported = answer_questions([made_up(*rows, has_runs=False)])
     assert imported.tables["rq2"]["evaluations"].isna().all()
-    assert "number of evaluations" in "".join(imported.tables["remarks"]["remark"])
+    assert "number of their simulations" in "".join(imported.tables["remarks"]["remark"])
 
 
 def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
@@ -306,7 +306,10 @@ def test_a_run_without_solutions_is_the_worst_run() -> None:
     assert (found["runs"], found["median"]) == (3, 0)
     assert only(medians, algorithm="nsga2", metric="igd")["median"] == math.inf
     text = answer.render("text", "medians")
-    assert "made-up: runs with solutions: NSGA-II 1 of 3, RS 2 of 3. The other runs count" in text
+    assert (
+        "Only these runs of made-up have a solution: NSGA-II 1 of 3, RS 2 of 3. Runs without"
+        in text
+    )
 
 
 @pytest.mark.parametrize(
@@ -435,7 +438,7 @@ def test_equal_solutions_of_a_run_are_counted_and_said_in_pooled_tables() -> Non
     """Equal ones of two runs are not equal solutions of a run."""
     rows = [row("nsga2", run) for run in (0, 0, 0, 1)] + [row("rs", 0)]
     answer = answer_questions([made_up(*rows)])
-    twice = "2 of 5 solutions equal an earlier one of their run"
+    twice = "2 of 5 solutions equal an earlier solution of the same run"
     for name in ("rq1", "rq2", "collisions"):
         assert twice in " ".join(answer.only(name).tables["remarks"]["remark"])
     assert twice not in " ".join(answer.only("rq1-runs").tables["remarks"]["remark"])

@@ -138,7 +138,7 @@ def test_an_algorithm_that_leaves_most_of_its_budget_is_named_unless_it_says_so(
     )
     study = load_study(study, search={"parameters": {**options, **STOPS}})
     with pytest.warns(
-        UserWarning, match="less than 90% of a run's evaluations are simulated"
+        UserWarning, match="use less than 90% of the simulations that they may use"
     ) as warned:
         results = run(study, in_tmp / "out", jobs=1)
     counts = results.evaluations.groupby("algorithm").size()
@@ -148,7 +148,7 @@ def test_an_algorithm_that_leaves_most_of_its_budget_is_named_unless_it_says_so(
         < counts["rs"]
     )
     remark = str(warned[-1].message)
-    assert f"PSO (pymoo) {counts['pymoo_PSO']} of 60 (equal settings are simulated once)" in remark
+    assert f"PSO (pymoo) {counts['pymoo_PSO']} of 60 (equal vehicles are simulated once)" in remark
     assert f"CMAES (pymoo) {counts['pymoo_CMAES']} of 60 (it ended early)" in remark
     assert "SafeFuzzer" not in remark
     assert remark in str(tables(results.directory).to_dict())

@@ -265,7 +265,7 @@ def _table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
     members = common.evaluators[0].characteristics.members
     columns = {
         "source": Column(
-            "", "where the setting comes from: a solution of a or of b, or the sample"
+            "", "where the vehicle comes from: a solution of a or of b, or the sample"
         ),
         **SETTING_COLUMNS,
     }
@@ -358,7 +358,7 @@ def _decide(
 
 def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
     if np.isnan(tested.p):
-        return "There is no pair of results to test."
+        return "The results have no pair of values to test."
     return (
         f"A signed-rank test of the safety degree over {len(tested.pairs)} {tested.unit} gives"
         f" p = {tested.p:.2g}. The value of {titles[0]} is the larger one with a probability of"

@@ -34,10 +34,10 @@ LIMIT_COLUMNS: Columns = {
     "characteristic": "characteristic of the vehicle",
     "unit": "its unit",
     **with_interval(
-        "a", Column("", "value of A's original vehicle; the interval is safe alone in A", ".10g")
+        "a", Column("", "value of A's original vehicle (interval: safe alone in A)", ".10g")
     ),
     **with_interval(
-        "b", Column("", "value of B's original vehicle; the interval is safe alone in B", ".10g")
+        "b", Column("", "value of B's original vehicle (interval: safe alone in B)", ".10g")
     ),
     "change": "how the interval changes from A to B: grown, shrunk, both, or the same",
 }

@@ -41,16 +41,16 @@ NAMED = 3
 SMALLEST_COLUMNS: Columns = {
     "causes": Column(
         "",
-        "smallest set of changes that is unsafe, all else as in the original: the values at the"
-        " ends of the domain or, where these are safe, those at which the set begins to be unsafe",
+        "smallest set of changes that is unsafe, at the ends of the domain (or where the set begins"
+        " to be unsafe)",
         EXACT,
         head="cause",
     ),
     "size": Column("", "number of changes", is_shown=False),
     "begins_at": Column(
         "-",
-        "smallest share of the way to the ends of the domain at which these changes are unsafe and"
-        " fewer of them are safe, all at the same share; rounded up, and simulated as printed",
+        "smallest share of the way to the ends of the domain at which these changes together are"
+        " unsafe (rounded up)",
         EXACT,
         head="begins at share of the way",
     ),

@@ -53,8 +53,8 @@ CAUSE_COLUMNS: Columns = {
     "encounter": Column("", "the encounter, in which the original vehicle is safe", EXACT),
     "boundary": Column(
         "",
-        "the values if these changes are made as small as they can be and still unsafe; rounded to"
-        " the unsafe side, and simulated as they stand here",
+        "smallest values of these changes that are still unsafe (rounded to the unsafe side, and"
+        " simulated)",
         EXACT,
         head="cause",
     ),
@@ -100,7 +100,7 @@ SOLUTION_COLUMNS: Columns = {
     "safety_degree": Column("m", "safety degree; in -m/s on a collision", ".2f"),
     "changed": "number of changes",
     "largest_change": Column(
-        "-", "its largest change, as a share of the original value", is_shown=False
+        "-", "largest change of a characteristic (share of the original value)", is_shown=False
     ),
     "unsafe_neighbours": Column(
         "-", "share of vehicles with nearly the values of the whole failure that are unsafe", ".2f"

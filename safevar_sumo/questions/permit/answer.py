@@ -211,7 +211,7 @@ class PermitAnswer:
             sentences.append(f"Above {top} nothing was driven, where the tests {tests} end.")
         if span.left_out:
             sentences.append(
-                f"Not driven, as they begin above {top}: {join_phrases(span.left_out)}."
+                f"Not driven, because they begin above {top}: {join_phrases(span.left_out)}."
             )
         sentences += [f"Scope: {scope}.", f"Safe means: {self._safe_in_words()}."]
         return [*filter(None, sentences)]

@@ -50,7 +50,7 @@ def assumed_in_words(study: Study, vehicle: CharacteristicSet, fleet: Fleet) -> 
     if further := np.sum((fleet.measured < is_stated).any(axis=1)):
         cars = f"{further} of {len(fleet.names)} cars"
         phrases.append(f"values in {cars} that others state (column assumed, --details)")
-    return f"Assumed, as not measured: {join_phrases(phrases)}." if phrases else ""
+    return f"Assumed, because not measured: {join_phrases(phrases)}." if phrases else ""
 
 
 def cars_of(vehicle: CharacteristicSet, fleet: Fleet) -> list[Cars]:

@@ -45,7 +45,7 @@ CARS: Columns = {
 }
 SETS: Columns = {
     "car": "name of the car",
-    "fit": Column("-", "number of the parameter set in [spread]; 0 is the study's own", "d"),
+    "fit": Column("-", "number of the parameter set in [spread] (0: that of the study)", "d"),
     "up_to": Column("", "greatest value up to which it is safe with this set", ".10g"),
     "test": "the test that limits it",
     "encounter": "the encounter in which it is unsafe",

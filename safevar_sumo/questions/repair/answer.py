@@ -33,7 +33,7 @@ REPAIRS: Columns = {
         "-", "number of parameter sets of the vehicle model in which it holds", is_shown=False
     ),
     "largest_change": Column(
-        "-", "largest change of a parameter, as a share of its range", is_detail=True
+        "-", "largest change of a parameter (share of its range)", is_detail=True
     ),
     "metres_earlier": Column(
         "m",
@@ -153,7 +153,7 @@ def _verdict(
         ending = unsafe.value_in_words(worst) if unsafe.bound else degree
         verdict = (
             "No repair is necessary: with the driving system of today all tested vehicles"
-            f"{where} {safe} within the required range ({wear}). The worst of them {ending}."
+            f"{where} {safe} within the required range ({wear}). The worst vehicle {ending}."
         )
     elif repairs:
         verdict = _repair_in_words(repairs, wear, safe)

@@ -256,8 +256,8 @@ def _equal_solutions(case: Case) -> str:
         return ""
     of_all = f"{count} of {number_of(len(case.solutions), 'solution')}"
     return (
-        f"{of_all} equal an earlier one of their run. They count here, because they count in the"
-        " paper's method."
+        f"{of_all} equal an earlier solution of the same run. Equal solutions count here, as in the"
+        " paper."
     )
 
 
@@ -322,11 +322,11 @@ def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) 
     elif not case.has_runs:
         yield (
             "igd, igd_plus and hypervolume are missing, because they need runs, and imported"
-            " solutions belong to none. Their number of evaluations is not known either."
+            " solutions belong to none. The number of their simulations is unknown, too."
         )
     elif len(case.evaluations):
         yield (
-            "Number of settings that a run simulates on average:"
+            "Number of vehicles that a run simulates on average:"
             f" {describe_evaluations(case, count_evaluations(case))}."
         )
 

@@ -380,9 +380,9 @@ def describe_runs_without_solutions(case: Case) -> str:
     if not texts:
         return ""
     return (
-        f"{case.name}: runs with solutions: {', '.join(texts)}. The other runs count with"
-        " hypervolume 0, and as worst in IGD+, IGD and the best safety degree, so that a median may"
-        " be undefined. Means over solutions leave them out."
+        f"Only these runs of {case.name} have a solution: {', '.join(texts)}. Runs without a"
+        " solution count as the worst runs (hypervolume 0, and the worst IGD+, IGD and safety"
+        " degree). Means over solutions leave out such runs, and a median may be undefined."
     )
 
 

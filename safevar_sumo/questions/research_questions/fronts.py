@@ -161,9 +161,9 @@ def describe_rules(case: Case) -> str:
     if not len(others):
         return ""
     return (
-        "the algorithms choose their solutions by different rules. Those of"
-        f" {', '.join(map(case.title_of, others))} are not all non-dominated settings of a run, so"
-        " means over solutions depend on the rule. The table rq2-common applies one rule to all."
+        "the algorithms choose their solutions by different rules, so means over solutions depend"
+        f" on the rule. The solutions of {', '.join(map(case.title_of, others))} are not all"
+        " non-dominated vehicles of a run. The table rq2-common applies one rule to all."
     )
 
 
@@ -199,7 +199,7 @@ def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
             "it stops by its own rule" if algorithm in case.stop_by_themselves else "it ended early"
         )
         reasons = [end] if requested < budget else []
-        reasons += ["equal settings are simulated once"] if simulated < requested else []
+        reasons += ["equal vehicles are simulated once"] if simulated < requested else []
         words = f" ({' and '.join(reasons)})" if reasons else ""
         texts.append(f"{case.title_of(str(algorithm))} {simulated:,.0f} of {budget:,.0f}{words}")
     return "; ".join(texts)
@@ -222,8 +222,8 @@ def why_few_evaluations(case: Case) -> str:
         return ""
     texts = describe_evaluations(case, counts[is_few])
     return (
-        f"{case.name}: less than {USUAL_SHARE:.0%} of a run's evaluations are simulated: {texts}."
-        " Are the options as meant?"
+        f"The runs of {case.name} use less than {USUAL_SHARE:.0%} of the simulations that they may"
+        f" use: {texts}. Check the options of the study."
     )
 
 

@@ -53,7 +53,7 @@ def verdict_sentences(told: Told, nearest: Rows, in_ranges: Rows) -> Iterator[st
         yield told.unsafe.remark
     if told.tests_left_out:
         tests = join_phrases(told.tests_left_out)
-        yield f"Left out, as all their values are above {told.up_to}: {tests}."
+        yield f"Left out, because all their values are above {told.up_to}: {tests}."
     if told.at_tests:
         yield "Nothing was simulated between the values of the tests (--at-tests)."
     yield f"Scope: {told.scope}."
