@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from typing import Any
@@ -107,7 +107,7 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
     }
 
 
-def _row_of_part(item: Characteristic, row: Mapping[Any, Any] | None) -> tuple[str, ...]:
+def _row_of_part(item: Characteristic, row: JsonObject | None) -> tuple[str, ...]:
     """A row of `PARTS`."""
     name = item.meaning or item.short_name
     limit = _limit_in_words(item, row)
@@ -158,7 +158,7 @@ def _limits_of(study: ReportedStudy) -> Answer | None:
     return next((answer for answer in study.answers if answer.question == "tolerance"), None)
 
 
-def _rows_of(limits: Answer) -> dict[str, dict[Any, Any]]:
+def _rows_of(limits: Answer) -> dict[str, JsonObject]:
     return {row["characteristic"]: row for row in _records(limits.table())}
 
 
@@ -175,7 +175,7 @@ def speeds_of(case: Case) -> Span | None:
 
 
 def _greatest_speed(
-    study: ReportedStudy, speed: Answer, ranges: Sequence[Mapping[Any, Any]]
+    study: ReportedStudy, speed: Answer, ranges: Sequence[JsonObject]
 ) -> tuple[str, str]:
     """The greatest speed of vehicles within the limits, with its unit; empty if there is no answer
     or they are not safe at the least one, with a sentence that says so.
@@ -226,7 +226,7 @@ def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
     return "The study names no item that a workshop can measure."
 
 
-def _together(item: Characteristic, row: Mapping[Any, Any] | None) -> tuple[float, float]:
+def _together(item: Characteristic, row: JsonObject | None) -> tuple[float, float]:
     """The joint limits of an item; one whose limits were not asked for, and one without room, stays
     as in the original.
     """
@@ -236,7 +236,7 @@ def _together(item: Characteristic, row: Mapping[Any, Any] | None) -> tuple[floa
 
 
 def _limit_in_words(
-    item: Characteristic, row: Mapping[Any, Any] | None, value: float | None = None
+    item: Characteristic, row: JsonObject | None, value: float | None = None
 ) -> str:
     """A limit: `at least 3 mm`, or the value that the study states. An end of the domain is none,
     unless both are; an item whose original is at one end has a limit on the other side all the
