@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import json_of, numbers_of, refused, run
+from tests.in_process import SLOW, json_of, numbers_of, refused, run
 from tests.questions.conftest import model_of
 
 SHORT = """
@@ -81,7 +80,7 @@ def are_unsafe(
     return found
 
 
-@pytest.mark.slow
+@SLOW
 def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None:
     study = load_study("wear", encounters="ranges")
     members = assemble(study).characteristics.vehicle
@@ -115,7 +114,7 @@ def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None
     assert not answer.numbers["rough"]
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(short: Study) -> None:
     row = json_of("permit", "short.toml", "--cars", "fleet.csv", "--ignore", "note", "--fits", "0")
     cars = row["tables"]["cars"]["rows"]
@@ -149,7 +148,7 @@ def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(sh
     assert run(*typed, "--format", "csv").stdout == printed, "the written list has the same answer"
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_car_is_answered_alike_in_any_list_and_with_any_jobs(
     short: Study, worker_processes: None
 ) -> None:
@@ -165,17 +164,7 @@ def test_a_car_is_answered_alike_in_any_list_and_with_any_jobs(
         pd.testing.assert_frame_equal(own, alone.tables[name], check_dtype=False)
 
 
-@pytest.mark.slow
-def test_a_speed_that_is_needed(short: Study) -> None:
-    typed = ["permit", "short.toml", "--set", "brakeTorque=0.6", "--others", "new", "--fits", "0"]
-    slow = json_of(*typed)["tables"]["cars"]["rows"][0]["up_to"]
-    assert json_of(*typed, "--need", f"{slow:g} km/h")["numbers"]["drive"] == 1
-    found = json.loads(run(*typed, "--need", f"{slow + 1:g} km/h", "--json", expect=3).stdout)
-    assert "1 car may not drive" in found["verdict"]
-    assert found["numbers"]["need"] == slow + 1
-
-
-@pytest.mark.slow
+@SLOW
 def test_all_cars_within_limits(short: Study) -> None:
     limits = ("brakeTorque >= 0.7", "payload <= 525", "treadDepth >= 3")
     answer = permit(short, limits=limits, others="new", fits=2, out="out.csv")
@@ -194,7 +183,7 @@ def test_all_cars_within_limits(short: Study) -> None:
         assert not are_unsafe(short, fit, np.unique(cars, axis=0), speeds, PLACES, keep=0.1).any()
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_rough_answer_lets_no_car_drive_and_says_so_in_each_form(short: Study) -> None:
     cars = {"new": {}, "worn": {"treadDepth": 3}}
     answer = permit(short, cars=cars, others="new", quick=True)
@@ -227,7 +216,7 @@ def test_a_needed_speed_is_no_less_where_the_new_car_is_unsafe_too() -> None:
         assert verdict_of(up_to, 50, 60, need, is_proven=True) == expected, (up_to, need)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_speed_that_no_scenario_can_move_is_one_that_was_driven() -> None:
     asked = {"unsafe": "stopping_distance > 50", "quick": True}
     answer = permit("stop", cars={"a": {"brakeTorque": 0.9}}, others="new", **asked)
@@ -242,7 +231,7 @@ def test_a_speed_that_no_scenario_can_move_is_one_that_was_driven() -> None:
     assert "at 30, 50, 80, 100 and 120 km/h" in answer.numbers["scope"]
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_car_passes_a_test_of_a_regulation() -> None:
     """It is no promise for the road."""
     told = permit("r152", cars={"a": {"brakeTorque": 0.9}}, others="new", quick=True).verdict
@@ -276,7 +265,7 @@ def test_a_car_is_safe_with_all_values_that_its_measured_one_may_have(
     assert failure.setting[column] == pytest.approx(unsafe_at, abs=0.01)
 
 
-@pytest.mark.slow
+@SLOW
 def test_one_car_is_told_which_assumed_value_lowers_its_speed_most(short: Study) -> None:
     stated = {"brakeTorque": 0.7, "brakeResponse": 0.1, "sensorLatency": 0.05}
     options: dict[str, Any] = {"others": "new", "fits": 0, "quick": True}
@@ -331,7 +320,7 @@ def own_search(study: Study, budget: int = LEAST_SIMULATIONS) -> PermitSearch:
     return PermitSearch(Models((own,), ()), span, values, budget)
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path) -> None:
     Path("three.toml").write_text(MATRIX)
     study = load_study("three.toml")
@@ -348,13 +337,13 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path)
     assert span_of(load_study("alks"), "lateral_speed").unit == "m/s"
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_study_that_states_ranges_keeps_what_searched_encounters_leave() -> None:
     options: dict[str, Any] = {"others": "new", "fits": 0, "quick": True, "up_to": "speed=12"}
     assert permit("wear", cars={"a": {}}, **options).numbers["margin"] == 0.1
 
 
-@pytest.mark.slow
+@SLOW
 @settings(max_examples=25)
 @given(
     begin=st.floats(10.1, 58),

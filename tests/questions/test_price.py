@@ -16,7 +16,7 @@ from safevar_sumo.questions.price import Account, round_down
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.tolerance.tell import ROUGH
 from safevar_sumo.terminal import show_no_progress
-from tests.in_process import InlinePool, json_of, refused, run
+from tests.in_process import SLOW, InlinePool, json_of, refused, run
 from tests.scenarios.test_simulated import MODELS, STUDY
 
 CLEARANCE = 40 - 15 * 0.5
@@ -34,7 +34,7 @@ def keeps(decel: float, delay: float, clearance: float = 0.0) -> bool:
     return CLEARANCE - 15 * delay - 15**2 / 2 / decel >= clearance
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("question", ["risk", "rules", "explain", "tolerance", "compare"])
 @pytest.mark.parametrize("number", [150, 700])
 def test_a_question_keeps_to_the_number_of_simulations(
@@ -92,7 +92,7 @@ def test_the_least_number_is_told_before_anything_is_simulated(
         getattr(sv, question)(rig, simulations=least - 1, pool=InlinePool())
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_rough_comparison_keeps_to_its_number_in_a_matrix() -> None:
     answer = sv.compare("wear", "wear", simulations=1000, jobs=1)
     assert answer.numbers["simulations"] <= 1000
@@ -203,8 +203,8 @@ class Counted(Rig):
 """
 
 
-@pytest.mark.parametrize("number", [10, 40, pytest.param(300, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [10, 40, pytest.param(300, marks=SLOW)])
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=SLOW)])
 @pytest.mark.parametrize("question", ["risk", "rules", "tolerance --limits decel>=5", "explain"])
 def test_a_number_is_that_of_all_simulations_of_an_edited_class(
     rig: str, question: str, number: int, jobs: int, request: pytest.FixtureRequest
@@ -264,7 +264,7 @@ def test_a_slow_simulator_gets_a_rough_answer(rig: str, monkeypatch: pytest.Monk
     assert output.stdout.startswith("Rough answer (--simulations 500)")
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("cache", ["off", "folder"])
 @pytest.mark.parametrize("number", [400, 2000])
 def test_a_page_and_a_pack_share_one_number(

@@ -14,10 +14,10 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.questions import model_spread
 from safevar_sumo.report.page import report
-from tests.in_process import InlinePool, run
+from tests.in_process import SLOW, InlinePool, run
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_rough_tolerance_calls_no_limit_kept() -> None:
     """It says what was tested, and ends with code 3: a gate must not pass by it."""
     asked = ("tolerance", "smoke", "--quick", "--limits", "mass <= 2500", "--unsafe", "collision")
@@ -29,7 +29,7 @@ def test_a_rough_tolerance_calls_no_limit_kept() -> None:
     assert "calls no limit kept" in done.stderr
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_rough_tolerance_says_which_limit_fails() -> None:
     answer = sv.tolerance("smoke", limits=("mass <= 2700",), unsafe="below=2.7", quick=True)
     assert answer.numbers["kept"] is False
@@ -49,7 +49,7 @@ over.impact_location = [25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35, 36, 37, 38, 
 """
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_rough_answer_about_many_test_cases_searches_a_little(in_tmp: Path) -> None:
     Path("many.toml").write_text(MANY)
     answer = sv.tolerance("many.toml", quick=True, characteristics=("brakeTorque",))
@@ -60,7 +60,7 @@ WORN = {"one": {"brakeTorque": 0.7}, "two": {"brakeTorque": 0.9}}
 PROMISE = {"promise": ("brakeTorque >= 0.95",), "change": ("margin",)}
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_rough_list_says_its_price_and_drives_the_own_parameter_set_alone(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -71,7 +71,7 @@ def test_a_rough_list_says_its_price_and_drives_the_own_parameter_set_alone(
     assert re.fullmatch(price, capfd.readouterr().err.strip())
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize(
     ("ask", "options"),
     [(sv.explain, {}), (sv.tolerance, {"characteristics": ("brakeTorque",)}), (sv.repair, PROMISE)],
@@ -85,7 +85,7 @@ def test_rough_answers_simulate_the_own_parameter_set_alone(
     assert answer.numbers["rough"]
 
 
-@pytest.mark.slow
+@SLOW
 def test_a_rough_page_has_no_line_to_sign_and_no_other_parameter_set(
     slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -97,7 +97,7 @@ def test_a_rough_page_has_no_line_to_sign_and_no_other_parameter_set(
     assert 'class="signature"' not in page
 
 
-@pytest.mark.slow
+@SLOW
 def test_on_a_terminal_the_rough_answer_comes_first(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -24,14 +24,14 @@ from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import InlinePool, json_of
+from tests.in_process import SLOW, InlinePool, json_of
 from tests.questions.conftest import ORIGINAL, Plant, Region, made_up_evaluator, made_up_study
 
 COLLISION = Unsafe()
 SIDES = (0.0, ORIGINAL, 10.0)
 
 
-@pytest.mark.slow
+@SLOW
 @given(table=st.lists(st.booleans(), min_size=27, max_size=27))
 def test_all_minimal_combinations_of_ends_and_no_other_are_found_whatever_the_outcomes(
     table: list[bool],
@@ -190,7 +190,7 @@ def test_few_settings_find_the_causes_of_shipped_studies(
     assert evaluator.simulated <= budget
 
 
-@pytest.mark.slow
+@SLOW
 def test_the_answer_leads_with_the_smallest_changes() -> None:
     """Of rain: one pair, one of three, two of four (the enumeration of another implementation)."""
     answer = json_of("explain", "rain", "--fits", "2", "--jobs", "1")
@@ -225,7 +225,7 @@ def test_the_study_of_results_is_explained_as_without_results(slippery: Path) ->
     assert answer.to_dict() == sv.explain(study, simulations=600, jobs=1).to_dict()
 
 
-@pytest.mark.slow
+@SLOW
 def test_of_a_searched_scenario_each_combination_meets_critical_encounters() -> None:
     answer = sv.explain("sun", ranges=True, fits=0, quick=True, pool=InlinePool())
     assert "Scope: the original encounter and the 16 encounters in which" in answer.verdict
@@ -265,7 +265,7 @@ def test_with_repeats_a_cause_has_the_share_of_its_unsafe_runs() -> None:
     assert "The vehicle is unsafe in 25 % of its runs." in sentences
 
 
-@pytest.mark.slow
+@SLOW
 def test_what_is_left_of_few_simulations_explains_a_sampled_failure() -> None:
     """Of one failure there are causes, but no shares."""
     answer = sv.explain("native", simulations=300, unsafe="collision", pool=InlinePool())

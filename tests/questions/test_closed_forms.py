@@ -1,0 +1,139 @@
+"""Answers about a car before a wall, whose stop is a formula: speeds, versions, limits and
+pictures.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import safevar_sumo as sv
+from tests.in_process import InlinePool
+from tests.scenarios.test_simulated import STUDY
+
+CARS = """
+from typing import Annotated
+
+import msgspec
+
+from safevar_sumo.study import searched
+
+
+class Car(msgspec.Struct, frozen=True):
+    UNITS = {"decel": "m/s^2", "delay": "s"}
+    OPTIONAL = ("delay",)
+    speed: Annotated[float, searched(5.0, 30.0, "m/s", "speed")] = 15.0
+    gap: float = 25.0
+
+    def simulate(self, setting):
+        way = self.speed * (0.5 + setting["delay"]) + self.speed**2 / 2 / setting["decel"]
+        rest = self.gap - way
+        if rest < 0:
+            impact = (-2 * setting["decel"] * rest) ** 0.5
+            return {"outcome": "collision", "safety_degree": -impact}
+        return {"outcome": "stopped", "safety_degree": rest}
+"""
+SPEED = """[scenario.over]
+speed = { lower = 10, upper = 20, original = 12, unit = "m/s" }
+
+[vehicle."""
+ERROR, LATENESS, MARGIN = 0.5, 0.125, 1.0
+"""Precision of a measured deceleration and delay; clearance to keep."""
+OPTIONS = {"others": "new", "step": 0.5, "margin": MARGIN, "pool": InlinePool()}
+SPEEDS = np.arange(10, 20.5, 0.5)
+
+
+@pytest.fixture
+def car(coarse: None, in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Its study, with few simulations of every search."""
+    monkeypatch.setattr("safevar_sumo.questions.permit.LEAST_SIMULATIONS", 90)
+    monkeypatch.setattr("safevar_sumo.questions.falsify.USUAL_BUDGET", 90)
+    Path("cars.py").write_text(CARS)
+    return STUDY.replace("models:Wall", "cars:Car")
+
+
+def rest(decel: object, delay: object, speed: object = 15.0, gap: float = 25.0) -> pd.Series:
+    """What is left in front of the wall [m]."""
+    return gap - speed * (0.5 + delay) - np.square(speed) / 2 / decel
+
+
+def permitted(decel: float, delay: float) -> float:
+    """The last speed of the grid at which the margin is left."""
+    return float(SPEEDS[rest(decel, delay, SPEEDS) >= MARGIN].max())
+
+
+def test_cars_may_drive_at_the_speeds_of_the_formula(car: str) -> None:
+    """A measured value is the worse end of its interval."""
+    study = car.replace("[vehicle.", SPEED)
+    for end, error in (9, ERROR), (1, LATENESS):
+        precision = f"precision = {{ value = {error}, source = 'test' }}"
+        study = study.replace(f"upper = {end} }}", f"upper = {end}, {precision} }}")
+    Path("car.toml").write_text(study)
+    worn = {"decel": 5.0, "delay": 0.25}
+    cars = {"new": {}, "worn": worn, "old": {"decel": 3.0, "delay": 1.0}}
+    rows = sv.permit("car.toml", cars=cars, **OPTIONS).tables["cars"].set_index("car")
+    new, up_to = permitted(8.0, 0.0), permitted(5.0 - ERROR, 0.25 + LATENESS)
+    assert rows["up_to"].to_dict() == pytest.approx(
+        {"old": np.nan, "worn": up_to, "new": new}, nan_ok=True
+    )
+    assert rows["verdict"].to_dict() == {"old": "stop", "worn": "up to", "new": "drive"}
+    after = {"decel": permitted(8.0, 0.25 + LATENESS), "delay": permitted(5.0 - ERROR, 0.0)}
+    row = rows.loc["worn"]
+    assert after[row["repair_first"]] == row["up_to_after_repair"] == max(after.values())
+    assert row["simulate"].endswith(f"--set speed={up_to + 0.5}")
+    typed = [f"{name}={value}" for name, value in worn.items()]
+    for need in (up_to, up_to + 0.5):
+        answer = sv.permit("car.toml", set=typed, need=f"{need} m/s", **OPTIONS)
+        assert answer.numbers["drive"] == (need == up_to)
+        assert f"from 10 up to {new:g} m/s" in answer.verdict
+
+
+def test_all_cars_within_limits_drive_as_fast_as_the_worst_of_them(car: str) -> None:
+    Path("car.toml").write_text(car.replace("[vehicle.", SPEED))
+    answer = sv.permit("car.toml", limits=["decel >= 5", "delay <= 0.25"], **OPTIONS)
+    (row,) = answer.tables["cars"].to_dict("records")
+    assert row["up_to"] == permitted(5.0, 0.25)
+    assert "decel 8 -> 5 m/s^2 (-37.5 %) and delay 0 -> 0.25 s" in row["because"]
+
+
+@pytest.mark.parametrize(("is_worse", "least"), [(True, 3), (False, 4)])
+def test_two_versions_are_counted_as_the_formula_says(car: str, is_worse: bool, least: int) -> None:
+    """One brakes with 8 m/s^2, the other with 6.5: the same changes of each are compared."""
+    study = car.replace("[vehicle.", "parameters.gap = 40.0\n[vehicle.")
+    Path("hard.toml").write_text(study)
+    Path("soft.toml").write_text(study.replace("original = 8", "original = 6.5"))
+    names = ["hard.toml", "soft.toml"][:: 1 if is_worse else -1]
+    answer = sv.compare(*names, samples=64, limits=[f"decel >= {least}"], pool=InlinePool())
+    hard, soft = "ab" if is_worse else "ba"
+    frame, numbers = answer.tables["settings"], answer.numbers
+    assert frame["b_decel"].to_numpy() == pytest.approx(frame["decel"] + (1.5, -1.5)[is_worse])
+    assert frame[["decel", "b_decel"]].min(axis=None) >= least
+    changes = frame.sort_index()[["decel", "delay"]].to_numpy() - [(6.5, 8.0)[is_worse], 0.0]
+    ratio = changes[16:32] / changes[:16]  # of the second setting of each line to its first
+    assert ratio[:, 0] == pytest.approx(ratio[:, 1])
+    assert set(ratio.ravel().round(9)) <= {0.5, 1.5}
+    fails = {}
+    for side, decel in ("a", frame["decel"]), ("b", frame["b_decel"]):
+        left = rest(decel, frame["delay"], gap=40.0)
+        degree = np.where(left < 0, -np.sqrt(np.abs(2 * decel * left)), left)
+        assert frame[f"{side}_degree"].to_numpy() == pytest.approx(degree)
+        fails[side] = left < 0.3
+    counts = [numbers[f"only_{soft}_unsafe"], numbers["both"], numbers["neither"]]
+    both = fails[soft] & fails[hard]
+    assert counts == [(fails[soft] & ~both).sum(), both.sum(), (~fails[soft]).sum()]
+    assert numbers["decision"] == ("do not release" if is_worse else "decide")
+    assert f"within decel >= {least}. The original vehicles differ (decel" in answer.verdict
+    assert is_worse or "but may brake more often without need, which was not" in answer.verdict
+    assert answer.figure().axes
+    assert (numbers["limits_shrunk"], numbers["limits_grown"]) == (is_worse, not is_worse)
+    assert numbers["p"] == pytest.approx(2 * 0.5**16), "each of 16 lines is safer in one of both"
+    limits = answer.tables["limits"].set_index("characteristic")
+    assert limits["change"].tolist() == ["the same", "shrunk" if is_worse else "grown"]
+    for side, original in (hard, 8.0), (soft, 6.5):
+        latest = min(1, (39.7 - 7.5 - 225 / 2 / original) / 15)
+        weakest = max(least, 225 / 2 / 32.2)
+        assert limits.loc["delay", f"{side}_high"] == pytest.approx(latest, abs=0.01)
+        assert limits.loc["decel", f"{side}_low"] == pytest.approx(weakest, abs=0.01)
