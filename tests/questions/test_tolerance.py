@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 import scipy
 from hypothesis import assume, given, settings, strategies as st
@@ -20,18 +19,15 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.box import Box, Judgement, prove
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.tables import reader_columns, tabulate
 from safevar_sumo.questions.tolerance import boxes
 from safevar_sumo.questions.tolerance.asked import asked_of
 from safevar_sumo.questions.tolerance.search import find_limits
-from safevar_sumo.questions.tolerance.tell import LIMITS
 from safevar_sumo.questions.words import bound_in_words
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles import region_of
 from tests.in_process import InlinePool, run
 from tests.made_up import case_of
-from tests.manual import ROOT
 from tests.questions.conftest import (
     Plant,
     Region,
@@ -360,15 +356,3 @@ def test_an_unsafe_original_keeps_no_limit_and_says_what_it_has() -> None:
         assert answer.tables["limits"]["kept"].tolist() == (
             [False, None] if limits else [None, None]
         )
-
-
-def test_the_manual_names_the_columns_of_limits_that_text_may_leave_out() -> None:
-    """They are shown where they have a value, and no other column is ever left out."""
-    values = {name: "any" for name in LIMITS}
-    always = {name: values[name] for name in ("characteristic", "unit", "original")}
-    shown, fewest = (
-        {column.head for column in reader_columns(tabulate("", LIMITS, pd.DataFrame([row])))}
-        for row in (values, dict.fromkeys(LIMITS) | always)
-    )
-    table = (ROOT / "docs/tolerance.md").read_text().partition("empty in every row where")[2]
-    assert shown - fewest == {*re.findall("`([^`]+)`", table.partition("\n\n")[0])}
