@@ -22,6 +22,7 @@ from safevar_sumo.questions.pairs import SIDES
 from safevar_sumo.questions.repair.price import benign_scenes, drive_new_cars, needless_braking
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
+from safevar_sumo.questions.tolerance.alone import Alone
 from safevar_sumo.questions.tolerance.asked import Asked, asked_of
 from safevar_sumo.questions.tolerance.search import alone_with_own_set
 from safevar_sumo.questions.words import join_phrases, number_of
@@ -165,7 +166,7 @@ def _safe_alone(asked: Asked) -> list[Interval | None]:
     own, members = asked.oracle.own, asked.oracle.vehicle.members
     if own.are_unsafe(own.characteristics.original_settings, "original vehicle")[0]:
         return [None] * len(members)
-    alone = alone_with_own_set(asked)
+    alone = alone_with_own_set(asked, Alone(asked.lower, asked.upper))
     ends = zip(alone.lower.tolist(), alone.upper.tolist(), strict=True)
     return [item.rounded_inwards(end) for item, end in zip(members, ends, strict=True)]
 

@@ -106,7 +106,12 @@ def no_limits(asked: Asked) -> FoundLimits:
 
 def _with_own_set(asked: Asked, outer: FoundLimits | None) -> FoundLimits:
     """The limits with the study's own parameter set."""
-    alone = alone_with_own_set(asked, None if outer is None else outer.alone)
+    alone = Alone(asked.lower, asked.upper) if outer is None else outer.alone
+    suffices = asked.effort.own >= LEAST_CASES
+    try:
+        alone = alone_with_own_set(asked, alone)
+    except Exhausted:
+        suffices = False
     longest = _sides_of(asked, alone)
     broken: Mapping[int, FloatArray] = {}
     if outer is not None:
@@ -116,7 +121,7 @@ def _with_own_set(asked: Asked, outer: FoundLimits | None) -> FoundLimits:
     encounter = np.tile(asked.star.lower[boxes.space.size :], (len(asked.avoided), 1))
     known = Known(np.hstack([asked.avoided, encounter]), asked.nothing)
     limits = FoundLimits(alone, broken, boxes, boxes.fixed, known)
-    if asked.effort.own < LEAST_CASES:
+    if not suffices:
         return limits
     try:
         limits = _with_broken(asked, limits, 0)
@@ -125,12 +130,11 @@ def _with_own_set(asked: Asked, outer: FoundLimits | None) -> FoundLimits:
         return limits
 
 
-def alone_with_own_set(asked: Asked, outer: Alone | None = None) -> Alone:
-    """The limits of each characteristic alone, within outer ones; they end before what cannot be
+def alone_with_own_set(asked: Asked, limits: Alone) -> Alone:
+    """The limits of each characteristic alone, within known ones; they end before what cannot be
     simulated, too.
     """
     oracle, effort, star = asked.oracle, asked.effort, asked.star
-    limits = outer or Alone(asked.lower, asked.upper)
     hardest = oracle.hardest(effort.encounters)
     parts = effort.box.parts
     limits = scan_alone(oracle.with_failed, star, limits, hardest, effort.values, parts)
