@@ -193,7 +193,9 @@ def defer_interrupts() -> Iterator[None]:
     is_main = threading.current_thread() is threading.main_thread()
     handlers = dict[int, Any]()
     for interrupt in INTERRUPTS if is_main else ():
-        handlers[interrupt] = signal.signal(interrupt, lambda number, _: waiting.append(number))
+        # A handler that was not set from Python could not be set again.
+        if signal.getsignal(interrupt) is not None:
+            handlers[interrupt] = signal.signal(interrupt, lambda number, _: waiting.append(number))
     try:
         yield
     finally:

@@ -125,6 +125,15 @@ def limit_text(item: Characteristic, value: float) -> str:
     return f"{value:{EXACT}}{item.suffix}"
 
 
+def values_in_words(members: CharacteristicSet, values: NamedValues) -> str:
+    """Values of some characteristics: `brake torque at 0.5 and payload at 525 kg`."""
+    return join_phrases(
+        f"{item.short_name} at {limit_text(item, values[item.name])}"
+        for item in members
+        if item.name in values
+    )
+
+
 def as_printed(
     members: CharacteristicSet,
     setting: FloatArray,

@@ -163,9 +163,9 @@ class Packed:
             )
 
         # No question writes a file, or takes for ever.
-        words = [word for text in self.packed.questions for word in split(text)]
-        numbers = [int(word) for word in words if WHOLE_NUMBER.fullmatch(word)]
-        total = sum([*numbers, *self.packed.simulations.values()])
+        words = [word for text in self.packed.questions for word in split(text.replace("=", " "))]
+        numbers = [int(word) for word in words if WHOLE_NUMBER.fullmatch(word.strip())]
+        total = sum(map(abs, [*numbers, *self.packed.simulations.values()]))
         if total > MAX_ASKED:
             problem = f"its questions ask for {total:,} vehicles and simulations"
             raise InputError("ask", problem, f"at most {MAX_ASKED:,} in a pack")

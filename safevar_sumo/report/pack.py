@@ -97,8 +97,8 @@ def write_pack(path: Path, studies: list[PackedStudy], files: Mapping[str, bytes
 
 def versions_here() -> dict[str, str]:
     """Versions of Python and of the packages with which a pack's answers and page are computed."""
-    # Matplotlib draws the pictures of the page.
-    packages = (*PACKAGES, "matplotlib")
+    # Matplotlib and Pillow draw the pictures of the page.
+    packages = (*PACKAGES, "matplotlib", "pillow")
     return {**{name: version(name) for name in packages}, "python": sys.version.split()[0]}
 
 

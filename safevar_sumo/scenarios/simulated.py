@@ -167,6 +167,8 @@ def unit_contradiction(trace: Trace) -> str:
         return ""
     speed, gap = trace.speed[active, 0], trace.gap[active, 0]
     position, obstacle_speed = trace.position[active, 0], trace.obstacle_speed[active, 0]
+    # Nobody is seen at an infinite gap.
+    gap = np.where(np.isfinite(gap), gap, np.nan)
     driven = float(np.sum(speed[1:] + speed[:-1]) * trace.step / 2)
     ways = {"position": np.ptp(position)}
     if (obstacle_speed == 0).all() and (np.diff(gap) <= 0).all():

@@ -5,6 +5,7 @@ sets, under [limits] or on the command line as `NAME >= X` and `NAME <= X`.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any
@@ -208,6 +209,12 @@ class Constraint(Table, frozen=True, kw_only=True):
         # The first term has its sign without a space.
         return re.sub("^- ", "-", text.removeprefix("+ "))
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The bounds; infinite where none is stated."""
+        low = -math.inf if self.at_least is None else self.at_least
+        return low, math.inf if self.at_most is None else self.at_most
+
     def allows(self, values: Mapping[str, Any]) -> Any:
         """Whether the sum is within its bounds at these values, numbers or arrays of shape (N,), or
         one of its terms has no value among them.
@@ -215,8 +222,8 @@ class Constraint(Table, frozen=True, kw_only=True):
         if not self.sum.keys() <= values.keys():
             return True
         total = sum(weight * values[name] for name, weight in self.sum.items())
-        is_high = self.at_least is None or total >= self.at_least
-        return is_high & (self.at_most is None or total <= self.at_most)
+        low, high = self.ends
+        return (total >= low) & (total <= high)
 
     def unit_of(self, rows: Mapping[str, Domain]) -> str:
         """The unit of the sum; `rows` are the characteristics of the vehicle."""

@@ -117,11 +117,10 @@ def _for_tests(tables: Tables, overrides: Tables) -> Parameters:
     if "constraints" in overrides:
         constraints = tables.get("constraints")
     variables |= {*table_in(overrides, "variation")}
-    variation = table_in(tables, "variation")
-    return {
-        "constraints": constraints,
-        "variation": {name: variation[name] for name in variation if name in variables},
-    }
+    variation = tables.get("variation", {})
+    if isinstance(variation, dict):
+        variation = {name: variation[name] for name in variation if name in variables}
+    return {"constraints": constraints, "variation": variation}
 
 
 def _tables_in(tables: Tables, key: str) -> list[Parameters]:

@@ -105,9 +105,8 @@ class Moving(NamedTuple):
 
         # Who crosses is seen from the side from which it comes.
         sign = np.where((vy > 0).any(axis=0), 1.0, -1.0)
-        level = np.where(
-            is_in_path.any(axis=0), IN_PATH, np.where((track.speed > 0).any(axis=0), BESIDE, 0)
-        )
+        moves = (is_there & (track.speed > 0)).any(axis=0)
+        level = np.where(is_in_path.any(axis=0), IN_PATH, np.where(moves, BESIDE, 0))
         return cls(
             track=track,
             edge=edge,
@@ -198,7 +197,7 @@ def tracks_of(
     width = n_encounters if len(points) > 1 else 1
     joined = [_joined(tracks, width) for tracks in of_bodies]
     for track in joined:
-        check_motion(track, step)
+        check_motion(track, times, step)
     check_start(joined, vehicle)
     return joined
 

@@ -166,7 +166,9 @@ def _attempt(command: str, system: System) -> Iterator[None]:
         raise UserCodeError(system.source, f"{problem}{REPRODUCED_BY}{command}")
     attempt = attempts / uuid4().hex
     with this_process.attempts.with_name(attempt.name).open("x") as file:
-        portalocker.lock(file, ALONE)
+        # Some disks have no locks.
+        with suppress(portalocker.LockException):
+            portalocker.lock(file, ALONE)
         os.replace(file.name, attempt)
         try:
             yield

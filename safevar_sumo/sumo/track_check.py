@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -63,39 +64,31 @@ def check_shapes(tracks: Sequence[Track], n_samples: int, n_encounters: int, ste
                 )
 
 
-def check_motion(track: Track, step: float) -> None:
-    """Refuse a body, whose quantities are columns, that is not at every sample at one place, or
-    jumps.
+def check_motion(track: Track, times: FloatArray, step: float) -> None:
+    """Refuse a body, whose quantities are columns, that is not at each of T `times`, shape (T, 1),
+    at one place, or jumps.
 
     Raises
     ------
     InputError
         With the actor, the time [s] and what is expected.
     """
+    refuse = partial(_refuse, track, step)
     for name, column in zip(Track._fields[2:], track[2:], strict=True):
-        _refuse(
-            track,
-            step,
-            ~np.isfinite(column),
-            column,
-            f"has {name} = {{:g}}",
-            "a finite number at every sample",
+        refuse(
+            ~np.isfinite(column), column, f"has {name} = {{:g}}", "a finite number at every sample"
         )
     for name, column in (("length", track.length), ("width", track.width)):
-        _refuse(track, step, column < 0, column, f"has {name} = {{:g}} m", "a size of 0 m or more")
-    speed = np.broadcast_to(track.speed, np.broadcast_shapes(track.speed.shape, track.x.shape))
-    _refuse(
-        track,
-        step,
+        refuse(column < 0, column, f"has {name} = {{:g}} m", "a size of 0 m or more")
+    speed = track.speed
+    refuse(
         (speed < 0) | (speed > MOST_SPEED),
         speed,
         "has a speed of {:g} m/s",
         f"a speed from 0 to {MOST_SPEED:g} m/s",
     )
     norm = np.square(track.along) + np.square(track.left)
-    _refuse(
-        track,
-        step,
+    refuse(
         ~(np.abs(norm - 1) <= UNIT_TOLERANCE),
         np.sqrt(norm),
         "has a direction of length {:g}",
@@ -104,25 +97,26 @@ def check_motion(track: Track, step: float) -> None:
 
     for column in (track.x, track.y):
         jumps = np.diff(column, axis=0, prepend=column[:1]) / step
-        _refuse(
-            track,
-            step,
+        refuse(
             np.abs(jumps) > MOST_SPEED,
             jumps,
             "jumps, at {:g} m/s",
             f"at most {MOST_SPEED:g} m/s between two samples",
         )
 
-    # It goes along the road where its speed takes it, while it is there. (Who changes lane may face
-    # along it.)
-    velocity = speed * track.along * (track.length > 0)
-    velocity, way = np.broadcast_arrays(velocity, track.x - track.x[:1])
-    driven = travelled(velocity, np.arange(len(way), dtype=float)[:, np.newaxis] * step)
-    tolerance = np.maximum(APART, np.maximum(np.abs(way), np.abs(driven)) / 3)
-    _refuse(
-        track,
-        step,
-        np.abs(way - driven) > tolerance,
+    # It goes along the road where its speed takes it, from each sample to the next one at which it
+    # is there. (Who changes lane may face along it.)
+    is_there, x, velocity, _ = np.broadcast_arrays(
+        track.length > 0, track.x, speed * track.along, times
+    )
+    stays = is_there & np.vstack([is_there[:1], is_there[:-1]])
+    way, driven = (
+        np.cumsum(np.diff(path, axis=0, prepend=path[:1]) * stays, axis=0)
+        for path in (x, travelled(velocity, times))
+    )
+    most = np.maximum(np.abs(way), np.abs(driven))
+    refuse(
+        np.abs(way - driven) > np.maximum(APART, most / 3),
         way - driven,
         "is {:.3g} m in x from where its speed takes it",
         "an x that changes by vx, the speed along the road, times the time",

@@ -54,14 +54,11 @@ class _Bounds(NamedTuple):
             (characteristics.names.index(name), weight) for name, weight in constraint.sum.items()
         )
         width = float(sum(abs(weight) * widths[column] for column, weight in weights))
-        minimum = -np.inf if constraint.at_least is None else constraint.at_least
-        maximum = np.inf if constraint.at_most is None else constraint.at_most
         return cls(
             constraint,
             weights,
             width,
-            minimum,
-            maximum,
+            *constraint.ends,
             constraint.bounds_in_words(table),
             unit_text(constraint.unit_of(table)),
         )

@@ -172,6 +172,13 @@ def test_ctrl_c_waits_for_a_compiler() -> None:
     assert done == ["compiled"]
 
 
+def test_a_handler_that_was_not_set_from_python_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signal, "getsignal", lambda _: None)
+    monkeypatch.setattr(signal, "signal", lambda *_: pytest.fail("set"))
+    with defer_interrupts():
+        pass
+
+
 def take_streams() -> None:
     sys.stdout = sys.stderr = None  # type: ignore[assignment]
 

@@ -73,7 +73,7 @@ def test_cars_may_drive_at_the_speeds_of_the_formula(car: str) -> None:
         study = study.replace(f"upper = {end} }}", f"upper = {end}, {precision} }}")
     Path("car.toml").write_text(study)
     worn = {"decel": 5.0, "delay": 0.25}
-    cars = {"new": {}, "worn": worn, "old": {"decel": 3.0, "delay": 1.0}}
+    cars = {"new": {}, "worn": worn, "old": {"decel": 3.5, "delay": 0.875}}
     rows = sv.permit("car.toml", cars=cars, **OPTIONS).tables["cars"].set_index("car")
     new, up_to = permitted(8.0, 0.0), permitted(5.0 - ERROR, 0.25 + LATENESS)
     assert rows["up_to"].to_dict() == pytest.approx(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy
 import tomli_w
+from msgspec import to_builtins
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
@@ -39,6 +40,8 @@ def _coarse_scans_and_no_benign_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
+CUT_OUT_SLOWER = [to_builtins(test) for test in load_study("alks").tests]
+CUT_OUT_SLOWER[1]["over"]["speed"] |= {"at": [20, 40], "upper": 40}
 LISTED = {"name": "CCRs", "model": "car_to_car", "parameters": {"test": "CCRs"}}
 OTHERS = {
     "a test with one speed less": (
@@ -74,6 +77,21 @@ OTHERS = {
         "sun",
         {"encounters": "ranges", "scenario": {"over": {"distance": {"lower": 9.0}}}},
         ["the range of distance from 8 to 18"],
+    ),
+    "a range that is narrower in one of two tests": (
+        "alks",
+        {"encounters": "ranges", "matrix": {"tests": CUT_OUT_SLOWER}},
+        ["the range of speed from 20 to 130 in the test cut_out"],
+    ),
+    "a margin that leaves encounters out": (
+        "sun",
+        {"encounters": "ranges", "scenario": {"margin": 2.0}},
+        ["the encounters in which its original keeps less than 2 m"],
+    ),
+    "a constraint": (
+        "sun",
+        {"constraints": [{"sum": {"mass": 1.0}, "at_most": 2500.0}]},
+        ["what its constraint on mass excludes"],
     ),
 }
 

@@ -6,6 +6,7 @@ import json
 import re
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,6 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain, failures
 from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE
 from safevar_sumo.questions.explain.tables import CAUSE_COLUMNS, MAX_DISTINCT, printed_limits
-from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tables import cell_text, columns_of
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
@@ -42,9 +42,11 @@ from tests.in_process import InlinePool, json_of
 from tests.questions.conftest import (
     ORIGINAL,
     Plant,
+    Region,
     box,
     everywhere,
     made_up_evaluator,
+    made_up_model,
     made_up_study,
     nowhere,
     two_islands,
@@ -250,6 +252,14 @@ def limits(evaluator: Evaluator, *setting: float) -> Limits:
     return result
 
 
+def printed_of(n: int, region: Region, *setting: float) -> Any:
+    """The limits of the only cause of a setting, as they are printed."""
+    model = made_up_model(n, region)
+    (causes,) = find_minimal_causes(model.evaluator, np.array([setting]), COLLISION)
+    limits = find_cause_limits(model.evaluator, causes, COLLISION)
+    return printed_limits(model, causes, limits)[0]
+
+
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
     result = limits(made_up_evaluator(3, two_islands), 9.5, 1.0, 8.0)
     assert result.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
@@ -271,10 +281,7 @@ def test_a_boundary_is_rounded_to_the_unsafe_side_with_as_many_digits_as_it_need
     low: float, high: float, value: float, printed: str
 ) -> None:
     """Between `low` and `high` it is unsafe."""
-    evaluator = made_up_evaluator(1, lambda rows: (rows[:, 0] > low) & (rows[:, 0] < high))
-    (causes,) = find_minimal_causes(evaluator, np.array([[value]]), COLLISION)
-    found = find_cause_limits(evaluator, causes, COLLISION)
-    (rounded,) = printed_limits(Model(0, evaluator, COLLISION), causes, found)
+    rounded = printed_of(1, lambda rows: (rows[:, 0] > low) & (rows[:, 0] < high), value)
     number_format = CAUSE_COLUMNS["boundary"].number_format  # type: ignore[union-attr]
     for values in (rounded["boundary"], rounded["single_boundary"]):
         assert cell_text(values["a"], number_format) == printed
@@ -288,13 +295,8 @@ def test_a_boundary_of_a_single_change_is_unsafe_when_typed_with_the_others() ->
         total = rows[:, 0] + rows[:, 1]
         return ((total > 16) & (total < 16.04)) | (total > 16.08)
 
-    evaluator = made_up_evaluator(2, region)
-    (causes,) = find_minimal_causes(evaluator, np.array([[9.0, 8.55]]), COLLISION)
-    found = find_cause_limits(evaluator, causes, COLLISION)
-    (printed,) = printed_limits(Model(0, evaluator, COLLISION), causes, found)
-    for name, value in printed["single_boundary"].items():
-        typed = causes[0].changes | {name: value}
-        assert region(np.array([[typed["a"], typed["b"]]])).all()
+    alone = printed_of(2, region, 9.0, 8.55)["single_boundary"]
+    assert region(np.array([[alone["a"], 8.55], [9.0, alone["b"]]])).all()
 
 
 def test_a_boundary_just_below_a_change_is_found_as_accurately() -> None:

@@ -13,10 +13,12 @@ from hypothesis import given, settings, strategies as st
 
 from safevar_sumo.ads import Aeb
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.scenarios import Track, TrackScenario, travelled
 from safevar_sumo.sumo.bodies import Body, distance_between, find_overlaps
 from safevar_sumo.sumo.matrix import drive_worst
+from safevar_sumo.sumo.moving import Moving
 from safevar_sumo.sumo.system import assemble
 from tests.made_up import original_of
 from tests.scenarios.holding import Hold, driven
@@ -75,6 +77,16 @@ def test_a_cast_of_five_is_hit_by_whoever_comes_first() -> None:
     assert np.nanmin(gone.encounter.separation[gone.trace.active]) >= min(nearest, 0.5)
 
 
+def test_who_is_not_there_neither_moves_nor_jumps() -> None:
+    late = moving("late", -20.0, 4.0, 30.0, 0.0)
+    arrives = held(lambda times: late(times)._replace(length=np.where(times < 1, 0.0, 4.0)))
+    assert arrives.outcome[0] == Outcome.TIMEOUT, "it drives away"
+    gone = [np.full((1, 1), value) for value in (0.0, 0.0, 60.0, 4.0, 1.0, 0.0, 10.0)]
+    assert Moving.of(Track("gone", "car", *gone), 0.05, WIDTH).level.tolist() == [0]
+    with pytest.raises(InputError, match="in x from where its speed takes it"):
+        held(lambda times: Track.of("stands", "car", 60.0, 4.0, 5.0))
+
+
 def test_a_contact_at_the_side_counts_but_in_a_test_of_the_front() -> None:
     cast = moving("cutting", -LENGTH / 2, -3.0, SPEED, 0.4)
     run = held(cast)
@@ -126,6 +138,11 @@ def test_a_braking_leader_is_avoided_only_once_he_has_stopped_braking() -> None:
     assert gap[run.trace.speed[run.trace.active] >= 12].min() == pytest.approx(4.95, abs=0.02)
 
 
+def body_of(*quantities: Any) -> Body:
+    """A body that stands: its middle, its direction and its size."""
+    return Body(*(np.array([value], dtype=float) for value in (*quantities, 0.0)))
+
+
 angles = st.floats(-math.pi, math.pi)
 
 
@@ -143,27 +160,19 @@ def test_distance_and_overlap_of_bodies_agree_with_points_on_them(
     """Points of a grid on one rectangle against the other: a second implementation, coarse as its
     grid.
     """
-    along = np.array([math.cos(angle), math.sin(angle)])
-    body = Track("b", "car", length, width, x, y, along[0], along[1], 0.0)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    body = Track("b", "car", length, width, x, y, cosine, sine, 0.0)
     distance = float(distance_between(body, np.zeros(1), LENGTH, WIDTH)[0])
-    u, v = np.meshgrid(np.linspace(-0.5, 0.5, 81), np.linspace(-0.5, 0.5, 81))
-    points = np.stack(
-        [
-            x + u * length * along[0] - v * width * along[1],
-            y + u * length * along[1] + v * width * along[0],
-        ]
+    sides = np.linspace(-0.5, 0.5, 81)
+    grid = np.array(np.meshgrid(length * sides, width * sides)).reshape(2, -1)
+    points = np.array([[cosine, -sine], [sine, cosine]]) @ grid + [[x], [y]]
+    outside = np.maximum(np.abs(points) - [[LENGTH / 2], [WIDTH / 2]], 0.0)
+    assert distance == pytest.approx(np.hypot(*outside).min(), abs=0.06)
+    depth = float(
+        find_overlaps(
+            body_of([0, 0], [1, 0], LENGTH, WIDTH), body_of([x, y], [cosine, sine], length, width)
+        )[0]
     )
-    outside = np.maximum(
-        np.abs(points) - np.array([LENGTH, WIDTH])[:, np.newaxis, np.newaxis] / 2, 0.0
-    )
-    assert distance == pytest.approx(float(np.sqrt((outside**2).sum(axis=0)).min()), abs=0.06)
-    own = Body(
-        np.zeros((1, 2)), np.array([[1.0, 0.0]]), np.array([LENGTH]), np.array([WIDTH]), np.zeros(1)
-    )
-    other = Body(
-        np.array([[x, y]]), along[np.newaxis], np.array([length]), np.array([width]), np.zeros(1)
-    )
-    depth = float(find_overlaps(own, other)[0])
     assert (depth > 1e-9) == (distance == 0) or abs(depth) < 1e-6
 
 

@@ -15,6 +15,7 @@ import jsonschema
 import msgspec
 import pytest
 
+from safevar_sumo.errors import InputError
 from safevar_sumo.results.identity import evaluation_keys
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
@@ -187,6 +188,8 @@ def test_what_is_about_tests_that_a_study_replaces_ends_with_them() -> None:
     heir = read_study({"extends": "sun", "name": "heir", "variation": {}}, matrix=crash)
     assert {*heir.scenario.over} == {"road_friction", "recognition_delay"}
     assert read_study(base, matrix=crash).variation == {}
+    with pytest.raises(InputError, match="variation"):
+        read_study("sun", matrix=crash, variation=5)
 
 
 @pytest.mark.parametrize("scenario", [{"model": "mine:Deer"}, {"model": "along"}])

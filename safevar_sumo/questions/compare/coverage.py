@@ -1,5 +1,5 @@
-"""What one of two systems is simulated in and the other is not: test cases, weathers, ranges and
-parameter sets.
+"""What one of two systems is simulated in and the other is not: test cases, weathers, ranges,
+what a constraint or a margin excludes, and parameter sets.
 
 A version whose failing tests were deleted looks safer, although nothing shows that it is.
 """
@@ -50,7 +50,8 @@ def missing_parts(side: Evaluator, other: Evaluator) -> list[str]:
     """What the other system is simulated in and this one is not, as phrases."""
     parts = [
         *_missing_cases(side, other),
-        *_missing_ranges(side.study, other.study),
+        *_missing_ranges(side, other),
+        *_excluded(side.study, other.study),
         *_missing_sets(side.study, other.study),
     ]
     return [*dict.fromkeys(parts)]
@@ -84,11 +85,34 @@ def _missing_cases(side: Evaluator, other: Evaluator) -> Iterator[str]:
             yield f"the test {test}"
 
 
-def _missing_ranges(study: Study, other: Study) -> Iterator[str]:
-    for name, domain in other.ranges.items():
-        narrower = study.ranges.get(name)
-        if narrower is None or narrower.lower > domain.lower or narrower.upper < domain.upper:
-            yield f"the range of {name} from {domain.lower:g} to {domain.upper:g}"
+def _missing_ranges(side: Evaluator, other: Evaluator) -> Iterator[str]:
+    tests = points_of_tests(side.study, side.system.points)
+    by_name = {test and test.name: side.study.ranges_of(test) for test, _ in tests}
+    for test, _ in points_of_tests(other.study, other.system.points):
+        # Those of all tests, where none has this name.
+        own = by_name.get(test and test.name, side.study.ranges)
+        for name, domain in other.study.ranges_of(test).items():
+            narrower = own.get(name)
+            if narrower is None or narrower.lower > domain.lower or narrower.upper < domain.upper:
+                where = f" in the test {test.name}" if test else ""
+                yield f"the range of {name} from {domain.lower:g} to {domain.upper:g}{where}"
+
+
+def _excluded(study: Study, other: Study) -> Iterator[str]:
+    """What a constraint or the margin of the original vehicle excludes in one study alone."""
+    for one in study.constraints:
+        low, high = one.ends
+        if not any(
+            (own.sum, own.tests) == (one.sum, one.tests)
+            and low <= own.ends[0]
+            and own.ends[1] <= high
+            for own in other.constraints
+        ):
+            yield f"what its constraint on {one.quantity} excludes"
+    margin = study.scenario.margin
+    others = other.scenario.margin
+    if study.ranges and margin is not None and (others is None or margin > others):
+        yield f"the encounters in which its original keeps less than {margin:g} m"
 
 
 def _missing_sets(study: Study, other: Study) -> Iterator[str]:

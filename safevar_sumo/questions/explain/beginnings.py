@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.boundary import find_boundaries, on_lines
+from safevar_sumo.questions.boundary import on_lines
 from safevar_sumo.questions.causes import (
     BOUNDARIES,
     Cause,
@@ -18,17 +18,11 @@ from safevar_sumo.questions.causes import (
 )
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.combinations import Enumeration
-from safevar_sumo.records import BoolArray, FloatArray, NamedValues
+from safevar_sumo.records import FloatArray, NamedValues
 from safevar_sumo.vehicles import CharacteristicSet
 
-PARTS, COARSE_PARTS = (32, 8), (8, 4)
-"""Parts of the way to the ends, as `boundary.PARTS`; and where few simulations are allowed."""
-DECIMALS = (2, 3, 4, 15)
-"""Decimals of a share of the way: as few as possible."""
-PLACES = 20
-"""Number of shares at which changes may be safe again."""
-VALUE_DIGITS = 12
-"""Digits of the values at this share."""
+STEPS, COARSE_STEPS = 100, 20
+"""Parts of the way to the ends, and where few simulations are allowed."""
 
 
 class Beginning(NamedTuple):
@@ -62,32 +56,28 @@ def find_beginnings(
     unless both are minimal at the ends.
     """
     members = evaluator.characteristics
-    at_ends, *others = steps
-    nearer = [(cause, step.share) for step in others for cause in step.causes]
-    pending = [(cause, at_ends.share) for cause in at_ends.causes]
-    pending += _smallest(members, pending, nearer)
+    pending, *others = ([(cause, step.share) for cause in step.causes] for step in steps)
+    known = [cause for cause, _ in pending]
+    pending += _smallest(members, known, [placed for nearer in others for placed in nearer])
     beginnings = list[Beginning]()
     while pending:
         begun, smaller = _begin(evaluator, unsafe, pending)
         beginnings += begun
-        known = [(one.cause, one.share) for one in beginnings]
-        pending = _smallest(members, known, smaller)
+        pending = _smallest(members, [one.cause for one in beginnings], smaller)
     return beginnings
 
 
 def _smallest(
-    members: CharacteristicSet,
-    known: Sequence[tuple[Cause, float]],
-    others: Sequence[tuple[Cause, float]],
+    members: CharacteristicSet, known: Sequence[Cause], others: Sequence[tuple[Cause, float]]
 ) -> list[tuple[Cause, float]]:
     """Those of other causes that contain no known one, nor a smaller one of them."""
-    kinds = [{*directions(members, cause.changes)} for cause, _ in known]
+    kinds = [{*directions(members, cause.changes)} for cause in known]
     smallest = list[tuple[Cause, float]]()
-    for cause, share in sorted(others, key=lambda placed: len(placed[0].changes)):
-        kind = {*directions(members, cause.changes)}
+    for placed in sorted(others, key=lambda placed: len(placed[0].changes)):
+        kind = {*directions(members, placed[0].changes)}
         if not any(one <= kind for one in kinds):
             kinds.append(kind)
-            smallest.append((cause, share))
+            smallest.append(placed)
     return smallest
 
 
@@ -95,103 +85,57 @@ def _begin(
     evaluator: Evaluator, unsafe: Unsafe, placed: Sequence[tuple[Cause, float]]
 ) -> tuple[list[Beginning], list[tuple[Cause, float]]]:
     """Where causes begin, and smaller causes that are unsafe there."""
-    # Lines from the original to the ends of the domain, for as many as may be simulated.
-    members = evaluator.characteristics
-    parts = PARTS if evaluator.left is None else COARSE_PARTS
-    sizes = np.array([len(cause.changes) for cause, _ in placed])
-    prices = np.cumsum(sum(parts) + len(DECIMALS) + PLACES + 2**sizes)
     # Of few simulations half are left for the neighbours and the other parameter sets.
-    number = np.count_nonzero(prices <= evaluator.at_most(int(prices[-1]), 2))
-    last = np.array([share for _, share in placed])
-    values = settings_of(members, [cause for cause, _ in placed])
+    is_free = evaluator.left is None
+    steps = STEPS if is_free else COARSE_STEPS
+    prices = np.cumsum([steps + 2 ** len(cause.changes) for cause, _ in placed])
+    number = int(np.count_nonzero(prices <= evaluator.at_most(int(prices[-1]), 2)))
+    beginnings = [
+        Beginning(cause, share if share < 1 else np.nan, cause.changes, np.inf)
+        for cause, share in placed
+    ]
+    if not number:
+        return beginnings, []
+
+    # Lines from the original to the ends of the domain, shape (K, steps, n).
+    members = evaluator.characteristics
+    values = settings_of(members, [cause for cause, _ in placed[:number]])
     starts = members.with_original_vehicle(values)
     outer = np.where(values > starts, members.upper, members.lower)
     ends = np.where(values == starts, starts, outer)
-    lines = _Lines(starts[:number], ends[:number], last[:number])
+    shares = np.arange(1, steps + 1) / steps
+    settings = on_lines(starts, ends, np.tile(shares, (number, 1)))
+    runs = evaluator.evaluate(settings.reshape(-1, len(members)), BOUNDARIES)
+    is_unsafe = unsafe.of(runs).reshape(settings.shape[:2])
+    is_safe = runs.valid.reshape(is_unsafe.shape) & ~is_unsafe
 
-    def are_unsafe(settings: FloatArray) -> BoolArray:
-        return unsafe.of(evaluator.evaluate(settings, BOUNDARIES))
-
-    def are_causes(settings: FloatArray) -> BoolArray:
-        """Which are unsafe, and safe with fewer of their changes."""
-        flags = are_unsafe(settings)
-        rows = settings[flags]
-        whole = (members.changed(rows) & members.of_vehicle).sum(axis=1).tolist()
-        groups = find_minimal_causes(evaluator, rows, unsafe)
-        flags[flags] = [
-            any(len(cause.changes) == size for cause in group)
+    def smaller_causes(settings: FloatArray) -> list[list[Cause]]:
+        """The causes with fewer changes of each of several unsafe settings."""
+        groups = find_minimal_causes(evaluator, settings, unsafe)
+        whole = members.number_changed(settings).tolist()
+        return [
+            [cause for cause in group if len(cause.changes) < size]
             for group, size in zip(groups, whole, strict=True)
         ]
-        return flags
 
     # Where each is unsafe first. If fewer of its changes are unsafe there, it is a cause later.
-    begins = np.where(last < 1, last, np.nan)
-    begins[:number] = lines.first(are_unsafe, parts)
-    groups = find_minimal_causes(evaluator, lines.at(begins[:number]), unsafe)
-    fewer = [
-        [(cause, share) for cause in group if len(cause.changes) < size]
-        for group, share, size in zip(groups, begins.tolist(), sizes.tolist(), strict=False)
-    ]
-    is_later = np.array([bool(group) for group in fewer], dtype=bool)
-    begins[:number][is_later] = np.nan
-    if is_later.any() and evaluator.left is None:
-        begins[:number][is_later] = lines.some(is_later).first(are_causes, parts)
+    first = is_unsafe.argmax(axis=1)
+    groups = smaller_causes(settings[range(number), first])
+    smaller = list[tuple[Cause, float]]()
+    for row, (group, at) in enumerate(zip(groups, first.tolist(), strict=True)):
+        smaller += [(cause, float(shares[at])) for cause in group]
+        if group and not is_free:
+            continue
+        if group:
+            (unsafe_at,) = np.nonzero(is_unsafe[row])
+            are_causes = [not fewer for fewer in smaller_causes(settings[row, unsafe_at])]
+            at = unsafe_at[are_causes][0]
 
-    # Where it is safe again, and the values where it begins.
-    again = lines.safe_again(begins[:number], evaluator, unsafe)
-    at_begins = lines.at(begins[:number])
-    beginnings = []
-    for row, (cause, _) in enumerate(placed):
-        boundary = cause.changes
-        if row < number and not np.isnan(begins[row]):
-            named = members.named(at_begins[row])
-            boundary = {name: float(f"{named[name]:.{VALUE_DIGITS}g}") for name in cause.changes}
-        gap = float(again[row]) if row < number else np.inf
-        beginnings.append(Beginning(cause, float(begins[row]), boundary, gap))
-    return beginnings, [one for group in fewer for one in group]
-
-
-class _Lines(NamedTuple):
-    """K lines from the original to the ends of the domain, shape (K, n), and the share of each at
-    which it is known to be unsafe, shape (K,).
-    """
-
-    starts: FloatArray
-    ends: FloatArray
-    last: FloatArray
-
-    def at(self, shares: FloatArray) -> FloatArray:
-        """The settings at a share of each line, shape (K, n)."""
-        return on_lines(self.starts, self.ends, shares[:, np.newaxis])[:, 0]
-
-    def some(self, rows: BoolArray) -> _Lines:
-        """Some of the lines."""
-        return _Lines(*(values[rows] for values in self))
-
-    def first(
-        self, are_unsafe: Callable[[FloatArray], BoolArray], parts: Sequence[int]
-    ) -> FloatArray:
-        """The first unsafe share of each line, with as few decimals as it needs to be unsafe."""
-        unsafe_ends = self.at(self.last)
-        exact = find_boundaries(self.starts, unsafe_ends, are_unsafe, parts).unsafe_shares
-        shares = self.last.copy()
-        is_open = np.ones(len(shares), dtype=bool)
-        for decimals in DECIMALS:
-            # What is a rounding error of the scaled share is none of the share.
-            scaled = np.round(exact * self.last * 10**decimals, 6)
-            rounded = np.minimum(np.ceil(scaled) / 10**decimals, self.last)
-            is_unsafe = are_unsafe(self.at(rounded))
-            shares = np.where(is_open & is_unsafe, rounded, shares)
-            is_open = is_open & ~is_unsafe
-        return shares
-
-    def safe_again(self, begins: FloatArray, evaluator: Evaluator, unsafe: Unsafe) -> FloatArray:
-        """The first of `PLACES` equally distant shares of each line that is beyond its beginning
-        and safe; infinite if there is none.
-        """
-        grid = np.tile(np.arange(1, PLACES + 1) / PLACES, (len(begins), 1))
-        settings = on_lines(self.starts, self.ends, grid).reshape(-1, self.starts.shape[1])
-        runs = evaluator.evaluate(settings, BOUNDARIES)
-        is_safe = (runs.valid & ~unsafe.of(runs)).reshape(grid.shape)
-        is_again = is_safe & (grid > begins[:, np.newaxis])
-        return np.asarray(np.where(is_again, grid, np.inf).min(axis=1))
+        # The values there, and where it is safe again.
+        cause = placed[row][0]
+        named = members.named(settings[row, at])
+        # What is a rounding error of the share is none of the value.
+        boundary = {name: float(f"{named[name]:.12g}") for name in cause.changes}
+        again = shares[at + 1 :][is_safe[row, at + 1 :]]
+        beginnings[row] = Beginning(cause, float(shares[at]), boundary, min(again, default=np.inf))
+    return beginnings, smaller

@@ -13,7 +13,7 @@ import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.counterexamples import limit_text
+from safevar_sumo.questions.counterexamples import values_in_words
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.beginnings import find_beginnings
 from safevar_sumo.questions.explain.combinations import (
@@ -50,7 +50,7 @@ SMALLEST_COLUMNS: Columns = {
     "begins_at": Column(
         "-",
         "smallest share of the way to the ends of the domain at which these changes together are"
-        " unsafe (rounded up)",
+        " unsafe (in steps of 1 %)",
         EXACT,
         head="begins at share of the way",
     ),
@@ -139,12 +139,18 @@ class Smallest(NamedTuple):
     def _first(self, members: CharacteristicSet, unsafe: Unsafe) -> Iterator[str]:
         """The smallest changes at any simulated share of the way, and how sure they are."""
         thing = "a collision" if unsafe.is_collision else "an unsafe vehicle"
+        if not self.at_ends.tried:
+            yield "No combination of changes was simulated: the simulations did not suffice."
+            return
         if self.table.empty:
             up_to = _up_to(max(self.at_ends.simulated, default=0))
             yield f"No cause of {thing} was found with {up_to} to the ends of their domains."
             return
 
         # The fewest changes that begin nearest to the original.
+        if not self.table["size"].min():
+            yield "No change is necessary: the original vehicle is unsafe in one of the encounters."
+            return
         of_size = self.table[self.table["size"] == self.table["size"].min()]
         first, *others = of_size.sort_values("begins_at", kind="stable").to_dict("records")
         size = first["size"]
@@ -154,12 +160,7 @@ class Smallest(NamedTuple):
             way, enough = "the end of its domain (its range of values)", "One change is"
         if first["begins_at"] < 1:
             way = f"{100 * first['begins_at']:.12g} % of the way to {way}"
-        values = [
-            f"{item.short_name} at {limit_text(item, first['boundary'][item.name])}"
-            for item in members
-            if item.name in first["boundary"]
-        ]
-        yield f"{enough} enough for {thing}: {join_phrases(values)}, {way}."
+        yield f"{enough} enough for {thing}: {values_in_words(members, first['boundary'])}, {way}."
         if others:
             other = f"other combination{'' if len(others) == 1 else 's'} of {_count(size)} changes"
             if size == 1:
@@ -170,6 +171,11 @@ class Smallest(NamedTuple):
         if pd.notna(first["safe_again"]):
             again = f"{percentage(first['safe_again'])} % of the way"
             yield f"The unsafe range has a gap: at {again} the vehicle is safe again."
+        if first["causes"] != first["boundary"] and pd.notna(first["robust_share"]):
+            yield (
+                "How sure this cause is, was simulated with"
+                f" {values_in_words(members, first['causes'])}."
+            )
         if first["unsafe_runs"] < 1:
             yield f"The vehicle is unsafe in {percentage(first['unsafe_runs'])} % of its runs."
         if pd.notna(first["holds"]):

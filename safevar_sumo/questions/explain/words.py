@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.counterexamples import limit_text
+from safevar_sumo.questions.counterexamples import values_in_words
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import Population
 from safevar_sumo.questions.explain.robustness import LEAST_NEIGHBOURS, robustness_in_words
@@ -21,7 +21,6 @@ from safevar_sumo.questions.words import (
     counted_in_words,
     encounter_in_words,
     ending_in_words,
-    join_phrases,
     number_of,
     share_in_words,
 )
@@ -68,14 +67,9 @@ def verdict_on_failures(
     # Its values, its encounter, and how sure the cause is.
     members = evaluator.characteristics
     boundary = leading["boundary"]
-    values = [
-        f"{item.short_name} at {limit_text(item, boundary[item.name])}"
-        for item in members
-        if item.name in boundary
-    ]
     encounter = encounter_in_words(members, leading.get("encounter", {}), are_printed=True)
     where = " in an encounter in which the original vehicle is safe" if encounter else ""
-    yield f"With {join_phrases(values)} the vehicle {unsafe.verbs[0]}{where}."
+    yield f"With {values_in_words(members, boundary)} the vehicle {unsafe.verbs[0]}{where}."
     yield f"The encounter has {encounter.partition(' with ')[2]}." if encounter else ""
     yield _beyond_in_words(evaluator, unsafe, boundary, leading.get("encounter", {}))
     yield robustness_in_words(leading["robust_share"])

@@ -22,7 +22,7 @@ from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, budget_of
 from safevar_sumo.questions.models import keeping_distance, models_of
 from safevar_sumo.questions.options import CARS_FILE, Fits, LimitTexts, Margin, Range, ValueTexts
 from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
-from safevar_sumo.questions.permit.assumed import assumed_in_words, cars_of, worst_ends
+from safevar_sumo.questions.permit.assumed import assumed_in_words, cars_of, worst_end
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.questions.permit.rows import CARS, SETS, failure_columns
@@ -122,15 +122,16 @@ def permit(
     models = models_of(evaluator, criterion, fits, with_unsafe_originals=True)
     # A claim about all cars within limits gets the search of one about joint limits.
     budget = budget_of(evaluator) if limits else evaluator.scaled(LEAST_SIMULATIONS)
-    budget = 0 if quick else budget
-    search = PermitSearch(models, span, values, budget)
+    search = PermitSearch(models, span, values, 0 if quick else budget)
+    _check_driven(needed, search)
     within = _within(members, limits, study, fleet.settings[0])
     asked = [within] if limits else cars_of(members, fleet)
     has_repairs = not quick and not limits
     new_car, permits, repaired = _drive(evaluator, search, fleet, asked, with_repairs=has_repairs)
     # Further simulations, where their number has no limit.
     is_free = not limits and evaluator.account.asked is evaluator.left is None
-    ends = worst_ends(search, members, fleet, asked, permits) if is_free else None
+    found = zip(asked, fleet.measured, permits, strict=True)
+    ends = [worst_end(search, members, *of_car) for of_car in found] if is_free else None
     result = PermitAnswer(
         study=study,
         span=span,
@@ -249,6 +250,13 @@ def _needed(text: str | None, span: Span) -> float | None:
         legal = f'from {span.low:g} to {span.high:g} with the unit, such as "{example}"'
         raise InputError("need", repr(text), legal)
     return float(match[1])
+
+
+def _check_driven(needed: float | None, search: PermitSearch) -> None:
+    """Refuse a value that is needed between those of a test that lists them."""
+    if needed is not None and len(search.listed) and needed not in search.listed:
+        driven = join_phrases(f"{value:g}" for value in search.listed)
+        raise InputError("need", f"{needed:g}", f"a value that is driven: {driven}")
 
 
 def _grid(span: Span, step: float) -> FloatArray:

@@ -264,7 +264,7 @@ class PermitAnswer:
         values = self.search.values
         unit = unit_text(self.span.unit)
         driven = f"from {values[0]:g} to {values[-1]:g}{unit}"
-        if self.search.is_listed:
+        if len(values) == len(self.search.listed):
             driven = f"({join_phrases(f'{value:g}' for value in values)}{unit})"
         grid = f"{len(values)} values {driven}, in every test alone"
         attacked = f"{self.search.attacked:,} simulations that search for an unsafe encounter"

@@ -4,7 +4,6 @@ not, and the one of these that lowers the speed most.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from safevar_sumo.questions.permit.fleet import Fleet
 from safevar_sumo.questions.permit.search import Permit, PermitSearch
 from safevar_sumo.questions.permit.speeds import Cars
 from safevar_sumo.questions.words import EXACT, join_phrases
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study, unit_text
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -75,40 +74,32 @@ class WorstEnd(NamedTuple):
     value: float
 
 
-def worst_ends(
+def worst_end(
     search: PermitSearch,
     vehicle: CharacteristicSet,
-    fleet: Fleet,
-    cars: Sequence[Cars],
-    permits: Sequence[Permit],
-) -> list[WorstEnd | None]:
-    """The worst end of each car; None where nothing is assumed, the car may not drive as it is, or
-    no end lowers its speed on the grid.
+    car: Cars,
+    is_measured: BoolArray,
+    permit: Permit,
+) -> WorstEnd | None:
+    """The worst end of a car; None where nothing is assumed, the car may not drive as it is, or no
+    end lowers its speed on the grid.
     """
-    # A car with each assumed value at either end, side by side, and its other values as they are
-    # worst. Any failure shows that it may drive no faster, so the grid up to its own speed is
-    # enough, with the set that limits it.
-    variants = list[Cars]()
-    for car, permit, is_measured in zip(cars, permits, fleet.measured, strict=True):
-        failure = permit.least.failure
-        own = Cars.one(car.lower if failure is None else failure.setting[: len(vehicle)])
-        ends = [
-            own.with_value_of(column, end).lower
-            for column in np.flatnonzero(~is_measured).tolist()
-            for end in (vehicle.lower, vehicle.upper)
-        ]
-        variants.append(own._replace(vehicles=np.array(ends or [own.lower])))
-    found = list[WorstEnd | None]()
-    for car, failure in zip(cars, search.worst_ends(variants, permits), strict=True):
-        worst = car.lower if failure is None else failure.setting[: len(vehicle)]
-        other = np.flatnonzero((worst < car.lower) | (worst > car.upper))
-        if failure is None or not len(other):
-            found.append(None)
-            continue
-        item = vehicle.members[other[0]]
-        end = f"{worst[other[0]]:{EXACT}}{item.suffix}"
-        found.append(WorstEnd(item.name, end, failure.value))
-    return found
+    if permit.up_to is None or is_measured.all():
+        return None
+
+    # Each assumed value at either end, all others as they are worst. Any failure shows that the car
+    # may drive no faster, so the grid up to its own speed is enough, with the set that limits it.
+    limiting = permit.least.failure
+    own = car.lower if limiting is None else limiting.setting[: len(vehicle)]
+    is_one = np.eye(len(vehicle), dtype=bool)[~is_measured]
+    sides = [np.where(is_one, end, own) for end in (vehicle.lower, vehicle.upper)]
+    failure = search.worst_end(Cars(own, own, np.vstack(sides)), permit)
+    worst = own if failure is None else failure.setting[: len(vehicle)]
+    if failure is None or (worst == own).all():
+        return None
+    column = np.argmax(worst != own)
+    item = vehicle.members[column]
+    return WorstEnd(item.name, f"{worst[column]:{EXACT}}{item.suffix}", failure.value)
 
 
 def worst_end_in_words(worst: WorstEnd | None, span: Span) -> str:

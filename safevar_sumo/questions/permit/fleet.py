@@ -362,7 +362,12 @@ def _number(text: str, mark: str, item: Characteristic) -> float:
         raise InputError("", f"{text!r} is no number with {MARKS[mark]}", domain)
     value = float(text.replace(",", "."))
     if item.is_legal(value, beyond=False):
-        return value
+        # Beyond the domain no vehicle is driven.
+        ends = {item.lower, item.upper} - {item.original}
+        if all(np.round(abs(value - end), 12) >= item.error for end in ends):
+            return value
+        problem = f"{value:{EXACT}}, measured to within {item.error:g}, may be outside the domain"
+        raise InputError("", problem, f"{domain}, also by that")
 
     # A part may be measured better than that of a new car, where that is an end of the domain.
     problem = f"{value:{EXACT}} is outside {item.lower:g} to {item.upper:g}{item.suffix}"

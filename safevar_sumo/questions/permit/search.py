@@ -74,6 +74,8 @@ class PermitSearch:
     ----------
     values, span
         The values of the grid, and the parameter.
+    listed
+        The values of tests that cannot move it: nothing is known between them.
     attacked
         Number of simulations of the falsification so far.
     """
@@ -85,10 +87,10 @@ class PermitSearch:
         self._budget = budget
         ranges = encounters_of(models.own, span)
         self._ranges = {models.own.fit: ranges}
-        # Where no scenario can move the parameter, its listed values alone.
-        self.is_listed = all(each.column is None for each in ranges)
-        listed = np.unique([each.low for each in ranges if np.isfinite(each.low)])
-        self.values = listed if self.is_listed else values
+        fixed = [each.low for each in ranges if each.column is None]
+        self.listed = np.unique([value for value in fixed if np.isfinite(value)])
+        is_moved = len(fixed) < len(ranges)
+        self.values = np.union1d(values, self.listed) if is_moved else self.listed
         self._models_in_order = [*models.members]
         self._usual = 0.0
         """Usual number of settings of a car in all parameter sets."""
@@ -144,32 +146,25 @@ class PermitSearch:
                     search.falsify(self._budget)
             self.attacked += search.attacked
             for number, car in enumerate(waiting):
-                found[car].append(Reached(model.fit, search.up_to(number), search.failures[number]))
+                up_to = self._driven(search.up_to(number))
+                found[car].append(Reached(model.fit, up_to, search.failures[number]))
         return [Permit(reached) for reached in found]
 
-    def worst_ends(
-        self, cars: Sequence[Cars], permits: Sequence[Permit]
-    ) -> list[LimitingFailure | None]:
-        """The failure at the least value, up to that of its permit, of each of several cars that
-        drive the grid with the parameter set that limits the permit; None where none fails.
+    def _driven(self, up_to: float | None) -> float | None:
+        """The last listed value up to one, if any."""
+        below = self.listed[self.listed <= (up_to or -np.inf)]
+        return max(below.tolist(), default=up_to)
+
+    def worst_end(self, cars: Cars, permit: Permit) -> LimitingFailure | None:
+        """The failure at the least value, up to that of a permit, of cars that drive the grid with
+        the parameter set that limits the permit; None where none fails.
         """
-        found: list[LimitingFailure | None] = [None] * len(cars)
-        for fit, ranges in self._ranges.items():
-            chosen = [
-                car
-                for car, permit in enumerate(permits)
-                if permit.least.fit == fit and permit.up_to is not None
-            ]
-            caps = [permits[car].order for car in chosen]
-            if not chosen:
-                continue
-            values = self.values[self.values <= max(caps)]
-            driven = [each for each in ranges if each.low <= values[-1]]
-            search = SpeedSearch(driven, [cars[car] for car in chosen], values, caps, ENDS_STAGE)
-            search.drive_grid()
-            for car, cap, failure in zip(chosen, caps, search.failures, strict=True):
-                found[car] = failure if failure is not None and failure.value <= cap else None
-        return found
+        up_to = permit.order
+        driven = [each for each in self._ranges[permit.least.fit] if each.low <= up_to]
+        values = self.values[self.values <= up_to]
+        search = SpeedSearch(driven, [cars], values, [up_to], ENDS_STAGE)
+        search.drive_grid()
+        return search.failures[0]
 
     def repair_first(
         self, cars: Sequence[Cars], worn: BoolArray, original: FloatArray, permits: Sequence[Permit]

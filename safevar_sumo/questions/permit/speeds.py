@@ -82,6 +82,19 @@ class Cars(NamedTuple):
         """How many of the vehicles meet an encounter of the grid."""
         return min(len(self.vehicles), MOST_VEHICLES)
 
+    def at(self, place: FloatArray) -> FloatArray:
+        """The vehicles that meet an encounter of the grid; of many, others at each, and half of
+        them at corners.
+        """
+        if len(self.vehicles) == self.together:
+            return self.vehicles
+        rng = np.random.default_rng([self.number, zlib.crc32(place.tobytes())])
+        vehicles = rng.permutation(self.vehicles)
+        is_corner = np.isin(vehicles, [self.lower, self.upper]).all(axis=1)
+        corners = vehicles[is_corner]
+        half = self.together // 2
+        return np.vstack([corners[:half], vehicles[~is_corner], corners[half:]])[: self.together]
+
     @property
     def number(self) -> int:
         """A number by which random numbers of these cars are drawn: it does not depend on others
@@ -206,9 +219,9 @@ class SpeedSearch:
 
     def _settings(self, car: int, places: FloatArray) -> FloatArray:
         """The settings in which the vehicles of a car meet encounters, some of them in each."""
-        vehicles, many = self._cars[car].vehicles, self._cars[car].together
-        chosen = np.arange(many * len(places)) % len(vehicles)
-        return np.hstack([vehicles[chosen], np.repeat(places, many, axis=0)])
+        cars = self._cars[car]
+        vehicles = np.concatenate([cars.at(place) for place in places])
+        return np.hstack([vehicles, np.repeat(places, cars.together, axis=0)])
 
     def _note(
         self, car: int, encounters: EncounterRange, settings: FloatArray, robustness: FloatArray
