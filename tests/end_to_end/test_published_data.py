@@ -122,7 +122,7 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     Path("part/solutions.csv").unlink()
     output = json_of("tables", "part")
     assert "incomplete: 1 of 2 runs of rs are finished" in str(output["tables"]["remarks"])
-    assert "rs 1 of 2 runs" in run("rules", "part", "--samples", "64", "--jobs", "1").stderr
+    assert "1 of 2 runs of rs" in run("rules", "part", "--samples", "64", "--jobs", "1").stderr
     records = output["tables"]["rq2"]["rows"]
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
     assert "budget" not in output["tables"]
