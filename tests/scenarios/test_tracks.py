@@ -80,7 +80,7 @@ def test_a_cast_of_five_is_hit_by_whoever_comes_first() -> None:
 def test_who_is_not_there_neither_moves_nor_jumps() -> None:
     late = moving("late", -20.0, 4.0, 30.0, 0.0)
     arrives = held(lambda times: late(times)._replace(length=np.where(times < 1, 0.0, 4.0)))
-    assert arrives.outcome[0] == Outcome.TIMEOUT, "it drives away"
+    assert arrives.outcome[0] == Outcome.TIMEOUT
     gone = [np.full((1, 1), value) for value in (0.0, 0.0, 60.0, 4.0, 1.0, 0.0, 10.0)]
     assert Moving.of(Track("gone", "car", *gone), 0.05, WIDTH).level.tolist() == [0]
     with pytest.raises(InputError, match="in x from where its speed takes it"):

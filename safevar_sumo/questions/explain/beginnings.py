@@ -101,8 +101,7 @@ def _begin(
     members = evaluator.characteristics
     values = settings_of(members, [cause for cause, _ in placed[:number]])
     starts = members.with_original_vehicle(values)
-    outer = np.where(values > starts, members.upper, members.lower)
-    ends = np.where(values == starts, starts, outer)
+    ends = np.select([values > starts, values < starts], [members.upper, members.lower], starts)
     shares = np.arange(1, steps + 1) / steps
     settings = on_lines(starts, ends, np.tile(shares, (number, 1)))
     runs = evaluator.evaluate(settings.reshape(-1, len(members)), BOUNDARIES)

@@ -255,8 +255,11 @@ def _needed(text: str | None, span: Span) -> float | None:
 def _check_driven(needed: float | None, search: PermitSearch) -> None:
     """Refuse a value that is needed between those of a test that lists them."""
     if needed is not None and len(search.listed) and needed not in search.listed:
-        driven = join_phrases(f"{value:g}" for value in search.listed)
-        raise InputError("need", f"{needed:g}", f"a value that is driven: {driven}")
+        raise InputError(
+            "need",
+            f"{needed:g}",
+            f"a value that is driven: {join_phrases(f'{value:g}' for value in search.listed)}",
+        )
 
 
 def _grid(span: Span, step: float) -> FloatArray:

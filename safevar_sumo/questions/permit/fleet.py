@@ -363,8 +363,10 @@ def _number(text: str, mark: str, item: Characteristic) -> float:
     value = float(text.replace(",", "."))
     if item.is_legal(value, beyond=False):
         # Beyond the domain no vehicle is driven.
-        ends = {item.lower, item.upper} - {item.original}
-        if all(np.round(abs(value - end), 12) >= item.error for end in ends):
+        if all(
+            np.round(abs(value - end), 12) >= item.error
+            for end in {item.lower, item.upper} - {item.original}
+        ):
             return value
         problem = f"{value:{EXACT}}, measured to within {item.error:g}, may be outside the domain"
         raise InputError("", problem, f"{domain}, also by that")
