@@ -35,7 +35,6 @@ from safevar_sumo.questions.research_questions.comparisons import (
     rq2,
     rq2_runs,
 )
-from safevar_sumo.questions.research_questions.figures import draw_figures
 from safevar_sumo.questions.research_questions.fronts import compute_convergence, count_evaluations
 from safevar_sumo.questions.research_questions.statistics import ALPHA, compare_samples
 from safevar_sumo.records import JsonObject
@@ -379,20 +378,6 @@ def test_rq32_shares_and_ranks() -> None:
     )
     assert percents["lag", "any"] == 0
     assert frame[frame["j"] == "any"]["rank"].tolist() == [1, 2, 3]
-
-
-def test_figures_of_rq3_show_its_counts() -> None:
-    case = made_up(row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), row(values=HEAVY))
-    with pytest.warns(UserWarning, match="made-up: has no evaluations"):
-        figures = draw_figures([case])
-    panels = figures["rq3.3-sizes-of-changes"].axes[:3]
-    titles = "".join(panel.get_title() for panel in panels)
-    assert titles == "mass\n+3, -0grip\n+0, -2lag\n+0, -0"
-    assert [panel.get_xlim() for panel in panels] == [(-200, 400), (-1, 1), (-0.05, 0.4)]
-    shares = figures["rq3.2-changed-characteristics"].axes[0]
-    assert shares.texts[0].get_text() == "67"
-    (counts,) = figures["rq3.1-number-of-changes"].axes
-    assert [text.get_text() for text in counts.get_xticklabels()] == ["1", "2", "3"]
 
 
 def test_rq33_tells_increases_from_decreases() -> None:

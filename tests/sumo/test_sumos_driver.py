@@ -185,7 +185,7 @@ def test_delays_that_sumos_driver_does_not_know_cost_him_his_gap() -> None:
     assert run.outcome[0] == Outcome.STOPPED or run.collision_speed[0] < 3
     assert last_gap(run) < 2  # of the 2.5 m that he wants
     assert any(
-        "knows neither the delays of the vehicle" in remark for remark in without_effect(runs)
+        "knows neither the delays nor the brakes" in remark for remark in without_effect(runs)
     )
     close, far = top_speeds(runs)
     assert close > far + 1  # m/s: the study's headway is his

@@ -114,7 +114,7 @@ FITTED = {
     },
 }
 """The constants by their names in the script of the fit."""
-PAGE = Path("docs/trust_wear.md").read_text(encoding="utf-8")
+PAGE = " ".join(Path("docs/trust_wear.md").read_text(encoding="utf-8").split())
 
 
 @cache
@@ -161,9 +161,8 @@ def test_published_stops_are_repeated_as_the_page_of_trust_says() -> None:
         assert (f"|{source}|{row['speed_kmh']}|{row['tread_mm']}|{values}|{error}|") in PAGE
     assert np.median(errors) <= 0.06
     assert max(errors) <= 0.25
-    assert (
-        f"median error {100 * np.median(errors):.1f} %, largest {100 * max(errors):.1f} %" in PAGE
-    )
+    middle, largest = (f"{100 * error:.1f} %" for error in (np.median(errors), max(errors)))
+    assert f"median error of the stops is {middle}, the largest {largest}." in PAGE
 
 
 def test_the_handbooks_wet_rows_have_its_order() -> None:
@@ -179,8 +178,6 @@ def test_the_handbooks_wet_rows_have_its_order() -> None:
     assert f"mean error {error:.3f}, rank correlation {rank:.3f}" in PAGE
     shallow = [row["water_mm"] == "0.2" and row["speed_kmh"] == "50" for row in wet]
     assert f"up to {(here - published)[shallow].max():.2f} too grippy at 50 km/h and 0.2 mm" in PAGE
-    as_stated = np.array([fit.model_friction(row, {**FITTED, "film": 1.0}) for row in wet])
-    assert f"up to {(as_stated - published).max():.2f} too grippy); even so" in PAGE
 
 
 @pytest.mark.parametrize(
