@@ -250,6 +250,19 @@ def test_a_search_ends_soon_after_a_failure_or_with_its_budget() -> None:
     assert (len(met.cases), met.least, met.simulated) == (0, np.inf, 600), "none of them counts"
 
 
+def test_children_lie_between_beside_and_around_their_parents() -> None:
+    """Moved ones at nine places of parents at 4 and 5; others change about one value of seven."""
+    rng = default_rng(0)
+    parents = np.repeat(cases_of([4.0] * 4, [5.0] * 4), 16, axis=0)
+    children = space_of(4).children(parents, 4000, rng)
+    between = {pulled + shift for pulled in (4.0, 4.5, 5.0) for shift in (-0.7, 0.0, 0.7)}
+    assert {*np.round(children[1::2, 0], 9).tolist()} == {round(value, 9) for value in between}
+    values = children[::2, :4]
+    is_new = ~np.isin(values, (4.0, 5.0))
+    assert is_new.mean() == pytest.approx(1.2 / 7, abs=0.01)
+    assert np.isin(values, (0.0, 10.0)).mean() == pytest.approx(0.6 / 7, abs=0.01)
+
+
 def test_children_come_nearer_to_what_is_unsafe_than_random_cases() -> None:
     """A corner of 4 % of each of six domains: a random case hits it with 2^-6 0.52^6."""
 
