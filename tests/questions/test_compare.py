@@ -217,7 +217,7 @@ def test_the_gap_stands_beside_a_degree_from_centre_to_centre() -> None:
     """The vehicle is 4.7 m long."""
     later = sv.load_study("native", name="later", ads={"parameters": {"braking_share": 0.5}})
     numbers = sv.compare("native", later, samples=8, pool=POOL).numbers
-    assert numbers["metres_later"] > 0 == numbers["metres_earlier"]
+    assert numbers["metres_earlier"] > 0 == numbers["metres_later"]
     assert [numbers[f"{side}_degree"] - numbers[f"{side}_gap"] for side in "ab"] == pytest.approx(
         [4.7, 4.7]
     )
