@@ -1,5 +1,5 @@
-"""Rules of the house that the source shows: how large the package and its tests are, and that a
-public name stands for one thing in the whole package.
+"""Rules of the house that the source shows: how large the package and its tests are, how
+dense the package is to read, and that a public name stands for one thing in the whole package.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import pytest
 
 from tests.in_process import SLOW
 from tests.manual import ROOT
-from tests.size import elements_in, function_lengths_in, sizes, sources_of
+from tests.reading import counts_in, reading
+from tests.size import elements_in, sizes, sources_of
 
-LIMITS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["size"]
+LIMITS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
 DOUBLE = {
     *("Failure", "Failures", "FullBraking", "Parameter", "Search"),  # of repair and tolerance
     *("columns_of", "parameters_of"),
@@ -53,7 +54,12 @@ def public_names_in(source: str) -> Iterator[str]:
 
 @pytest.mark.parametrize(("name", "size"), sizes().items())
 def test_the_sizes_are_within_their_limits(name: str, size: int) -> None:
-    assert size <= LIMITS[name]
+    assert size <= LIMITS["size"][name]
+
+
+@pytest.mark.parametrize(("name", "figure"), reading().items())
+def test_the_package_is_no_denser_than_its_limits(name: str, figure: float) -> None:
+    assert figure <= LIMITS["reading"][name]
 
 
 def test_a_public_name_is_defined_once() -> None:
@@ -71,9 +77,12 @@ def test_tests_are_collected_without_the_extras() -> None:
 
 
 def test_the_rules_find_what_breaks_them() -> None:
-    function = "def long():\n    '''One\n    two.'''\n\n    # Pass.\n" + "    pass\n" * 60
-    assert [*function_lengths_in(function)] == [("long", 61)]
-    assert elements_in(function) == elements_in("def long():\n" + "    pass\n" * 60)
+    function = "def long():\n    '''One\n    two.'''\n\n    # Pass.\n    pass\n"
+    assert elements_in(function) == elements_in("def long():\n    pass\n")
     assert elements_in("x = 1\n") == 5  # module, assignment, target, its context, value
     module = "class World: ...\nPair = tuple\nSIZE = 1\n_Own = int\ndef play(): ...\n"
     assert [*public_names_in(module)] == ["World", "Pair", "play"]
+    counts = counts_in(function + "left = [1 if one else 2 for one in (3, 4)]\n")
+    assert counts["line"] == 3
+    assert (counts["conditional"], counts["comprehension"], counts["nested"]) == (1, 1, 1)
+    assert counts["word"] == 2

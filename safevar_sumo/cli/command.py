@@ -21,7 +21,7 @@ from click.shell_completion import CompletionItem
 from rich.console import Console
 
 from safevar_sumo.errors import InputError, check_name
-from safevar_sumo.metrics.unsafe import COMPARISONS
+from safevar_sumo.metrics.bound import COMPARISONS
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.ask import COMMON_OPTIONS

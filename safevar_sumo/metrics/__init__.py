@@ -15,6 +15,7 @@ from safevar_sumo.metrics.legal import (
     STOP_FROM_PEDAL,
     STOPPING_DISTANCE as STOPPING_DISTANCE,
 )
+from safevar_sumo.metrics.margin import margin_of as margin_of
 from safevar_sumo.metrics.measures import (
     AVE_DECE,
     DRAC,
@@ -29,7 +30,6 @@ from safevar_sumo.metrics.measures import (
 from safevar_sumo.metrics.unsafe import (
     CriterionLike as CriterionLike,
     Unsafe as Unsafe,
-    margin_of as margin_of,
 )
 from safevar_sumo.metrics.words import impact_in_words as impact_in_words
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import F_SAFE
+from safevar_sumo.metrics.bound import COMPARISONS, MetricBound
 from safevar_sumo.metrics.legal import IMPACT_EXCESS, IMPACT_SPEED
 from safevar_sumo.metrics.measures import UNSAFE_SHARE
 from safevar_sumo.metrics.words import (
@@ -24,7 +24,7 @@ from safevar_sumo.metrics.words import (
     value_on_side,
 )
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome, Quantity, TextArray
-from safevar_sumo.study import SAFETY_DEGREE, Study
+from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.study.schema import Tables
 
 if TYPE_CHECKING:
@@ -34,43 +34,15 @@ CRITERIA = (
     "collision, below=X with a clearance X [m] of at least 0, or a metric with <, <=, > or >= and a"
     ' number, such as "drac > 6"'
 )
-COMPARISONS: Mapping[str, Callable[[Quantity, float], Quantity]] = {
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
-}
 COLLISION = str(Outcome.COLLISION)
 DEGREE_SHARE, LIMIT_DIGITS = 0.5, 6
 """The default limit if nothing collides: this share of the original's safety degree, to this many
 significant digits.
 """
-DEFAULT_MARGIN = 0.3
-"""Distance to keep in a study that states no error of its model [m]."""
 SHARE_DECIMALS = 9
 """Decimals of a sum of shares."""
 LEAST = 1e-9
 """The least by which what is unsafe is beyond a limit, in its unit."""
-
-
-class MetricBound(NamedTuple):
-    """A measure, one of `COMPARISONS`, and a number: `drac > 6`."""
-
-    measure: str
-    comparison: str
-    limit: float
-
-    def __str__(self) -> str:
-        return f"{self.measure} {self.comparison} {self.limit:.12g}"
-
-    @property
-    def worst_is_largest(self) -> bool:
-        return self.comparison.startswith(">")
-
-    @property
-    def sign(self) -> int:
-        """1 where small values are unsafe, -1 where large ones are."""
-        return 1 - 2 * self.worst_is_largest
 
 
 @dataclass(frozen=True)
@@ -500,15 +472,6 @@ class UnsafeShare(UnsafeMetric):
 
 METRIC_KINDS = {IMPACT_EXCESS.name: UnsafeImpact, UNSAFE_SHARE.name: UnsafeShare}
 """The classes of criteria by a metric that are not `UnsafeMetric`."""
-
-
-def margin_of(study: Study, margin: float | None) -> float:
-    """The distance to keep [m]: the stated one, else the study's error of its model, else
-    `DEFAULT_MARGIN`.
-    """
-    if margin is None:
-        return study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN)
-    return margin
 
 
 CriterionLike = Unsafe | float | str

@@ -133,14 +133,11 @@ class Packed:
         self._check_claims(study)
         solutions = read_table(files[SOLUTIONS])
         self._check_solutions(study, solutions)
-
-        # Evaluations are known by the numbers of their outcomes alone.
         outcomes = packed.outcomes
         codes = np.repeat(np.arange(len(outcomes), dtype=np.int8), list(outcomes.values()))
         evaluations = pd.DataFrame(
             {"outcome": pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))}
         )
-
         original = self.manifest["original"]
         scoring = manifest.scoring or PUBLISHED_SCORING
         self.case = build_case(

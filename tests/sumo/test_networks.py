@@ -66,7 +66,8 @@ def test_without_sumos_programs_what_needs_them_says_so(
 
 
 CAR = (
-    '<vType id="car" speedDev="0" sigma="0"/><vType id="walker" vClass="pedestrian" speedDev="0"/>'
+    '<vType id="car" speedDev="0" sigma="0"/>'
+    '<vType id="walker" vClass="pedestrian" speedDev="0"/>'
 )
 
 

@@ -1,0 +1,36 @@
+"""A limit that a measure must not pass."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from safevar_sumo.records import Quantity
+
+COMPARISONS: Mapping[str, Callable[[Quantity, float], Quantity]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+
+
+class MetricBound(NamedTuple):
+    """A measure, one of `COMPARISONS`, and a number: `drac > 6`."""
+
+    measure: str
+    comparison: str
+    limit: float
+
+    def __str__(self) -> str:
+        return f"{self.measure} {self.comparison} {self.limit:.12g}"
+
+    @property
+    def worst_is_largest(self) -> bool:
+        return self.comparison.startswith(">")
+
+    @property
+    def sign(self) -> int:
+        """1 where small values are unsafe, -1 where large ones are."""
+        return 1 - 2 * self.worst_is_largest
