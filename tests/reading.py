@@ -1,4 +1,4 @@
-"""How dense the package is to read; `python -m tests.reading` prints its densest files.
+"""How dense the package is to read; `python -m tests.reading` prints its figures.
 
 Lines are those with code, without docstrings, comments and blank lines. A function word is a name
 of a variable or a parameter that is no noun.
@@ -30,14 +30,8 @@ NO_CODE = {
 }
 COMPREHENSIONS = ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp
 NESTED = COMPREHENSIONS | ast.IfExp | ast.Lambda
-FIGURES = {
-    "elements_a_line": ("elements", 1),
-    "conditional_expressions_in_100_lines": ("conditional", 100),
-    "comprehensions_in_100_lines": ("comprehension", 100),
-    "nested_ones_in_100_lines": ("nested", 100),
-    "function_words_in_1000_lines": ("word", 1000),
-}
-"""Figures: what is counted, and for how many lines."""
+LINES_OF = {"elements": 1, "conditional": 100, "comprehension": 100, "nested": 100, "word": 1000}
+"""What is counted, and in how many lines."""
 
 
 def has_nested(node: ast.AST) -> bool:
@@ -69,21 +63,11 @@ def counts_in(source: str) -> Counter[str]:
     return counts
 
 
-def figures_of(counts: Counter[str]) -> dict[str, float]:
-    """The figures that `pyproject.toml` limits, by its keys."""
-    lines = max(counts["line"], 1)
-    return {name: per * counts[what] / lines for name, (what, per) in FIGURES.items()}
-
-
 def reading() -> dict[str, float]:
-    """The figures of the package."""
-    return figures_of(sum(map(counts_in, sources_of("safevar_sumo").values()), Counter()))
+    """The figures of the package that `pyproject.toml` limits, by its keys."""
+    counts = sum(map(counts_in, sources_of("safevar_sumo").values()), Counter())
+    return {name: per * counts[name] / counts["line"] for name, per in LINES_OF.items()}
 
 
 if __name__ == "__main__":
-    by_file = {path: counts_in(text) for path, text in sources_of("safevar_sumo").items()}
-    densest = sorted(by_file, key=lambda path: -figures_of(by_file[path])["elements_a_line"])
-    for path in densest[:20]:
-        print(*(f"{figure:7.1f}" for figure in figures_of(by_file[path]).values()), path)
-    for name, figure in reading().items():
-        print(f"{figure:7.2f}  {name}")
+    print(reading())

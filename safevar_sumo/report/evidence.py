@@ -101,7 +101,8 @@ def evidence(
     out
         File to write the pack to. The name ends in .zip.
     ask
-        Ask this question, such as "risk --samples 4000", not the usual ones; may be repeated.
+        Ask this question in place of the usual ones, such as "risk --samples 4000"; may be
+        repeated.
     unsafe
         Criterion for an unsafe vehicle in all answers and on the page, such as collision or "drac >
         6". Default: the criterion of the study, else a collision.
@@ -264,8 +265,8 @@ def verify(
     pack
         The pack.
     search
-        Repeat the whole search, too. Default: repeat only the original vehicle, the solutions and
-        the answers.
+        Repeat the whole search, too. Default: simulate only the original vehicle and the solutions
+        again, and ask the questions again.
     run_code
         Run user code that the pack contains or names. Default: such a pack is an error, and no code
         is run.

@@ -86,13 +86,13 @@ def report(
     out
         File to write the page to.
     ask
-        Ask this question, such as "risk --samples 4000", not the usual ones; may be repeated. The
-        answer to the first question leads the page.
+        Ask this question in place of the usual ones, such as "risk --samples 4000"; may be
+        repeated. The answer to the first question leads the page.
     unsafe
         Criterion for an unsafe vehicle on the whole page, such as collision or "drac > 6". Default:
         the criterion of the study, else a collision.
     point
-        Write the page about this test case only. Default: about all test cases.
+        Write the page about this test case only. Default: the page covers all test cases.
     jobs
         Number of worker processes. Default: one for each processor core.
     cluster

@@ -82,7 +82,7 @@ class PermitAnswer:
         columns = _in_unit(CARS, span)
         if self._is_test:
             columns["up_to"] = columns["up_to"]._replace(head="passes the test up to")
-        cars = tabulate("The cars, those that stop first", columns, rows)
+        cars = tabulate("The cars, first those that may not drive", columns, rows)
         counts = {
             verdict: int((cars["verdict"] == verdict).sum()) for verdict in (DRIVE, LIMITED, STOP)
         }
@@ -266,9 +266,9 @@ class PermitAnswer:
         driven = f"from {values[0]:g} to {values[-1]:g}{unit}"
         if len(values) == len(self.search.listed):
             driven = f"({join_phrases(f'{value:g}' for value in values)}{unit})"
-        grid = f"{len(values)} values {driven}, in every test alone"
+        grid = f"{len(values)} values {driven} in each test"
         attacked = f"{self.search.attacked:,} simulations that search for an unsafe encounter"
-        return f"{grid}; {'no search beside them' if self.is_quick else attacked}."
+        return f"{grid}; {'no search for an unsafe encounter' if self.is_quick else attacked}."
 
     def _listing(self, cars: pd.DataFrame, fleet: Fleet) -> pd.DataFrame:
         """The list: the columns of the input, then those of the answer, in the input's order."""

@@ -106,8 +106,8 @@ def repair(
     out
         Write a study with the first repair to this file.
     at_tests
-        Find a repair for the listed test cases only. Default: also for speeds and places between
-        the listed values.
+        Find a driving system that is safe in the listed test cases only. Default: also at speeds
+        and places between the listed values.
     quick
         Give a rough answer that proves nothing, with at most an eighth of the usual simulations. A
         rough repair is not written to a file.

@@ -143,8 +143,8 @@ def tolerance(
         Test the limits only at the listed test cases. Default: also at speeds and places between
         the listed values.
     quick
-        Give a rough answer that confirms no limit, with at most an eighth of the usual simulations.
-        The exit code is always 3 if you state limits, because no limit is confirmed.
+        Give a rough answer, with at most an eighth of the usual simulations. A rough answer
+        confirms no limit that you state, so the exit code is then 3.
     """
     whole = evaluator
     if up_to is not None:
