@@ -24,19 +24,11 @@ FUNCTION_WORDS = frozenset(
     near far inner outer ahead behind drawn begun moved missing open_ whole
     """.split()  # noqa: SIM905
 )
-NO_CODE = {
-    *(tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE),
-    *(tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER),
-}
+NO_CODE = "COMMENT NL NEWLINE INDENT DEDENT ENDMARKER".split()  # noqa: SIM905
 COMPREHENSIONS = ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp
 NESTED = COMPREHENSIONS | ast.IfExp | ast.Lambda
 LINES_OF = {"elements": 1, "conditional": 100, "comprehension": 100, "nested": 100, "word": 1000}
 """What is counted, and in how many lines."""
-
-
-def has_nested(node: ast.AST) -> bool:
-    """Whether an expression holds another one of its kinds."""
-    return sum(isinstance(inner, NESTED) for inner in ast.walk(node)) > 1
 
 
 def counts_in(source: str) -> Counter[str]:
@@ -44,7 +36,7 @@ def counts_in(source: str) -> Counter[str]:
     tree = ast.parse(source)
     lines = set[int]()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type not in NO_CODE:
+        if tokenize.tok_name[token.type] not in NO_CODE:
             lines |= {*range(token.start[0], token.end[0] + 1)}
     for docstring in take_docstrings(tree):
         lines -= {*range(docstring.lineno, (docstring.end_lineno or 0) + 1)}
@@ -58,7 +50,8 @@ def counts_in(source: str) -> Counter[str]:
         counts["elements"] += 1
         counts["conditional"] += isinstance(node, ast.IfExp)
         counts["comprehension"] += isinstance(node, COMPREHENSIONS)
-        counts["nested"] += isinstance(node, NESTED) and has_nested(node)
+        if isinstance(node, NESTED):
+            counts["nested"] += sum(isinstance(inner, NESTED) for inner in ast.walk(node)) > 1
         counts["word"] += name.strip("_") in FUNCTION_WORDS
     return counts
 

@@ -1,4 +1,4 @@
-"""Size of the package and of its tests; `python -m tests.size` prints it by folder.
+"""Size of the package and of its tests; `python -m tests.size` prints it.
 
 Elements are nodes of the syntax trees without docstrings: neither line length nor blank lines nor
 documentation change their number.
@@ -7,8 +7,6 @@ documentation change their number.
 from __future__ import annotations
 
 import ast
-from collections import Counter
-from pathlib import Path
 
 from tests.manual import ROOT
 
@@ -50,11 +48,4 @@ def sizes() -> dict[str, int]:
 
 
 if __name__ == "__main__":
-    for name in ("safevar_sumo", "tests"):
-        by_folder = Counter[str]()
-        for path, source in sources_of(name).items():
-            by_folder[str(Path(path).parent)] += elements_in(source)
-        for folder, number in by_folder.most_common():
-            print(f"{number:9,}  {name}/{folder}")
-    for name, size in sizes().items():
-        print(f"{size:9,}  {name}")
+    print(sizes())

@@ -163,15 +163,6 @@ def test_every_generated_list_of_a_page_is_that_of_the_code() -> None:
         assert text == filled(text), f"{page}: `make docs-outputs` writes it"
 
 
-def test_a_formula_becomes_mathml() -> None:
-    pytest.importorskip("latex2mathml")  # of the extra `docs`
-    page = '<p>If <span class="arithmatex">\\(x^2 &lt; y\\)</span>, stop.</p>'
-    html = script_of_docs("generate").on_page_content(page)
-    assert "<msup><mi>x</mi><mn>2</mn></msup><mo>&#x0003C;</mo><mi>y</mi>" in html
-    assert html.startswith("<p>If <math")
-    assert html.endswith("</math>, stop.</p>")
-
-
 class Numbers(NamedTuple):
     """A comment of a page: commands, and of the last one's JSON the values at some paths, as the
     page's next paragraph has them.

@@ -165,8 +165,7 @@ def study(
     as_written = part_of_study(read_study(study), ranges, point, up_to)
     directory = out or Path("results") / directory_name(as_written)
     if unsafe is not None and status:
-        problem = "beside --status, which simulates no search"
-        raise InputError("unsafe", problem, "one of the two options")
+        raise InputError("unsafe", "beside --status, which simulates no search", "one of the two options")
     if status:
         return summarise(load(directory))
 
@@ -324,8 +323,7 @@ def summarise(results: Results) -> Answer:
     case = results.case
     study = results.study
     if not case.has_runs:
-        problem = "holds imported solutions, which have no runs"
-        raise InputError(results.directory, problem, "results of the command `study`")
+        raise InputError(results.directory, "holds imported solutions, which have no runs", "results of the command `study`")
 
     finished = Counter(name for name, _ in results.finished)
     rows = []

@@ -72,8 +72,7 @@ def refuse_other_worker(study: Study, manifest: JsonObject, package: str) -> Non
     """
     refuse_changed_inputs(study, system_of(study), manifest)
     if package != package_digest():
-        problem = f"a worker on {platform.node()} has other code of safevar_sumo, or another Python"
-        raise InputError("cluster", problem, "the same installation everywhere")
+        raise InputError("cluster", f"a worker on {platform.node()} has other code of safevar_sumo, or another Python", "the same installation everywhere")
 
 
 def _refuse_other_workers(study: Study, used: Iterable[str], pool: Pool) -> None:

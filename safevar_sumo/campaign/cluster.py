@@ -62,8 +62,7 @@ def everywhere(client: Any, function: Callable[..., Any], *arguments: Any) -> No
         client.run(_carry_out, pickle.dumps((function, arguments)), "")
     except (AttributeError, ImportError, TypeError) as error:
         # Another version knows no such function.
-        problem = f"a worker has another version of safevar_sumo: {describe_error(error)}"
-        raise InputError("cluster", problem, "the same installation everywhere") from None
+        raise InputError("cluster", f"a worker has another version of safevar_sumo: {describe_error(error)}", "the same installation everywhere") from None
 
 
 class ClusterWorker:

@@ -41,9 +41,8 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
                 versions[name] = version(name)
                 libraries.add(name)
             except PackageNotFoundError:
-                problem = f"scenario.model = {study.scenario.model!r}: LIBRARIES has {name!r}"
                 raise InputError(
-                    study.source, problem, "names of installed distributions"
+                    study.source, f"scenario.model = {study.scenario.model!r}: LIBRARIES has {name!r}", "names of installed distributions"
                 ) from None
     used_by = {"libraries": sorted(libraries)} if libraries else {}
     return manifest_of(study, {**identity, "versions": versions, **used_by})

@@ -90,9 +90,8 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
                 legal = dict.fromkeys(
                     (*SearchTable.__struct_fields__, *DESCRIPTIONS, *search.labels)
                 )
-                problem = f"search.{table}: there is no such key and no such algorithm"
                 raise unknown_name(
-                    "", problem, table, PYMOO_ALGORITHMS if table.startswith(PYMOO) else legal
+                    "", f"search.{table}: there is no such key and no such algorithm", table, PYMOO_ALGORITHMS if table.startswith(PYMOO) else legal
                 )
 
         lookup = Lookup.of(study)

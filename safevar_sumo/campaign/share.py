@@ -120,8 +120,7 @@ def _refuse_failures(study: Study, runs: Sequence[Run]) -> None:
         failures = next(run.failures for run in reversed(runs) if len(run.failures))
         problem = f"search.failed = 'skip': {number} settings failed, more than 10 % of {total}"
         reason = failures.reason(len(failures) - 1)
-        legal = "a simulator that fails less often; `study --retry-failed` tries them again"
-        raise UserCodeError(f"study {study.name!r}", f"{problem}; the last one: {reason}", legal)
+        raise UserCodeError(f"study {study.name!r}", f"{problem}; the last one: {reason}", "a simulator that fails less often; `study --retry-failed` tries them again")
 
 
 def _begin(task: Task, share: Share, key: RunKey) -> Run:

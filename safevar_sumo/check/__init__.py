@@ -124,9 +124,8 @@ def refuse_defects(study: Study, limit: int | None = None) -> None:
     """
     for finding in find_defects(study, limit=limit):
         command = f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}"
-        problem = f"{finding}; to reproduce it: {command}"
         raise UserCodeError(
-            study.source, problem, f"{finding.expected}; {CHECKS[finding.check]}", finding.where
+            study.source, f"{finding}; to reproduce it: {command}", f"{finding.expected}; {CHECKS[finding.check]}", finding.where
         )
 
 

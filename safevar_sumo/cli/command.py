@@ -347,8 +347,7 @@ def _parse(text: str) -> tuple[str, str, float]:
     """The key, the operator and the limit of a condition."""
     match = CONDITION.fullmatch(text)
     if match is None or not math.isfinite(limit := float(match[3])):
-        expected = '"KEY > X" with <, <=, > or >= and a number, such as "probability > 0.01"'
-        raise InputError("fail_if", repr(text), expected)
+        raise InputError("fail_if", repr(text), '"KEY > X" with <, <=, > or >= and a number, such as "probability > 0.01"')
     return match[1], match[2], limit
 
 

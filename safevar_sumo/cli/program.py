@@ -98,8 +98,7 @@ class LazyCommands(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Suggest the nearest command if the name is unknown, or what stands in its place."""
         if args and args[0] in ENDED_COMMANDS:
-            problem = "a command of releases before 0.5"
-            raise InputError(args[0], problem, ENDED_COMMANDS[args[0]])
+            raise InputError(args[0], "a command of releases before 0.5", ENDED_COMMANDS[args[0]])
         if args and args[0] not in COMMANDS and not args[0].startswith("-") and ":" not in args[0]:
             ctx.fail(f"there is no command {args[0]!r}{did_you_mean(args[0], COMMANDS)}")
         return super().resolve_command(ctx, args)

@@ -60,8 +60,7 @@ def user_errors(source: str) -> Iterator[None]:
                 raise user_error from error
             raise
         for problem in damage:
-            legal = "code that leaves streams and descriptors of its process open"
-            raise UserCodeError(source, problem, legal)
+            raise UserCodeError(source, problem, "code that leaves streams and descriptors of its process open")
 
 
 def user_error_of(error: BaseException) -> UserCodeError | None:

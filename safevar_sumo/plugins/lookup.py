@@ -118,11 +118,8 @@ class Lookup:
         try:
             target = getattr(module, attribute)
         except AttributeError:
-            problem = (
-                f"{code.name} cannot be imported: {file_of_module(module_name)} has no"
-                f" {attribute!r}"
-            )
-            raise InputError("", problem, expected) from None
+            raise InputError("", f"{code.name} cannot be imported: {file_of_module(module_name)} has no"
+                f" {attribute!r}", expected) from None
         return Member(target, code._replace(target=target), self._time_limit)
 
     def class_of(
@@ -141,9 +138,8 @@ class Lookup:
             return member
         base = _base_of(member.target, bases)
         if reason := violation(member.target, base):
-            expected = "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])])
             raise UserCodeError(
-                "", f"{member.code.name} {reason}", expected, member.code.definition()
+                "", f"{member.code.name} {reason}", "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])]), member.code.definition()
             )
         member = self._classes[name, bases] = member._replace(
             target=checked_class(member.code, base)
@@ -183,8 +179,7 @@ class Lookup:
 
     def _import(self, name: str, key: str) -> ModuleType:
         if name.partition(".")[0] == "__main__":
-            problem = f"{key}: other processes cannot import from __main__"
-            raise InputError("", problem, "a module in a file of its own")
+            raise InputError("", f"{key}: other processes cannot import from __main__", "a module in a file of its own")
 
         # Modules beside the study come before those of the working directory.
         folders = list(dict.fromkeys((*self.folders, os.getcwd())))
@@ -203,11 +198,8 @@ class Lookup:
                 return _import_beside(name, folders) or importlib.import_module(name)
         except (ModuleNotFoundError, UserCodeError) as error:
             problem = error.problem if isinstance(error, UserCodeError) else describe_error(error)
-            expected = (
-                getattr(error, "legal", "")
-                or f"a module in {' or '.join(folders)}, or an installed one"
-            )
-            raise UserCodeError("", f"{key} cannot be imported: {problem}", expected) from error
+            raise UserCodeError("", f"{key} cannot be imported: {problem}", getattr(error, "legal", "")
+                or f"a module in {' or '.join(folders)}, or an installed one") from error
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
             this_process.modules |= sys.modules.keys() - modules_before

@@ -67,8 +67,7 @@ class Contents(NamedTuple):
         elif name and rest.isdecimal():
             wanted = name
         if ... not in names and wanted not in names:
-            problem = f"the answer has no number {key!r}{did_you_mean(key, self.keys)}"
-            raise InputError("fail_if", problem, one_of(legal))
+            raise InputError("fail_if", f"the answer has no number {key!r}{did_you_mean(key, self.keys)}", one_of(legal))
 
     @property
     def keys(self) -> list[str]:

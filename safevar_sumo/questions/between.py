@@ -91,9 +91,7 @@ def with_set_axes(study: Study, system: System, changes: Collection[str]) -> tup
     if PHASE in names:
         phased = in_phases(found, assemble(found))
         if phased == found:
-            problem = f"study {study.name!r} has no {PHASE}"
-            expected = "a study whose actors move on tracks, and react to nobody"
-            raise InputError("", problem, expected)
+            raise InputError("", f"study {study.name!r} has no {PHASE}", "a study whose actors move on tracks, and react to nobody")
         found = phased
     return found, system if found == study else assemble(found)
 
@@ -116,6 +114,5 @@ def _with_axes(study: Study, system: System, names: set[str]) -> Study:
         if axes <= domains.keys()
     ]
     if not kept:
-        problem = f"no test has {join_phrases(sorted(axes))} together"
-        raise InputError("", problem, "values of one test's axes")
+        raise InputError("", f"no test has {join_phrases(sorted(axes))} together", "values of one test's axes")
     return in_ranges(study, kept)

@@ -46,8 +46,7 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
         metrics = replace_in(metrics, also=[*metrics.also, name])
     allows = matrix is not None and any(test.allowed_impact_speed for test in matrix.tests)
     if allows and not unsafe.is_of_impacts:
-        problem = f"{str(unsafe)!r}: tests of study {study.name!r} allow an impact"
-        raise InputError("unsafe", problem, "a bound on impact_excess, or collision")
+        raise InputError("unsafe", f"{str(unsafe)!r}: tests of study {study.name!r} allow an impact", "a bound on impact_excess, or collision")
 
     # And counts the point that is worst by it.
     if matrix is not None:

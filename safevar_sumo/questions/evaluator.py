@@ -338,12 +338,9 @@ class Evaluator:
         """
         evaluations = self.evaluate(self.characteristics.original_settings, "original vehicle")
         if len(self.characteristics.scenario) and evaluations.infeasible[0]:
-            problem = (
-                "encounters: the original vehicle is not safe in the encounter of the original"
-                " values"
-            )
             raise InputError(
-                self.study.source, problem, "original values with which it is, as in all results"
+                self.study.source, "encounters: the original vehicle is not safe in the encounter of the original"
+                " values", "original values with which it is, as in all results"
             )
         if not evaluations.valid[0]:
             raise SimulationError(
@@ -416,9 +413,7 @@ class Evaluator:
         road.
         """
         if self.system.meets_nobody and np.isnan(self.evaluate_original().column(measure)[0]):
-            problem = "nobody else is on the road, so that no vehicle collides or is too close"
-            legal = 'a metric with a limit, such as "stopping_distance > 100"'
-            raise InputError("unsafe", problem, legal)
+            raise InputError("unsafe", "nobody else is on the road, so that no vehicle collides or is too close", 'a metric with a limit, such as "stopping_distance > 100"')
 
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""

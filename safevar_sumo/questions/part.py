@@ -39,8 +39,7 @@ def part_of_study(study: Study, ranges: bool, point: str | None, up_to: str | No
     if ranges and study.encounters != RANGES:
         whole = with_ranges(study)
         if whole.encounters != RANGES:
-            problem = f"no axis of study {study.name!r} has a range"
-            raise InputError("ranges", problem, "a study with such an axis")
+            raise InputError("ranges", f"no axis of study {study.name!r} has a range", "a study with such an axis")
         study = whole
     if point is not None:
         study = at_point(study, point)
@@ -111,8 +110,7 @@ def study_up_to(study: Study, text: str) -> Study:
         domain = study.ranges[name]
         low, highest, unit = domain.lower, domain.upper, unit_text(domain.unit)
         if not low < high <= highest:
-            problem = f"{name}={high:g} is outside the domain of study {study.name!r}"
-            raise InputError(OPTION, problem, f"a value above {low:g} and up to {highest:g}{unit}")
+            raise InputError(OPTION, f"{name}={high:g} is outside the domain of study {study.name!r}", f"a value above {low:g} and up to {highest:g}{unit}")
     cut = study if name in study.ranges else _lists_up_to(study, name, high)
     return _ranges_up_to(cut, name, high)
 
@@ -168,8 +166,7 @@ def _lists_up_to(study: Study, name: str, high: float) -> Study:
     if not min(driven) <= high <= max(driven):
         units = [searchable_in(points[0].scenario) for _, points in by_test]
         unit = next((unit_text(each[name].unit) for each in units if name in each), "")
-        problem = f"{name}={high:g} is not among the values that study {study.name!r} drives"
-        raise InputError(OPTION, problem, f"a value from {min(driven):g} to {max(driven):g}{unit}")
+        raise InputError(OPTION, f"{name}={high:g} is not among the values that study {study.name!r} drives", f"a value from {min(driven):g} to {max(driven):g}{unit}")
     tests = list[MatrixTest]()
     for test, points in by_test:
         values = _values(study, test, name)

@@ -105,15 +105,13 @@ class Account:
         self.spent += simulations
         bound = self.asked if self.most is None else self.most
         if bound is not None and self.spent > bound:
-            problem = f"{bound:,} do not suffice: {self.spent:,} are needed to go on"
-            raise InputError("simulations", problem, "a larger number")
+            raise InputError("simulations", f"{bound:,} do not suffice: {self.spent:,} are needed to go on", "a larger number")
 
     def require(self, least: int) -> None:
         """Refuse fewer simulations than the least number for an answer."""
         self.least = least
         if self.asked is not None and self.asked < least:
-            problem = f"{self.asked:,} do not suffice: an answer takes at least {least:,}"
-            raise InputError("simulations", problem, f"{least} or more")
+            raise InputError("simulations", f"{self.asked:,} do not suffice: an answer takes at least {least:,}", f"{least} or more")
 
     def open(self, expected: float, seconds: float | None, checked: int = 0) -> None:
         """Allow what the user allows, or all if that does not take too long; `expected` simulations

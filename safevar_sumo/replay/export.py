@@ -204,9 +204,8 @@ def carla_physics(setting: NamedValues) -> dict[str, NamedValues]:
 
     if surplus := [name for name in setting if name not in names]:
         verb = "has" if len(surplus) == 1 else "have"
-        problem = f"{', '.join(surplus)} of its vehicle {verb} no counterpart in CARLA"
         raise InputError(
-            "", problem, f"the vehicle `carla`, with {', '.join(names)}; or `to=openscenario`"
+            "", f"{', '.join(surplus)} of its vehicle {verb} no counterpart in CARLA", f"the vehicle `carla`, with {', '.join(names)}; or `to=openscenario`"
         )
     if lacking := [name for name in names if name not in setting]:
         raise InputError(
@@ -290,8 +289,7 @@ def export(
     system.require("roads", "export")
     setting = target.setting(system)
     if system.characteristics.named(setting).get(PHASE):
-        problem = f"solution {solution} has a {PHASE}, which another simulator does not have"
-        raise InputError(directory, problem, "a solution of a study that does not search it")
+        raise InputError(directory, f"solution {solution} has a {PHASE}, which another simulator does not have", "a solution of a study that does not search it")
     values = system.characteristics.vehicle.named(setting[system.characteristics.of_vehicle])
     with about(directory):
         physics = carla_physics(values) if to == "carla" else {}

@@ -52,6 +52,5 @@ def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str,
     remaining_simulations -= len(free) * (times * simulations_of_setting(system) + repeats)
     part = remaining_simulations // max(len(costly), 1)
     if part < 1:
-        problem = f"{simulations:,} do not suffice for {len(costly) + len(free)} questions"
-        raise InputError("simulations", problem, "a larger number, or fewer questions (--ask)")
+        raise InputError("simulations", f"{simulations:,} do not suffice for {len(costly) + len(free)} questions", "a larger number, or fewer questions (--ask)")
     return {**dict.fromkeys([*costly, *free], part), REPLAYS: replays}

@@ -164,8 +164,7 @@ class Packed:
         numbers = [int(word) for word in words if WHOLE_NUMBER.fullmatch(word.strip())]
         total = sum(map(abs, [*numbers, *self.packed.simulations.values()]))
         if total > MAX_ASKED:
-            problem = f"its questions ask for {total:,} vehicles and simulations"
-            raise InputError("ask", problem, f"at most {MAX_ASKED:,} in a pack")
+            raise InputError("ask", f"its questions ask for {total:,} vehicles and simulations", f"at most {MAX_ASKED:,} in a pack")
         for text in self.packed.questions:
             if "--out" in split(text):
                 raise InputError("ask", f"{text!r} writes a file", "a question without --out")

@@ -228,8 +228,7 @@ def _files_of_user(
     paths_beside = [os.path.abspath(Path(places[0], name)) for name in beside]
     outside = [path for path in paths_beside if not Path(path).is_relative_to(places[0])]
     for name in [*outside, *filter(os.path.isabs, names)]:
-        problem = "lies outside the study's folders, so that no pack can hold it"
-        raise InputError(name, problem, "a copy beside the study, which then names the copy")
+        raise InputError(name, "lies outside the study's folders, so that no pack can hold it", "a copy beside the study, which then names the copy")
 
     # SUMO does not start without the views that a network names.
     for name in [name for name in names if Path(name).name == OPTIONS_FILE]:
@@ -295,8 +294,7 @@ def verify(
 
         # Its code runs only if the user trusts it.
         if not run_code and (code := [name for packed in studies.values() for name in packed.code]):
-            problem = f"`verify` would run code of the pack: {', '.join(code)}"
-            raise InputError(path, problem, "`run_code=True`, if you trust it")
+            raise InputError(path, f"`verify` would run code of the pack: {', '.join(code)}", "`run_code=True`, if you trust it")
 
         names = ", ".join(packed.case.study.name for packed in studies.values())
         of_files = Claim(

@@ -174,8 +174,7 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         if described.versions.get(name) != present[name]
     ]
     if changed:
-        expected = f"a pack of this version: {', '.join(map(' '.join, present.items()))}"
-        raise InputError(path, f"was made with {', '.join(changed)}", expected)
+        raise InputError(path, f"was made with {', '.join(changed)}", f"a pack of this version: {', '.join(map(' '.join, present.items()))}")
     return described, files
 
 

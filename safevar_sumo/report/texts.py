@@ -96,9 +96,7 @@ def answer_about(
     simulations = options.pop(SIMULATIONS.name, None)
     try:
         if len(question.others) + 1 != len(cases):
-            expected = f"{len(question.others) + 1} results directories"
-            problem = f"{question.name} cannot be asked about {len(cases)}"
-            raise InputError("ask", problem, expected)
+            raise InputError("ask", f"{question.name} cannot be asked about {len(cases)}", f"{len(question.others) + 1} results directories")
         command = question.command_line([*map(str, directories)], {"point": point}, options)
         answer = question.answer(
             cases,

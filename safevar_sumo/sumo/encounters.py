@@ -63,8 +63,7 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
                 weather, name
             ):
                 weathers = f"{first_weather.name} and {weather.name}"
-                problem = f"{key}: weathers {weathers} of the matrix set {name}, too"
-                raise InputError("", problem, "a range, or values in the weathers")
+                raise InputError("", f"{key}: weathers {weathers} of the matrix set {name}, too", "a range, or values in the weathers")
         _check_corners(study, point, ranges)
 
 

@@ -73,8 +73,7 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
 
     for name in study.metrics.also:
         if name in METRICS:
-            problem = f"metrics.also = {study.metrics.also}: every study has {name!r}"
-            raise InputError("", problem, f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
+            raise InputError("", f"metrics.also = {study.metrics.also}: every study has {name!r}", f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
         if named.look_up(name, "metrics.also", metrics).of == "settings":
             raise InputError("", f"metrics.also = {name!r} measures settings", "a measure of runs")
 
@@ -96,8 +95,7 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)
     for names in texts.values():
         if len(names) > 1:
-            problem = f"{OBJECTIVES_KEY}: {' and '.join(names)} are the same objective"
-            raise InputError("", problem, "each objective once")
+            raise InputError("", f"{OBJECTIVES_KEY}: {' and '.join(names)} are the same objective", "each objective once")
     of_runs = tuple(measure.facts for measure in named.computed.values() if measure.of == "runs")
     return Measuring(named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives)))
 

@@ -299,11 +299,8 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
         *as_arguments(fixed_options),
     )
     if exit_code != 0:
-        problem = (
-            f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}:"
-            f" {messages or f'exit code {exit_code}'}"
-        )
-        raise InputError(network.folder, problem, legal)
+        raise InputError(network.folder, f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}:"
+            f" {messages or f'exit code {exit_code}'}", legal)
 
     # Traffic that is random moves otherwise in each copy.
     try:

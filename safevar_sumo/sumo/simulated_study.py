@@ -36,11 +36,9 @@ def check_tables(study: Study, mover: Mover) -> None:
     }
     if mover.has("a driving system"):
         if study.scenario.repeats > 1:
-            problem = f"scenario.repeats = {study.scenario.repeats}: SUMO repeats itself to the bit"
-            raise InputError("", problem, "no repeats, or a simulator of the user's own")
+            raise InputError("", f"scenario.repeats = {study.scenario.repeats}: SUMO repeats itself to the bit", "no repeats, or a simulator of the user's own")
         if study.search.failed != "stop":
-            problem = f"search.failed = {study.search.failed!r} without a simulator of one's own"
-            raise InputError("", problem, "'stop': settings on which SUMO fails are skipped anyway")
+            raise InputError("", f"search.failed = {study.search.failed!r} without a simulator of one's own", "'stop': settings on which SUMO fails are skipped anyway")
         for key in ("vehicle.model", "ads.model", "weather"):
             if not entries[key]:
                 table = key.removesuffix(".model") if key.startswith("ads") else key
@@ -60,8 +58,7 @@ def check_tables(study: Study, mover: Mover) -> None:
     for key, value in entries.items():
         if value:
             text = value if isinstance(value, str | float) else str(value)
-            problem = f"{key} = {text!r} beside the simulator of scenario.model"
-            raise InputError("", problem, IN_SIMULATOR)
+            raise InputError("", f"{key} = {text!r} beside the simulator of scenario.model", IN_SIMULATOR)
 
 
 def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
@@ -75,8 +72,7 @@ def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
     for point in matrix:
         kind, study_kind = point.scenario.mover.kind, scenario.mover.kind
         if kind != study_kind:
-            problem = f"matrix.tests: {point.name!r} is {kind}, and scenario.model is {study_kind}"
-            raise InputError("", problem, "tests of the kind of scenario.model")
+            raise InputError("", f"matrix.tests: {point.name!r} is {kind}, and scenario.model is {study_kind}", "tests of the kind of scenario.model")
 
 
 def noise_remarks(characteristics: CharacteristicSet, points: Sequence[Point]) -> list[str]:

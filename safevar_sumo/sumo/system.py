@@ -103,8 +103,7 @@ class System:
             About the study.
         """
         if reason := self.mover.lacks.get(part):
-            problem = f"{question} needs {part}, and scenario.model is {self.mover.kind}: {reason}"
-            raise InputError(self.source, problem, "a study with a vehicle and a driving system")
+            raise InputError(self.source, f"{question} needs {part}, and scenario.model is {self.mover.kind}: {reason}", "a study with a vehicle and a driving system")
 
     @property
     def meets_nobody(self) -> bool:

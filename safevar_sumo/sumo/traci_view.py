@@ -62,8 +62,7 @@ def refused(domain: str, name: str, problem: str) -> InputError:
     """The error for a controller's call of a function, of traci itself if `domain` is ""."""
     function = ".".join(filter(None, ("traci", domain, name)))
     if function == "traci.vehicle.setType":
-        problem = "makes it another vehicle, but the study's vehicle drives"
-        return InputError(function, problem, ", ".join(DRIVER_COMMANDS))
+        return InputError(function, "makes it another vehicle, but the study's vehicle drives", ", ".join(DRIVER_COMMANDS))
     body = (
         "the body of your script's loop, without this call, as a function step(traci, vehicle_id)"
     )

@@ -66,17 +66,15 @@ def check_plausible(study: Study, vehicle: Vehicle) -> None:
     try:
         ranges = msgspec.convert(vehicle.PLAUSIBLE, dict[str, Plausible])
     except msgspec.ValidationError as error:
-        problem = f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE: {error}"
         raise InputError(
-            "", problem, "(lowest, highest) or (lowest, highest, unit) by name"
+            "", f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE: {error}", "(lowest, highest) or (lowest, highest, unit) by name"
         ) from None
     for name, (lowest, highest, own_unit) in ranges.items():
         entry = study.vehicle.characteristics.get(name)
         if entry is None and name in vehicle.OPTIONAL:
             continue
         if entry is None and not hasattr(vehicle, name):
-            problem = f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE has {name!r}"
-            raise InputError("", problem, "names of characteristics and of parameters")
+            raise InputError("", f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE has {name!r}", "names of characteristics and of parameters")
         values: list[tuple[str, Any]] = [(f"parameters.{name}", getattr(vehicle, name, None))]
         if entry is not None:
             values = [

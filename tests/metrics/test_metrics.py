@@ -381,8 +381,7 @@ def test_an_impact_counts_above_the_speed_that_is_allowed(
 
 
 def test_without_a_contact_the_excess_is_minus_the_clearance() -> None:
-    gap = np.array([[5.0], [2.0], [2.5]])
-    run = made_up_runs(0.1, np.full((3, 1), 3.0), gap=gap)
+    run = made_up_runs(0.1, np.full((3, 1), 3.0), gap=np.array([[5.0], [2.0], [2.5]]))
     run = dataclasses.replace(run, allowed_impact_speed=np.array(4.0))
     assert value("impact_excess", run) == -2.0
     assert np.isnan(value("impact_speed", run))

@@ -49,8 +49,7 @@ def test_a_search_between_the_tests_finds_what_no_test_shows(ahead: Study) -> No
     end = vehicle.setting(AT_TESTS_ALONE)
     ends = np.minimum(vehicle.original, end), np.maximum(vehicle.original, end)
     space = oracle.space(0, *ends, phases=False)
-    corners = default_rng(0).random((512, len(vehicle))) < 0.5
-    vehicles = np.where(corners, *ends)
+    vehicles = np.where(default_rng(0).random((512, len(vehicle))) < 0.5, *ends)
     assert oracle(product_of(vehicles, oracle.listed())).min() >= 0
     nothing = space.lower[np.newaxis][:0]
     met = search_cases(oracle, space, nothing, SearchPlan(5000), default_rng(1))

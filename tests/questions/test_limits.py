@@ -211,8 +211,7 @@ def test_a_value_whose_limit_never_settles_stays_as_in_the_original() -> None:
 def test_a_star_changes_one_value_and_a_space_holds_its_cases() -> None:
     star = star_of(4)
     cases = star.draw(1000, default_rng(0))
-    changed = np.count_nonzero(cases[:, :4] != 5, axis=1)
-    assert set(changed.tolist()) == {1}
+    assert set(np.count_nonzero(cases[:, :4] != 5, axis=1).tolist()) == {1}
     assert (np.count_nonzero(cases[:, :4] != 5, axis=0) > 150).all()
     children = star.children(cases[:PARENTS], 1000, default_rng(1))
     assert (np.count_nonzero(children[:, :4] != 5, axis=1) <= 1).all()
@@ -258,8 +257,7 @@ def test_children_lie_between_beside_and_around_their_parents() -> None:
     between = {pulled + shift for pulled in (4.0, 4.5, 5.0) for shift in (-0.7, 0.0, 0.7)}
     assert {*np.round(children[1::2, 0], 9).tolist()} == {round(value, 9) for value in between}
     values = children[::2, :4]
-    is_new = ~np.isin(values, (4.0, 5.0))
-    assert is_new.mean() == pytest.approx(1.2 / 7, abs=0.01)
+    assert ~np.isin(values, (4.0, 5.0)).mean() == pytest.approx(1.2 / 7, abs=0.01)
     assert np.isin(values, (0.0, 10.0)).mean() == pytest.approx(0.6 / 7, abs=0.01)
 
 
@@ -312,8 +310,7 @@ def test_causes_are_as_few_changes_as_possible_and_places_where_the_box_was_unsa
     assert (judge(known.cases) < 0).all()
     assert known.cases[:, 0].min() == pytest.approx(7, abs=0.02), "nearly the first on its way"
     assert known.places[:, :3].tolist() == [[0.8, -0.8, 0]]
-    half = np.full((2, 3), 2.5)
-    assert known.at_places(boxes, half)[:, :3].tolist() == [[7, 3, 5]]
+    assert known.at_places(boxes, np.full((2, 3), 2.5))[:, :3].tolist() == [[7, 3, 5]]
 
 
 def test_a_box_grows_up_to_a_wall_and_shrinks_from_what_is_beyond() -> None:

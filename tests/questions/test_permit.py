@@ -71,8 +71,7 @@ def are_unsafe(
     own = studies_of_sets(study)[fit]
     assert own.matrix is not None
     for test in own.matrix.tests:
-        single = replace(own, matrix=replace(own.matrix, tests=[test]))
-        system = assemble(single)
+        system = assemble(replace(own, matrix=replace(own.matrix, tests=[test])))
         rows = [[*car, *at] for car in cars for at in product(values, places)]
         runs = drive_and_score(system, np.array(rows), with_originals=False)
         fails = runs.collided | (runs.f_safe < (keep if fit == 0 else 0.0))

@@ -90,9 +90,7 @@ def verdicts(*drivers: Sequence[float], points: Sequence[str] | None = None) -> 
 
 
 def test_what_drivers_avoid_is_counted_among_the_collisions_with_a_verdict() -> None:
-    of_driver = [1.0] + [0.0] * 42 + [np.nan] * 1336
-    full = [1.0] * 1061 + [0.0] * 318
-    many = verdicts(of_driver, full)
+    many = verdicts([1.0] + [0.0] * 42 + [np.nan] * 1336, [1.0] * 1061 + [0.0] * 318)
     assert avoided_in_words(many) == (
         "A competent driver (as in UN R157) in the same vehicle would have avoided 1 of 43"
         " collisions with a verdict (1,379 examined). Full braking at the first possible moment"

@@ -17,7 +17,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.models import SEARCHED_MARGIN
-from safevar_sumo.questions.part import names_left_out, smaller_cuts, study_up_to
+from safevar_sumo.questions.part import names_left_out, study_up_to
 from safevar_sumo.questions.tolerance import _unsafe_solutions, tell
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -123,13 +123,6 @@ def test_solutions_of_results_in_encounters_above_the_value_do_not_limit() -> No
     assert known.tolist() == [settings[0, : len(columns)].tolist()]
     whole = _unsafe_solutions(SimpleNamespace(**options, whole=evaluator), evaluator)  # type: ignore[arg-type]
     assert len(whole) == 3, "those of results about the whole study all count"
-
-
-def test_limits_up_to_a_value_lie_within_those_up_to_smaller_ones(ahead: Study) -> None:
-    joint = load_study("wear", encounters="ranges")
-    for study, value, steps in ((ahead, 55, (30, 50)), (ahead, 30, ()), (joint, 45, (20, 30, 40))):
-        cuts = [study_up_to(study, f"speed={step}") for step in steps]
-        assert smaller_cuts(study, f"speed={value}") == cuts
 
 
 @SLOW

@@ -192,8 +192,7 @@ def test_the_staircase_is_on_the_page_as_a_table_and_as_steps_with_names(slipper
     section = page.partition(">Smallest changes<")[2].partition("</section>")[0]
     first = r'The fewest changes at a share[^\n]*\n[^\n]*>1\.0</td>[^\n]*class="label"[^>]*>(\w+)'
     part = re.findall(first, section)[0]
-    picture = unquote(section.partition("data:image/svg+xml,")[2])
-    assert f">{part}</text>" in picture
+    assert f">{part}</text>" in unquote(section.partition("data:image/svg+xml,")[2])
 
 
 def test_a_question_without_an_answer_has_the_reason(case: Case, slippery: Path) -> None:

@@ -89,8 +89,7 @@ def test_a_body_is_there_from_its_first_to_its_last_row_alone(in_tmp: Path) -> N
     steady = rows_of("van", range(50), 200.0, 30.0)
     early = rows_of("early", [0.0, 1.0], 44.0, 0.0)
     late = rows_of("late", [4.0, 5.0], 44.0, 0.0)
-    inside = rows_of("inside", [30.0, 31.0], 0.0, 0.0)
-    result = held(early, late, inside, steady)
+    result = held(early, late, rows_of("inside", [30.0, 31.0], 0.0, 0.0), steady)
     assert result.outcome[0] == Outcome.PASSED
     assert result.encounter.separation[:21, 0].min() == pytest.approx(40.0 - SPEED, abs=1e-6)
     hidden = np.flatnonzero(~np.broadcast_to(result.trace.visible, result.trace.gap.shape)[:, 0])

@@ -761,8 +761,7 @@ def test_a_pack_states_the_number_that_followed_from_time(
         run("evidence", "results", "--out", "pack.zip", "--ask", "risk --samples 4000")
         first = sv.risk("results")
     assert re.search(r"risk results --simulations \d+$", first.command)
-    number = first.command.split()[-1]
-    again = sv.risk("results", simulations=int(number))
+    again = sv.risk("results", simulations=int(first.command.split()[-1]))
     assert again.to_dict() == first.to_dict()
     with ZipFile("pack.zip") as pack:
         assert b" --simulations " in pack.read("1-wall/answers.json")

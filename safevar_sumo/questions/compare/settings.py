@@ -128,12 +128,9 @@ class CommonDomain(NamedTuple):
         lower, upper = common.ends_in_a
         is_empty = lower > upper
         if is_empty.any():
-            problem = (
-                f"{a.names[int(np.argmax(is_empty))]}: the domains of the two studies do not"
-                " overlap"
-            )
             raise InputError(
-                second.source, problem, "studies with a common domain of each parameter"
+                second.source, f"{a.names[int(np.argmax(is_empty))]}: the domains of the two studies do not"
+                " overlap", "studies with a common domain of each parameter"
             )
         return common
 

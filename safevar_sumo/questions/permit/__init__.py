@@ -176,10 +176,7 @@ def _drive(
     if new_car.up_to is None:
         study = evaluator.study
         words = failure_columns([new_car.least.failure])[0]["because"]
-        problem = (
-            f"the new car is not safe at {search.values[0]:g}{unit_text(search.span.unit)}: {words}"
-        )
-        raise InputError(study.source, problem, "a study in which it is, or another --unsafe")
+        raise InputError(study.source, f"the new car is not safe at {search.values[0]:g}{unit_text(search.span.unit)}: {words}", "a study in which it is, or another --unsafe")
     if not with_repairs:
         return new_car, permits, [None] * len(permits)
     worn = fleet.measured & (fleet.settings != members.original)
@@ -228,8 +225,7 @@ def _check_forms(
     if out is None:
         return
     if is_quick:
-        legal = "--quick without --out, or --out without --quick"
-        raise InputError("quick", f"a rough answer is not written to {out}", legal)
+        raise InputError("quick", f"a rough answer is not written to {out}", "--quick without --out, or --out without --quick")
     path = Path(out)
     if isinstance(cars, str | Path) and path.exists() and path.samefile(cars):
         raise InputError("out", f"{out} is the list itself", "another file")
@@ -247,8 +243,7 @@ def _needed(text: str | None, span: Span) -> float | None:
         or not span.low <= float(match[1]) <= span.high
     ):
         example = f"{span.high:g} {span.unit}".strip()
-        legal = f'from {span.low:g} to {span.high:g} with the unit, such as "{example}"'
-        raise InputError("need", repr(text), legal)
+        raise InputError("need", repr(text), f'from {span.low:g} to {span.high:g} with the unit, such as "{example}"')
     return float(match[1])
 
 
@@ -265,8 +260,7 @@ def _check_driven(needed: float | None, search: PermitSearch) -> None:
 def _grid(span: Span, step: float) -> FloatArray:
     """The ends of the range, and all multiples of the step between them."""
     if (span.high - span.low) / step > MOST_VALUES:
-        legal = f"at most {MOST_VALUES:,} steps from {span.low:g} to {span.high:g}"
-        raise InputError("step", f"{step:g}", legal)
+        raise InputError("step", f"{step:g}", f"at most {MOST_VALUES:,} steps from {span.low:g} to {span.high:g}")
     first, last = np.floor(span.low / step), np.ceil(span.high / step)
     multiples = np.round(step * np.arange(first, last + 1), 9)
     inside = multiples[(multiples > span.low) & (multiples < span.high)]

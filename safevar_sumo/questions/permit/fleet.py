@@ -183,12 +183,10 @@ def _cells_of_file(path: Path) -> _Cells:
         content = read_file(path)
         text = content.decode("utf-8-sig")
     except OSError as error:
-        problem = f"cannot be read: {error.strerror or error}"
-        raise InputError(path, problem, "a list of cars (CSV)") from None
+        raise InputError(path, f"cannot be read: {error.strerror or error}", "a list of cars (CSV)") from None
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        expected = 'UTF-8; in Excel: save as "CSV UTF-8"'
-        raise InputError(f"{path}, line {line}", "is not encoded in UTF-8", expected) from None
+        raise InputError(f"{path}, line {line}", "is not encoded in UTF-8", 'UTF-8; in Excel: save as "CSV UTF-8"') from None
 
     # The separator, by Excel's first line or by the header.
     stated = SEPARATOR_LINE.match(text)
@@ -199,8 +197,7 @@ def _cells_of_file(path: Path) -> _Cells:
     separator = stated[1] if stated else next((one for one in SEPARATORS if one in head), "")
     place = f"{path}, line {first + 1}"
     if separator not in SEPARATORS or separator not in head:
-        expected = f"a header with a {', '.join(SEPARATORS.values())} between its columns"
-        raise InputError(place, repr(head.strip()), expected)
+        raise InputError(place, repr(head.strip()), f"a header with a {', '.join(SEPARATORS.values())} between its columns")
 
     # Records, each with its first line.
     reader = csv.reader(lines, delimiter=separator, strict=True)
@@ -217,8 +214,7 @@ def _cells_of_file(path: Path) -> _Cells:
     header = records[0][1]
     for line, record in records:
         if len(record) != len(header):
-            expected = f"{len(header)} fields with a {SEPARATORS[separator]} between them"
-            raise InputError(f"{path}, line {line}", number_of(len(record), "field"), expected)
+            raise InputError(f"{path}, line {line}", number_of(len(record), "field"), f"{len(header)} fields with a {SEPARATORS[separator]} between them")
     places = [f"{path}, line {line}" for line, _ in records[1:]]
     return _Cells(place, header, places, [record for _, record in records[1:]], separator)
 
@@ -285,11 +281,9 @@ def _columns(
             if names.count(name) > 1:
                 raise InputError("", f"the column {name!r} is there twice", "each column once")
             if column in read and name in varied:
-                problem = f"the column {name!r} is a parameter that the study itself varies"
-                raise InputError("", problem, "characteristics of the vehicle, or --ignore")
+                raise InputError("", f"the column {name!r} is a parameter that the study itself varies", "characteristics of the vehicle, or --ignore")
             if name in answer_columns and (column, name) != (naming, CAR):
-                problem = f"the column {name!r} has the name of a column of the answer"
-                raise InputError("", problem, "another name, or all columns that --out writes")
+                raise InputError("", f"the column {name!r} has the name of a column of the answer", "another name, or all columns that --out writes")
         return naming, {
             column: _characteristic(names[column], header[column], vehicle) for column in read[1:]
         }
@@ -314,8 +308,7 @@ def _names(cells: _Cells, naming: int) -> list[str]:
         name = row[naming].strip()
         with about(f"{place}, column {cells.header[naming].strip()!r}"):
             if not name or not name.isprintable() or name[0] in "=+-@":
-                legal = "a text of one line that does not begin with =, +, - or @, as formulas do"
-                raise InputError("", f"{name!r} is no name of a car", legal)
+                raise InputError("", f"{name!r} is no name of a car", "a text of one line that does not begin with =, +, - or @, as formulas do")
             # Names that differ in case, blanks or the form of their characters are one.
             key = " ".join(unicodedata.normalize("NFKC", name).casefold().split())
             if key in places:
@@ -368,8 +361,7 @@ def _number(text: str, mark: str, item: Characteristic) -> float:
             for end in {item.lower, item.upper} - {item.original}
         ):
             return value
-        problem = f"{value:{EXACT}}, measured to within {item.error:g}, may be outside the domain"
-        raise InputError("", problem, f"{domain}, also by that")
+        raise InputError("", f"{value:{EXACT}}, measured to within {item.error:g}, may be outside the domain", f"{domain}, also by that")
 
     # A part may be measured better than that of a new car, where that is an end of the domain.
     problem = f"{value:{EXACT}} is outside {item.lower:g} to {item.upper:g}{item.suffix}"
@@ -402,8 +394,7 @@ def _completed(
         problem = f"no value of {names}, neither measured nor under [unmeasured] of the study"
         if len(settings) > 1:
             problem += f" ({len(lacking)} of {len(settings)} cars lack one)"
-        expected = "a value for each car, or --others new: as in the original vehicle"
-        raise InputError(cells.places[lacking[0]], problem, expected)
+        raise InputError(cells.places[lacking[0]], problem, "a value for each car, or --others new: as in the original vehicle")
     return settings
 
 

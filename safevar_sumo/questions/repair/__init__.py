@@ -115,8 +115,7 @@ def repair(
     study = evaluator.study
     evaluator.system.require("a driving system", "repair")
     if out is not None and quick:
-        legal = "--quick without --out, or --out without --quick"
-        raise InputError("quick", f"a rough repair is not written to {out}", legal)
+        raise InputError("quick", f"a rough repair is not written to {out}", "--quick without --out, or --out without --quick")
     if out is not None:
         _check_file(Path(out), study)
     criterion = evaluator.checked(unsafe or Unsafe())

@@ -186,10 +186,9 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
     shipped = CHANGEABLE.get(study.ads.model, {})
     table = study.repair.parameters or shipped
     if not table:
-        problem = f"ads.model = {study.ads.model!r}: no parameter may change"
         raise InputError(
             source,
-            problem,
+            f"ads.model = {study.ads.model!r}: no parameter may change",
             "parameters under [repair], such as gain = { lower, upper, unit, meaning }",
         )
     for name in names:
@@ -213,14 +212,8 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
             or row.lower == row.upper
             or (row.log and row.lower <= 0)
         ):
-            problem = (
-                f"repair.{name}: lower = {row.lower:g}, upper = {row.upper:g},"
-                f" ads.parameters.{name} = {today!r}"
-            )
-            legal = (
-                f"{'0 < ' if row.log else ''}lower < upper, and bounds that hold the value of today"
-            )
-            raise InputError(source, problem, legal)
+            raise InputError(source, f"repair.{name}: lower = {row.lower:g}, upper = {row.upper:g},"
+                f" ads.parameters.{name} = {today!r}", f"{'0 < ' if row.log else ''}lower < upper, and bounds that hold the value of today")
         parameters.append(Parameter(name, row, number))
     return parameters
 

@@ -254,12 +254,8 @@ def _check_drawable(evaluator: Evaluator) -> None:
         return members.lower + rng.random((number, len(members))) * width
 
     if not len(region.draw_feasible(draw, 1)):
-        problem = (
-            f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no"
-            f" box to test: {region}"
-        )
-        legal = "characteristics that the constraints do not tie to each other"
-        raise InputError(evaluator.study.source, problem, legal)
+        raise InputError(evaluator.study.source, f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no"
+            f" box to test: {region}", "characteristics that the constraints do not tie to each other")
 
 
 def _in_ranges(asked: LimitsQuestion, evaluator: Evaluator, limits: FoundLimits) -> InRanges | None:

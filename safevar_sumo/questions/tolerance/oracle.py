@@ -124,8 +124,7 @@ class Oracle:
         """What each of M cases leaves; NaN where it could not be simulated."""
         # Simulations of the original vehicle may follow.
         if (1 + self._tries_originals) * len(cases) > self.available:
-            problem = "too few are left for the limits"
-            raise Exhausted("simulations", problem, "a larger number")
+            raise Exhausted("simulations", "too few are left for the limits", "a larger number")
         n = len(self.vehicle)
         robustness = np.full(len(cases), np.inf)
         numbers = np.floor(cases[:, n]).astype(int)
