@@ -78,7 +78,9 @@ class Counted:
     def evaluate(self, task: Task, rows: FloatArray) -> Evaluations:
         points = len(task.selection.of(system_of(task.study)).points)
         self.studies.setdefault(task.study.name, task.study)
-        self.simulations[task.study.name] += vehicles_each(task.study) * points * len(rows)
+        self.simulations[task.study.name] += (
+            vehicles_each(task.study) * points * len(rows)
+        )
         start = time.process_time()
         evaluations = evaluate_batch(task, rows)
         self.seconds += time.process_time() - start
@@ -140,14 +142,20 @@ def records_in(folder: str, command: str) -> Iterator[Record]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="What an answer costs beside its simulations.")
+    parser = argparse.ArgumentParser(
+        description="What an answer costs beside its simulations."
+    )
     parser.add_argument("commands", nargs="*", default=COMMANDS, metavar="COMMAND")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         print_records(
-            (record for command in arguments.commands for record in records_in(folder, command)),
+            (
+                record
+                for command in arguments.commands
+                for record in records_in(folder, command)
+            ),
             as_json=arguments.json,
         )
 

@@ -96,7 +96,9 @@ def drawn(study: Study, n: int, seed: int = 1) -> FloatArray:
     characteristics = CharacteristicSet.of(study)
     rng = np.random.default_rng(seed)
     return characteristics.filter(
-        rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics)))
+        rng.uniform(
+            characteristics.lower, characteristics.upper, (n, len(characteristics))
+        )
     )
 
 
@@ -104,7 +106,9 @@ def campaign(study: Study, opened: AbstractContextManager[Pool]) -> Cost:
     """Carry out a study in a pool that is at work already."""
     with tempfile.TemporaryDirectory() as folder, opened as pool:
         task = Task(study=study, batch_size=MAX_VEHICLES)
-        pool.map(evaluate_settings, [(task, drawn(study, MAX_VEHICLES))] * 4 * pool.workers)
+        pool.map(
+            evaluate_settings, [(task, drawn(study, MAX_VEHICLES))] * 4 * pool.workers
+        )
         before, system = processors(), assemble(study)
 
         def carry_out() -> None:
@@ -137,7 +141,9 @@ def ceiling(batches: list[Computed]) -> float:
                 future.result()
 
         together(2)
-        return 2 * clock_seconds(lambda: together(1)) / clock_seconds(lambda: together(2))
+        return (
+            2 * clock_seconds(lambda: together(1)) / clock_seconds(lambda: together(2))
+        )
 
 
 def floor(study: Study) -> float:
@@ -156,7 +162,9 @@ def two_dask_workers() -> Iterator[Pool]:
     from distributed import LocalCluster
 
     with (
-        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None
+        ) as cluster,
         open_pool(cluster=cluster.scheduler_address) as pool,
     ):
         yield pool
@@ -167,7 +175,10 @@ def turn(study: Study) -> dict[str, float]:
     alone = ThisProcess()
     whole = campaign(study, nullcontext(Pool(1, lambda place: alone)))
     alone.end()
-    simulated, bare_each = sum(len(settings) for _, settings in alone.batches), floor(study)
+    simulated, bare_each = (
+        sum(len(settings) for _, settings in alone.batches),
+        floor(study),
+    )
     one, two = (campaign(study, open_pool(jobs)) for jobs in (1, 2))
     cluster = campaign(study, two_dask_workers())
     most = ceiling(alone.batches)
@@ -194,18 +205,26 @@ def records_of(study: Study, turns: int) -> Iterator[Record]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="What a campaign costs beside its simulations.")
+    parser = argparse.ArgumentParser(
+        description="What a campaign costs beside its simulations."
+    )
     parser.add_argument("study", nargs="?", default="rain", metavar="STUDY")
     parser.add_argument("--runs", type=int, default=30)
     parser.add_argument("--evaluations", type=int, default=500, help="of each run")
     parser.add_argument(
-        "--turns", type=int, default=3, help="how often everything is measured; medians are told"
+        "--turns",
+        type=int,
+        default=3,
+        help="how often everything is measured; medians are told",
     )
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     study = read_study(arguments.study)
     search = msgspec.structs.replace(
-        study.search, algorithms=["nsga2"], runs=arguments.runs, evaluations=arguments.evaluations
+        study.search,
+        algorithms=["nsga2"],
+        runs=arguments.runs,
+        evaluations=arguments.evaluations,
     )
     print_records(
         records_of(msgspec.structs.replace(study, search=search), arguments.turns),

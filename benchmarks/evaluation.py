@@ -26,7 +26,13 @@ import libsumo
 import numpy as np
 import sumo
 import traci
-from measuring import Record, clock_seconds, medians_in_turn, print_records, processor_seconds
+from measuring import (
+    Record,
+    clock_seconds,
+    medians_in_turn,
+    print_records,
+    processor_seconds,
+)
 
 from safevar_sumo.ads import PerVehicleAds, ScalarAds
 from safevar_sumo.plugins import UserCode
@@ -84,7 +90,9 @@ def settings_of(system: System, n: int) -> FloatArray:
     characteristics = system.characteristics
     rng = np.random.default_rng(1)
     return characteristics.filter(
-        rng.uniform(characteristics.lower, characteristics.upper, (n, len(characteristics)))
+        rng.uniform(
+            characteristics.lower, characteristics.upper, (n, len(characteristics))
+        )
     )
 
 
@@ -97,7 +105,9 @@ def bare(network: str, n: int, steps: int) -> tuple[float, float]:
     def whole() -> None:
         nonlocal stepping
         with open_world(copied_network(network, n), n):
-            stepping = processor_seconds(lambda: [libsumo.simulationStep() for _ in range(steps)])
+            stepping = processor_seconds(
+                lambda: [libsumo.simulationStep() for _ in range(steps)]
+            )
 
     return processor_seconds(whole), stepping
 
@@ -124,10 +134,17 @@ def through_socket(system: System, settings: FloatArray, command: list[str]) -> 
     for setting in settings:
         traci.load(command[1:])
         world = SumoWorld(traci, 1)
-        drive(system, setting[None], world, observer_of(system.points[0].scenario, world, None))
+        drive(
+            system,
+            setting[None],
+            world,
+            observer_of(system.points[0].scenario, world, None),
+        )
 
 
-def records_of(study: str, populations: tuple[int, ...] = POPULATIONS) -> Iterator[Record]:
+def records_of(
+    study: str, populations: tuple[int, ...] = POPULATIONS
+) -> Iterator[Record]:
     """Measure a study's evaluations."""
     system = assemble(read_study(study))
     network = network_for(system.points[0].scenario)
@@ -163,12 +180,17 @@ def beside_others(study: str, system: System, settings: FloatArray) -> Iterator[
     scalar = replace(system, ads=PerVehicleAds(Coasting, UserCode("ads")))
     drive_and_score(system, settings)
     program = str(Path(sumo.SUMO_HOME) / "bin" / "sumo")
-    command = [program, *sumo_options(copied_network(network_for(system.points[0].scenario), 1))]
+    command = [
+        program,
+        *sumo_options(copied_network(network_for(system.points[0].scenario), 1)),
+    ]
     with socket_to(command):
         through_socket(system, few[:1], command)
         together, alone, coasting, socket = medians_in_turn(
             lambda: clock_seconds(lambda: drive_and_score(system, settings)),
-            lambda: clock_seconds(lambda: [drive_and_score(system, one[None]) for one in few]),
+            lambda: clock_seconds(
+                lambda: [drive_and_score(system, one[None]) for one in few]
+            ),
             lambda: clock_seconds(lambda: drive_and_score(scalar, settings)),
             lambda: clock_seconds(lambda: through_socket(system, few, command)),
             repetitions=5,
@@ -182,7 +204,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description="What an evaluation costs, beside what it could cost."
     )
-    parser.add_argument("studies", nargs="*", default=["rain", "lgsvl"], metavar="STUDY")
+    parser.add_argument(
+        "studies", nargs="*", default=["rain", "lgsvl"], metavar="STUDY"
+    )
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     print_records(

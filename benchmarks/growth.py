@@ -41,7 +41,10 @@ def records_of(study: Study, evaluations: int) -> Iterator[Record]:
         for done in range(0, evaluations, FIRST):
             before = sum(worker.cpu_times()[:2])
             for batch in range(FIRST // MAX_VEHICLES):
-                pool.map(evaluate_settings, [(task, drawn(study, MAX_VEHICLES, seed=done + batch))])
+                pool.map(
+                    evaluate_settings,
+                    [(task, drawn(study, MAX_VEHICLES, seed=done + batch))],
+                )
             spans.append(sum(worker.cpu_times()[:2]) - before)
             first = first or worker.memory_info().rss
         last = worker.memory_info().rss
@@ -59,5 +62,6 @@ if __name__ == "__main__":
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     print_records(
-        records_of(read_study(arguments.study), arguments.evaluations), as_json=arguments.json
+        records_of(read_study(arguments.study), arguments.evaluations),
+        as_json=arguments.json,
     )

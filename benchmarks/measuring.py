@@ -69,7 +69,9 @@ def print_records(records: Iterable[Record], *, as_json: bool) -> None:
         )
 
 
-def medians_in_turn(*measured: Callable[[], float], repetitions: int = REPETITIONS) -> list[float]:
+def medians_in_turn(
+    *measured: Callable[[], float], repetitions: int = REPETITIONS
+) -> list[float]:
     """Median seconds that every call tells, called in turns, so that what disturbs one disturbs the
     others too.
     """

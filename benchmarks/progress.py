@@ -41,7 +41,9 @@ def record(command: str) -> list[tuple[float, int, int]]:
 
         yield note if progress is True else progress or terminal.show_no_progress
 
-    terminal.open_progress = open_progress  # before the commands' modules take it from there
+    terminal.open_progress = (
+        open_progress  # before the commands' modules take it from there
+    )
     from safevar_sumo.cli.program import run_command_line
 
     start = time.monotonic()
@@ -63,7 +65,9 @@ def main(commands: list[str]) -> None:
         end = rows[-1][0]
         kept = {int((LINES - 1) * row[0] / end): row for row in rows}
         for seconds, done, total in kept.values():
-            writer.writerow((command.partition(" --")[0], f"{seconds:.1f}", done, total))
+            writer.writerow(
+                (command.partition(" --")[0], f"{seconds:.1f}", done, total)
+            )
 
 
 if __name__ == "__main__":

@@ -22,10 +22,18 @@ import moocore
 import numpy as np
 
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings, system_of
-from safevar_sumo.campaign.runs import RunKey, algorithm_of, problem_of, random_generator_of
+from safevar_sumo.campaign.runs import (
+    RunKey,
+    algorithm_of,
+    problem_of,
+    random_generator_of,
+)
 from safevar_sumo.questions.causes import directions, find_minimal_causes
 from safevar_sumo.questions.research_questions.fronts import hypervolume, normalised
-from safevar_sumo.questions.research_questions.statistics import compare_samples, effect_interval
+from safevar_sumo.questions.research_questions.statistics import (
+    compare_samples,
+    effect_interval,
+)
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import Study
@@ -62,7 +70,9 @@ def simulated_by(study: Study, key: RunKey, evaluator: InThisProcess) -> Evaluat
     system = system_of(study)
     original = evaluator.evaluate(system.characteristics.original_settings)
     problem = problem_of(study, system, original)
-    search = algorithm_of(key.algorithm, study).search(problem, random_generator_of(study, key))
+    search = algorithm_of(key.algorithm, study).search(
+        problem, random_generator_of(study, key)
+    )
     batches = [evaluator.evaluate(next(search))]
     try:
         while True:
@@ -71,12 +81,16 @@ def simulated_by(study: Study, key: RunKey, evaluator: InThisProcess) -> Evaluat
         return Evaluations.concatenate(batches)
 
 
-def hypervolumes_of(study: Study, runs: dict[RunKey, Evaluations]) -> dict[RunKey, list[float]]:
+def hypervolumes_of(
+    study: Study, runs: dict[RunKey, Evaluations]
+) -> dict[RunKey, list[float]]:
     """The hypervolume of each run after each number of simulations."""
     scoring = system_of(study).measuring.scoring
     points = {key: scoring.values(found) for key, found in runs.items()}
     valid = {key: scoring.valid(found) for key, found in runs.items()}
-    front = moocore.filter_dominated(np.concatenate([points[key][valid[key]] for key in runs]))
+    front = moocore.filter_dominated(
+        np.concatenate([points[key][valid[key]] for key in runs])
+    )
     return {
         key: [
             hypervolume(
@@ -103,11 +117,17 @@ def causes_of(study: Study, found: Evaluations, evaluator: Any) -> list[int]:
 
         # Causes of those that are new.
         new = np.array([row for row in settings if row.tobytes() not in known])
-        found_causes = find_minimal_causes(evaluator, new, criterion, ALL) if len(new) else []
+        found_causes = (
+            find_minimal_causes(evaluator, new, criterion, ALL) if len(new) else []
+        )
         for row, causes in zip(new, found_causes, strict=True):
-            kinds = {directions(evaluator.characteristics, cause.changes) for cause in causes}
+            kinds = {
+                directions(evaluator.characteristics, cause.changes) for cause in causes
+            }
             known[row.tobytes()] = kinds
-        numbers.append(len(set[Any]().union(*(known[row.tobytes()] for row in settings))))
+        numbers.append(
+            len(set[Any]().union(*(known[row.tobytes()] for row in settings)))
+        )
     return numbers
 
 
@@ -124,17 +144,27 @@ def print_rows(study: Study, title: str, values: dict[RunKey, list[Any]]) -> Non
             low, high = effect_interval(test.effect_size, test.n1, test.n2, alpha=0.05)
             cells.append(f"{test.effect_size:.2f} ({low:.2f} to {high:.2f})")
         number = len(samples["surrogate"])
-        print(f"| {study.name} | {title}, {number} runs | {count} |", " | ".join(cells), "|")
+        print(
+            f"| {study.name} | {title}, {number} runs | {count} |",
+            " | ".join(cells),
+            "|",
+        )
     sys.stdout.flush()
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="What searches find with few simulations.")
+    parser = argparse.ArgumentParser(
+        description="What searches find with few simulations."
+    )
     parser.add_argument("studies", nargs="*", default=STUDIES, metavar="STUDY")
     parser.add_argument("--runs", type=int, default=30)
     parser.add_argument("--causes", type=int, default=5)
     arguments = parser.parse_args()
-    print("| study | median of | simulations |", " | ".join(ALGORITHMS), "| A12: nsga2 | A12: rs |")
+    print(
+        "| study | median of | simulations |",
+        " | ".join(ALGORITHMS),
+        "| A12: nsga2 | A12: rs |",
+    )
     print("| --- " * 8 + "|")
     for name in arguments.studies:
         search = {"algorithms": list(ALGORITHMS), "evaluations": COUNTS[-1]}

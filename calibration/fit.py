@@ -30,7 +30,11 @@ from safevar_sumo.questions.model_spread import (
     with_values,
 )
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
-from safevar_sumo.reference.agreement import defined_pairs, measure_agreement, rank_correlation
+from safevar_sumo.reference.agreement import (
+    defined_pairs,
+    measure_agreement,
+    rank_correlation,
+)
 from safevar_sumo.reference.rows import ReferenceData, read_reference
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import SAFETY_DEGREE, Study
@@ -114,7 +118,12 @@ class Fit(NamedTuple):
         pairs = list(zip(self.plan.parameters, values, strict=True))
         return {
             name: with_values(
-                study, {p.key: value for p, value in pairs if not p.studies or name in p.studies}
+                study,
+                {
+                    p.key: value
+                    for p, value in pairs
+                    if not p.studies or name in p.studies
+                },
             )
             for name, study in self.studies.items()
         }
@@ -140,11 +149,16 @@ class Fit(NamedTuple):
 
     def _loss_of_study(self, name: str, study: Study) -> float:
         target, hold_out = self.plan.studies[name], self.plan.hold_out
-        files = [data.take(~held_back(data, hold_out)) for data in self.rows[name].values()]
+        files = [
+            data.take(~held_back(data, hold_out)) for data in self.rows[name].values()
+        ]
         original, *evaluated = simulate(study, files)
         if not all(evaluations.valid.all() for evaluations in (original, *evaluated)):
             return WORST_LOSS
-        losses = [loss_of_file(*pair, study, target) for pair in zip(files, evaluated, strict=True)]
+        losses = [
+            loss_of_file(*pair, study, target)
+            for pair in zip(files, evaluated, strict=True)
+        ]
         return loss_of_original(original, study, target, self.plan.tolerance) + float(
             np.mean(losses)
         )
@@ -154,7 +168,10 @@ def simulate(study: Study, files: Sequence[ReferenceData]) -> list[Evaluations]:
     """Evaluations of the original vehicle and of the rows of each file; equal settings are
     simulated once.
     """
-    blocks = [CharacteristicSet.of(study).original[np.newaxis], *(data.settings for data in files)]
+    blocks = [
+        CharacteristicSet.of(study).original[np.newaxis],
+        *(data.settings for data in files),
+    ]
     settings, places = np.unique(np.concatenate(blocks), axis=0, return_inverse=True)
     evaluations = drive_and_score(assemble(study), settings)
     ends = np.cumsum([len(block) for block in blocks])[:-1]
@@ -169,17 +186,23 @@ def loss_of_original(
     """
     names = list(study.published)
     deviations = (
-        np.array([original.metrics[name][0] / study.published[name] - 1 for name in names])
+        np.array(
+            [original.metrics[name][0] / study.published[name] - 1 for name in names]
+        )
         / tolerance
     )
     deviations = np.nan_to_num(
         np.clip(deviations, -WORST_DEVIATION, WORST_DEVIATION), nan=WORST_DEVIATION
     )
     weights = np.array([target.weights.get(name, 0.0) for name in names])
-    return target.original * float(np.mean(weights * 2 * np.maximum(np.abs(deviations) - 1, 0.0)))
+    return target.original * float(
+        np.mean(weights * 2 * np.maximum(np.abs(deviations) - 1, 0.0))
+    )
 
 
-def loss_of_file(data: ReferenceData, here: Evaluations, study: Study, target: Target) -> float:
+def loss_of_file(
+    data: ReferenceData, here: Evaluations, study: Study, target: Target
+) -> float:
     """The sum of rank correlations' distance from 1 and of mean errors, by metric, of differences
     between the characteristics' linear effects, and of the share of rows that collide on one side
     only, all weighted.
@@ -195,7 +218,8 @@ def loss_of_file(data: ReferenceData, here: Evaluations, study: Study, target: T
         unit = study.repeatability.get(name) or float(np.nanstd(data.metrics[name]))
         correlation = rank_correlation(there, values) or 0.0
         loss += weight * (
-            target.rank * (1 - correlation) + float(np.mean(np.abs(values - there))) / unit
+            target.rank * (1 - correlation)
+            + float(np.mean(np.abs(values - there))) / unit
         )
         if name == SAFETY_DEGREE and target.effects:
             effects = [
@@ -210,7 +234,9 @@ def loss_of_file(data: ReferenceData, here: Evaluations, study: Study, target: T
     return loss
 
 
-def linear_effects(study: Study, settings: FloatArray, values: FloatArray) -> FloatArray:
+def linear_effects(
+    study: Study, settings: FloatArray, values: FloatArray
+) -> FloatArray:
     """How much `values` change over the whole domain of each characteristic, by linear regression
     on all characteristics that vary; NaN where undefined.
     """
@@ -254,7 +280,9 @@ class Cube(NamedTuple):
     def places(self, values: FloatArray) -> FloatArray:
         """Places in the cube, shape (..., parameters), from values."""
         start = self.scale(self.lower)
-        return np.clip((self.scale(values) - start) / (self.scale(self.upper) - start), 0, 1)
+        return np.clip(
+            (self.scale(values) - start) / (self.scale(self.upper) - start), 0, 1
+        )
 
     def values(self, place: FloatArray) -> list[float]:
         """The parameters' values at a place, with `SIGNIFICANT_DIGITS`."""
@@ -266,24 +294,37 @@ class Cube(NamedTuple):
         return [float(f"{value:.{SIGNIFICANT_DIGITS}g}") for value in values]
 
 
-def search(fit: Fit, log: Path, trials: int, seed: int, jobs: int, *, from_scratch: bool) -> None:
+def search(
+    fit: Fit, log: Path, trials: int, seed: int, jobs: int, *, from_scratch: bool
+) -> None:
     """Add at most `trials` trials of one CMA-ES to the log, in whole generations.
 
     It begins at the studies' values, which are the first trial; from scratch at a random place.
     """
     import cma
 
-    cube, keys = Cube.of(fit.plan.parameters), [parameter.key for parameter in fit.plan.parameters]
+    cube, keys = (
+        Cube.of(fit.plan.parameters),
+        [parameter.key for parameter in fit.plan.parameters],
+    )
     own = fit.own_values()
     start = (
         np.random.default_rng(seed).random(len(keys))
         if from_scratch
         else cube.places(np.array(own))
     )
-    options = {"seed": seed, "bounds": [0, 1], "popsize": fit.plan.population, "verbose": -9}
+    options = {
+        "seed": seed,
+        "bounds": [0, 1],
+        "popsize": fit.plan.population,
+        "verbose": -9,
+    }
     strategy = cma.CMAEvolutionStrategy(start, FAR if from_scratch else NEAR, options)
     is_new = not log.exists()
-    with log.open("a", newline="", encoding="utf-8") as file, ProcessPoolExecutor(jobs) as pool:
+    with (
+        log.open("a", newline="", encoding="utf-8") as file,
+        ProcessPoolExecutor(jobs) as pool,
+    ):
         writer, lowest = csv.writer(file, lineterminator="\n"), np.inf
         writer.writerows([["loss", *keys]] if is_new else [])
         writer.writerows([] if from_scratch else [[repr(fit.loss(own)), *own]])
@@ -292,7 +333,9 @@ def search(fit: Fit, log: Path, trials: int, seed: int, jobs: int, *, from_scrat
             values = [cube.values(place) for place in places]
             losses = list(pool.map(fit.loss, values))
             strategy.tell(places, losses)
-            writer.writerows([repr(loss), *row] for loss, row in zip(losses, values, strict=True))
+            writer.writerows(
+                [repr(loss), *row] for loss, row in zip(losses, values, strict=True)
+            )
             file.flush()
             lowest = min(lowest, *losses)
             print(f"{done} of {trials} trials, lowest loss {lowest:.4f}", flush=True)
@@ -305,7 +348,9 @@ def distant_rows(places: FloatArray) -> list[int]:
     indices, distances = [0], np.linalg.norm(places - places[0], axis=1)
     while len(indices) < min(MAX_SETS, len(places)) and distances.max() > 0:
         indices.append(int(np.argmax(distances)))
-        distances = np.minimum(distances, np.linalg.norm(places - places[indices[-1]], axis=1))
+        distances = np.minimum(
+            distances, np.linalg.norm(places - places[indices[-1]], axis=1)
+        )
     return indices
 
 
@@ -323,7 +368,9 @@ def model_error(study: Study, files: Sequence[ReferenceData]) -> float:
         margins.append(
             float(
                 np.quantile(
-                    beyond / error_distance(study, data.settings), share, method="inverted_cdf"
+                    beyond / error_distance(study, data.settings),
+                    share,
+                    method="inverted_cdf",
                 )
             )
         )
@@ -340,7 +387,9 @@ def print_result(fit: Fit, log: Path) -> None:
     lowest = trials[0, 0]
     alike = trials[trials[:, 0] <= lowest * (1 + fit.plan.alike), 1:]
     sets = alike[distant_rows(Cube.of(parameters).places(alike))]
-    print(f"\n# loss {lowest:.4f}, lowest of {len(trials)} trials; {len(alike)} fit equally well")
+    print(
+        f"\n# loss {lowest:.4f}, lowest of {len(trials)} trials; {len(alike)} fit equally well"
+    )
     for name, study in fit.studies_at(alike[0].tolist()).items():
         files = fit.rows[name]
         own = [
@@ -358,16 +407,22 @@ def print_result(fit: Fit, log: Path) -> None:
                 ("used", ~held_back(data, hold_out)),
                 ("held back", held_back(data, hold_out)),
             ):
-                table = measure_agreement(data.take(rows), here.take(rows)).set_index("metric")
+                table = measure_agreement(data.take(rows), here.take(rows)).set_index(
+                    "metric"
+                )
                 agreement = table.loc[SAFETY_DEGREE].drop("unit")
                 print(
                     f"# {file}, {part}: "
-                    + ", ".join(f"{key} {value:.3f}" for key, value in agreement.items())
+                    + ", ".join(
+                        f"{key} {value:.3f}" for key, value in agreement.items()
+                    )
                 )
         error = model_error(
             study, [data.take(~held_back(data, hold_out)) for data in files.values()]
         )
-        print(f"[model_error]\n{SAFETY_DEGREE} = {round(error, ERROR_DECIMALS)}\n[spread]")
+        print(
+            f"[model_error]\n{SAFETY_DEGREE} = {round(error, ERROR_DECIMALS)}\n[spread]"
+        )
         for key, values in study.spread.items():
             print(f'"{key}" = {values}')
 
@@ -380,18 +435,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("plan", type=Path, help="free parameters, studies and weights")
     parser.add_argument("folder", type=Path, help="folder of the published files")
     parser.add_argument(
-        "--log", type=Path, required=True, metavar="FILE.csv", help="loss and values of every trial"
+        "--log",
+        type=Path,
+        required=True,
+        metavar="FILE.csv",
+        help="loss and values of every trial",
     )
     parser.add_argument("--trials", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1, help="seed of the search")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="worker processes")
-    parser.add_argument("--from-scratch", action="store_true", help="begin at a random place")
+    parser.add_argument(
+        "--jobs", type=int, default=os.cpu_count(), help="worker processes"
+    )
+    parser.add_argument(
+        "--from-scratch", action="store_true", help="begin at a random place"
+    )
     given = parser.parse_args(arguments)
     plan = msgspec.toml.decode(given.plan.read_bytes(), type=Plan)
     studies = {name: read_study(name) for name in plan.studies}
     rows = {
         name: {
-            file: read_reference(given.folder / file, CharacteristicSet.of(studies[name]))
+            file: read_reference(
+                given.folder / file, CharacteristicSet.of(studies[name])
+            )
             for file in target.files
         }
         for name, target in plan.studies.items()
@@ -399,7 +464,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     fit = Fit(plan, studies, rows)
     if given.trials:
         search(
-            fit, given.log, given.trials, given.seed, given.jobs, from_scratch=given.from_scratch
+            fit,
+            given.log,
+            given.trials,
+            given.seed,
+            given.jobs,
+            from_scratch=given.from_scratch,
         )
     print_result(fit, given.log)
 

@@ -121,20 +121,29 @@ def published_stop(row: Row) -> float:
 
 def model_friction(row: Row, values: Values) -> float:
     """The friction coefficient of a row of the handbook."""
-    tread, water = float(row["tread_mm"] or NEW_TREAD), values["film"] * float(row["water_mm"])
+    tread, water = (
+        float(row["tread_mm"] or NEW_TREAD),
+        values["film"] * float(row["water_mm"]),
+    )
     lift = lift_of(water, np.array(tread), values["lift"], values["texture"])
     return float(
         lifted_friction(
-            values["grip handbook"], lift, np.array(float(row["speed_kmh"]) / KMH_PER_MS)
+            values["grip handbook"],
+            lift,
+            np.array(float(row["speed_kmh"]) / KMH_PER_MS),
         )
     )
 
 
 def residuals(values: Values) -> tuple[Floats, Floats]:
     """Of stops and of the handbook's rows, in their units."""
-    stops = [np.log(model_stop(row, values) / published_stop(row)) / STOP_UNIT for row in STOPS]
+    stops = [
+        np.log(model_stop(row, values) / published_stop(row)) / STOP_UNIT
+        for row in STOPS
+    ]
     handbook = [
-        (model_friction(row, values) - float(row["friction"])) / FRICTION_UNIT for row in HANDBOOK
+        (model_friction(row, values) - float(row["friction"])) / FRICTION_UNIT
+        for row in HANDBOOK
     ]
     return np.array(stops), np.array(handbook) * np.sqrt(HANDBOOK_WEIGHT)
 
@@ -156,8 +165,12 @@ def fit(
     lower, upper = np.array([BOUNDS[name.split()[0]] for name in names]).T
 
     def weighted(place: Floats) -> Floats:
-        stops, handbook = residuals({**fixed, **dict(zip(names, place.tolist(), strict=True))})
-        return np.concatenate([stops * np.sqrt(stop_counts), handbook * np.sqrt(handbook_counts)])
+        stops, handbook = residuals(
+            {**fixed, **dict(zip(names, place.tolist(), strict=True))}
+        )
+        return np.concatenate(
+            [stops * np.sqrt(stop_counts), handbook * np.sqrt(handbook_counts)]
+        )
 
     begin = np.clip([start[name] for name in names], lower * 1.001, upper * 0.999)
     found = least_squares(weighted, begin, bounds=(lower, upper), x_scale=upper - lower)
@@ -167,7 +180,10 @@ def fit(
 def best_fit() -> dict[str, float]:
     """The best of fits from several places."""
     rng = np.random.default_rng(1)
-    places = [{name: rng.uniform(*BOUNDS[name.split()[0]]) for name in NAMES} for _ in range(8)]
+    places = [
+        {name: rng.uniform(*BOUNDS[name.split()[0]]) for name in NAMES}
+        for _ in range(8)
+    ]
     return min((fit(place) for place in places), key=loss_of)
 
 
@@ -183,7 +199,8 @@ def alike_fits(best: Values) -> list[dict[str, float]]:
         loss_of(best),
     )
     groups = [
-        np.flatnonzero([source == each for each in sources]) for source in dict.fromkeys(sources)
+        np.flatnonzero([source == each for each in sources])
+        for source in dict.fromkeys(sources)
     ]
     alike = [dict(best)]
     for _ in range(DRAWS):
@@ -202,8 +219,12 @@ def alike_fits(best: Values) -> list[dict[str, float]]:
     chosen, distances = [0], np.linalg.norm(places - places[0], axis=1)
     while len(chosen) < SETS:
         chosen.append(int(np.argmax(distances)))
-        distances = np.minimum(distances, np.linalg.norm(places - places[chosen[-1]], axis=1))
-    print(f"# {len(alike)} of {DRAWS + 1} fits agree about as well; lowest loss {lowest:.2f}")
+        distances = np.minimum(
+            distances, np.linalg.norm(places - places[chosen[-1]], axis=1)
+        )
+    print(
+        f"# {len(alike)} of {DRAWS + 1} fits agree about as well; lowest loss {lowest:.2f}"
+    )
     return [alike[number] for number in chosen]
 
 
@@ -213,11 +234,15 @@ def digits(value: float) -> float:
 
 def mean_grip(values: Values) -> float:
     """The geometric mean of the grips of the published stops."""
-    return float(np.exp(np.mean([np.log(values[f"grip {name}"]) for name in GRIPS.values()])))
+    return float(
+        np.exp(np.mean([np.log(values[f"grip {name}"]) for name in GRIPS.values()]))
+    )
 
 
 def print_residuals(values: Values) -> None:
-    errors = np.array([model_stop(row, values) / published_stop(row) - 1 for row in STOPS])
+    errors = np.array(
+        [model_stop(row, values) / published_stop(row) - 1 for row in STOPS]
+    )
     for row, error in zip(STOPS, errors, strict=True):
         unit = "m" if row["distance_m"] else "times new"
         print(
@@ -271,7 +296,9 @@ def main() -> None:
     fits = alike_fits(best)
     print("\n[worn]")
     print(f"tyre_friction = {digits(mean_grip(best))}")
-    print(f"water_lift = {digits(best['lift'])}\nroad_texture = {digits(best['texture'])}")
+    print(
+        f"water_lift = {digits(best['lift'])}\nroad_texture = {digits(best['texture'])}"
+    )
     for table in ("grip", "water"):
         print(f"\n[{table}]")
         for name in NAMES:

@@ -43,11 +43,17 @@ def _evaluate(columns: Mapping[str, FloatArray]) -> Evaluations:
 def draw_sawtooth(path: str) -> None:
     frictions = np.linspace(1.0, 3.5, VALUES)
     degrees = _evaluate({SWEPT: frictions}).f_safe
-    figure, ((axis,),) = new_figure("rain: less grip is not always less safe", 1, 1, SIZE)
+    figure, ((axis,),) = new_figure(
+        "rain: less grip is not always less safe", 1, 1, SIZE
+    )
     axis.plot(frictions, degrees, color=BLUE, linewidth=1.2)
     axis.plot(3.5, degrees[-1], "o", color="black", markersize=5)
     axis.annotate(
-        "original car", (3.5, degrees[-1]), (-8, 10), textcoords="offset points", ha="right"
+        "original car",
+        (3.5, degrees[-1]),
+        (-8, 10),
+        textcoords="offset points",
+        ha="right",
     )
     degree = "safety degree [m]\n(below 0: minus the collision's speed [m/s])"
     axis.set(xlabel="tyre friction tireFric [-]", ylabel=degree)
@@ -63,11 +69,18 @@ def draw_boundary(path: str) -> None:
     title = f"rain, maxBrakeTorque {WEAK_BRAKES:g} N m: collisions and clearance"
     figure, ((axis,),) = new_figure(title, 1, 1, SIZE)
     shown = axis.contourf(
-        frictions, drags, degrees, levels=np.arange(0.0, 2.6, 0.25), cmap="Blues", extend="max"
+        frictions,
+        drags,
+        degrees,
+        levels=np.arange(0.0, 2.6, 0.25),
+        cmap="Blues",
+        extend="max",
     )
     axis.contourf(frictions, drags, degrees < 0, levels=[0.5, 1.5], colors=[VERMILION])
     axis.annotate("collision", (1.03, 1.03), color="black", fontweight="bold")
-    axis.set(xlabel="tyre friction tireFric [-]", ylabel=f"engine drag {OVER} [kg m^2/s]")
+    axis.set(
+        xlabel="tyre friction tireFric [-]", ylabel=f"engine drag {OVER} [kg m^2/s]"
+    )
     figure.colorbar(shown, ax=axis, label="safety degree [m]")
     figure.savefig(path, dpi=130)
 

@@ -52,14 +52,21 @@ def main(path: str) -> None:
     treads = np.linspace(members.lower[tread], members.upper[tread], TREADS)
     worn = members.setting({**WORN, "impact_location": IMPACT_LOCATION})
     settings = np.tile(worn, (SPEEDS * TREADS, 1))
-    settings[:, speed], settings[:, tread] = np.tile(speeds, TREADS), np.repeat(treads, SPEEDS)
+    settings[:, speed], settings[:, tread] = (
+        np.tile(speeds, TREADS),
+        np.repeat(treads, SPEEDS),
+    )
     evaluations = drive_and_score(system, settings)
     collided = evaluations.collided.reshape(TREADS, SPEEDS)
-    unsafe_original = system.measuring.scoring.violation(evaluations).reshape(TREADS, SPEEDS)[0] > 0
+    unsafe_original = (
+        system.measuring.scoring.violation(evaluations).reshape(TREADS, SPEEDS)[0] > 0
+    )
     figure, ((axis,),) = new_figure(
         "wear --ranges: collisions over speed and tread", 1, 1, (6.4, 3.4)
     )
-    axis.contourf(speeds, treads, collided, levels=[0.5, 1.5], colors=[VERMILION], alpha=0.45)
+    axis.contourf(
+        speeds, treads, collided, levels=[0.5, 1.5], colors=[VERMILION], alpha=0.45
+    )
     border = speeds[np.argmax(unsafe_original)] if unsafe_original.any() else FASTEST
     axis.axvspan(border, FASTEST + 1, color="0.75")
     axis.set_xlim(speeds[0], FASTEST + 1)
@@ -68,7 +75,9 @@ def main(path: str) -> None:
     axis.set_xlabel("speed in all tests [km/h]")
     axis.set_ylabel("tread depth [mm]")
     wear = ", ".join(
-        f"{item.name} {WORN[item.name]:g}{item.suffix}" for item in members if item.name in WORN
+        f"{item.name} {WORN[item.name]:g}{item.suffix}"
+        for item in members
+        if item.name in WORN
     )
     axis.set_title(f"{wear},\nimpact location {IMPACT_LOCATION:g} %", fontsize=8)
     colours = "orange: collision; grey: the original is not safe; blue, dotted: speeds of the tests"
@@ -87,7 +96,9 @@ def count_between(fastest: float) -> None:
         np.random.default_rng(5),
     )
     drawn = rng.uniform(members.lower, members.upper, (VEHICLES, len(members)))
-    vehicles = members.original + (drawn - members.original) * rng.uniform(0.2, 0.8, (VEHICLES, 1))
+    vehicles = members.original + (drawn - members.original) * rng.uniform(
+        0.2, 0.8, (VEHICLES, 1)
+    )
     safe = vehicles[~drive_and_score(grid, vehicles).collided]
     encounters = sobol_settings(joint.characteristics, ENCOUNTERS)
     settings = np.tile(encounters, (len(safe), 1))
@@ -115,7 +126,10 @@ def compare_lines(fastest: float) -> None:
         rng.uniform(members.lower, members.upper, (LINES, len(members))),
         np.arange(1, PARTS + 1) / PARTS,
     )
-    vehicles = members.original + (ends - members.original)[:, np.newaxis] * shares[:, np.newaxis]
+    vehicles = (
+        members.original
+        + (ends - members.original)[:, np.newaxis] * shares[:, np.newaxis]
+    )
     vehicles = vehicles.reshape(-1, len(members))
     encounters = sobol_settings(joint.characteristics, ENCOUNTERS_ON_LINES)
     settings = np.tile(encounters, (len(vehicles), 1))
@@ -128,7 +142,9 @@ def compare_lines(fastest: float) -> None:
         fails.reshape(len(vehicles), -1).any(axis=1),
     ):
         rows = collided.reshape(LINES, PARTS)
-        firsts.append(np.where(rows.any(axis=1), shares[np.argmax(rows, axis=1)], np.inf))
+        firsts.append(
+            np.where(rows.any(axis=1), shares[np.argmax(rows, axis=1)], np.inf)
+        )
     on_grid, between = firsts
     print(
         f"of {LINES} lines earlier in the ranges: {(between < on_grid).sum()}, later:"

@@ -44,19 +44,28 @@ MARKED = re.compile(
 
 def filled(page: str) -> str:
     """A page with its lists as the code has them now."""
-    return MARKED.sub(lambda match: f"{match[1]}\n{LISTS[match[2]]().strip()}\n\n", page)
+    return MARKED.sub(
+        lambda match: f"{match[1]}\n{LISTS[match[2]]().strip()}\n\n", page
+    )
 
 
 def on_page_content(html: str, **_: Any) -> str:
     """Called by MkDocs for every page: formulas, which arithmatex marks, become MathML, which
     browsers draw themselves.
     """
-    from latex2mathml.converter import convert  # the rest of this module works without it
+    from latex2mathml.converter import (
+        convert,  # the rest of this module works without it
+    )
 
-    for mark, display in ((r"\\\((.*?)\\\)</span>", "inline"), (r"\\\[(.*?)\\\]</div>", "block")):
+    for mark, display in (
+        (r"\\\((.*?)\\\)</span>", "inline"),
+        (r"\\\[(.*?)\\\]</div>", "block"),
+    ):
         html = re.sub(
             rf'<(?:span|div) class="arithmatex">{mark}',
-            lambda match, display=display: convert(unescape(match[1].strip()), display=display),
+            lambda match, display=display: convert(
+                unescape(match[1].strip()), display=display
+            ),
             html,
             flags=re.DOTALL,
         )
@@ -66,7 +75,9 @@ def on_page_content(html: str, **_: Any) -> str:
 def _table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     heads = list(heads)
     return (
-        "\n".join(f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows))
+        "\n".join(
+            f"| {' | '.join(cells)} |" for cells in (heads, ["---"] * len(heads), *rows)
+        )
         + "\n"
     )
 
@@ -86,7 +97,12 @@ def _default(value: Any) -> str:
 def _range(kind: Any) -> str:
     bounds = [
         f"{sign} {value:g}"
-        for name, sign in (("gt", ">"), ("ge", "at least"), ("lt", "<"), ("le", "at most"))
+        for name, sign in (
+            ("gt", ">"),
+            ("ge", "at least"),
+            ("lt", "<"),
+            ("le", "at most"),
+        )
         if (value := getattr(kind, name, None)) is not None
     ]
     return f", {', '.join(bounds)}" if bounds else ""
@@ -100,7 +116,9 @@ def _words(kind: Any) -> str:
     if name == "StructType":
         return f"[{kind.cls.__name__}](#{kind.cls.__name__.lower()})"
     if name == "UnionType":
-        return " or ".join(_words(one) for one in kind.types if type(one).__name__ != "NoneType")
+        return " or ".join(
+            _words(one) for one in kind.types if type(one).__name__ != "NoneType"
+        )
     if name == "LiteralType":
         return " or ".join(f'`"{value}"`' for value in kind.values)
     if name in ("ListType", "VarTupleType"):
@@ -128,7 +146,9 @@ def study_keys() -> str:
     """Every table of a study file with its keys."""
     parts = []
     for kind in {
-        one.cls: one for one in _structs(type_info(Study)) if one.cls.__name__ != "Origin"
+        one.cls: one
+        for one in _structs(type_info(Study))
+        if one.cls.__name__ != "Origin"
     }.values():
         rows = [
             (
@@ -144,7 +164,9 @@ def study_keys() -> str:
             if field.name != "origin"
         ]
         table = _table(("key", "value", "default"), rows)
-        parts.append(f"### {kind.cls.__name__}\n\n{inspect.getdoc(kind.cls)}\n\n{table}")
+        parts.append(
+            f"### {kind.cls.__name__}\n\n{inspect.getdoc(kind.cls)}\n\n{table}"
+        )
     return "\n".join(parts)
 
 
@@ -178,7 +200,9 @@ def models(classes: dict[str, Any]) -> Callable[[], str]:
                 if rows
                 else "No parameters.\n"
             )
-            parts.append(f"### {name}\n\n{doc.partition('Parameters')[0].strip()}\n\n{table}")
+            parts.append(
+                f"### {name}\n\n{doc.partition('Parameters')[0].strip()}\n\n{table}"
+            )
         return "\n".join(parts)
 
     return text
@@ -225,8 +249,16 @@ def readme() -> str:
 
 def command_list() -> str:
     """Every command with its own options, below the options of many commands."""
-    common = {f"--{name.replace('_', '-')}" for names in COMMON_NAMES.values() for name in names}
-    shared = {flag: text for flag, text in _options("risk").items() if flag.split()[0] in common}
+    common = {
+        f"--{name.replace('_', '-')}"
+        for names in COMMON_NAMES.values()
+        for name in names
+    }
+    shared = {
+        flag: text
+        for flag, text in _options("risk").items()
+        if flag.split()[0] in common
+    }
     parts = ["## Options of many commands", _option_table(shared)]
     for title, group in COMMANDS_BY_GROUP.items():
         parts.append(f"## {title}")
@@ -236,7 +268,9 @@ def command_list() -> str:
             places = [one for one in command.params if isinstance(one, click.Argument)]
             usage = " ".join([name, *(place.make_metavar(context) for place in places)])
             own = {
-                flag: text for flag, text in _options(name).items() if text not in shared.values()
+                flag: text
+                for flag, text in _options(name).items()
+                if text not in shared.values()
             }
             parts += [f"### {name}", f"`{usage}`", inspect.cleandoc(str(command.help))]
             parts += [_option_table(own)] if own else []
@@ -260,7 +294,8 @@ def _options(name: str) -> dict[str, str]:
 def _option_table(options: dict[str, str]) -> str:
     rows = [(f"`{flag}`", text) for flag, text in options.items()]
     return _table(
-        ("option", "meaning"), [[cell.replace("|", "\\|") for cell in row] for row in rows]
+        ("option", "meaning"),
+        [[cell.replace("|", "\\|") for cell in row] for row in rows],
     )
 
 
@@ -277,7 +312,13 @@ def characteristics() -> str:
             )
     return _table(
         (
-            *("vehicle", "characteristic", "unit", "name (what it is)", "real-world counterpart"),
+            *(
+                "vehicle",
+                "characteristic",
+                "unit",
+                "name (what it is)",
+                "real-world counterpart",
+            ),
             "how a workshop measures it",
         ),
         seen.values(),
@@ -287,7 +328,10 @@ def characteristics() -> str:
 def published_systems() -> str:
     """The source of the driving systems that are put in front of published libraries."""
     folder = Path(ads.__file__).parent
-    parts = [(name, (folder / name).read_text()) for name in ("highway_idm.py", "intel_rss.py")]
+    parts = [
+        (name, (folder / name).read_text())
+        for name in ("highway_idm.py", "intel_rss.py")
+    ]
     return "\n".join(
         f"`safevar_sumo/ads/{name}`:\n\n```python\n{text}```\n" for name, text in parts
     )

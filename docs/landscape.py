@@ -32,13 +32,17 @@ Evaluate = Callable[[FloatArray], Evaluations]
 
 
 def predict(
-    forest: RandomForestRegressor, characteristics: CharacteristicSet, settings: FloatArray
+    forest: RandomForestRegressor,
+    characteristics: CharacteristicSet,
+    settings: FloatArray,
 ) -> Evaluations:
     """Evaluations with the forest's safety degrees of settings, shape (M, n); other metrics are
     undefined.
     """
     undefined = np.full(len(settings), np.nan)
-    metrics = dict.fromkeys(METRICS, undefined) | {SAFETY_DEGREE: forest.predict(settings)}
+    metrics = dict.fromkeys(METRICS, undefined) | {
+        SAFETY_DEGREE: forest.predict(settings)
+    }
     return evaluations_of(ReferenceData(settings, metrics), characteristics)
 
 
@@ -53,7 +57,9 @@ def search(
         evaluations=evaluations,
         population=POPULATION,
     )
-    searches = [Nsga2().search(problem, np.random.default_rng(run)) for run in range(runs)]
+    searches = [
+        Nsga2().search(problem, np.random.default_rng(run)) for run in range(runs)
+    ]
     requests, solutions = [next(run) for run in searches], list[Evaluations]()
     while not solutions:
         evaluated = evaluate(np.concatenate(requests))
@@ -73,7 +79,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("study")
-    parser.add_argument("files", nargs="+", type=Path, help="published rows, NSGA-II's first")
+    parser.add_argument(
+        "files", nargs="+", type=Path, help="published rows, NSGA-II's first"
+    )
     parser.add_argument("--runs", type=int, default=6)
     parser.add_argument("--evaluations", type=int, default=5000)
     arguments = parser.parse_args()
@@ -96,7 +104,9 @@ def main() -> None:
     with open_evaluator(study, None, None, lambda *progress: None) as evaluator:
         solutions = {
             "published": files[0],
-            "on a forest of the published rows": run(partial(predict, forest, characteristics)),
+            "on a forest of the published rows": run(
+                partial(predict, forest, characteristics)
+            ),
             "on this package's model": run(
                 lambda settings: evaluator.evaluate(settings, "settings")
             ),

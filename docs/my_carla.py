@@ -53,7 +53,12 @@ class StandingCar:
         # The vehicle with its characteristics, and a car that stands ahead in its lane.
         blueprint = world.get_blueprint_library().find("vehicle.lincoln.mkz_2020")
         place = world.get_map().get_spawn_points()[self.start]
-        ahead = world.get_map().get_waypoint(place.location).next(self.distance)[0].transform
+        ahead = (
+            world.get_map()
+            .get_waypoint(place.location)
+            .next(self.distance)[0]
+            .transform
+        )
         ahead.location.z = place.location.z
         ego = world.spawn_actor(blueprint, place)
         standing = world.spawn_actor(blueprint, ahead)
@@ -63,11 +68,15 @@ class StandingCar:
         standing.apply_control(carla.VehicleControl(hand_brake=True))
         touched: list[carla.SensorData] = []
         sensor = world.spawn_actor(
-            world.get_blueprint_library().find("sensor.other.collision"), carla.Transform(), ego
+            world.get_blueprint_library().find("sensor.other.collision"),
+            carla.Transform(),
+            ego,
         )
         assert isinstance(sensor, carla.Sensor)
         sensor.listen(touched.append)
-        ego.set_autopilot(True, manager.get_port())  # your driving system in place of this line
+        ego.set_autopilot(
+            True, manager.get_port()
+        )  # your driving system in place of this line
 
         # One row for each step, until the vehicle hits something.
         lengths = ego.bounding_box.extent.x + standing.bounding_box.extent.x
@@ -79,10 +88,15 @@ class StandingCar:
             world.tick()
             if touched:
                 break
-        trace = dict(zip(("time", "speed", "separation", "brake"), np.array(rows).T, strict=True))
+        trace = dict(
+            zip(("time", "speed", "separation", "brake"), np.array(rows).T, strict=True)
+        )
         if touched:
             return {**trace, "outcome": "collision", "impact_speed": trace["speed"][-1]}
-        return {**trace, "outcome": "stopped" if trace["speed"][-1] < 0.1 else "timeout"}
+        return {
+            **trace,
+            "outcome": "stopped" if trace["speed"][-1] < 0.1 else "timeout",
+        }
 
 
 def worn(physics: carla.VehiclePhysicsControl, setting: Mapping[str, float]) -> Any:

@@ -12,7 +12,13 @@ from metadrive.envs import MetaDriveEnv
 from metadrive.examples.ppo_expert import numpy_expert
 from shapely.geometry import Polygon
 
-CURVE = {"id": "C", "pre_block_socket_index": 0, "dir": 1, "radius": 40.0, "angle": 120.0}
+CURVE = {
+    "id": "C",
+    "pre_block_socket_index": 0,
+    "dir": 1,
+    "radius": 40.0,
+    "angle": 120.0,
+}
 START = {"spawn_lane_index": (">>", ">>>", 0), "spawn_longitude": 35.0}
 CONFIG = {
     "log_level": 50,
@@ -46,7 +52,9 @@ class LearnedDriver:
         ego.set_velocity(ego.heading, 8.0)
         place = {"spawn_lane_index": (">>>", "1C0_0_", 0), "spawn_longitude": 20.0}
         traffic = self.worker.engine.traffic_manager
-        standing = Polygon(traffic.spawn_object(type(ego), vehicle_config=place).bounding_box)
+        standing = Polygon(
+            traffic.spawn_object(type(ego), vehicle_config=place).bounding_box
+        )
 
         rows, is_hit = [], False
         while not is_hit and len(rows) < 80:
@@ -55,7 +63,12 @@ class LearnedDriver:
             action = numpy_expert.expert(ego, deterministic=True)
             is_hit = self.worker.step(action)[-1]["crash"]
         time, speed, gap = np.array(rows).T
-        trace = {"time": time, "speed": speed, "separation": gap, "impact_speed": speed[-1]}
+        trace = {
+            "time": time,
+            "speed": speed,
+            "separation": gap,
+            "impact_speed": speed[-1],
+        }
         ending = "collision" if is_hit else "stopped" if speed[-1] < 0.3 else "timeout"
         return {**trace, "outcome": ending}
 

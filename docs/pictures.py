@@ -16,10 +16,13 @@ from pathlib import Path
 DOCS = Path(__file__).parent
 PROGRAM = f"{shlex.quote(sys.executable)} -m safevar_sumo"
 FAILURE = (
-    f"{PROGRAM} simulate rain --set dampRateZeroT_CE=1 --set tireFric=1 --set maxBrakeTorque=1200"
+    f"{PROGRAM} simulate rain --set dampRateZeroT_CE=1 --set tireFric=1 --set"
+    " maxBrakeTorque=1200"
 )
 PUBLISHED = Path(os.environ.get("SAFEVAR_PUBLISHED", "published")).resolve()
-SCREEN = "--headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=1160,1772"
+SCREEN = (
+    "--headless --no-sandbox --disable-gpu --hide-scrollbars --window-size=1160,1772"
+)
 COMMANDS = {
     "failure.png": f"{FAILURE} --plot {{}}",
     "failure.gif": f"{FAILURE} --animate {{}}",
@@ -49,7 +52,9 @@ def draw(name: str, folder: Path) -> Path:
     picture = folder.resolve() / name
     with tempfile.TemporaryDirectory() as place:
         command = COMMANDS[name].format(shlex.quote(str(picture)))
-        subprocess.run(command, shell=True, check=True, cwd=place, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            command, shell=True, check=True, cwd=place, stdout=subprocess.DEVNULL
+        )
     return picture
 
 

@@ -35,7 +35,12 @@ TREADS = np.linspace(1.6, 8.0, 33)
 def stops(speed: float, water: float, grip: float) -> FloatArray:
     """Stopping distances at all tread depths [m] on a road with this water [mm] and grip [-]."""
     friction = grip / WET_FRICTION["worn"]["tyre_friction"]
-    weather = {"name": "road", "road_friction": friction, "visibility": 1.0, "water": water}
+    weather = {
+        "name": "road",
+        "road_friction": friction,
+        "visibility": 1.0,
+        "water": water,
+    }
     tables = {"extends": "stop", "name": "picture", "weather": weather}
     matrix = {"tests": [{"name": "stop", "over": {"speed": [speed]}}]}
     study = read_study(
@@ -51,17 +56,25 @@ def main(path: str) -> None:
     with ROWS.open(encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["distance_m"]]
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    for colour, (label, (source, grip, speed)) in zip(COLOURS, TESTS.items(), strict=True):
+    for colour, (label, (source, grip, speed)) in zip(
+        COLOURS, TESTS.items(), strict=True
+    ):
         published = [
-            row for row in rows if row["source"].startswith(source) and row["speed_kmh"] == speed
+            row
+            for row in rows
+            if row["source"].startswith(source) and row["speed_kmh"] == speed
         ]
         water = float(published[0]["water_mm"] or WET_FRICTION["water"]["AutoBild"])
         distances = stops(float(speed), water, WET_FRICTION["grip"][grip])
         axes.plot(TREADS, distances, color=colour, label=label)
-        points = [(float(row["tread_mm"]), float(row["distance_m"])) for row in published]
+        points = [
+            (float(row["tread_mm"]), float(row["distance_m"])) for row in published
+        ]
         axes.plot(*np.transpose(points), "o", color=colour)
     axes.set(
-        xlabel="tread depth [mm]", ylabel="stopping distance on a wet road [m]", ylim=(0, None)
+        xlabel="tread depth [mm]",
+        ylabel="stopping distance on a wet road [m]",
+        ylim=(0, None),
     )
     axes.set_title("Stops on a wet road with worn tyres", loc="left")
     axes.legend(title="lines: here; dots: published", frameon=False)

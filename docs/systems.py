@@ -63,8 +63,12 @@ def main() -> None:
     """Print both tables, row by row."""
     begin, studies = time.perf_counter(), dict[str, sv.Study]()
     for name in ADS:
-        parameters = sv.load_study(STUDIES[name]).ads.parameters if name in STUDIES else {}
-        studies[name] = sv.load_study("wear", ads={"model": name, "parameters": parameters})
+        parameters = (
+            sv.load_study(STUDIES[name]).ads.parameters if name in STUDIES else {}
+        )
+        studies[name] = sv.load_study(
+            "wear", ads={"model": name, "parameters": parameters}
+        )
     limits = {name: limits_of(study) for name, study in studies.items()}
     heads = max((list(row) for row in limits.values()), key=len)
     print_row("driving system", *heads)
@@ -72,7 +76,12 @@ def main() -> None:
     for name, row in limits.items():
         print_row(f"`{name}`", *(row.get(head, "-") for head in heads))
     print()
-    print_row("driving system", "smallest repair", "brakes earlier, at most", "brakes needlessly")
+    print_row(
+        "driving system",
+        "smallest repair",
+        "brakes earlier, at most",
+        "brakes needlessly",
+    )
     print_row(*["---"] * 4)
     for name, study in studies.items():
         if name in CHANGEABLE:

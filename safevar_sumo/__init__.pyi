@@ -1,6 +1,10 @@
 from .api.evaluation import evaluate as evaluate
 from .api.running import run as run
-from .api.simulation import Simulation as Simulation, load_study as load_study, simulate as simulate
+from .api.simulation import (
+    Simulation as Simulation,
+    load_study as load_study,
+    simulate as simulate,
+)
 from .campaign.pool import Pool as Pool
 from .errors import (
     InputError as InputError,

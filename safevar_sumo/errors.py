@@ -19,7 +19,9 @@ INTERRUPT_EXIT_CODE = 130
 """Exit code after Ctrl-C, as in shells: 128 plus the signal's number."""
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 """Signals that end the program as Ctrl-C does."""
-CONTROLS = re.compile(r"[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+CONTROLS = re.compile(
+    r"[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 """Characters that steer a terminal or hide text, and halves of characters."""
 
 
@@ -96,7 +98,9 @@ class UserCodeError(InputError):
     line, "" if they are unknown.
     """
 
-    def __init__(self, source: object, problem: str, legal: str = "", place: str = "") -> None:
+    def __init__(
+        self, source: object, problem: str, legal: str = "", place: str = ""
+    ) -> None:
         super().__init__(source, problem, legal)
         self.place = place
 
@@ -117,7 +121,8 @@ def warn(message: str) -> None:
     level = 1
     while (
         frame is not None
-        and str(frame.f_globals.get("__name__")).partition(".")[0] == __name__.partition(".")[0]
+        and str(frame.f_globals.get("__name__")).partition(".")[0]
+        == __name__.partition(".")[0]
     ):
         frame = frame.f_back
         level = level + 1
@@ -144,7 +149,11 @@ def describe_error(error: BaseException) -> str:
 
 
 def unknown_name(
-    source: object, problem: str, name: object, names: Iterable[str], otherwise: str = ""
+    source: object,
+    problem: str,
+    name: object,
+    names: Iterable[str],
+    otherwise: str = "",
 ) -> InputError:
     """Make the error for an unknown name: it suggests the nearest known name, and lists all known
     names.
@@ -162,7 +171,9 @@ def unknown_name(
     """
     known_names = list(names)
     return InputError(
-        source, f"{problem}{did_you_mean(name, known_names)}", f"{one_of(known_names)}{otherwise}"
+        source,
+        f"{problem}{did_you_mean(name, known_names)}",
+        f"{one_of(known_names)}{otherwise}",
     )
 
 
@@ -174,7 +185,11 @@ def check_text(argument: str, value: Any) -> Any:
 
 
 def check_name(
-    source: object, problem: str, name: object, names: Collection[str], otherwise: str = ""
+    source: object,
+    problem: str,
+    name: object,
+    names: Collection[str],
+    otherwise: str = "",
 ) -> None:
     """Refuse a name that is not known; raises the error of `unknown_name`."""
     if name not in names:

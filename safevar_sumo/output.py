@@ -63,7 +63,9 @@ def whole_file(path: Path, option: str = "") -> Iterator[Path]:
     short_stem = target.stem[:100]
     file = path
     if not is_stream:
-        file = target.with_name(f".{short_stem}.{secrets.token_hex(4)}.tmp{target.suffix}")
+        file = target.with_name(
+            f".{short_stem}.{secrets.token_hex(4)}.tmp{target.suffix}"
+        )
     try:
         pattern = f".{escape(short_stem)}.????????.tmp{escape(target.suffix)}"
         with nullcontext() if is_stream else _owned(file, file.parent.glob(pattern)):
@@ -85,7 +87,9 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     """Give a temporary folder, which ends with the block; those that killed processes have left are
     removed.
     """
-    with tempfile.TemporaryDirectory(prefix=PREFIX, dir=parent, ignore_cleanup_errors=True) as text:
+    with tempfile.TemporaryDirectory(
+        prefix=PREFIX, dir=parent, ignore_cleanup_errors=True
+    ) as text:
         folder = Path(text)
         with _owned(folder / LOCK, folder.parent.glob(f"{PREFIX}*/{LOCK}")):
             yield folder
@@ -118,7 +122,9 @@ def _remove_left_behind(file: Path) -> None:
             shutil.rmtree(file.parent) if file.name == LOCK else file.unlink()
 
 
-def check_writable(path: Path, option: str, endings: Sequence[str] = (), but: str = "") -> None:
+def check_writable(
+    path: Path, option: str, endings: Sequence[str] = (), but: str = ""
+) -> None:
     """Refuse an output file that cannot be written, before the work begins, whose name has another
     ending, or that exists and is named `but`; raises InputError.
     """
@@ -127,7 +133,11 @@ def check_writable(path: Path, option: str, endings: Sequence[str] = (), but: st
     if path.name == but and path.exists():
         raise InputError(option, f"{path} holds results", "another file")
     try:
-        with path.open("a") if path.exists() else tempfile.TemporaryFile(dir=path.resolve().parent):
+        with (
+            path.open("a")
+            if path.exists()
+            else tempfile.TemporaryFile(dir=path.resolve().parent)
+        ):
             pass
     except OSError as error:
         raise unwritable(path, option, error) from None
@@ -136,7 +146,9 @@ def check_writable(path: Path, option: str, endings: Sequence[str] = (), but: st
 def unwritable(path: Path, option: str, error: Exception) -> InputError:
     """The error for an output file that cannot be written."""
     return InputError(
-        option, f"cannot write {path}: {getattr(error, 'strerror', None) or error}", WRITABLE
+        option,
+        f"cannot write {path}: {getattr(error, 'strerror', None) or error}",
+        WRITABLE,
     )
 
 
@@ -146,7 +158,11 @@ def file_beside(text: str, folders: Sequence[str]) -> str:
     """
     try:
         return next(
-            (os.path.abspath(path) for folder in folders if (path := Path(folder, text)).is_file()),
+            (
+                os.path.abspath(path)
+                for folder in folders
+                if (path := Path(folder, text)).is_file()
+            ),
             "",
         )
     except (OSError, ValueError):

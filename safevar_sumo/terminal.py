@@ -47,16 +47,22 @@ class WholeTable(Table):
     breaks words. Each column has a head, whether it holds numbers, and its cells.
     """
 
-    def __init__(self, title: str, columns: Iterable[tuple[str, bool, Sequence[str]]]) -> None:
+    def __init__(
+        self, title: str, columns: Iterable[tuple[str, bool, Sequence[str]]]
+    ) -> None:
         super().__init__()
         self._title_line = printable_text(title, "italic")
         heads, are_numbers, cells = zip(*columns, strict=True)
         for head, is_number in zip(heads, are_numbers, strict=True):
-            self.add_column(printable_text(head), justify="right" if is_number else "left")
+            self.add_column(
+                printable_text(head), justify="right" if is_number else "left"
+            )
         for row in zip(*cells, strict=True):
             self.add_row(*map(printable_text, row))
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+    def __rich_console__(
+        self, console: Console, options: ConsoleOptions
+    ) -> RenderResult:
         # Rich would break a title where its table ends.
         if self._title_line:
             yield self._title_line
@@ -81,7 +87,9 @@ class WholeTable(Table):
             if spare < 0:
                 self.padding = 0
                 spare += 2 * count
-            for column, (longest_word, full_width) in zip(self.columns, sizes, strict=True):
+            for column, (longest_word, full_width) in zip(
+                self.columns, sizes, strict=True
+            ):
                 if spare >= 0:
                     share = (full_width - longest_word) * spare // max(texts - words, 1)
                     column.width = longest_word + share
@@ -179,11 +187,15 @@ class _TimeLeft(ProgressColumn):
 
     def render(self, task: Task | None = None) -> Text:
         seconds = self._pace.seconds_left()
-        return Text("" if seconds is None else f"{timedelta(seconds=math.ceil(seconds))} left")
+        return Text(
+            "" if seconds is None else f"{timedelta(seconds=math.ceil(seconds))} left"
+        )
 
 
 @contextmanager
-def open_progress(progress: bool | Progress, console: Console | None = None) -> Iterator[Progress]:
+def open_progress(
+    progress: bool | Progress, console: Console | None = None
+) -> Iterator[Progress]:
     """Yield the function to call: `progress` itself, or one that moves a bar or prints lines (True)
     or does nothing.
     """
@@ -205,11 +217,15 @@ def open_progress(progress: bool | Progress, console: Console | None = None) -> 
         if total:
             count = f"{number:,} of {total:,}"
             line = f"{phase}: {count}"
-        bar.update(task, description=phase, completed=number, total=total or None, count=count)
+        bar.update(
+            task, description=phase, completed=number, total=total or None, count=count
+        )
 
     def print_lines() -> None:
         while not ended.wait(SECONDS_BETWEEN_LINES) and not console.is_terminal:
-            print_text(console, ", ".join(filter(None, (line, str(time_left.render())))))
+            print_text(
+                console, ", ".join(filter(None, (line, str(time_left.render()))))
+            )
 
     text = TextColumn("{task.description}", markup=False)
     count = TextColumn("{task.fields[count]}", markup=False)

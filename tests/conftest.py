@@ -27,7 +27,9 @@ from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import EVERY_STUDY, InlinePool, inline_worker, searched
 
 collect_ignore = (
-    [] if os.name == "posix" else ["campaign/test_pool.py", "end_to_end/test_processes.py"]
+    []
+    if os.name == "posix"
+    else ["campaign/test_pool.py", "end_to_end/test_processes.py"]
 )
 """Tests that send POSIX signals to processes; other systems skip them."""
 
@@ -69,7 +71,10 @@ def _own_cache_and_pools_of_this_process(
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(
             "XDG_CACHE_HOME",
-            str((session.parent if "PYTEST_XDIST_WORKER" in os.environ else session) / "cache"),
+            str(
+                (session.parent if "PYTEST_XDIST_WORKER" in os.environ else session)
+                / "cache"
+            ),
         )
         patch.setenv("SAFEVAR_CACHE", "off")
         patch.setattr(local, "ProcessWorker", inline_worker)
@@ -86,7 +91,8 @@ def _answers_have_what_their_questions_declare() -> Iterator[None]:
         if answer.question in COMMANDS:
             declared = contents_of(command_function(answer.question))
             keys = Contents(
-                answer.numbers, {name: [*frame] for name, frame in answer.tables.items()}
+                answer.numbers,
+                {name: [*frame] for name, frame in answer.tables.items()},
             ).keys
             for key in keys:
                 declared.check_key(key)
@@ -125,7 +131,9 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     """Claims are falsified with the fewest simulations that are enough to print them."""
     monkeypatch.setattr(falsify, "USUAL_BUDGET", falsify.LEAST_SIMULATIONS)
-    few = asked.USUAL._replace(own=falsify.LEAST_SIMULATIONS, alone=falsify.LEAST_SIMULATIONS)
+    few = asked.USUAL._replace(
+        own=falsify.LEAST_SIMULATIONS, alone=falsify.LEAST_SIMULATIONS
+    )
     monkeypatch.setattr(asked, "USUAL", few)
 
 
@@ -133,7 +141,9 @@ def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
 def any_system(request: pytest.FixtureRequest) -> System:
     """The system of each shipped study in turn."""
     system = assemble(load_study(request.param))
-    return replace(system, points=system.points[::30])  # only some points of a long matrix
+    return replace(
+        system, points=system.points[::30]
+    )  # only some points of a long matrix
 
 
 @pytest.fixture

@@ -32,7 +32,14 @@ from tests.made_up import MISSING
 
 SLOW = pytest.mark.slow
 LONG = (
-    *("alks", "autoware_december", "euro_ncap_pedestrian", "fmvss127", "lgsvl", "r152_laden"),
+    *(
+        "alks",
+        "autoware_december",
+        "euro_ncap_pedestrian",
+        "fmvss127",
+        "lgsvl",
+        "r152_laden",
+    ),
     *("sensing", "wear_idm", "wear_realistic", "wear_rss"),
 )
 EVERY_STUDY = [
@@ -72,16 +79,28 @@ def inline_worker(last_words: Path) -> InlinePool:
     return InlinePool()
 
 
-def searched(study: Study, out: Path, warn: Callable[[str], None] = lambda message: None) -> Path:
+def searched(
+    study: Study, out: Path, warn: Callable[[str], None] = lambda message: None
+) -> Path:
     """Search a study in this process; returns its results directory, `out`."""
-    run_campaign(study, assemble(study), all_runs(study), out, InlinePool(), show_no_progress, warn)
+    run_campaign(
+        study,
+        assemble(study),
+        all_runs(study),
+        out,
+        InlinePool(),
+        show_no_progress,
+        warn,
+    )
     return out
 
 
 def verify_everywhere(system: System, settings: FloatArray) -> None:
     """Verify settings, shape (M, n), in SUMO at every point."""
     for point in system.points:
-        assert not verify_in_sumo(system.at(point), settings, np.zeros(len(settings), dtype=int))
+        assert not verify_in_sumo(
+            system.at(point), settings, np.zeros(len(settings), dtype=int)
+        )
 
 
 class CommandOutput(NamedTuple):
@@ -101,7 +120,11 @@ def run(*arguments: str, expect: int | None = 0) -> CommandOutput:
     # a command that fails ignores Ctrl-C, and so would later processes
     handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
     loaded_modules = set(sys.modules)
-    with redirect_stdout(out), redirect_stderr(err), pytest.MonkeyPatch.context() as patch:
+    with (
+        redirect_stdout(out),
+        redirect_stderr(err),
+        pytest.MonkeyPatch.context() as patch,
+    ):
         patch.setattr(sys, "argv", ["safevar-sumo", *arguments])
         patch.setattr(
             os, "_exit", sys.exit
@@ -116,7 +139,9 @@ def run(*arguments: str, expect: int | None = 0) -> CommandOutput:
         file = str(getattr(sys.modules[name], "__file__", None) or "")
         if file.startswith(os.getcwd()) and not file.startswith(sys.prefix):
             del sys.modules[name]
-    assert expect is None or code == expect, f"{code}\n{out.getvalue()}\n{err.getvalue()}"
+    assert expect is None or code == expect, (
+        f"{code}\n{out.getvalue()}\n{err.getvalue()}"
+    )
     return CommandOutput(out.getvalue(), err.getvalue())
 
 
@@ -139,6 +164,8 @@ def refused(*arguments: str, message: tuple[str, ...]) -> None:
         assert part in output.stderr, output.stderr
     assert "Traceback" not in output.stderr
     apart = re.compile(r"warning: |note: |.* left|.*: [\d,]+ of [\d,]+$")
-    lines = [line for line in output.stderr.strip().splitlines() if not apart.match(line)]
+    lines = [
+        line for line in output.stderr.strip().splitlines() if not apart.match(line)
+    ]
     assert len(lines) <= 2 or lines[0].endswith("mistakes"), output.stderr
     assert max(map(len, lines)) < 1000, output.stderr

@@ -43,7 +43,9 @@ HARDEST = Measure(
 
 def case_of(study: Study, original: Evaluations, solutions: Evaluations) -> Case:
     """A case of one run of NSGA-II with these solutions, without evaluations."""
-    frame = solutions_frame(CharacteristicSet.of(study).names, [(("nsga2", 0), solutions)])
+    frame = solutions_frame(
+        CharacteristicSet.of(study).names, [(("nsga2", 0), solutions)]
+    )
     return build_case(study, record(original, 0), frame, frame.iloc[:0], [("nsga2", 0)])
 
 
@@ -72,7 +74,9 @@ def made_up_runs(
     crash = np.full(speed.shape[1], collision_speed)
     outcome = np.where(np.isnan(crash), Outcome.STOPPED.value, Outcome.COLLISION.value)
     encounter = Encounter(gaps, gaps, speed, gaps > 0)
-    return SimulationRuns(trace=trace, encounter=encounter, outcome=outcome, collision_speed=crash)
+    return SimulationRuns(
+        trace=trace, encounter=encounter, outcome=outcome, collision_speed=crash
+    )
 
 
 def seen(

@@ -12,7 +12,9 @@ BLOCK = re.compile(
     r'(?:^<!-- ([^\n]*) -->\n+)?^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$',
     flags=re.DOTALL | re.MULTILINE,
 )
-GENERATED = re.compile("<!-- generated: .*?<!-- end of what is generated -->", re.DOTALL)
+GENERATED = re.compile(
+    "<!-- generated: .*?<!-- end of what is generated -->", re.DOTALL
+)
 
 
 class Block(NamedTuple):
@@ -43,4 +45,9 @@ def blocks(page: str) -> list[Block]:
 
 def files_of(*pages: str) -> dict[str, str]:
     """The files that pages of the manual show, by their names."""
-    return {block.title: block.text for page in pages for block in blocks(page) if block.title}
+    return {
+        block.title: block.text
+        for page in pages
+        for block in blocks(page)
+        if block.title
+    }

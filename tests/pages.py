@@ -68,13 +68,19 @@ def shortened(output: str, comment: str) -> str:
     shown = list[str]()
     for choice in filter(None, comment.removeprefix("output").strip(": ").split(";")):
         name, _, limit = choice.strip().partition(": ")
-        lines = found[0] if name == "verdict" else next(_beginning_with(name, found), None)
+        lines = (
+            found[0] if name == "verdict" else next(_beginning_with(name, found), None)
+        )
         if lines is None:
-            raise LookupError(f"no part begins with {name!r}, but {[part[0] for part in found]}")
+            raise LookupError(
+                f"no part begins with {name!r}, but {[part[0] for part in found]}"
+            )
         shown += _first_rows(lines, int(limit)) if limit else lines
     lines = shown or output.rstrip().splitlines()
     wrapped = (
-        [line] if len(line) <= WIDTH or line[0] in "┏┃┡│└" else textwrap.wrap(line, WIDTH)
+        [line]
+        if len(line) <= WIDTH or line[0] in "┏┃┡│└"
+        else textwrap.wrap(line, WIDTH)
         for line in lines
     )
     return "".join(f"{line.rstrip()}\n" for one in wrapped for line in one)
@@ -82,13 +88,17 @@ def shortened(output: str, comment: str) -> str:
 
 def _beginning_with(name: str, found: list[list[str]]) -> Iterator[list[str]]:
     """A table by its title, otherwise a single line."""
-    yield from (part for part in found if part[0].startswith(name) and part[-1].startswith("└"))
+    yield from (
+        part for part in found if part[0].startswith(name) and part[-1].startswith("└")
+    )
     yield from ([line] for part in found for line in part if line.startswith(name))
 
 
 def _first_rows(lines: list[str], count: int) -> list[str]:
     """A table's first rows, or a text's first lines."""
-    head = next((number + 1 for number, line in enumerate(lines) if line.startswith("┡")), 0)
+    head = next(
+        (number + 1 for number, line in enumerate(lines) if line.startswith("┡")), 0
+    )
     return lines if len(lines) <= head + count + 1 else [*lines[: head + count], "..."]
 
 
@@ -125,7 +135,9 @@ def run_page(page: str, options_of_tests: bool) -> Iterator[tuple[Block, str]]:
                     few = asked.USUAL._replace(own=least, alone=least)
                     patch.setattr(asked, "USUAL", few)
                     added = block.comment.removeprefix("in tests").replace(":", "", 1)
-                printed = "".join(_run(line, added, code) for line in block.text.splitlines())
+                printed = "".join(
+                    _run(line, added, code) for line in block.text.splitlines()
+                )
         else:
             assert block.language in ("text", "bibtex"), (
                 f"{page}: a block of {block.language!r} that nothing runs"
@@ -140,14 +152,19 @@ def _run(line: str, added: str, code: int) -> str:
         if done.exit_code != code:
             if done.exc_info:
                 traceback.print_exception(*done.exc_info)
-            raise AssertionError(f"{line}{added}: exit code {done.exit_code}\n{done.output}")
+            raise AssertionError(
+                f"{line}{added}: exit code {done.exit_code}\n{done.output}"
+            )
         return done.stdout or done.stderr
     if line.startswith("make "):
         target = rf"^{re.escape(line.split()[1])}:|^\.PHONY:.* {line.split()[1]}\b"
-        assert re.search(target, (ROOT / "Makefile").read_text(), flags=re.MULTILINE), line
+        assert re.search(target, (ROOT / "Makefile").read_text(), flags=re.MULTILINE), (
+            line
+        )
         return ""
     assert (
-        line.startswith(("pip install", "eval ", "#", "git clone", "cd ", "source ")) or not line
+        line.startswith(("pip install", "eval ", "#", "git clone", "cd ", "source "))
+        or not line
     ), f"a line that nothing runs: {line}"
     return ""
 

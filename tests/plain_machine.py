@@ -32,7 +32,12 @@ PAGES = {
 """Pages, and the commands of each that run, in its order."""
 SOLUTIONS = "results/rain/solutions.csv"
 """Solutions of README's study; some of them stand in for the published files of a page."""
-PUBLISHED = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
+PUBLISHED = {
+    "safety_degree": "SaftyDegree",
+    "tet": "TET",
+    "tit": "TIT",
+    "ave_dece": "Dece",
+}
 """Columns of the published files by those of solutions."""
 EXTRAS = {
     "study wear_rss": "ad-rss",
@@ -61,7 +66,9 @@ class Machine:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         subprocess.run([sys.executable, "-m", "venv", folder / "env"], check=True)
-        subprocess.run(["git", "clone", "--quiet", ROOT, folder / "checkout"], check=True)
+        subprocess.run(
+            ["git", "clone", "--quiet", ROOT, folder / "checkout"], check=True
+        )
 
     def run(self, line: str, place: str, codes: Sequence[int] = (0,)) -> str:
         """Run a line of a shell in a directory; returns what it prints.
@@ -73,9 +80,16 @@ class Machine:
         """
         where = self.folder / place
         where.mkdir(exist_ok=True)
-        kept = {name: os.environ[name] for name in os.environ if name.startswith("PIP_")}
+        kept = {
+            name: os.environ[name] for name in os.environ if name.startswith("PIP_")
+        }
         path = f"{self.folder / 'env' / 'bin'}:/usr/bin:/bin"
-        environment = {**kept, "PATH": path, "HOME": str(self.folder / "home"), "LANG": "C.UTF-8"}
+        environment = {
+            **kept,
+            "PATH": path,
+            "HOME": str(self.folder / "home"),
+            "LANG": "C.UTF-8",
+        }
         begin = time.monotonic()
         done = subprocess.run(
             line, shell=True, cwd=where, env=environment, capture_output=True, text=True
@@ -83,7 +97,9 @@ class Machine:
         printed = done.stdout + done.stderr
         print(f"{time.monotonic() - begin:6.1f} s  {line}", flush=True)
         if done.returncode not in codes or "Traceback" in printed:
-            raise SystemExit(f"{line}: exit code {done.returncode}, not {codes}\n{printed}")
+            raise SystemExit(
+                f"{line}: exit code {done.returncode}, not {codes}\n{printed}"
+            )
         return printed
 
 
@@ -119,7 +135,9 @@ def read_me(machine: Machine) -> None:
             raise SystemExit(f"{command}: README quotes nothing of what it prints")
         for quoted in quotes:
             if quoted not in " ".join(printed.split()):
-                raise SystemExit(f"{command}: README quotes {quoted!r}, but it prints\n{printed}")
+                raise SystemExit(
+                    f"{command}: README quotes {quoted!r}, but it prints\n{printed}"
+                )
 
 
 def questions() -> Iterator[tuple[str, str]]:
@@ -141,8 +159,12 @@ def pages(machine: Machine) -> None:
         for name, text in files_of(page).items():
             (machine.folder / place / name).write_text(text)
         lines = [line for block in blocks(page) for line in block.text.splitlines()]
-        commands = [line for line in lines if line.startswith(tuple(PROGRAM + n for n in names))]
-        missing = {*names} - {command.removeprefix(PROGRAM).split()[0] for command in commands}
+        commands = [
+            line for line in lines if line.startswith(tuple(PROGRAM + n for n in names))
+        ]
+        missing = {*names} - {
+            command.removeprefix(PROGRAM).split()[0] for command in commands
+        }
         if missing:
             raise SystemExit(f"{page} has no command {min(missing)}")
         for command in commands:
@@ -162,7 +184,9 @@ def write_published(solutions: Path, path: Path) -> None:
     with path.open("w", newline="") as written:
         file = writer(written)
         file.writerow([*characteristics, *PUBLISHED.values()])
-        file.writerows([row[name] or 0 for name in (*characteristics, *PUBLISHED)] for row in rows)
+        file.writerows(
+            [row[name] or 0 for name in (*characteristics, *PUBLISHED)] for row in rows
+        )
 
 
 def extras(machine: Machine) -> None:
@@ -177,9 +201,15 @@ def extras(machine: Machine) -> None:
         study = command.split()[1]
         for line in (command, f"check {study}") if "--" not in command else (command,):
             printed = machine.run(PROGRAM + line, "extras", (INPUT_ERROR,))
-            lines = [text for text in printed.splitlines() if not text.startswith("warning: ")]
+            lines = [
+                text
+                for text in printed.splitlines()
+                if not text.startswith("warning: ")
+            ]
             if len(lines) != 2 or f"pip install '.[{extra}]'" not in lines[1]:
-                raise SystemExit(f"{line}: two lines that name {extra}, but it prints\n{printed}")
+                raise SystemExit(
+                    f"{line}: two lines that name {extra}, but it prints\n{printed}"
+                )
 
 
 def main() -> None:

@@ -27,20 +27,26 @@ FUNCTION_WORDS = frozenset(
 NO_CODE = "COMMENT NL NEWLINE INDENT DEDENT ENDMARKER".split()  # noqa: SIM905
 COMPREHENSIONS = ast.ListComp | ast.SetComp | ast.DictComp | ast.GeneratorExp
 NESTED = COMPREHENSIONS | ast.IfExp | ast.Lambda
-LINES_OF = {"elements": 1, "conditional": 100, "comprehension": 100, "nested": 100, "word": 1000}
+LINES_OF = {
+    "elements": 1,
+    "conditional": 100,
+    "comprehension": 100,
+    "nested": 100,
+    "word": 1000,
+}
 """What is counted, and in how many lines."""
 
 
 def counts_in(source: str) -> Counter[str]:
     """What is counted in a module, and its lines of code."""
     tree = ast.parse(source)
-    lines = set[int]()
+    lines = set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if tokenize.tok_name[token.type] not in NO_CODE:
             lines |= {*range(token.start[0], token.end[0] + 1)}
     for docstring in take_docstrings(tree):
         lines -= {*range(docstring.lineno, (docstring.end_lineno or 0) + 1)}
-    counts = Counter[str](line=len(lines))
+    counts = Counter(line=len(lines))
     for node in ast.walk(tree):
         name = ""
         if isinstance(node, ast.arg):
@@ -51,7 +57,9 @@ def counts_in(source: str) -> Counter[str]:
         counts["conditional"] += isinstance(node, ast.IfExp)
         counts["comprehension"] += isinstance(node, COMPREHENSIONS)
         if isinstance(node, NESTED):
-            counts["nested"] += sum(isinstance(inner, NESTED) for inner in ast.walk(node)) > 1
+            counts["nested"] += (
+                sum(isinstance(inner, NESTED) for inner in ast.walk(node)) > 1
+            )
         counts["word"] += name.strip("_") in FUNCTION_WORDS
     return counts
 

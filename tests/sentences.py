@@ -25,7 +25,8 @@ VERBS = (
 )
 UNITS = r"\b\d[\d,.]*(?: ?%| (?:kg m\^2/s|km/h|m/s\^2|m/s|N m|mm|kg|ms|m|s|N)\b)"
 SERIES = (
-    r"(?<![\w^/.-])(?:[\w^/.-]+ ){0,3}[\w^/.-]+(?:, [\w^/.-]+(?: [\w^/.-]+){0,3}){2,} (?:and|or) "
+    r"(?<![\w^/.-])(?:[\w^/.-]+ ){0,3}[\w^/.-]+(?:, [\w^/.-]+(?:"
+    r" [\w^/.-]+){0,3}){2,} (?:and|or) "
 )
 """Three and more values, which count as one word."""
 
@@ -86,7 +87,9 @@ def broken_rules(sentence: str) -> list[str]:
         rules = {**OUTSIDE_BRACKETS, **IN_LISTS}
         number = words_in(bare)
         reasons += [f"{number} words"] if number > MOST_WORDS else []
-    return reasons + [why for pattern, why in rules.items() if re.search(pattern, outside)]
+    return reasons + [
+        why for pattern, why in rules.items() if re.search(pattern, outside)
+    ]
 
 
 def split(text: str) -> Iterator[str]:
@@ -101,7 +104,9 @@ def split(text: str) -> Iterator[str]:
 def sentences_in(page: str) -> Iterator[str]:
     """The sentences of a page of Markdown: of its paragraphs, and of the cells of its tables."""
     text = re.sub(r"(?ms)^```.*?^```$|<!--.*?-->|\n{3,}", "\n\n", page)
-    text = re.sub(r"!?\[((?:[^\[\]]|\[[^\]]*\])*)\]\([^)]*\)", r"\1", text.replace("\\|", "¦"))
+    text = re.sub(
+        r"!?\[((?:[^\[\]]|\[[^\]]*\])*)\]\([^)]*\)", r"\1", text.replace("\\|", "¦")
+    )
     text = re.sub(r"(?s)`[^`]*`|\$\$.*?\$\$|\$[^$\n]+\$", "X", text.replace("**", ""))
     for paragraph in re.split(r"\n\s*\n|\n(?=\s*(?:[-*>] |\d+\. |\||#))|\|", text):
         if not paragraph.strip().startswith("#"):

@@ -18,7 +18,9 @@ DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 def take_docstrings(tree: ast.Module) -> list[ast.stmt]:
     """The docstrings of a module, which are taken out of its tree."""
     documented = [node for node in ast.walk(tree) if isinstance(node, DOCUMENTED)]
-    return [node.body.pop(0) for node in documented if ast.get_docstring(node) is not None]
+    return [
+        node.body.pop(0) for node in documented if ast.get_docstring(node) is not None
+    ]
 
 
 def elements_in(source: str) -> int:
@@ -43,7 +45,9 @@ def sizes() -> dict[str, int]:
     return {
         "package_elements": sum(map(elements_in, package.values())),
         "test_elements": sum(map(elements_in, sources_of("tests").values())),
-        "long_files": sum(source.count("\n") > LONG_FILE for source in package.values()),
+        "long_files": sum(
+            source.count("\n") > LONG_FILE for source in package.values()
+        ),
     }
 
 

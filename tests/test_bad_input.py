@@ -42,7 +42,8 @@ SCALARS = st.one_of(
 ANYTHING = st.recursive(
     SCALARS,
     lambda inner: st.one_of(
-        st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=8), inner, max_size=3)
+        st.lists(inner, max_size=3),
+        st.dictionaries(st.text(max_size=8), inner, max_size=3),
     ),
     max_leaves=6,
 )
@@ -61,7 +62,10 @@ def paths(tables: JsonObject, before: tuple[str, ...] = ()) -> list[tuple[str, .
 
 def replaced(tables: JsonObject, path: tuple[str, ...], value: object) -> JsonObject:
     key, *rest = path
-    return {**tables, key: value if not rest else replaced(tables[key], tuple(rest), value)}
+    return {
+        **tables,
+        key: value if not rest else replaced(tables[key], tuple(rest), value),
+    }
 
 
 @SLOW
@@ -73,7 +77,9 @@ def test_a_study_with_anything_in_one_place_is_read_or_refused(
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "mine.toml"
         try:
-            file.write_text(tomli_w.dumps(replaced(TABLES, path, value)), encoding="utf-8")
+            file.write_text(
+                tomli_w.dumps(replaced(TABLES, path, value)), encoding="utf-8"
+            )
         except (ValueError, UnicodeError):
             return
         try:
@@ -83,12 +89,16 @@ def test_a_study_with_anything_in_one_place_is_read_or_refused(
             return
         assert isinstance(study, Study)
         numbers = list(study.vehicle.characteristics.values())
-        assert all(math.isfinite(row.original) and row.lower < row.upper for row in numbers)
+        assert all(
+            math.isfinite(row.original) and row.lower < row.upper for row in numbers
+        )
 
 
 @pytest.mark.parametrize("command", PIPES, ids=" ".join)
 @pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_a_pipe_or_device_is_no_input(command: tuple[str, ...], kind: str, in_tmp: Path) -> None:
+def test_a_pipe_or_device_is_no_input(
+    command: tuple[str, ...], kind: str, in_tmp: Path
+) -> None:
     """Either may never end; /dev/zero does not."""
     Path("results").mkdir()
     for path in Path("pipe"), Path("results", MANIFEST):
@@ -100,5 +110,7 @@ def test_a_pipe_or_device_is_no_input(command: tuple[str, ...], kind: str, in_tm
 def test_a_file_that_is_too_large_is_no_input(in_tmp: Path) -> None:
     with open("huge.toml", "wb") as file:
         file.truncate(MAX_INPUT + 1)
-    with pytest.raises(InputError, match=r"huge\.toml: .*no regular file of at most 100 MB"):
+    with pytest.raises(
+        InputError, match=r"huge\.toml: .*no regular file of at most 100 MB"
+    ):
         load_study("huge.toml")

@@ -33,7 +33,9 @@ from tests.pages import PAGES, run_page
 
 @SLOW
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
-def test_every_block_of_a_page_does_and_shows_what_it_says(page: str, in_tmp: Path) -> None:
+def test_every_block_of_a_page_does_and_shows_what_it_says(
+    page: str, in_tmp: Path
+) -> None:
     for block, output in run_page(page, options_of_tests=True):
         assert block.text == output, f"{page}: `make docs-outputs` fills it in"
 
@@ -43,7 +45,9 @@ def test_lines_of_prose_have_at_most_100_characters() -> None:
     for page in PAGES:
         text = re.sub(r"(?s)^```.*?^```$|<!--.*?-->", "", written(page), flags=re.M)
         for line in text.splitlines():
-            assert len(line) <= 100 or line.startswith(("|", "#", "![", "[![")), f"{page}: {line}"
+            assert len(line) <= 100 or line.startswith(("|", "#", "![", "[![")), (
+                f"{page}: {line}"
+            )
 
 
 def script_of_docs(name: str) -> Any:
@@ -66,14 +70,24 @@ def test_every_picture_has_its_command_and_its_page() -> None:
 @SLOW
 @pytest.mark.parametrize(
     "name",
-    ["failure.png", "failure.gif", "sawtooth.png", "boundary.png", "stops.png", "encounters.png"],
+    [
+        "failure.png",
+        "failure.gif",
+        "sawtooth.png",
+        "boundary.png",
+        "stops.png",
+        "encounters.png",
+    ],
 )
 def test_a_picture_is_drawn_anew_as_large_as_it_stands_on_its_page(
     name: str, tmp_path: Path
 ) -> None:
     """That of a page of `report` takes minutes; tests/report/test_browser.py looks at pages."""
     drawn_anew = script_of_docs("pictures").draw(name, tmp_path)
-    with Image.open(drawn_anew) as drawn, Image.open(ROOT / "docs" / "pictures" / name) as stored:
+    with (
+        Image.open(drawn_anew) as drawn,
+        Image.open(ROOT / "docs" / "pictures" / name) as stored,
+    ):
         assert drawn.size == stored.size
         assert getattr(drawn, "n_frames", 1) == getattr(stored, "n_frames", 1)
 
@@ -83,10 +97,13 @@ def test_the_version_of_setup_cfg_is_that_of_results_citation_and_changelog() ->
     config.read(ROOT / "setup.cfg")
     version = config["metadata"]["version"]
     output = CliRunner().invoke(commands, ["--version"]).stdout
-    assert output.endswith(f", version {version}\n"), "install again: pip install --editable ."
+    assert output.endswith(f", version {version}\n"), (
+        "install again: pip install --editable ."
+    )
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
     assert (
-        re.findall("^## (.*) [(]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[0] == version
+        re.findall("^## (.*) [(]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[0]
+        == version
     )
 
 
@@ -115,7 +132,9 @@ def test_the_map_of_the_code_names_every_package_and_no_drawing_a_folder_that_is
     assert set(re.findall(r"(?<![\w/])(\w+)/(?=[\s,;`])", tree + drawing)) <= there
 
 
-MENTION = re.compile(r"((?:`[\w.]+`(?:,|\s+and)\s+)*`[\w.]+`)\s+(?:in\s+|of\s+|\()`([\w/]+\.py)`")
+MENTION = re.compile(
+    r"((?:`[\w.]+`(?:,|\s+and)\s+)*`[\w.]+`)\s+(?:in\s+|of\s+|\()`([\w/]+\.py)`"
+)
 """Names of code, and the file that a page says they are in."""
 
 
@@ -126,22 +145,28 @@ def test_every_name_of_code_that_a_page_mentions_is_in_the_file_that_it_names() 
             source = next(place for place in places if place.is_file()).read_text()
             for name in re.findall(r"(\w+)`", names):
                 defined = rf"^ *(def |class )?{name}\b *[(:=]"
-                assert re.search(defined, source, re.MULTILINE), f"{page}: {name} in {file}"
+                assert re.search(defined, source, re.MULTILINE), (
+                    f"{page}: {name} in {file}"
+                )
 
 
 def test_every_file_of_code_that_is_named_exists() -> None:
     """In a page, a study or the package; a page may also make the file that it names."""
     code = [*(ROOT / "studies").rglob("*.toml"), *(ROOT / "safevar_sumo").rglob("*.py")]
     there = [*code, *ROOT.glob("[bcdt]*/**/*.py")]
-    for file in ["CONTRIBUTING.md", *PAGES, *(str(path.relative_to(ROOT)) for path in code)]:
+    for file in [
+        "CONTRIBUTING.md",
+        *PAGES,
+        *(str(path.relative_to(ROOT)) for path in code),
+    ]:
         made = {block.title for block in blocks(file)}
         for name in re.findall(
             r"(?<![\w/.])((?:[a-z_]+/)*(?:[a-z_]+/[a-z_]+|test_\w+)\.py)\b",
             (ROOT / file).read_text(),
         ):
-            assert name in made or any(path.as_posix().endswith(f"/{name}") for path in there), (
-                f"{file}: {name}"
-            )
+            assert name in made or any(
+                path.as_posix().endswith(f"/{name}") for path in there
+            ), f"{file}: {name}"
 
 
 def test_the_page_on_results_lists_every_key_that_may_change() -> None:
@@ -185,9 +210,16 @@ def marked(page: str) -> list[Numbers]:
         flags=re.DOTALL,
     ):
         lines = [line.strip() for line in comment.splitlines() if line.strip()]
-        values = dict(line.split(" = ") for line in lines if not line.startswith(PROGRAM))
+        values = dict(
+            line.split(" = ") for line in lines if not line.startswith(PROGRAM)
+        )
         result.append(
-            Numbers(page, [line for line in lines if line.startswith(PROGRAM)], values, paragraph)
+            Numbers(
+                page,
+                [line for line in lines if line.startswith(PROGRAM)],
+                values,
+                paragraph,
+            )
         )
     return result
 
@@ -204,7 +236,9 @@ def test_marked_numbers_stand_in_the_paragraph_below_them() -> None:
 
 @SLOW
 @pytest.mark.parametrize(
-    "lines", sorted({tuple(one.commands) for one in MARKED}), ids=lambda lines: lines[-1]
+    "lines",
+    sorted({tuple(one.commands) for one in MARKED}),
+    ids=lambda lines: lines[-1],
 )
 def test_marked_numbers_are_those_that_their_commands_print(
     lines: tuple[str, ...], in_tmp: Path
@@ -236,4 +270,6 @@ def test_marked_numbers_are_those_that_their_commands_print(
             if path.startswith("tables.limits.")
             else f"{result:.2f} {unit}".strip()
         )
-        assert value == (f"{100 * result:.0f} %" if unit == "%" else text), f"{page}: {path}"
+        assert value == (f"{100 * result:.0f} %" if unit == "%" else text), (
+            f"{page}: {path}"
+        )

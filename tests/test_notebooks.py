@@ -56,8 +56,15 @@ def test_a_notebook_is_stored_with_what_it_shows(name: str) -> None:
 def test_stored_outputs_are_of_todays_vehicle() -> None:
     """`python -m tests.test_notebooks [NAME]...` stores them anew."""
     texts = {name: _texts(_read(name)) for name in (*SHOWN, "answers")}
-    assert str(sv.simulate("sun").metrics["safety_degree"]) in "".join(texts["quickstart"])
-    results = [text for name in SHOWN for text in texts[name] if text.startswith("<Results of sun")]
+    assert str(sv.simulate("sun").metrics["safety_degree"]) in "".join(
+        texts["quickstart"]
+    )
+    results = [
+        text
+        for name in SHOWN
+        for text in texts[name]
+        if text.startswith("<Results of sun")
+    ]
     assert results == results[:1] * len(SHOWN)
     assert "of the unsafe vehicles have " in "".join(texts["answers"])
     assert all(path.stat().st_size < 500_000 for path in NOTEBOOKS.glob("*.ipynb"))
@@ -119,7 +126,10 @@ def _executed(name: str, place: Path, timeout: int) -> nbformat.NotebookNode:
 
 def _outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
     return [
-        output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs
+        output
+        for cell in notebook.cells
+        if cell.cell_type == "code"
+        for output in cell.outputs
     ]
 
 
@@ -179,7 +189,9 @@ def main() -> None:
                 if "image/png" in data:
                     drawn = Image.open(io.BytesIO(base64.b64decode(data["image/png"])))
                     picture = io.BytesIO()
-                    drawn.convert("RGB").quantize(128).save(picture, "png", optimize=True)
+                    drawn.convert("RGB").quantize(128).save(
+                        picture, "png", optimize=True
+                    )
                     data["image/png"] = base64.b64encode(picture.getvalue()).decode()
             nbformat.write(notebook, NOTEBOOKS / f"{name}.ipynb")
 

@@ -32,9 +32,14 @@ def texts_in(source: str) -> Iterator[str]:
     """The whole sentences and the meanings of columns in a module; a slot is X."""
     yield from re.findall(r'Column\(\s*"[^"]*",\s*"([^"]+)"', source)
     tree = ast.parse(source)
-    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    docstrings = {
+        id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)
+    }
     for node in ast.walk(tree):
-        if isinstance(node, ast.Constant | ast.JoinedStr) and id(node) not in docstrings:
+        if (
+            isinstance(node, ast.Constant | ast.JoinedStr)
+            and id(node) not in docstrings
+        ):
             text = re.sub("(?<=[a-z]){.*?}", "", ast.unparse(node).strip("f'\""))
             for sentence in split(re.sub("{.*?}", "X", text)):
                 if re.match("[A-Z].*[.]$", sentence):
@@ -49,13 +54,18 @@ def test_the_sentences_of_a_page_keep_the_rules(page: str) -> None:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_help_of_a_command_keeps_the_rules(name: str) -> None:
     command = commands.get_command(click.Context(commands), name)
-    for text in (command.help, *(getattr(option, "help", "") for option in command.params)):
+    for text in (
+        command.help,
+        *(getattr(option, "help", "") for option in command.params),
+    ):
         plain = re.sub("`[^`]*`", "X", str(text)).partition("\n\nExample")[0]
         assert not found(split(re.sub(r"  \[.*", "", plain)))
 
 
 @pytest.mark.parametrize("path", sorted(SOURCES.keys() - BROKEN))
-def test_the_templates_and_the_meanings_of_columns_of_a_module_keep_the_rules(path: str) -> None:
+def test_the_templates_and_the_meanings_of_columns_of_a_module_keep_the_rules(
+    path: str,
+) -> None:
     assert not found(texts_in(SOURCES[path]))
 
 
@@ -66,8 +76,11 @@ def test_all_pages_together_are_short_enough_to_be_read() -> None:
 
 def test_a_broken_rule_is_found() -> None:
     broken = (
-        "Nearly all of them collide, as the value of tireFric is 1; it keeps 0.3 m of clearance."
+        "Nearly all of them collide, as the value of tireFric is 1; it keeps 0.3"
+        " m of clearance."
     )
     page = f"# A head of five words\n\n```\nIt is not read.\n```\n- {broken}\n- {'and ' * 23}."
     assert [len(reasons) for _, reasons in found(sentences_in(page))] == [4, 1]
-    assert not broken_rules("Valid for: the tests CPFA, CPNA and CPNCO at 10 to 60 km/h; by day.")
+    assert not broken_rules(
+        "Valid for: the tests CPFA, CPNA and CPNCO at 10 to 60 km/h; by day."
+    )

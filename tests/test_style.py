@@ -20,7 +20,13 @@ from tests.size import elements_in, sizes, sources_of
 
 LIMITS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
 DOUBLE = {
-    *("Failure", "Failures", "FullBraking", "Parameter", "Search"),  # of repair and tolerance
+    *(
+        "Failure",
+        "Failures",
+        "FullBraking",
+        "Parameter",
+        "Search",
+    ),  # of repair and tolerance
     *("columns_of", "parameters_of"),
 }
 """Names that may still have several meanings."""
@@ -45,8 +51,12 @@ def public_names_in(source: str) -> Iterator[str]:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             names = [node.name]
         elif isinstance(node, ast.Assign):
-            targets = [target.id for target in node.targets if isinstance(target, ast.Name)]
-            names = [name for name in targets if name[:1].isupper() and not name.isupper()]
+            targets = [
+                target.id for target in node.targets if isinstance(target, ast.Name)
+            ]
+            names = [
+                name for name in targets if name[:1].isupper() and not name.isupper()
+            ]
         else:
             names = []
         yield from (name for name in names if not name.startswith("_"))
@@ -73,7 +83,9 @@ def test_a_public_name_is_defined_once() -> None:
 
 @SLOW
 def test_tests_are_collected_without_the_extras() -> None:
-    subprocess.run([sys.executable, "-c", COLLECTION], cwd=ROOT, check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-c", COLLECTION], cwd=ROOT, check=True, capture_output=True
+    )
 
 
 def test_the_rules_find_what_breaks_them() -> None:

@@ -11,7 +11,11 @@ from safevar_sumo.ads.base import (
 )
 from safevar_sumo.ads.car_following import Acc, Idm, Krauss
 from safevar_sumo.ads.competent_driver import CompetentDriver
-from safevar_sumo.ads.fmu import MAX_INSTANCES as MAX_INSTANCES, Fmu as Fmu, FmuAds as FmuAds
+from safevar_sumo.ads.fmu import (
+    MAX_INSTANCES as MAX_INSTANCES,
+    Fmu as Fmu,
+    FmuAds as FmuAds,
+)
 from safevar_sumo.ads.highway_idm import HighwayIdm
 from safevar_sumo.ads.intel_rss import AdRss
 from safevar_sumo.ads.published import Apollo, WorldOnRails

@@ -23,7 +23,14 @@ from safevar_sumo.ads.base import (
     is_in_the_way,
     time_to_reach,
 )
-from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import (
+    TIME_ROUNDING,
+    BoolArray,
+    Command,
+    FloatArray,
+    Nominal,
+    Observation,
+)
 
 LEAST_DECELERATION = 0.5
 """Smallest deceleration of an obstacle that counts as braking [m/s^2]."""
@@ -122,7 +129,9 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             warns=nobody,
         )
 
-    def drive(self, observation: Observation, memory: _Memory) -> tuple[Command, _Memory]:
+    def drive(
+        self, observation: Observation, memory: _Memory
+    ) -> tuple[Command, _Memory]:
         nominal = memory.nominal
 
         # Without a threat it holds its speed; once it has intervened, it no longer accelerates.
@@ -134,10 +143,14 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         has_intervened = memory.intervened | (stage > NO_BRAKING)
         cruising = self.cruise_gain * (cruise_speed - observation.speed)
         pedals = self.pedals(cruising, observation.speed, nominal, cruise_trim)
-        throttle, cruise_brake = (np.where(has_intervened, 0.0, pedal) for pedal in pedals)
+        throttle, cruise_brake = (
+            np.where(has_intervened, 0.0, pedal) for pedal in pedals
+        )
 
         stage_brake = np.where(stage == FULL_BRAKING, 1.0, self.partial_share)
-        command = Command(throttle, np.where(stage > NO_BRAKING, stage_brake, cruise_brake))
+        command = Command(
+            throttle, np.where(stage > NO_BRAKING, stage_brake, cruise_brake)
+        )
 
         # It warns before it brakes.
         warns = is_threatened & (time_to_reach(observation) < self.warning_time)
@@ -166,7 +179,9 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         # How hard the obstacle has braked since the last step.
         deceleration = self.braking_share * memory.nominal.decel
         lost_speed = np.where(
-            observation.obstacle == memory.obstacle, memory.obstacle_speed - obstacle_speed, 0.0
+            observation.obstacle == memory.obstacle,
+            memory.obstacle_speed - obstacle_speed,
+            0.0,
         )
         obstacle_deceleration = lost_speed / memory.step
 
@@ -195,9 +210,13 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
         # It ends when nobody approaches any more who blocks the way.
         still_blocks = (
-            is_ahead(observation) & (closing_speed > 0) & blocks_the_way(observation, self.corridor)
+            is_ahead(observation)
+            & (closing_speed > 0)
+            & blocks_the_way(observation, self.corridor)
         )
-        return np.where(still_blocks | (speed <= 0), np.maximum(stage, memory.stage), stage)
+        return np.where(
+            still_blocks | (speed <= 0), np.maximum(stage, memory.stage), stage
+        )
 
 
 class _AutowareMemory(NamedTuple):
@@ -262,7 +281,9 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     corridor: PositiveParameter = CORRIDOR
 
     def start(self, n: int, nominal: Nominal, step: float) -> _AutowareMemory:
-        return _AutowareMemory(nominal, step, cruise=None, decision_time=np.full(n, -1.0))
+        return _AutowareMemory(
+            nominal, step, cruise=None, decision_time=np.full(n, -1.0)
+        )
 
     def drive(
         self, observation: Observation, memory: _AutowareMemory
@@ -277,8 +298,12 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             decision_time >= 0, decision_time + step, np.where(is_near, 0.0, -1.0)
         )
         # The mean over the coming step:
-        ramp = self.target_jerk * np.maximum(decision_time + step / 2 - self.command_delay, 0.0)
-        is_braking = (decision_time >= 0) & (decision_time + TIME_ROUNDING >= self.command_delay)
+        ramp = self.target_jerk * np.maximum(
+            decision_time + step / 2 - self.command_delay, 0.0
+        )
+        is_braking = (decision_time >= 0) & (
+            decision_time + TIME_ROUNDING >= self.command_delay
+        )
         acceleration = np.where(
             is_braking,
             -np.minimum(ramp, self.target_acceleration),

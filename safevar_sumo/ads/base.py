@@ -104,7 +104,9 @@ class FullBrake(Ads):
     def start(self, n: int, nominal: Nominal, step: float) -> Command:
         return Command(np.zeros(n), np.ones(n))
 
-    def drive(self, observation: Observation, memory: Command) -> tuple[Command, Command]:
+    def drive(
+        self, observation: Observation, memory: Command
+    ) -> tuple[Command, Command]:
         return memory, memory
 
 
@@ -193,13 +195,20 @@ class PerVehicleAds(Ads):
         if type(command) is tuple and len(command) == 2:
             throttle, brake = command
             # The fast path: this runs for every vehicle in every step.
-            if type(throttle) is type(brake) is float and 0 <= throttle <= 1 and 0 <= brake <= 1:
+            if (
+                type(throttle) is type(brake) is float
+                and 0 <= throttle <= 1
+                and 0 <= brake <= 1
+            ):
                 return throttle, brake
         if not isinstance(command, tuple | list) or len(command) != 2:
-            raise self._code.wrong("drive", quoted(command), "(throttle, brake), each in [0, 1]")
+            raise self._code.wrong(
+                "drive", quoted(command), "(throttle, brake), each in [0, 1]"
+            )
         pedals = zip(Command._fields, command, strict=True)
         throttle, brake = (
-            self._code.check_numbers("drive", name, value, (), SHARE) for name, value in pedals
+            self._code.check_numbers("drive", name, value, (), SHARE)
+            for name, value in pedals
         )
         return float(throttle), float(brake)
 
@@ -239,7 +248,9 @@ class DelayLine(NamedTuple):
     @staticmethod
     def parts(delay: FloatOrArray, step: float) -> tuple[FloatArray, FloatArray]:
         """Whole steps and the fraction of a step of a delay [s], or of several."""
-        steps, fraction = np.divmod(np.round(np.asarray(delay) / step, STEP_DECIMALS), 1)
+        steps, fraction = np.divmod(
+            np.round(np.asarray(delay) / step, STEP_DECIMALS), 1
+        )
         return steps, fraction
 
     def delayed(self, values: FloatArray) -> tuple[FloatArray, DelayLine]:
@@ -287,7 +298,9 @@ def trim_at(nominal: Nominal, observation: Observation) -> Trim:
     throttle = np.where(is_rolling, observation.throttle - holding_throttle, 0.0)
     return Trim(
         throttle,
-        np.where(is_rolling & (observation.brake > 0), observation.brake - holding_brake, 0.0),
+        np.where(
+            is_rolling & (observation.brake > 0), observation.brake - holding_brake, 0.0
+        ),
     )
 
 
@@ -295,7 +308,9 @@ def cruise_at(
     nominal: Nominal, observation: Observation, speed: float | None
 ) -> tuple[FloatArray, Trim]:
     """The speed that a cruise control holds [m/s], by default that of now, and its trim."""
-    speeds = observation.speed if speed is None else np.full_like(observation.speed, speed)
+    speeds = (
+        observation.speed if speed is None else np.full_like(observation.speed, speed)
+    )
     return speeds, trim_at(nominal, observation)
 
 
@@ -310,8 +325,12 @@ def pedals_for(
     )
     excess = acceleration + coasting - nominal.braking * pedal_trim.brake
     brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)
-    throttle = (acceleration + coasting) / (full_throttle + coasting) + pedal_trim.throttle
-    return Command(np.where(excess < 0, 0.0, np.minimum(np.maximum(throttle, 0.0), 1.0)), brake)
+    throttle = (acceleration + coasting) / (
+        full_throttle + coasting
+    ) + pedal_trim.throttle
+    return Command(
+        np.where(excess < 0, 0.0, np.minimum(np.maximum(throttle, 0.0), 1.0)), brake
+    )
 
 
 CORRIDOR = 1.15
@@ -338,7 +357,9 @@ def time_to_reach(observation: Observation) -> FloatArray:
     )
 
 
-def is_in_the_way(observation: Observation, corridor: float, reach: float = np.inf) -> BoolArray:
+def is_in_the_way(
+    observation: Observation, corridor: float, reach: float = np.inf
+) -> BoolArray:
     """Whether a side of a detected obstacle ahead is within `corridor` of the lane's middle [m], or
     will be when the vehicle reaches it.
 
@@ -353,9 +374,13 @@ def depth_in_the_way(
     """How far within `corridor` a side of a detected obstacle ahead is, or will be when the vehicle
     reaches it [m]; below 0 outside, and `-LARGEST_GAP` without an obstacle.
     """
-    is_detected = is_ahead(observation) & (observation.gap <= reach * observation.visibility)
+    is_detected = is_ahead(observation) & (
+        observation.gap <= reach * observation.visibility
+    )
     lateral = np.where(is_detected, observation.lateral, LARGEST_GAP)
-    lateral_at_arrival = lateral + observation.lateral_speed * time_to_reach(observation)
+    lateral_at_arrival = lateral + observation.lateral_speed * time_to_reach(
+        observation
+    )
     watched = corridor + observation.obstacle_width / 2
     nearest = np.minimum(np.abs(lateral), np.abs(lateral_at_arrival))
     return np.where(is_detected, watched - nearest, -LARGEST_GAP)

@@ -45,7 +45,9 @@ class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     standing_gap: Annotated[float, Meta(ge=0, le=100)] = 2.5
     corridor: PositiveParameter = CORRIDOR
 
-    def start(self, n: int, nominal: Nominal, step: float) -> tuple[Nominal, Trim | None]:
+    def start(
+        self, n: int, nominal: Nominal, step: float
+    ) -> tuple[Nominal, Trim | None]:
         return nominal, None
 
     def drive(
@@ -53,8 +55,12 @@ class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     ) -> tuple[Command, tuple[Nominal, Trim | None]]:
         nominal, trim = memory
         initial_trim = trim_at(nominal, observation) if trim is None else trim
-        gap = np.where(is_in_the_way(observation, self.corridor), observation.gap, LARGEST_GAP)
-        acceleration = self.acceleration_at(gap, observation.speed, observation.obstacle_speed)
+        gap = np.where(
+            is_in_the_way(observation, self.corridor), observation.gap, LARGEST_GAP
+        )
+        acceleration = self.acceleration_at(
+            gap, observation.speed, observation.obstacle_speed
+        )
         command = self.pedals(acceleration, observation.speed, nominal, initial_trim)
         return command, (nominal, initial_trim)
 
@@ -89,16 +95,24 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
         """
         excess_speed = speed - self.cruise_speed
         relative_speed = leader_speed - speed
-        standing_distance = np.minimum(np.maximum(75 / np.maximum(speed, 1.0) - 5, 0.0), 2.0)
+        standing_distance = np.minimum(
+            np.maximum(75 / np.maximum(speed, 1.0) - 5, 0.0), 2.0
+        )
         gap_error = gap - self.standing_gap - standing_distance - self.headway * speed
         closing, keeping, avoiding = (
             by_speed * relative_speed + by_gap * gap_error
             for by_speed, by_gap in (CLOSING_GAINS, KEEPING_GAINS, AVOIDING_GAINS)
         )
-        keeps_gap = (np.abs(gap_error) < GAP_TOLERANCE) & (np.abs(excess_speed) < SPEED_TOLERANCE)
-        acceleration = np.where(keeps_gap, keeping, np.where(gap_error < 0, avoiding, closing))
+        keeps_gap = (np.abs(gap_error) < GAP_TOLERANCE) & (
+            np.abs(excess_speed) < SPEED_TOLERANCE
+        )
+        acceleration = np.where(
+            keeps_gap, keeping, np.where(gap_error < 0, avoiding, closing)
+        )
         return np.where(
-            gap - self.standing_gap > FOLLOWING_GAP, SPEED_GAIN * excess_speed, acceleration
+            gap - self.standing_gap > FOLLOWING_GAP,
+            SPEED_GAIN * excess_speed,
+            acceleration,
         )
 
 
@@ -130,9 +144,13 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
         """dv/dt [m/s^2]."""
         speed_ratio = speed / self.cruise_speed
         closing_term = (
-            speed * (speed - leader_speed) / (2 * np.sqrt(self.acceleration * self.deceleration))
+            speed
+            * (speed - leader_speed)
+            / (2 * np.sqrt(self.acceleration * self.deceleration))
         )
-        desired_gap = self.standing_gap + np.maximum(speed * self.headway + closing_term, 0.0)
+        desired_gap = self.standing_gap + np.maximum(
+            speed * self.headway + closing_term, 0.0
+        )
         positive_gap = np.maximum(gap, LEAST_GAP)
         free_road = 1 - speed_ratio * speed_ratio * speed_ratio * speed_ratio
         return np.asarray(
@@ -180,9 +198,12 @@ class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         nominal, step = memory
         deceleration = self.braking_share * nominal.decel
         reaction_speed = deceleration * self.reaction_time
-        gap = np.minimum(np.maximum(observation.gap - self.standing_gap, 0.0), LARGEST_GAP)
+        gap = np.minimum(
+            np.maximum(observation.gap - self.standing_gap, 0.0), LARGEST_GAP
+        )
         safe_speed = (
-            np.sqrt(reaction_speed * reaction_speed + 2 * deceleration * gap) - reaction_speed
+            np.sqrt(reaction_speed * reaction_speed + 2 * deceleration * gap)
+            - reaction_speed
         )
         safe_speed = np.maximum(safe_speed, np.sqrt(2 * LAST_DECELERATION * gap))
         speed_change = np.minimum(safe_speed, self.cruise_speed) - observation.speed

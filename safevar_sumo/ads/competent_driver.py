@@ -23,7 +23,14 @@ from safevar_sumo.ads.reaction import (
     ReferenceDriver,
     StartThrottle,
 )
-from safevar_sumo.records import TIME_ROUNDING, BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import (
+    TIME_ROUNDING,
+    BoolArray,
+    Command,
+    FloatArray,
+    Nominal,
+    Observation,
+)
 
 
 class _Perceiving(NamedTuple):
@@ -104,7 +111,9 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         nobody = np.zeros(n, dtype=bool)
         return _Perceiving(reaction, np.full(n, np.inf), nobody, never, never, nobody)
 
-    def drive(self, observation: Observation, memory: _Perceiving) -> tuple[Command, _Perceiving]:
+    def drive(
+        self, observation: Observation, memory: _Perceiving
+    ) -> tuple[Command, _Perceiving]:
         step = memory.reaction.step
         is_same = observation.obstacle == memory.reaction.leader
         is_perceived, memory = self._perceive(observation, memory, is_same)
@@ -113,7 +122,9 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         reaction = self.watch_leader(observation, memory.reaction, is_in_way)
 
         # Since when has a leader braked so hard that it is a danger? It is seen a step later.
-        brakes_now = reaction.leader_deceleration > self.leader_braking + DECELERATION_ROUNDING
+        brakes_now = (
+            reaction.leader_deceleration > self.leader_braking + DECELERATION_ROUNDING
+        )
         new_braking_time = np.where(brakes_now, step, -1.0)
         has_begun = is_same & (memory.braking_time >= 0)
         braking_time = np.where(has_begun, memory.braking_time + step, new_braking_time)
@@ -126,16 +137,22 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
 
         # A new danger has lasted since its condition held, and not longer than it is perceived.
         is_followed = is_same & memory.was_in_way
-        perceived_time = np.where(is_followed, step, memory.stray_time - self.perception_time)
+        perceived_time = np.where(
+            is_followed, step, memory.stray_time - self.perception_time
+        )
         danger = Danger(
             is_danger,
             HARDEST_BRAKING,
             self.reaction_time,
             released=self.lets_go,
             nearness=np.where(brakes, np.inf, nearness),
-            longest=np.where(brakes, braking_time - self.perception_time, perceived_time),
+            longest=np.where(
+                brakes, braking_time - self.perception_time, perceived_time
+            ),
         )
-        command, reaction = self.react(observation, reaction, danger, self.start_throttle)
+        command, reaction = self.react(
+            observation, reaction, danger, self.start_throttle
+        )
         braking_time = np.where(is_in_way, braking_time, -1.0)
         return command, memory._replace(
             reaction=reaction, braking_time=braking_time, was_in_way=is_in_way
@@ -152,21 +169,35 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         lateral = np.where(is_sighted, observation.lateral, 0.0)
         is_first_sight = is_sighted & ~(is_same & np.isfinite(memory.first_lateral))
         first_lateral = np.where(is_first_sight, lateral, memory.first_lateral)
-        is_in_corridor = np.abs(lateral) <= self.corridor + observation.obstacle_width / 2
+        is_in_corridor = (
+            np.abs(lateral) <= self.corridor + observation.obstacle_width / 2
+        )
         appears_in_way = is_in_corridor & (memory.stray_time < 0)
-        appeared_in_way = np.where(is_first_sight, appears_in_way, memory.appeared_in_way)
+        appeared_in_way = np.where(
+            is_first_sight, appears_in_way, memory.appeared_in_way
+        )
 
         # Since when it has strayed from there.
-        deviation = np.abs(lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0))
+        deviation = np.abs(
+            lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0)
+        )
         strays_now = is_sighted & (deviation >= self.stray)
         drift = np.maximum(np.abs(observation.lateral_speed), LEAST_DIVISOR)
         strayed = (deviation - self.stray) / drift
-        new_stray_time = np.where(strays_now, np.minimum(strayed, memory.reaction.step), -1.0)
+        new_stray_time = np.where(
+            strays_now, np.minimum(strayed, memory.reaction.step), -1.0
+        )
         old_time = memory.stray_time
-        stray_time = np.where(old_time >= 0, old_time + memory.reaction.step, new_stray_time)
-        is_perceived = appeared_in_way | (stray_time >= self.perception_time - TIME_ROUNDING)
+        stray_time = np.where(
+            old_time >= 0, old_time + memory.reaction.step, new_stray_time
+        )
+        is_perceived = appeared_in_way | (
+            stray_time >= self.perception_time - TIME_ROUNDING
+        )
         return is_perceived, memory._replace(
-            first_lateral=first_lateral, appeared_in_way=appeared_in_way, stray_time=stray_time
+            first_lateral=first_lateral,
+            appeared_in_way=appeared_in_way,
+            stray_time=stray_time,
         )
 
 

@@ -33,7 +33,9 @@ NOMINAL_UNITS: Mapping[str, str] = {
 }
 """The numbers of the original vehicle, and their units."""
 UNITS: Mapping[str, str] = {
-    **dict.fromkeys(("speed", "closing_speed", "lateral_speed", "obstacle_speed"), "m/s"),
+    **dict.fromkeys(
+        ("speed", "closing_speed", "lateral_speed", "obstacle_speed"), "m/s"
+    ),
     **dict.fromkeys(("gap", "lateral", "obstacle_width", "obstacle_length"), "m"),
     **dict.fromkeys(("throttle", "brake", "visibility", "detected", "warns"), "1"),
     **{"time": "s", "step": "s", "acceleration": "m/s2"},
@@ -64,7 +66,8 @@ class Fmu:
         self._folder = TemporaryDirectory(prefix="fmu", ignore_cleanup_errors=True)
 
         expected = (
-            "an FMU of FMI 2.0 or 3.0 for co-simulation, of which a process may have many instances"
+            "an FMU of FMI 2.0 or 3.0 for co-simulation, of which a process may have"
+            " many instances"
         )
         try:
             from fmpy import extract, read_model_description
@@ -84,19 +87,27 @@ class Fmu:
             ) from None
 
         kind = self._model.coSimulation
-        if kind is None or self._model.fmiVersion < "2" or kind.canBeInstantiatedOnlyOncePerProcess:
+        if (
+            kind is None
+            or self._model.fmiVersion < "2"
+            or kind.canBeInstantiatedOnlyOncePerProcess
+        ):
             raise InputError("", f"{table.model} is another FMU", expected)
-        if ("acceleration" in table.outputs) == bool({"throttle", "brake"} & table.outputs.keys()):
+        if ("acceleration" in table.outputs) == bool(
+            {"throttle", "brake"} & table.outputs.keys()
+        ):
             expected = "throttle, brake or both; alternatively acceleration"
             raise InputError("", f"ads.outputs = {sorted(table.outputs)}", expected)
 
         observed = [
             name
             for name in UNITS
-            if name in (*Observation._fields, "detected", "step") or name.startswith(NOMINAL)
+            if name in (*Observation._fields, "detected", "step")
+            or name.startswith(NOMINAL)
         ]
         self.inputs = {
-            key: self._variable("input", key, name, observed) for key, name in table.inputs.items()
+            key: self._variable("input", key, name, observed)
+            for key, name in table.inputs.items()
         }
         self.outputs = {
             key: self._variable("output", key, name, COMMANDS)
@@ -107,7 +118,9 @@ class Fmu:
             for name, value in table.parameters.items()
         ]
 
-    def _variable(self, causality: str, quantity: str, name: str, quantities: Any) -> Any:
+    def _variable(
+        self, causality: str, quantity: str, name: str, quantities: Any
+    ) -> Any:
         """The real variable of a causality that takes or holds a quantity, one of some quantities,
         in its SI unit.
         """
@@ -132,7 +145,9 @@ class Fmu:
         )
         if unit and unit != UNITS.get(quantity, unit):
             raise InputError(
-                "", f"{key} = {name!r}: its unit is {unit!r}", f"a variable in {UNITS[quantity]}"
+                "",
+                f"{key} = {name!r}: its unit is {unit!r}",
+                f"a variable in {UNITS[quantity]}",
             )
         return variable
 
@@ -177,10 +192,12 @@ class FmuAds(ScalarAds):
 
     def start(self, nominal: Nominal, step: float) -> None:
         super().start(nominal, step)
-        self._known = {f"{NOMINAL}{name}": nominal._asdict()[name] for name in NOMINAL_UNITS} | {
-            "step": step
-        }
-        self._slave = self._fmu.code.call("initialisation", self._fmu.new_instance, step)
+        self._known = {
+            f"{NOMINAL}{name}": nominal._asdict()[name] for name in NOMINAL_UNITS
+        } | {"step": step}
+        self._slave = self._fmu.code.call(
+            "initialisation", self._fmu.new_instance, step
+        )
         self._end = weakref.finalize(self, _free, self._slave)
         self._end.atexit = False
 
@@ -188,7 +205,11 @@ class FmuAds(ScalarAds):
         outputs = self._fmu.code.call(
             "doStep",
             self._step,
-            {**observation._asdict(), "detected": np.isfinite(observation.gap), **self._known},
+            {
+                **observation._asdict(),
+                "detected": np.isfinite(observation.gap),
+                **self._known,
+            },
         )
         self._calls += 1
         self.warns = outputs.get("warns", 0.0) > 0.5
@@ -209,7 +230,9 @@ class FmuAds(ScalarAds):
             if result and any(result[1:3]):
                 raise RuntimeError("it ends the simulation or returns early")
             return {
-                name: getattr(slave, f"get{variable.type}")([variable.valueReference])[0]
+                name: getattr(slave, f"get{variable.type}")([variable.valueReference])[
+                    0
+                ]
                 for name, variable in self._fmu.outputs.items()
             }
         # FMPy may raise anything, and any further call of an instance that failed is undefined.

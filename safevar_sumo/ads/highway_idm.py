@@ -26,14 +26,20 @@ class HighwayIdm(ScalarAds):
         Half the width of the corridor that it watches [m].
     """
 
-    def __init__(self, target_speed: float | None = None, corridor: float = CORRIDOR) -> None:
+    def __init__(
+        self, target_speed: float | None = None, corridor: float = CORRIDOR
+    ) -> None:
         roads = library("highway_idm", "highway-env", "highway_env.road.road")
         vehicles = library("highway_idm", "highway-env", "highway_env.vehicle.behavior")
         self.target_speed = target_speed
         self.corridor = corridor
-        network = roads.RoadNetwork.straight_road_network(1, length=ROAD_LENGTH, speed_limit=None)
+        network = roads.RoadNetwork.straight_road_network(
+            1, length=ROAD_LENGTH, speed_limit=None
+        )
         road = roads.Road(network, record_history=False)
-        self._me, self._front = (vehicles.IDMVehicle(road, [0.0, 0.0]) for _ in range(2))
+        self._me, self._front = (
+            vehicles.IDMVehicle(road, [0.0, 0.0]) for _ in range(2)
+        )
 
     def drive(self, observation: Observation) -> tuple[float, float]:
         me = self._me
@@ -48,4 +54,6 @@ class HighwayIdm(ScalarAds):
             front.position[0] = observation.gap + (me.LENGTH + front.LENGTH) / 2
             front.speed = float(observation.obstacle_speed)
         wish = me.acceleration(me, front if is_led else None)
-        return self.pedals(min(max(float(wish), -me.ACC_MAX), me.ACC_MAX), observation.speed)
+        return self.pedals(
+            min(max(float(wish), -me.ACC_MAX), me.ACC_MAX), observation.speed
+        )

@@ -93,7 +93,9 @@ class AdRss(ScalarAds):
         self._rule = self._rule or _Rule(self._library, self)
         is_blocked = bool(is_in_the_way(observation, self.corridor))
         if is_blocked and self._rule.demands_braking(
-            float(observation.speed), float(observation.gap), float(observation.obstacle_speed)
+            float(observation.speed),
+            float(observation.gap),
+            float(observation.obstacle_speed),
         ):
             self.has_braked = True
             return 0.0, 1.0
@@ -123,7 +125,9 @@ class _Rule:
             "alpha_lon.brake_max": -driver.brake_max,
             "min_longitudinal_safety_distance": driver.min_longitudinal_safety_distance,
         }
-        dynamics = filled(self._rss.world.RssDynamics(), {**tables["dynamics"], **self._rule})
+        dynamics = filled(
+            self._rss.world.RssDynamics(), {**tables["dynamics"], **self._rule}
+        )
         self._situation = self._rss.core.RssSituationSnapshot()
         self._situation.default_ego_vehicle_rss_dynamics = dynamics
 
@@ -144,10 +148,17 @@ class _Rule:
         """
         # Describe the situation: the objects are the library's, the list of pairs holds copies.
         physics = self._physics
-        for state, value in ((self._pair.ego_state, speed), (self._pair.other_state, leader_speed)):
+        for state, value in (
+            (self._pair.ego_state, speed),
+            (self._pair.other_state, leader_speed),
+        ):
             velocity = state.structured_object_state.velocity
-            velocity.speed_lon_min = velocity.speed_lon_max = physics.Speed(max(value, 0.0))
-        self._pair.relative_position.longitudinal_distance = physics.Distance(max(gap, 0.0))
+            velocity.speed_lon_min = velocity.speed_lon_max = physics.Speed(
+                max(value, 0.0)
+            )
+        self._pair.relative_position.longitudinal_distance = physics.Distance(
+            max(gap, 0.0)
+        )
         self._situation.time_index += 1
         del self._situation.constellations[:]
         self._situation.constellations.append(self._pair)
@@ -156,7 +167,9 @@ class _Rule:
         response = self._rss.state.ProperResponse()
         is_legal = self._check.checkSituation(self._situation, states)
         if not (is_legal and self._resolve.provideProperResponse(states, response)):
-            rule = ", ".join(f"{name} = {value:g}" for name, value in self._rule.items())
+            rule = ", ".join(
+                f"{name} = {value:g}" for name, value in self._rule.items()
+            )
             raise ValueError(
                 f"ad-rss refuses {speed:g} m/s, {gap:g} m behind {leader_speed:g} m/s, with {rule}"
             )
@@ -169,5 +182,7 @@ def filled(target: Any, values: Mapping[str, Any]) -> Any:
         *owners, name = path.split(".")
         owner = reduce(getattr, owners, target)
         kind = type(getattr(owner, name))
-        setattr(owner, name, getattr(kind, value) if isinstance(value, str) else kind(value))
+        setattr(
+            owner, name, getattr(kind, value) if isinstance(value, str) else kind(value)
+        )
     return target

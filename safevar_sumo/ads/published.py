@@ -10,7 +10,14 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.ads.base import Ads, DelayLine
-from safevar_sumo.records import KMH_PER_MS, BoolArray, Command, FloatArray, Nominal, Observation
+from safevar_sumo.records import (
+    KMH_PER_MS,
+    BoolArray,
+    Command,
+    FloatArray,
+    Nominal,
+    Observation,
+)
 
 WidePositive = Annotated[float, Meta(gt=0, le=1e5)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -112,7 +119,8 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         nominal, step, *old_arrays = memory
         _, _, *new_arrays = plan
         arrays = (
-            np.where(is_waiting, old, new) for old, new in zip(old_arrays, new_arrays, strict=True)
+            np.where(is_waiting, old, new)
+            for old, new in zip(old_arrays, new_arrays, strict=True)
         )
         pedals = (np.where(is_waiting, 0.0, pedal) for pedal in command)
         return Command(*pedals), _ApolloMemory(nominal, step, *arrays)
@@ -124,12 +132,16 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         speed = observation.speed
         is_detected = observation.gap <= self.perception_range * observation.visibility
         distance = np.where(
-            is_detected, np.minimum(observation.gap, self.perception_range) - self.stop_gap, np.inf
+            is_detected,
+            np.minimum(observation.gap, self.perception_range) - self.stop_gap,
+            np.inf,
         )
         needed_deceleration = speed * speed / (2 * np.maximum(distance, LEAST_DISTANCE))
         # The onset allows for the distance lost by the lag of the pedals and while the deceleration
         # rises at the jerk limit.
-        lost_distance = speed * (self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk)
+        lost_distance = speed * (
+            self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk
+        )
         needed_after_lag = (
             speed * speed / (2 * np.maximum(distance - lost_distance, LEAST_DISTANCE))
         )
@@ -150,10 +162,14 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             last_acceleration = np.where(
                 begins_braking, np.minimum(last_acceleration, 0.0), last_acceleration
             )
-            largest_change = largest_change * np.where(begins_braking, share_since_onset, 1.0)
+            largest_change = largest_change * np.where(
+                begins_braking, share_since_onset, 1.0
+            )
 
         taper = np.maximum(speed - self.creep_speed, 0.0) / TAPER_TIME
-        braking = np.minimum(np.minimum(needed_deceleration, self.largest_deceleration), taper)
+        braking = np.minimum(
+            np.minimum(needed_deceleration, self.largest_deceleration), taper
+        )
         cruising = np.minimum(
             self.cruise_gain * (self.cruise_speed - speed), self.cruise_acceleration
         )
@@ -177,9 +193,13 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         """Pedals for the commanded acceleration, from the calibration table of the original
         vehicle.
         """
-        pedals = self.pedals(memory.commanded_acceleration, observation.speed, memory.nominal)
+        pedals = self.pedals(
+            memory.commanded_acceleration, observation.speed, memory.nominal
+        )
         stops = memory.has_begun_to_stop
-        return Command(np.where(stops, 0.0, pedals.throttle), np.where(stops, pedals.brake, 0.0))
+        return Command(
+            np.where(stops, 0.0, pedals.throttle), np.where(stops, pedals.brake, 0.0)
+        )
 
 
 UpTo60 = Annotated[float, Meta(ge=0, le=60)]
@@ -276,7 +296,9 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
             DelayLine.by(self.hesitation, step),
         )
 
-    def drive(self, observation: Observation, memory: _RailsMemory) -> tuple[Command, _RailsMemory]:
+    def drive(
+        self, observation: Observation, memory: _RailsMemory
+    ) -> tuple[Command, _RailsMemory]:
         (gap, lateral), recognition_line = memory.recognition_line.delayed(
             np.array([observation.gap, observation.lateral])
         )
@@ -284,7 +306,9 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         is_waiting = (observation.speed == 0) & (observation.time < self.first_command)
         low, middle, high = self.throttle
         level = observation.speed / SPEED_LEVEL
-        above_first_level = middle + (high - middle) * np.minimum(np.maximum(level - 1, 0.0), 1.0)
+        above_first_level = middle + (high - middle) * np.minimum(
+            np.maximum(level - 1, 0.0), 1.0
+        )
         throttle = np.where(
             is_braking | is_waiting | (observation.speed > SPEED_LIMIT),
             0.0,
@@ -298,10 +322,16 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
         memory = _RailsMemory(
             is_braking, tuple(pending_commands), recognition_line, hesitation_line
         )
-        return Command(command.throttle, np.minimum(command.brake, delayed_brake)), memory
+        return Command(
+            command.throttle, np.minimum(command.brake, delayed_brake)
+        ), memory
 
     def _decide_to_brake(
-        self, observation: Observation, gap: FloatArray, lateral: FloatArray, was_braking: BoolArray
+        self,
+        observation: Observation,
+        gap: FloatArray,
+        lateral: FloatArray,
+        was_braking: BoolArray,
     ) -> BoolArray:
         """Whether the policy brakes for the recognised obstacle, which is in the corridor and was
         near.

@@ -135,7 +135,9 @@ class Danger(NamedTuple):
     longest: FloatArray | float = np.inf
 
 
-class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ReferenceDriver(
+    Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
     """Base of the drivers: a driver feels how the vehicle coasts, and brakes by what its
     deceleration lacks.
 
@@ -173,13 +175,19 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         speed = np.where(is_in_way, observation.obstacle_speed, 0.0)
         is_same = observation.obstacle == memory.leader
         is_led = is_in_way & is_same & (memory.leader_speed > 0)
-        deceleration = np.where(is_led, (memory.leader_speed - speed) / memory.step, 0.0)
+        deceleration = np.where(
+            is_led, (memory.leader_speed - speed) / memory.step, 0.0
+        )
         memory = memory._replace(leader_speed=speed, leader_deceleration=deceleration)
         has_braked = memory.leader_has_braked & is_same | memory.leader_brakes
         return memory._replace(leader_has_braked=is_in_way & has_braked)
 
     def react(
-        self, observation: Observation, memory: Reaction, danger: Danger, start: StartThrottle = ()
+        self,
+        observation: Observation,
+        memory: Reaction,
+        danger: Danger,
+        start: StartThrottle = (),
     ) -> tuple[Command, Reaction]:
         """Hold the cruise speed, or answer a danger.
 
@@ -215,18 +223,23 @@ class ReferenceDriver(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fie
         nearness = _nearness(observation, danger)
         rise = np.maximum(nearness, LEAST_DIVISOR)
         part_of_step = 1 / (1 - np.minimum(old_nearness, 0.0) / rise)
-        new_time = np.maximum(np.minimum(danger.longest, memory.step * part_of_step), 0.0)
+        new_time = np.maximum(
+            np.minimum(danger.longest, memory.step * part_of_step), 0.0
+        )
         known_time = np.where(is_known, memory.aware_time + memory.step, new_time)
         aware_time = np.where(is_aware, known_time, -1.0)
 
         # Without a danger it holds its speed; aware of a cause it only ever becomes slower.
         if (step_index := round(observation.time / memory.step)) < len(start):
             calm = Command(
-                np.full_like(observation.speed, start[step_index]), np.zeros_like(observation.speed)
+                np.full_like(observation.speed, start[step_index]),
+                np.zeros_like(observation.speed),
             )
         else:
             acceleration = CRUISE_GAIN * (speed_to_hold - observation.speed)
-            acceleration = np.where(is_aware, np.minimum(acceleration, 0.0), acceleration)
+            acceleration = np.where(
+                is_aware, np.minimum(acceleration, 0.0), acceleration
+            )
             calm = self.pedals(acceleration, observation.speed, memory.nominal, trim)
 
         # In a danger it brakes by what the vehicle's own deceleration lacks.
@@ -285,5 +298,7 @@ def _decelerations(
     rise = danger.jerk * np.where(is_braking, braking_time, step)
     risen = share * np.minimum(begin + rise / 2, danger.deceleration)
     mean = risen + (1 - share) * np.maximum(released, felt)
-    intended = np.where(is_braking, np.minimum(begin + rise, danger.deceleration), released)
+    intended = np.where(
+        is_braking, np.minimum(begin + rise, danger.deceleration), released
+    )
     return mean, felt, intended

@@ -48,7 +48,9 @@ class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
 
     start_throttle: StartThrottle = ()
 
-    def drive(self, observation: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+    def drive(
+        self, observation: Observation, memory: Reaction
+    ) -> tuple[Command, Reaction]:
         is_in_way = is_in_the_way(observation, self.corridor)
         memory = self.watch_leader(observation, memory, is_in_way)
         is_present = is_in_way & (observation.closing_speed > 0)
@@ -81,12 +83,16 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
     reaction_time: NonNegativeParameter = 0.35
     margin: NonNegativeParameter = 0.1
 
-    def drive(self, observation: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+    def drive(
+        self, observation: Observation, memory: Reaction
+    ) -> tuple[Command, Reaction]:
         depth = depth_in_the_way(observation, self.corridor)
 
         # Towards somebody who does not brake, the time to collision decides.
         critical_ttc = (
-            observation.closing_speed / (2 * self.deceleration) + self.reaction_time + self.margin
+            observation.closing_speed / (2 * self.deceleration)
+            + self.reaction_time
+            + self.margin
         )
         when_steady = np.minimum(depth, critical_ttc - time_to_reach(observation))
 
@@ -103,7 +109,11 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
         when_braking = np.where(memory.leader_brakes & ~is_undercut, np.inf, -np.inf)
         nearness = np.where(memory.leader_has_braked, when_braking, when_steady)
         danger = Danger(
-            nearness > 0, self.deceleration, self.reaction_time, np.inf, nearness=nearness
+            nearness > 0,
+            self.deceleration,
+            self.reaction_time,
+            np.inf,
+            nearness=nearness,
         )
         return self.react(observation, memory._replace(is_undercut=is_undercut), danger)
 
@@ -136,14 +146,19 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
     braking: PositiveParameter = HARDEST_BRAKING
     leader_deceleration: PositiveParameter = HARDEST_BRAKING
 
-    def drive(self, observation: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+    def drive(
+        self, observation: Observation, memory: Reaction
+    ) -> tuple[Command, Reaction]:
         depth = depth_in_the_way(observation, self.corridor)
         memory = self.watch_leader(observation, memory, depth >= 0)
         lacking = (
-            self.safe_distance(observation.speed, observation.obstacle_speed) - observation.gap
+            self.safe_distance(observation.speed, observation.obstacle_speed)
+            - observation.gap
         )
         nearness = np.minimum(depth, lacking)
-        danger = Danger(nearness > 0, self.braking, self.reaction_time, nearness=nearness)
+        danger = Danger(
+            nearness > 0, self.braking, self.reaction_time, nearness=nearness
+        )
         return self.react(observation, memory, danger)
 
     def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
@@ -186,37 +201,58 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     leader_deceleration: PositiveParameter = 7.0
     margin: NonNegativeParameter = 2.0
 
-    def drive(self, observation: Observation, memory: Reaction) -> tuple[Command, Reaction]:
+    def drive(
+        self, observation: Observation, memory: Reaction
+    ) -> tuple[Command, Reaction]:
         depth = depth_in_the_way(observation, self.corridor)
         memory = self.watch_leader(observation, memory, depth >= 0)
         gap = np.where(depth >= 0, observation.gap, np.inf)
         pfs = self.proactive_metric(gap, observation.speed, observation.obstacle_speed)
         cfs = self.critical_metric(
-            gap, observation.speed, observation.obstacle_speed, memory.acceleration(observation)
+            gap,
+            observation.speed,
+            observation.obstacle_speed,
+            memory.acceleration(observation),
         )
-        critical_deceleration = cfs * (self.hardest - self.comfortable) + self.comfortable
+        critical_deceleration = (
+            cfs * (self.hardest - self.comfortable) + self.comfortable
+        )
         deceleration = np.minimum(
-            np.where(cfs > 0, critical_deceleration, pfs * self.comfortable), HARDEST_BRAKING
+            np.where(cfs > 0, critical_deceleration, pfs * self.comfortable),
+            HARDEST_BRAKING,
         )
-        _, safe_distance = self.proactive_distances(observation.speed, observation.obstacle_speed)
+        _, safe_distance = self.proactive_distances(
+            observation.speed, observation.obstacle_speed
+        )
         nearness = np.minimum(depth, safe_distance + self.margin - observation.gap)
-        danger = Danger((pfs > 0) | (cfs > 0), deceleration, self.reaction_time, nearness=nearness)
+        danger = Danger(
+            (pfs > 0) | (cfs > 0), deceleration, self.reaction_time, nearness=nearness
+        )
         return self.react(observation, memory, danger)
 
-    def proactive_metric(self, gap: FloatArray, v: FloatArray, u: FloatArray) -> FloatArray:
+    def proactive_metric(
+        self, gap: FloatArray, v: FloatArray, u: FloatArray
+    ) -> FloatArray:
         """PFS at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe
         distance, 1 below the unsafe distance.
         """
         unsafe_distance, safe_distance = self.proactive_distances(v, u)
         return _falling_ramp(gap - self.margin, unsafe_distance, safe_distance)
 
-    def proactive_distances(self, v: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def proactive_distances(
+        self, v: FloatArray, u: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """The unsafe and the safe distance [m] of PFS."""
         leader_stop = u * u / (2 * self.leader_deceleration)
         safe_distance = (
-            v * self.reaction_time + v * v / (2 * self.comfortable) - leader_stop + self.margin
+            v * self.reaction_time
+            + v * v / (2 * self.comfortable)
+            - leader_stop
+            + self.margin
         )
-        unsafe_distance = v * self.reaction_time + v * v / (2 * self.hardest) - leader_stop
+        unsafe_distance = (
+            v * self.reaction_time + v * v / (2 * self.hardest) - leader_stop
+        )
         return unsafe_distance, safe_distance
 
     def critical_metric(
@@ -229,16 +265,21 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
         speed_after_reaction = v + self.reaction_time * acceleration
         # How much the gap shrinks within the reaction time and, if the vehicle is slower then,
         # until speeds are equal:
-        loss_in_reaction = (v + acceleration * self.reaction_time / 2 - u) * self.reaction_time
+        loss_in_reaction = (
+            v + acceleration * self.reaction_time / 2 - u
+        ) * self.reaction_time
         loss_to_leader_speed = (
             (v - u) * (v - u) / (2 * np.maximum(np.abs(acceleration), LEAST_DIVISOR))
         )
         square = (speed_after_reaction - u) * (speed_after_reaction - u)
         unsafe_distance, safe_distance = (
-            loss_in_reaction + square / (2 * b) for b in (self.hardest, self.comfortable)
+            loss_in_reaction + square / (2 * b)
+            for b in (self.hardest, self.comfortable)
         )
         cfs_still_faster = _falling_ramp(gap, unsafe_distance, safe_distance)
-        cfs = np.where(speed_after_reaction < u, gap < loss_to_leader_speed, cfs_still_faster)
+        cfs = np.where(
+            speed_after_reaction < u, gap < loss_to_leader_speed, cfs_still_faster
+        )
         return np.where(v <= u, 0.0, cfs)
 
 

@@ -59,7 +59,9 @@ class VariedAds(Ads):
                     setattr(driver, name, value)
             return varied, drivers
         # Frozen ones get the values, too.
-        set_field = force_setattr if isinstance(varied, msgspec.Struct) else object.__setattr__
+        set_field = (
+            force_setattr if isinstance(varied, msgspec.Struct) else object.__setattr__
+        )
         for name, column in zip(self._names, columns, strict=True):
             set_field(varied, name, column)
         return varied, varied.start(n, nominal, step)
@@ -82,4 +84,6 @@ def with_tau(ads: Ads, tau: FloatArray | None) -> Ads:
     if not isinstance(ads, VariedAds):
         return VariedAds(ads, (ads.tau_parameter,), tau[:, np.newaxis])
     values = np.tile(ads._values, (len(tau) // len(ads._values), 1))
-    return VariedAds(ads._ads, (*ads._names, ads.tau_parameter), np.column_stack([values, tau]))
+    return VariedAds(
+        ads._ads, (*ads._names, ads.tau_parameter), np.column_stack([values, tau])
+    )

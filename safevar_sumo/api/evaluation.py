@@ -96,11 +96,15 @@ def evaluate(
         with about("settings"):
             system.region.check(simulated, otherwise=", or any with beyond=True")
     with open_progress(progress) as report_progress:
-        evaluations = evaluate_with_workers(loaded_study, simulated, pool, jobs, report_progress)
+        evaluations = evaluate_with_workers(
+            loaded_study, simulated, pool, jobs, report_progress
+        )
 
     # The evaluations are of no algorithm and run.
     groups = [(("", 0), evaluations)]
-    frame = evaluations_frame(characteristics.names, groups).drop(columns=["algorithm", "run"])
+    frame = evaluations_frame(characteristics.names, groups).drop(
+        columns=["algorithm", "run"]
+    )
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
     if (scoring := system.measuring.scoring).safe_original is not None:
         frame["feasible"] = scoring.feasible_rows(frame)
@@ -135,22 +139,32 @@ def _read_settings(
     names = list(characteristics.names)
     if isinstance(settings, Sequence):
         settings = plain_values(settings)
-    if isinstance(settings, Sequence) and all(isinstance(setting, Mapping) for setting in settings):
+    if isinstance(settings, Sequence) and all(
+        isinstance(setting, Mapping) for setting in settings
+    ):
         settings = pd.DataFrame(list(settings), index=range(len(settings)))
     try:
         # A table may leave out characteristics; an array has all.
         if isinstance(settings, pd.DataFrame):
             for name in settings.columns:
-                check_name("settings", f"column {name!r} is no characteristic", name, names)
+                check_name(
+                    "settings", f"column {name!r} is no characteristic", name, names
+                )
                 _check_numbers(name, settings[name])
-            values = settings.reindex(columns=names).to_numpy(dtype=float, na_value=np.nan)
+            values = settings.reindex(columns=names).to_numpy(
+                dtype=float, na_value=np.nan
+            )
             array = np.where(np.isnan(values), characteristics.original, values)
             index = settings.index
         else:
             array = np.array(settings, dtype=float)
             if array.ndim != 2 or array.shape[1] != len(names):
-                expected = f"{SETTINGS_FORMAT}; here n = {len(names)}: {', '.join(names)}"
-                got = f"an array of shape {array.shape}" if array.ndim else repr(settings)
+                expected = (
+                    f"{SETTINGS_FORMAT}; here n = {len(names)}: {', '.join(names)}"
+                )
+                got = (
+                    f"an array of shape {array.shape}" if array.ndim else repr(settings)
+                )
                 raise InputError("settings", got, expected)
             index = pd.RangeIndex(len(array))
     except (TypeError, ValueError) as error:
@@ -163,7 +177,9 @@ def _read_settings(
     ]
     for row, column in np.argwhere(~np.column_stack(is_legal))[:1]:
         with about(f"settings, row {row}"):
-            characteristics.members[column].check(float(array[row, column]), beyond=beyond)
+            characteristics.members[column].check(
+                float(array[row, column]), beyond=beyond
+            )
     return array, index
 
 
@@ -173,4 +189,6 @@ def _check_numbers(name: str, column: pd.Series) -> None:
         return
     for row, value in enumerate(column):
         if not isinstance(value, Real | None):
-            raise InputError(f"settings, row {row}", f"{name} = {value!r}", "a number, or None")
+            raise InputError(
+                f"settings, row {row}", f"{name} = {value!r}", "a number, or None"
+            )

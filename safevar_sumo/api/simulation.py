@@ -71,7 +71,8 @@ def trace_frame(
     columns = {
         "position [m]": trace.position,
         "speed [m/s]": trace.speed,
-        "acceleration [m/s^2]": np.diff(trace.speed, axis=0, prepend=trace.speed[:1]) / trace.step,
+        "acceleration [m/s^2]": np.diff(trace.speed, axis=0, prepend=trace.speed[:1])
+        / trace.step,
         "gap [m]": trace.gap,
         "ttc [s]": ttc,
         "throttle [-]": trace.throttle,
@@ -88,12 +89,20 @@ def trace_frame(
 
     # The driving system of a simulator of the user's own is inside, and says nothing.
     if not observations:
-        return frame.replace([np.inf, -np.inf], np.nan).dropna(axis="columns", how="all")
-    times = [round(float(observation.time), TIME_DECIMALS) for observation in observations]
+        return frame.replace([np.inf, -np.inf], np.nan).dropna(
+            axis="columns", how="all"
+        )
+    times = [
+        round(float(observation.time), TIME_DECIMALS) for observation in observations
+    ]
     observed = pd.DataFrame({"time [s]": times})
     for name, head in OBSERVATION_HEADS.items():
-        observed[head] = [float(getattr(observation, name)[row]) for observation in observations]
-    return frame.merge(observed, how="left", on="time [s]").replace([np.inf, -np.inf], np.nan)
+        observed[head] = [
+            float(getattr(observation, name)[row]) for observation in observations
+        ]
+    return frame.merge(observed, how="left", on="time [s]").replace(
+        [np.inf, -np.inf], np.nan
+    )
 
 
 class Pair(NamedTuple):
@@ -178,7 +187,9 @@ class Simulation:
     @property
     def metrics(self) -> dict[str, float]:
         """Safety metrics by name, in the units that `list` prints; NaN where undefined."""
-        return {name: float(values[0]) for name, values in self.evaluation.metrics.items()}
+        return {
+            name: float(values[0]) for name, values in self.evaluation.metrics.items()
+        }
 
     @property
     def objectives(self) -> dict[str, float]:
@@ -197,7 +208,11 @@ class Simulation:
         measures = (*self.scoring.metrics, *self.scoring.objectives)
         return {
             "collision_speed": "m/s",
-            **{measure.name: measure.unit for measure in measures if measure.name in self.metrics},
+            **{
+                measure.name: measure.unit
+                for measure in measures
+                if measure.name in self.metrics
+            },
             "gap": "m",
             "f_safe": "m, or -m/s",
             "f_diff": "fraction",
@@ -222,14 +237,19 @@ class Simulation:
         false if simulations of the study tell nothing about its ADS.
         """
         gap = finite_or_none(self.gap)
-        return {"driven": not self.no_verdict, **record(self.evaluation, row=0), "gap": gap}
+        return {
+            "driven": not self.no_verdict,
+            **record(self.evaluation, row=0),
+            "gap": gap,
+        }
 
     @property
     def verdict(self) -> str:
         """How the simulation ended, in words; with repeats, in how many of them it is unsafe."""
         runs = runs_in_words(self.pair.system.criterion.runs(self.evaluation)[:, 0])
         is_breach = (
-            self.pair.system.criterion.of(self.evaluation)[0] and self.evaluation.collided[0]
+            self.pair.system.criterion.of(self.evaluation)[0]
+            and self.evaluation.collided[0]
         )
         if runs and not is_breach:
             return f"{self._ending}, unsafe{runs}"
@@ -243,8 +263,12 @@ class Simulation:
             excess = self.metrics[IMPACT_EXCESS.name]
             return f"has an {impact_in_words(speed, excess)}"
         if self.outcome is Outcome.COLLISION:
-            return collision_in_words(-safety_degree, self.collision_speed, self._digits)
-        distance = distance_in_words(safety_degree, self.runs.middles_apart, self._digits)
+            return collision_in_words(
+                -safety_degree, self.collision_speed, self._digits
+            )
+        distance = distance_in_words(
+            safety_degree, self.runs.middles_apart, self._digits
+        )
         ending = OUTCOME_VERBS[self.outcome]
         if np.isnan(safety_degree):
             return ending
@@ -275,7 +299,9 @@ class Simulation:
         return f"<p>{escape(repr(self))}</p>\n{table.to_html()}"
 
     def __repr__(self) -> str:
-        metrics = ", ".join(f"{name}={value:.4g}" for name, value in self.metrics.items())
+        metrics = ", ".join(
+            f"{name}={value:.4g}" for name, value in self.metrics.items()
+        )
         return f"<Simulation of {self.study.name}: {self.outcome}, {metrics}>"
 
 
@@ -348,10 +374,14 @@ def changed_setting(
     after the filter if `filtered`, infeasible.
     """
     with about("changes"):
-        setting = system.characteristics.setting({} if changes is None else changes, beyond=beyond)
+        setting = system.characteristics.setting(
+            {} if changes is None else changes, beyond=beyond
+        )
         if not beyond:
             simulated = system.characteristics.filter(setting) if filtered else setting
-            system.region.check(simulated[np.newaxis], otherwise=", or any with beyond=True")
+            system.region.check(
+                simulated[np.newaxis], otherwise=", or any with beyond=True"
+            )
         return setting
 
 
@@ -378,7 +408,12 @@ def simulate_with_original(
     )
     pair = Pair(point, at_point, runs, score(at_point, settings, runs), observations)
 
-    values = zip(characteristics.names, requested.tolist(), filtered_setting.tolist(), strict=True)
+    values = zip(
+        characteristics.names,
+        requested.tolist(),
+        filtered_setting.tolist(),
+        strict=True,
+    )
     return Simulation(
         study=study,
         pair=pair,

@@ -49,7 +49,9 @@ from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.without_effect import without_effect
 from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
 
-INTERRUPTED = "finished evaluations are kept in {}: run the same command again to continue"
+INTERRUPTED = (
+    "finished evaluations are kept in {}: run the same command again to continue"
+)
 VERDICT_COST = 80_000
 """Number of simulations of a search that take as long as the verdict on it, roughly; the search
 states its own number.
@@ -66,7 +68,9 @@ ALGORITHMS: Columns = {
         "those that leave a test's speed before the ADS acts: neither failure nor success"
     ),
     "simulator_errors": "those that cannot be simulated",
-    "best": Column("m", "least safety degree; minus the collision's speed in m/s", ".2f"),
+    "best": Column(
+        "m", "least safety degree; minus the collision's speed in m/s", ".2f"
+    ),
     "solutions": "solutions of finished runs",
 }
 CHANGES: Columns = {
@@ -165,11 +169,17 @@ def study(
     as_written = part_of_study(read_study(study), ranges, point, up_to)
     directory = out or Path("results") / directory_name(as_written)
     if unsafe is not None and status:
-        raise InputError("unsafe", "beside --status, which simulates no search", "one of the two options")
+        raise InputError(
+            "unsafe",
+            "beside --status, which simulates no search",
+            "one of the two options",
+        )
     if status:
         return summarise(load(directory))
 
-    changed = _with_options(as_written, algorithms, runs=runs, evaluations=evaluations, seed=seed)
+    changed = _with_options(
+        as_written, algorithms, runs=runs, evaluations=evaluations, seed=seed
+    )
     loaded, system = load_for_search(changed)
     # What no study has is refused before the search.
     if unsafe is not None:
@@ -178,7 +188,9 @@ def study(
         warn(remark)
     if system.mover.takes_long:
         command = f"{PROGRAM_COMMAND} explain {loaded.words}"
-        warn(f"{command} --simulations N looks for the smallest changes with N simulations alone")
+        warn(
+            f"{command} --simulations N looks for the smallest changes with N simulations alone"
+        )
 
     try:
         with open_progress(not quiet) as show:
@@ -214,7 +226,9 @@ def _found(
     criterion = "" if unsafe is None else f" --unsafe {quote(str(unsafe))}"
     directory = quote(str(results.directory))
     questions = f"explain {study}", f"explain {directory}", f"tolerance {directory}"
-    advice = ", ".join(f"{PROGRAM_COMMAND} {question}{criterion}" for question in questions)
+    advice = ", ".join(
+        f"{PROGRAM_COMMAND} {question}{criterion}" for question in questions
+    )
 
     # Questions refuse an original encounter in which the original vehicle is not safe.
     demanded = results.case.scoring.safe_original
@@ -255,7 +269,9 @@ def directory_name(study: Study) -> str:
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
     """The study with the numbers and algorithms of its search that the command states."""
     search = study.search
-    changes: JsonObject = {name: value for name, value in numbers.items() if value is not None}
+    changes: JsonObject = {
+        name: value for name, value in numbers.items() if value is not None
+    }
     if algorithms is not None:
         names = [name.strip() for name in algorithms.split(",")]
         changes["algorithms"] = [search.labels.get(name, name) for name in names]
@@ -300,7 +316,9 @@ def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, Rows]
     changed = [item for item in members if values[item.name] != item.original]
     texts = change_texts(members.vehicle, values, are_printed=True)
     where = encounter_in_words(members, values, are_printed=True)
-    options = "".join(f" --set {item.name}={values[item.name]:{EXACT}}" for item in changed)
+    options = "".join(
+        f" --set {item.name}={values[item.name]:{EXACT}}" for item in changed
+    )
     if 0 < len(texts) <= MAX_LISTED:
         where += f": {', '.join(texts)}"
     return (
@@ -323,13 +341,18 @@ def summarise(results: Results) -> Answer:
     case = results.case
     study = results.study
     if not case.has_runs:
-        raise InputError(results.directory, "holds imported solutions, which have no runs", "results of the command `study`")
+        raise InputError(
+            results.directory,
+            "holds imported solutions, which have no runs",
+            "results of the command `study`",
+        )
 
     finished = Counter(name for name, _ in results.finished)
     rows = []
     for name in study.search.labels:
         simulated, solutions = (
-            frame[frame["algorithm"] == name] for frame in (results.evaluations, results.solutions)
+            frame[frame["algorithm"] == name]
+            for frame in (results.evaluations, results.solutions)
         )
         outcomes = Counter(simulated["outcome"])
         feasible = simulated[case.scoring.feasible_rows(simulated)]
@@ -337,7 +360,9 @@ def summarise(results: Results) -> Answer:
         means = solutions[[metric.name for metric in case.scoring.metrics]].mean()
         collisions = int(are_collisions(feasible).sum())
         ends = (collisions, *counts, feasible["f_safe"].min(), len(solutions))
-        rows.append((name, finished[name], study.search.runs, len(simulated), *ends, *means))
+        rows.append(
+            (name, finished[name], study.search.runs, len(simulated), *ends, *means)
+        )
 
     metrics = {
         metric.name: Column(metric.unit, "mean over solutions", ".2f", is_detail=True)
@@ -352,7 +377,9 @@ def summarise(results: Results) -> Answer:
         tables |= answer_questions([case], names=RUN_TESTS).tables
         untested = [name for name in RUN_TESTS if not tables[name]["enough_runs"].any()]
         # The first remark on tests of which none can be significant says how many runs are needed.
-        if few := " ".join(next(remarks_on_runs(name, tables[name]), "") for name in untested):
+        if few := " ".join(
+            next(remarks_on_runs(name, tables[name]), "") for name in untested
+        ):
             remarks = tables["remarks"]
             remarks.loc[len(remarks)] = ["all", few]
     runs = study.search.runs * len(rows)

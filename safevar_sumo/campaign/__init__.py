@@ -16,7 +16,10 @@ Questions ask the same pool for single batches.
   or a batch.
 """
 
-from safevar_sumo.campaign.campaign import Campaign as Campaign, run_campaign as run_campaign
+from safevar_sumo.campaign.campaign import (
+    Campaign as Campaign,
+    run_campaign as run_campaign,
+)
 from safevar_sumo.campaign.runs import (
     RunKey as RunKey,
     all_runs as all_runs,

@@ -72,7 +72,11 @@ def refuse_other_worker(study: Study, manifest: JsonObject, package: str) -> Non
     """
     refuse_changed_inputs(study, system_of(study), manifest)
     if package != package_digest():
-        raise InputError("cluster", f"a worker on {platform.node()} has other code of safevar_sumo, or another Python", "the same installation everywhere")
+        raise InputError(
+            "cluster",
+            f"a worker on {platform.node()} has other code of safevar_sumo, or another Python",
+            "the same installation everywhere",
+        )
 
 
 def _refuse_other_workers(study: Study, used: Iterable[str], pool: Pool) -> None:
@@ -108,7 +112,9 @@ def evaluate_all(
     """
     packed_study = msgspec.msgpack.encode(study)
     if pool.shared is not None:
-        return _evaluate_shared(study, settings, pool, finish, verified, selection, begin)
+        return _evaluate_shared(
+            study, settings, pool, finish, verified, selection, begin
+        )
     opened = _opened_by(study, pool)
     system = system_of(study)
     if packed_study not in pool.inputs:
@@ -146,11 +152,15 @@ def evaluate_all(
         pool.failed += int(evaluations.failed.sum())
         if pool.failed > MAX_SKIPPED * max(pool.simulated, FEW_SKIPPED):
             failures = evaluations.take(evaluations.failed)
-            numbers = f"{pool.failed} of {pool.simulated} settings failed, more than 10 %"
+            numbers = (
+                f"{pool.failed} of {pool.simulated} settings failed, more than 10 %"
+            )
             problem = f"search.failed = 'skip': {numbers}"
             if len(failures):
                 problem += f": {failures.reason(0)}"
-            raise UserCodeError(study.source, problem, "a simulator that fails less often")
+            raise UserCodeError(
+                study.source, problem, "a simulator that fails less often"
+            )
     return evaluations.take(row_of.ravel())
 
 
@@ -168,12 +178,16 @@ def _evaluate_shared(
     pool.shared = None
     assert shared is not None
     try:
-        evaluation_of = shared.setdefault(msgspec.msgpack.encode((study, selection)), {})
+        evaluation_of = shared.setdefault(
+            msgspec.msgpack.encode((study, selection)), {}
+        )
         rows = np.unique(settings, axis=0)
         new_rows = rows[[row.tobytes() not in evaluation_of for row in rows]]
         finish(len(rows) - len(new_rows))
         if len(new_rows):
-            evaluations = evaluate_all(study, new_rows, pool, finish, verified, selection, begin)
+            evaluations = evaluate_all(
+                study, new_rows, pool, finish, verified, selection, begin
+            )
             for number, row in enumerate(new_rows):
                 evaluation_of[row.tobytes()] = evaluations.take([number])
     finally:
@@ -190,7 +204,9 @@ def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:
         key = hashlib.sha256(b"original" + cache.key_of(study, opened)).digest()
         cached = evaluations_in(cache.get(key))
         if cached is not None and [*differences(cached.results, original.results)]:
-            warn("does not continue: the simulator drives the original vehicle otherwise now")
+            warn(
+                "does not continue: the simulator drives the original vehicle otherwise now"
+            )
             cache.forget()
         cache.put(key, content_of(original))
 
@@ -237,18 +253,27 @@ def _simulate(
     """Simulate distinct settings, shape (k, n), in batches for the workers; where recorded scenes
     replace SUMO, some of the results are repeated in SUMO.
     """
-    jobs = [(task, rows) for rows in np.array_split(settings, batches.number(len(settings), pool))]
+    jobs = [
+        (task, rows)
+        for rows in np.array_split(settings, batches.number(len(settings), pool))
+    ]
 
     def show_ended(ended: Sequence[int]) -> None:
         for number in ended:
             finish(len(jobs[number][1]))
 
-    evaluations = Evaluations.concatenate(carry_out(evaluate_settings, jobs, pool, show_ended))
+    evaluations = Evaluations.concatenate(
+        carry_out(evaluate_settings, jobs, pool, show_ended)
+    )
     sample_size = min(sample_size, len(settings))
     if batches.are_recorded and sample_size > 0 and task.selection == EVERYTHING:
         sample = np.linspace(0, len(settings) - 1, sample_size).astype(int)
         sample = sample[~evaluations.failed[sample]]
-        carry_out(verify_settings, [(task, settings[sample], evaluations.points[sample])], pool)
+        carry_out(
+            verify_settings,
+            [(task, settings[sample], evaluations.points[sample])],
+            pool,
+        )
     return evaluations
 
 
@@ -289,7 +314,9 @@ def choose_batches(study: Study, selection: Selection) -> Batches:
     """Choose how settings of a study fill batches."""
     system = selection.of(system_of(study))
     are_recorded = not reason_against_scenes(system)
-    have_turns = isinstance(system.ads, PerVehicleAds) or system.ads.max_vehicles is not None
+    have_turns = (
+        isinstance(system.ads, PerVehicleAds) or system.ads.max_vehicles is not None
+    )
     size = settings_per_batch(system)
     return Batches(size, are_recorded and not have_turns, are_recorded)
 
@@ -315,7 +342,9 @@ def _compile_vehicle(task: Task, only_load: bool) -> bool:
     return bool(system_of(task.study).vehicle.compile(only_load=only_load))
 
 
-def ask_why_no_verdict(study: Study, pool: Pool, begin: Callable[[], None] = lambda: None) -> str:
+def ask_why_no_verdict(
+    study: Study, pool: Pool, begin: Callable[[], None] = lambda: None
+) -> str:
     """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker;
     "" if they do. `begin` is called before anything is simulated.
     """

@@ -85,7 +85,9 @@ class Cache:
         Whether an entry, `NUMBER`, counts the settings that are kept.
     """
 
-    def __init__(self, folder: Path, *, is_read: bool = True, is_counted: bool = False) -> None:
+    def __init__(
+        self, folder: Path, *, is_read: bool = True, is_counted: bool = False
+    ) -> None:
         self._folder = folder
         self._is_read = is_read
         self._entries: diskcache.Cache | None = None
@@ -163,7 +165,9 @@ class Cache:
             eviction_policy="least-recently-used",
         )
 
-    def _guarded(self, function: Callable[..., Any], otherwise: Any, *arguments: Any) -> Any:
+    def _guarded(
+        self, function: Callable[..., Any], otherwise: Any, *arguments: Any
+    ) -> Any:
         """What a function returns; where the folder is at fault, the cache ends."""
         try:
             return function(*arguments)
@@ -216,7 +220,9 @@ class CommandCache:
             self._lock.release()
 
     def _open_own(self, key: bytes) -> None:
-        self._own_folder = self._folder / sha256(key + self._command.encode()).hexdigest()
+        self._own_folder = (
+            self._folder / sha256(key + self._command.encode()).hexdigest()
+        )
         try:
             # Nobody continues what is older than a day.
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -296,7 +302,9 @@ def cache_of(study: Study, opened: Sequence[str]) -> Cache | None:
     return None
 
 
-def key_of_settings(study_key: bytes, selection: Selection, settings: FloatArray) -> bytes:
+def key_of_settings(
+    study_key: bytes, selection: Selection, settings: FloatArray
+) -> bytes:
     """The key of settings of a study, as a selection restricts and varies them."""
     digest = sha256(study_key)
     digest.update(msgspec.json.encode([selection, settings.shape]))
@@ -307,7 +315,9 @@ def key_of_settings(study_key: bytes, selection: Selection, settings: FloatArray
 def content_of(evaluations: Evaluations) -> bytes:
     """Evaluations without failures as the content of an entry."""
     arrays = {name: getattr(evaluations, name) for name in COLUMNS}
-    arrays |= {f"{METRIC}{name}": values for name, values in evaluations.metrics.items()}
+    arrays |= {
+        f"{METRIC}{name}": values for name, values in evaluations.metrics.items()
+    }
     if evaluations.worst_points is not None:
         arrays[POINTS] = evaluations.worst_points
     buffer = BytesIO()
@@ -356,4 +366,8 @@ def _environment() -> Any:
         [package.metadata.get_all("Name", []), package.metadata.get_all("Version", [])]
         for package in distributions()
     )
-    return platform.python_version(), versions, digests(files_in(PACKAGE), [str(PACKAGE)])
+    return (
+        platform.python_version(),
+        versions,
+        digests(files_in(PACKAGE), [str(PACKAGE)]),
+    )

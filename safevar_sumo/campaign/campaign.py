@@ -15,10 +15,21 @@ import numpy as np
 from numpy.random import default_rng
 
 from safevar_sumo.campaign.batches import ask_why_no_verdict, compile_vehicle
-from safevar_sumo.campaign.evaluation import Task, carry_out, evaluate_settings, verify_settings
+from safevar_sumo.campaign.evaluation import (
+    Task,
+    carry_out,
+    evaluate_settings,
+    verify_settings,
+)
 from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.campaign.pool import Pool
-from safevar_sumo.campaign.runs import MAX_REPEATED, RunKey, RunResult, algorithm_of, all_runs
+from safevar_sumo.campaign.runs import (
+    MAX_REPEATED,
+    RunKey,
+    RunResult,
+    algorithm_of,
+    all_runs,
+)
 from safevar_sumo.campaign.share import Share, carry_share
 from safevar_sumo.campaign.user_checks import check_code, repeat_elsewhere
 from safevar_sumo.errors import InputError, SimulationError, one_of
@@ -101,7 +112,9 @@ def run_campaign(
         read = opened if is_new else read_manifest(directory).get("files", ())
     manifest = manifest_now(study, system, read)
     names = [*map(str, keys)]
-    results = ResultsDirectory(directory, study, manifest, system.measuring.scoring, names)
+    results = ResultsDirectory(
+        directory, study, manifest, system.measuring.scoring, names
+    )
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
         warn(remark)
     system, engine_used, reason = choose_engine(system, engine)
@@ -147,7 +160,9 @@ def run_campaign(
 def _remarks_on_discarded(study: Study, runs: Sequence[RunResult]) -> Iterator[str]:
     """What algorithms returned that is no solution."""
     for algorithm in study.search.labels:
-        if count := sum(run.discarded for run in runs if run.key.algorithm == algorithm):
+        if count := sum(
+            run.discarded for run in runs if run.key.algorithm == algorithm
+        ):
             yield (
                 f"study {study.name!r}: {count} settings that {algorithm} returned are no"
                 " solutions: the original vehicle is not safe in their encounter, or an objective"
@@ -174,8 +189,14 @@ def _remarks(
 def _about_algorithms(study: Study) -> JsonObject:
     """What a manifest says of the study's algorithms: titles, and which stop by themselves."""
     algorithms = {name: algorithm_of(name, study) for name in study.search.labels}
-    stopping = [name for name, algorithm in algorithms.items() if algorithm.stops_by_itself]
-    titles = {name: algorithm.title for name, algorithm in algorithms.items() if algorithm.title}
+    stopping = [
+        name for name, algorithm in algorithms.items() if algorithm.stops_by_itself
+    ]
+    titles = {
+        name: algorithm.title
+        for name, algorithm in algorithms.items()
+        if algorithm.title
+    }
     return {"titles": titles, "stop_by_themselves": stopping}
 
 
@@ -212,7 +233,9 @@ def deal(
     return [keys[number::count] for number in range(count)]
 
 
-def choose_sample(study: Study, original: Evaluations, runs: Sequence[RunResult]) -> Evaluations:
+def choose_sample(
+    study: Study, original: Evaluations, runs: Sequence[RunResult]
+) -> Evaluations:
     """What SUMO repeats of a search: its unsafe solutions, or as many of them as `UNSAFE_REPEATED`
     allows, and others that the study's seed draws.
     """
@@ -230,12 +253,16 @@ def choose_sample(study: Study, original: Evaluations, runs: Sequence[RunResult]
     return candidates.take(np.sort(distinct)[:MAX_REPEATED])
 
 
-def repeat_in_sumo(task: Task, sample: Evaluations, pool: Pool, progress: Progress) -> set[str]:
+def repeat_in_sumo(
+    task: Task, sample: Evaluations, pool: Pool, progress: Progress
+) -> set[str]:
     """Repeat evaluations in SUMO; returns remarks on what could not be simulated. Raises the error
     of `verify_in_sumo`.
     """
     phase = f"{task.study.name}: verifying in SUMO"
-    batches = np.array_split(np.arange(len(sample)), math.ceil(len(sample) / SETTINGS_PER_JOB) or 1)
+    batches = np.array_split(
+        np.arange(len(sample)), math.ceil(len(sample) / SETTINGS_PER_JOB) or 1
+    )
     jobs = [(task, sample.settings[rows], sample.points[rows]) for rows in batches]
     verified = 0
 
@@ -255,7 +282,8 @@ def journal_progress(
     those that have not finished, all others are to come.
     """
     readers = [
-        JournalReader(journal_file(directory, str(key)), study.search.evaluations) for key in keys
+        JournalReader(journal_file(directory, str(key)), study.search.evaluations)
+        for key in keys
     ]
 
     def show(ended: Sequence[int]) -> None:

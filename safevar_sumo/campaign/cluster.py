@@ -15,7 +15,13 @@ from typing import Any
 
 import portalocker
 
-from safevar_sumo.errors import MAX_JOBS, InputError, SafevarError, describe_error, missing_extra
+from safevar_sumo.errors import (
+    MAX_JOBS,
+    InputError,
+    SafevarError,
+    describe_error,
+    missing_extra,
+)
 from safevar_sumo.plugins.process import this_process
 
 CLUSTER = (
@@ -50,7 +56,9 @@ def connect(address: str) -> Iterator[Any]:
         client = Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
-            "cluster", f"no scheduler answers at {address!r}: {describe_error(error)}", CLUSTER
+            "cluster",
+            f"no scheduler answers at {address!r}: {describe_error(error)}",
+            CLUSTER,
         ) from None
     with client:
         yield client
@@ -62,7 +70,11 @@ def everywhere(client: Any, function: Callable[..., Any], *arguments: Any) -> No
         client.run(_carry_out, pickle.dumps((function, arguments)), "")
     except (AttributeError, ImportError, TypeError) as error:
         # Another version knows no such function.
-        raise InputError("cluster", f"a worker has another version of safevar_sumo: {describe_error(error)}", "the same installation everywhere") from None
+        raise InputError(
+            "cluster",
+            f"a worker has another version of safevar_sumo: {describe_error(error)}",
+            "the same installation everywhere",
+        ) from None
 
 
 class ClusterWorker:
@@ -102,7 +114,9 @@ def _carry_out(packed_job: bytes, command: str) -> Any:
         if this_process.last_words is None:
             this_process.worker = _own_number()
         this_process.last_words = sys.__stderr__
-        this_process.attempts = Path(gettempdir(), f"safevar-{command}") if command else None
+        this_process.attempts = (
+            Path(gettempdir(), f"safevar-{command}") if command else None
+        )
         return function(*arguments)
 
 

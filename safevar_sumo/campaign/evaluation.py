@@ -18,7 +18,12 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.campaign.pool import Pool, WorkerLostError
-from safevar_sumo.errors import EnvironmentFault, SafevarError, SimulationError, UserCodeError
+from safevar_sumo.errors import (
+    EnvironmentFault,
+    SafevarError,
+    SimulationError,
+    UserCodeError,
+)
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins.process import REPRODUCED_BY
 from safevar_sumo.plugins.time_limit import end_if_longer
@@ -61,7 +66,9 @@ class Selection(msgspec.Struct, frozen=True):
         """The system at the selected points."""
         if self.points is None:
             return system
-        return replace(system, points=tuple(system.points[number] for number in self.points))
+        return replace(
+            system, points=tuple(system.points[number] for number in self.points)
+        )
 
 
 EVERYTHING = Selection()
@@ -123,7 +130,9 @@ def carry_out(
         problem = f"two workers were lost at the same work, {work}: {error}"
         if names:
             where = f", probably in {' and '.join(names)}"
-            raise UserCodeError(f"study {task.study.name!r}", f"{problem}{where}") from None
+            raise UserCodeError(
+                f"study {task.study.name!r}", f"{problem}{where}"
+            ) from None
         raise SafevarError(f"study {task.study.name!r}: {problem}") from None
 
 
@@ -143,7 +152,9 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
     """
     if len(rows) > task.batch_size:
         batches = np.array_split(rows, math.ceil(len(rows) / task.batch_size))
-        return Evaluations.concatenate([evaluate_settings(task, batch) for batch in batches])
+        return Evaluations.concatenate(
+            [evaluate_settings(task, batch) for batch in batches]
+        )
     try:
         return evaluate_batch(task, rows)
     except (SimulationError, UserCodeError) as error:
@@ -159,7 +170,9 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
         if isinstance(failure, UserCodeError):
             command = reproduction_command(task.study, setting[0])
             raise UserCodeError(
-                failure.source, f"{failure.problem}{REPRODUCED_BY}{command}", failure.legal
+                failure.source,
+                f"{failure.problem}{REPRODUCED_BY}{command}",
+                failure.legal,
             ) from None
         reasons = {rows[0].tobytes(): " ".join(str(failure).split())}
         changes = characteristics.change_objectives(setting)
@@ -189,7 +202,9 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
         else:
             evaluations = drive_and_score(system, rows)
     if user_code_names(task.study) and system.repeats == 1:
-        _first_batches.setdefault(msgspec.msgpack.encode(task.study), (task, rows, evaluations))
+        _first_batches.setdefault(
+            msgspec.msgpack.encode(task.study), (task, rows, evaluations)
+        )
     return evaluations
 
 
@@ -227,8 +242,12 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
 
     # A driving system that takes an array for each parameter drives all at once.
     if selection.arrays:
-        system = replace(system, ads=VariedAds(system.ads, selection.parameters, values))
-        return replace(drive_and_score(system, settings, with_originals=False), settings=rows)
+        system = replace(
+            system, ads=VariedAds(system.ads, selection.parameters, values)
+        )
+        return replace(
+            drive_and_score(system, settings, with_originals=False), settings=rows
+        )
 
     # Any other one drives once for each set of values.
     parameter_sets, set_of_row = np.unique(values, axis=0, return_inverse=True)
@@ -244,7 +263,9 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
         groups.append(replace(evaluations, settings=rows[group]))
         rows_of_groups.append(group)
     # The evaluations get the order of the rows.
-    return Evaluations.concatenate(groups).take(np.argsort(np.concatenate(rows_of_groups)))
+    return Evaluations.concatenate(groups).take(
+        np.argsort(np.concatenate(rows_of_groups))
+    )
 
 
 def with_parameters(study: Study, values: Mapping[str, float]) -> Study:

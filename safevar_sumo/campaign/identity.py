@@ -30,7 +30,11 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
     `used` are names of further files, which user code was seen to load; those that exist belong to
     the inputs.
     """
-    identity = {"files": files_of(study, system, used), "results": RESULTS, "platform": PLATFORM}
+    identity = {
+        "files": files_of(study, system, used),
+        "results": RESULTS,
+        "platform": PLATFORM,
+    }
     versions = {}
     libraries = set[str]()
     for scenario in (point.scenario for point in system.points):
@@ -42,7 +46,9 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
                 libraries.add(name)
             except PackageNotFoundError:
                 raise InputError(
-                    study.source, f"scenario.model = {study.scenario.model!r}: LIBRARIES has {name!r}", "names of installed distributions"
+                    study.source,
+                    f"scenario.model = {study.scenario.model!r}: LIBRARIES has {name!r}",
+                    "names of installed distributions",
                 ) from None
     used_by = {"libraries": sorted(libraries)} if libraries else {}
     return manifest_of(study, {**identity, "versions": versions, **used_by})
@@ -66,8 +72,16 @@ def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
     places = study.origin.places
     networks = {point.scenario.network for point in system.points} - {""}
     opened = [open_network(network) for network in sorted(networks)]
-    network_files = {network.path(name) for network in opened for name, _ in network.digests}
-    fmus = {Path(file_beside(name, places or [os.getcwd()])) for _, name in fmus_of(study)}
-    data = {file for path in data_files(study).values() for file in files_in(Path(path))}
+    network_files = {
+        network.path(name) for network in opened for name, _ in network.digests
+    }
+    fmus = {
+        Path(file_beside(name, places or [os.getcwd()])) for _, name in fmus_of(study)
+    }
+    data = {
+        file for path in data_files(study).values() for file in files_in(Path(path))
+    }
     files = network_files | code_files(user_modules(study), places) | fmus | data
-    return dict(sorted((digests_by_name(used, places) | digests(files, places)).items()))
+    return dict(
+        sorted((digests_by_name(used, places) | digests(files, places)).items())
+    )

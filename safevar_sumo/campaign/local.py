@@ -62,7 +62,12 @@ class ProcessWorker:
         arguments = (ImportPath.here(), last_words, self._mark)
         self._executor = ProcessPoolExecutor(1, context, _begin_work, arguments)
         variables = {MARK: self._mark, "PYTHONHASHSEED": "0"}
-        with _hide_main(), _show_package(), _block_interrupts(), set_variables(variables):
+        with (
+            _hide_main(),
+            _show_package(),
+            _block_interrupts(),
+            set_variables(variables),
+        ):
             # The first job starts the process.
             self._executor.submit(os.getpid)
         (self._process,) = self._executor._processes.values()
@@ -93,7 +98,9 @@ class ProcessWorker:
         if CLOSED in words:
             return f"{CLOSED}{place}"
         if TIMEOUT_MARK in words:
-            return f"a batch took longer than the time limit, `search.time_limit`{place}"
+            return (
+                f"a batch took longer than the time limit, `search.time_limit`{place}"
+            )
         # The executor's thread may have waited for the process, and be about to note its code.
         for _ in range(1000):
             if self._process.exitcode is not None:

@@ -149,7 +149,9 @@ class Pool:
 
     def _skipped(self) -> int:
         """Number of settings of which so many workers have died that they are skipped."""
-        folders = self.attempts.iterdir() if self.attempts and self.attempts.exists() else ()
+        folders = (
+            self.attempts.iterdir() if self.attempts and self.attempts.exists() else ()
+        )
         return sum(len([*folder.iterdir()]) > MAX_DEATHS for folder in folders)
 
     def everywhere(
@@ -166,7 +168,9 @@ class Pool:
         while self._started:
             self._started.popitem()[1].end()
 
-    def _begin(self, place: int, function: Callable[..., Any], job: tuple[Any, ...]) -> Future[Any]:
+    def _begin(
+        self, place: int, function: Callable[..., Any], job: tuple[Any, ...]
+    ) -> Future[Any]:
         if place in self._started:
             # Its process may have died between two jobs.
             with suppress(BrokenExecutor):
@@ -178,7 +182,11 @@ class Pool:
 
 def available_cores() -> int:
     """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1
+    )
 
 
 @contextmanager
@@ -193,7 +201,9 @@ def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[P
         is not installed.
     """
     if jobs is not None and (
-        isinstance(jobs, bool) or not isinstance(jobs, Integral) or not 1 <= int(jobs) <= MAX_JOBS
+        isinstance(jobs, bool)
+        or not isinstance(jobs, Integral)
+        or not 1 <= int(jobs) <= MAX_JOBS
     ):
         raise InputError("jobs", repr(jobs), f"a whole number from 1 to {MAX_JOBS:,}")
     with ExitStack() as stack:
@@ -206,7 +216,9 @@ def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[P
             pool.attempts = folder / local.ATTEMPTS
         else:
             client = stack.enter_context(dask.connect(cluster))
-            pool = Pool(max(1, len(client.nthreads())), lambda place: dask.ClusterWorker(client))
+            pool = Pool(
+                max(1, len(client.nthreads())), lambda place: dask.ClusterWorker(client)
+            )
             pool.on_cluster = lambda *job: dask.everywhere(client, *job)
         stack.callback(pool.close)
         yield pool

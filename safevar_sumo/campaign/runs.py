@@ -58,7 +58,11 @@ class RunResult(NamedTuple):
 
 def all_runs(study: Study) -> list[RunKey]:
     """The keys of all runs of a study."""
-    return [RunKey(label, run) for label in study.search.labels for run in range(study.search.runs)]
+    return [
+        RunKey(label, run)
+        for label in study.search.labels
+        for run in range(study.search.runs)
+    ]
 
 
 def algorithm_of(label: str, study: Study) -> Algorithm:
@@ -75,7 +79,8 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
         name = search.labels.get(label, label)
         key = f"search.{label}"
         parameters_of = {
-            label_of(table): parameters for table, parameters in search.parameters.items()
+            label_of(table): parameters
+            for table, parameters in search.parameters.items()
         }
         if len(search.labels) < len(search.algorithms):
             raise InputError(
@@ -85,13 +90,18 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
             )
         for table in search.parameters:
             if not (
-                table in PYMOO_ALGORITHMS or table in ALGORITHMS or label_of(table) in search.labels
+                table in PYMOO_ALGORITHMS
+                or table in ALGORITHMS
+                or label_of(table) in search.labels
             ):
                 legal = dict.fromkeys(
                     (*SearchTable.__struct_fields__, *DESCRIPTIONS, *search.labels)
                 )
                 raise unknown_name(
-                    "", f"search.{table}: there is no such key and no such algorithm", table, PYMOO_ALGORITHMS if table.startswith(PYMOO) else legal
+                    "",
+                    f"search.{table}: there is no such key and no such algorithm",
+                    table,
+                    PYMOO_ALGORITHMS if table.startswith(PYMOO) else legal,
                 )
 
         lookup = Lookup.of(study)
@@ -106,7 +116,9 @@ def algorithm_of(label: str, study: Study) -> Algorithm:
             )
 
         parameters = lookup.with_paths(member, parameters_of.get(label, {}), key)
-        algorithm: Algorithm = instance_of(member, parameters, f"search.algorithms: {name!r}", key)
+        algorithm: Algorithm = instance_of(
+            member, parameters, f"search.algorithms: {name!r}", key
+        )
         return algorithm
 
 
@@ -125,7 +137,9 @@ def check_algorithms(study: Study, system: System) -> None:
             f" {search.evaluations}"
         )
         raise InputError(study.source, excess, "a run of at least one population")
-    problem = problem_of(study, system, Evaluations.none(len(system.characteristics), METRICS))
+    problem = problem_of(
+        study, system, Evaluations.none(len(system.characteristics), METRICS)
+    )
     for name in search.labels:
         algorithm = algorithm_of(name, study)
         with about(study.source):
@@ -173,7 +187,12 @@ class Run:
     solutions: Evaluations
 
     def __init__(
-        self, key: RunKey, search: Search, journal: Journal, budget: int, scoring: Scoring
+        self,
+        key: RunKey,
+        search: Search,
+        journal: Journal,
+        budget: int,
+        scoring: Scoring,
     ) -> None:
         self.key = key
         self._search = search
@@ -192,7 +211,9 @@ class Run:
         """The first position in the run of each setting in this request that is not known."""
         self.is_finished = self._has_ended = budget in journal.content.results
         if self.is_finished:
-            self.solutions = journal.content.take_positions(journal.content.results[budget])
+            self.solutions = journal.content.take_positions(
+                journal.content.results[budget]
+            )
 
     def look_up(self) -> FloatArray:
         """Answer the search while all that it asks is known; returns the distinct settings that are
@@ -223,7 +244,9 @@ class Run:
 
     def receive(self, evaluations: Evaluations) -> None:
         """Journal and remember evaluations of missing settings."""
-        positions = [self._missing.pop(setting.tobytes()) for setting in evaluations.settings]
+        positions = [
+            self._missing.pop(setting.tobytes()) for setting in evaluations.settings
+        ]
         if not self._journaled.isdisjoint(positions):
             raise InputError(
                 self._journal.path,
@@ -233,7 +256,8 @@ class Run:
         self._journal.append(positions, evaluations)
         earlier = self._content.evaluations
         self._row_of |= {
-            setting.tobytes(): row for row, setting in enumerate(evaluations.settings, len(earlier))
+            setting.tobytes(): row
+            for row, setting in enumerate(evaluations.settings, len(earlier))
         }
         self._content = self._content._replace(
             positions=[*self._content.positions, *positions],

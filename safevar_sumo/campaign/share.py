@@ -14,7 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.campaign.cluster import has_caller
-from safevar_sumo.campaign.evaluation import Task, evaluate_settings, repeat_first_batch, system_of
+from safevar_sumo.campaign.evaluation import (
+    Task,
+    evaluate_settings,
+    repeat_first_batch,
+    system_of,
+)
 from safevar_sumo.campaign.identity import refuse_changed_inputs
 from safevar_sumo.campaign.runs import (
     Run,
@@ -27,7 +32,13 @@ from safevar_sumo.campaign.runs import (
 from safevar_sumo.errors import InputError, SafevarError, UserCodeError, about
 from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.records import Evaluations, JsonObject
-from safevar_sumo.results import MANIFEST, Journal, identity_digest, journal_file, journal_head
+from safevar_sumo.results import (
+    MANIFEST,
+    Journal,
+    identity_digest,
+    journal_file,
+    journal_head,
+)
 from safevar_sumo.study import Study
 
 MAX_SKIPPED = 0.1
@@ -86,7 +97,9 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
     # Before: this worker may have other files. Afterwards: somebody may have edited them meanwhile.
     refuse_changed_inputs(task.study, system_of(task.study), share.manifest)
     with about(task.study.source), ExitStack() as stack:
-        runs = [stack.enter_context(closing(_begin(task, share, key))) for key in share.keys]
+        runs = [
+            stack.enter_context(closing(_begin(task, share, key))) for key in share.keys
+        ]
         # Each search goes on until it asks for settings that are in no journal; a run's settings
         # are neighbours.
         while requests := [(run, setting) for run in runs for setting in run.look_up()]:
@@ -120,7 +133,11 @@ def _refuse_failures(study: Study, runs: Sequence[Run]) -> None:
         failures = next(run.failures for run in reversed(runs) if len(run.failures))
         problem = f"search.failed = 'skip': {number} settings failed, more than 10 % of {total}"
         reason = failures.reason(len(failures) - 1)
-        raise UserCodeError(f"study {study.name!r}", f"{problem}; the last one: {reason}", "a simulator that fails less often; `study --retry-failed` tries them again")
+        raise UserCodeError(
+            f"study {study.name!r}",
+            f"{problem}; the last one: {reason}",
+            "a simulator that fails less often; `study --retry-failed` tries them again",
+        )
 
 
 def _begin(task: Task, share: Share, key: RunKey) -> Run:
@@ -128,9 +145,13 @@ def _begin(task: Task, share: Share, key: RunKey) -> Run:
     study = task.study
     system = system_of(task.study)
     path = journal_file(share.directory, str(key))
-    head = journal_head(identity_digest(share.manifest), str(key), system.characteristics.names)
+    head = journal_head(
+        identity_digest(share.manifest), str(key), system.characteristics.names
+    )
     problem = problem_of(study, system, share.original)
     with user_errors(study.source):
-        search = algorithm_of(key.algorithm, study).search(problem, random_generator_of(study, key))
+        search = algorithm_of(key.algorithm, study).search(
+            problem, random_generator_of(study, key)
+        )
     journal = Journal(path, head, retry_failed=share.retry_failed)
     return Run(key, search, journal, study.search.evaluations, problem.scoring)

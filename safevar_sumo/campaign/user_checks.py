@@ -75,7 +75,9 @@ def repeat_elsewhere(study: Study, pool: Pool) -> None:
         If a result differs.
     """
     system = system_of(study)
-    rows = np.concatenate([system.characteristics.original_settings, random_settings(study)])
+    rows = np.concatenate(
+        [system.characteristics.original_settings, random_settings(study)]
+    )
     backwards = Selection(points=tuple(range(len(system.points)))[::-1])
     jobs = [(Task(study=study), rows), (Task(study=study, selection=backwards), rows)]
     # The worker of the second job must not have simulated anything.
@@ -88,7 +90,9 @@ def repeat_elsewhere(study: Study, pool: Pool) -> None:
     for row, difference in differences(repeated.results, evaluations.results):
         command = reproduction_command(study, rows[row])
         problem = f"{difference} in another process, or with points in another order"
-        raise UserCodeError(study.source, f"{problem}{REPRODUCED_BY}{command}", SAME_ELSEWHERE)
+        raise UserCodeError(
+            study.source, f"{problem}{REPRODUCED_BY}{command}", SAME_ELSEWHERE
+        )
 
 
 def random_settings(study: Study) -> FloatArray:
@@ -114,10 +118,14 @@ def find_in_new_process(study: Study) -> list[Finding]:
     if system.mover.is_exact or system.repeats > 1:
         return []
     members = system.characteristics
-    settings = system.region.repaired(np.stack([members.original, members.lower, members.upper]))
+    settings = system.region.repaired(
+        np.stack([members.original, members.lower, members.upper])
+    )
     # The new process comes first, as a simulator may end its process.
     with open_pool(1) as pool:
-        (repeated,) = carry_out(evaluate_settings, [(Task(study=study), settings)], pool)
+        (repeated,) = carry_out(
+            evaluate_settings, [(Task(study=study), settings)], pool
+        )
     evaluations = drive_and_score(replace(system, points=system.points[::-1]), settings)
     for row, difference in differences(evaluations.results, repeated.results):
         # It is slow to import, and rarely needed.

@@ -13,7 +13,12 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.check.trials import Finding, find_unused, try_algorithm, try_simulations
+from safevar_sumo.check.trials import (
+    Finding,
+    find_unused,
+    try_algorithm,
+    try_simulations,
+)
 from safevar_sumo.errors import UserCodeError, about
 from safevar_sumo.plugins import Lookup, unload_user_modules
 from safevar_sumo.scenarios.declared import read_study
@@ -101,7 +106,15 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
         words = sentence_on(problems, len(system.points))
         if next(iter(problems.values())).reason is Reason.LATE:
             where = _definition(study, "scenario.model", study.scenario.model)
-            return [Finding("meeting", words, where, "", "an encounter while the others are there")]
+            return [
+                Finding(
+                    "meeting",
+                    words,
+                    where,
+                    "",
+                    "an encounter while the others are there",
+                )
+            ]
         expected = "a drive to the encounter, without braking for nobody"
         return [Finding("reaction", words, where, "", expected)]
 
@@ -111,7 +124,9 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
         return []
     words = f"the original vehicle itself {unsafe.breach_in_words(original)}"
     point = system.points[original.points[0]].name
-    return [Finding("original", words, where, point, "an original vehicle that is safe")]
+    return [
+        Finding("original", words, where, point, "an original vehicle that is safe")
+    ]
 
 
 def refuse_defects(study: Study, limit: int | None = None) -> None:
@@ -123,9 +138,14 @@ def refuse_defects(study: Study, limit: int | None = None) -> None:
         With the first defect, the input that shows it, file and line, and advice.
     """
     for finding in find_defects(study, limit=limit):
-        command = f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}"
+        command = (
+            f"{PROGRAM_COMMAND} check {shlex.quote(study.origin.called or study.name)}"
+        )
         raise UserCodeError(
-            study.source, f"{finding}; to reproduce it: {command}", f"{finding.expected}; {CHECKS[finding.check]}", finding.where
+            study.source,
+            f"{finding}; to reproduce it: {command}",
+            f"{finding.expected}; {CHECKS[finding.check]}",
+            finding.where,
         )
 
 
@@ -157,7 +177,11 @@ def _first_defect(
             yield finding._replace(where=where)
     except UserCodeError as error:
         yield Finding(
-            "contract", error.problem, error.place or where, "", error.legal or "no exception"
+            "contract",
+            error.problem,
+            error.place or where,
+            "",
+            error.legal or "no exception",
         )
 
 

@@ -110,12 +110,18 @@ def try_simulations(
         # Each vehicle is in four runs, and both ends of the list are alone in one more.
         simulations = simulations_of_setting(system)
         remaining_simulations = limit - system.repeats - 2 * simulations
-        vehicles = remaining_simulations // (simulations * (1 if system.repeats > 1 else 4))
+        vehicles = remaining_simulations // (
+            simulations * (1 if system.repeats > 1 else 4)
+        )
         if vehicles < 1:
             return
-    own_metrics = [name for name in (*study.metrics.also, *study.search.objectives) if ":" in name]
+    own_metrics = [
+        name for name in (*study.metrics.also, *study.search.objectives) if ":" in name
+    ]
     if not system.mover.is_exact or own_metrics:
-        yield from try_original(system, drive_all(system.at(system.points[0]), settings[:1]))
+        yield from try_original(
+            system, drive_all(system.at(system.points[0]), settings[:1])
+        )
     number, seconds = (1, 0.0) if limit is not None else _affordable(system, settings)
     if vehicles is not None:
         vehicles = min(vehicles, len(settings))
@@ -136,7 +142,9 @@ def try_simulations(
 
     expected = "the same, to the bit"
     if not system.mover.is_exact:
-        expected += "; or repeats = N in [scenario], where the share of unsafe runs counts"
+        expected += (
+            "; or repeats = N in [scenario], where the share of unsafe runs counts"
+        )
     yield from _try(load, region.characteristics, settings, progress, expected)
 
     # Recorded scenes of a user's scenario hold in SUMO, too.
@@ -146,7 +154,9 @@ def try_simulations(
             verify_in_sumo(system, settings, drive_and_score(system, settings).points)
         except InputError as error:
             problem, _, setting = error.problem.partition(", with ")
-            reacts = "reactive_actors = True where somebody reacts to the vehicle under test"
+            reacts = (
+                "reactive_actors = True where somebody reacts to the vehicle under test"
+            )
             yield Finding("contract", problem, "", setting, reacts)
 
 
@@ -168,7 +178,9 @@ def try_original(system: System, runs: SimulationRuns) -> Iterator[Finding]:
                 with user_errors(system.source):
                     is_read = not all(
                         np.array_equal(
-                            values, measure.of_runs(variant, system.metrics_table), equal_nan=True
+                            values,
+                            measure.of_runs(variant, system.metrics_table),
+                            equal_nan=True,
                         )
                         for variant in variants
                     )
@@ -192,10 +204,14 @@ def find_unused(study: Study) -> Iterator[Finding]:
     for name in map(label_of, (*study.metrics.also, *study.search.objectives)):
         if name in results and np.isnan(results[name].astype(float)).all():
             expected = "a value in some run"
-            yield Finding("undefined", f"{name} is undefined in all runs", "", sample, expected)
+            yield Finding(
+                "undefined", f"{name} is undefined in all runs", "", sample, expected
+            )
     if unread := sorted(unread_characteristics(system, settings)):
         expected = "a simulator that reads each characteristic of its vehicle"
-        yield Finding("unread", f"simulate never reads {', '.join(unread)}", "", sample, expected)
+        yield Finding(
+            "unread", f"simulate never reads {', '.join(unread)}", "", sample, expected
+        )
 
 
 def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
@@ -221,7 +237,9 @@ def try_algorithm(study: Study, name: str) -> Iterator[Finding]:
     repeated = _search(study, name, seeds=(2, 1))
     expected = "the same in every run with the same random numbers, to the bit"
     if len(outputs) != len(repeated):
-        difference = f"{len(repeated)} settings instead of {len(outputs)} in another run"
+        difference = (
+            f"{len(repeated)} settings instead of {len(outputs)} in another run"
+        )
         yield Finding("repetition", difference, "", "", expected)
     elif (outputs != repeated).any():
         row = int(np.argmax((outputs != repeated).any(axis=1)))
@@ -284,9 +302,9 @@ def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
         np.where(is_odd, lower, upper),
         np.where(is_odd, upper, lower),
     ]
-    return np.concatenate([corners, default_rng(0).uniform(lower, upper, (count, len(lower)))])[
-        :count
-    ]
+    return np.concatenate(
+        [corners, default_rng(0).uniform(lower, upper, (count, len(lower)))]
+    )[:count]
 
 
 def _system(study: Study) -> System:

@@ -66,7 +66,9 @@ class _Command(click.Command):
     too.
     """
 
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    def format_options(
+        self, ctx: click.Context, formatter: click.HelpFormatter
+    ) -> None:
         if ctx.meta.get("all"):
             super().format_options(ctx, formatter)
             return
@@ -83,7 +85,8 @@ class _Command(click.Command):
             flags = [
                 options.pop(name).opts[0]
                 for name in names
-                if name in options and str(options[name].help).startswith(meanings.get(name, ""))
+                if name in options
+                and str(options[name].help).startswith(meanings.get(name, ""))
             ]
             if flags:
                 lines.append((title, ", ".join(flags)))
@@ -92,7 +95,9 @@ class _Command(click.Command):
             formatter.write_dl([*filter(None, records)], col_max=16)
 
         if lines:
-            with formatter.section("Options of many commands (--help-all explains them)"):
+            with formatter.section(
+                "Options of many commands (--help-all explains them)"
+            ):
                 formatter.write_dl(lines)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -101,7 +106,9 @@ class _Command(click.Command):
             if instead := ENDED_OPTIONS.get(f"{self.name} {word}"):
                 raise InputError(word, "is an option of releases before 0.5", instead)
         for option in self.params:
-            takes_one = isinstance(option, click.Option) and not (option.multiple or option.is_flag)
+            takes_one = isinstance(option, click.Option) and not (
+                option.multiple or option.is_flag
+            )
             if takes_one and counts[option.opts[0]] > 1:
                 raise InputError(option.opts[0], "is given twice", "it once")
         return super().parse_args(ctx, args)
@@ -188,7 +195,9 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         for parameter in signature.parameters.values()
         if parameter.kind is not parameter.KEYWORD_ONLY
     ]
-    options = [option for option in options_of(function) if option.name not in LIBRARY_ONLY]
+    options = [
+        option for option in options_of(function) if option.name not in LIBRARY_ONLY
+    ]
     constants = {"progress": True} if "progress" in signature.parameters else {}
 
     def call(**values: Any) -> Any:
@@ -219,7 +228,10 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
 
 
 def _check_names(
-    declared: Contents, values: Mapping[str, Any], keys: Sequence[str], table: str | None
+    declared: Contents,
+    values: Mapping[str, Any],
+    keys: Sequence[str],
+    table: str | None,
 ) -> None:
     """Refuse keys of conditions, and a table, that no answer of the command has."""
     # Answers such as that of `simulate` have the metrics of their study.
@@ -231,7 +243,9 @@ def _check_names(
         check_name("table", f"there is no table {table!r}", table, declared.tables)
 
 
-def _exit_on_failures(answer: Answer, conditions: Sequence[tuple[str, str, float]]) -> None:
+def _exit_on_failures(
+    answer: Answer, conditions: Sequence[tuple[str, str, float]]
+) -> None:
     """End with an exit code if a limit is not kept, a condition holds, a check has findings, or a
     person has to decide; the verdict's reasons are not said again.
     """
@@ -256,7 +270,9 @@ def names_in_study(values: Mapping[str, Any]) -> list[str]:
     # It takes long to load.
     from safevar_sumo.sumo import assemble
 
-    study = study_in(study_or_case(values["source"], as_it_is_now=values["as_it_is_now"]))
+    study = study_in(
+        study_or_case(values["source"], as_it_is_now=values["as_it_is_now"])
+    )
     return [*assemble(study).measuring.measures]
 
 
@@ -282,7 +298,8 @@ def _argument(parameter: inspect.Parameter) -> click.Argument:
         [parameter.name],
         nargs=-1 if is_repeated else 1,
         required=parameter.default is parameter.empty,
-        metavar=METAVARS.get(parameter.name, parameter.name.upper()) + "..." * is_repeated,
+        metavar=METAVARS.get(parameter.name, parameter.name.upper())
+        + "..." * is_repeated,
         shell_complete=_complete_study,
     )
 
@@ -291,14 +308,18 @@ def _complete_study(
     _ctx: click.Context, _param: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
     """Complete names of studies, files and directories."""
-    names = [CompletionItem(name) for name in study_names() if name.startswith(incomplete)]
+    names = [
+        CompletionItem(name) for name in study_names() if name.startswith(incomplete)
+    ]
     return [*names, CompletionItem(incomplete, type="file")]
 
 
 class _Path(click.Path):
     """A path, which is not empty."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> Any:
         if value == "":
             raise InputError(str(param and param.name), "''", "a path")
         return super().convert(value, param, ctx)
@@ -319,7 +340,8 @@ def _flag(option: Option) -> click.Option:
         type=kind,
         is_flag=option.kind is bool,
         multiple=option.is_repeated,
-        show_default=option.default not in (None, (), False, "", inspect.Parameter.empty),
+        show_default=option.default
+        not in (None, (), False, "", inspect.Parameter.empty),
         metavar=option.metavar,
         help=meaning,
         **({"required": True} if is_required else {"default": option.default}),
@@ -347,7 +369,11 @@ def _parse(text: str) -> tuple[str, str, float]:
     """The key, the operator and the limit of a condition."""
     match = CONDITION.fullmatch(text)
     if match is None or not math.isfinite(limit := float(match[3])):
-        raise InputError("fail_if", repr(text), '"KEY > X" with <, <=, > or >= and a number, such as "probability > 0.01"')
+        raise InputError(
+            "fail_if",
+            repr(text),
+            '"KEY > X" with <, <=, > or >= and a number, such as "probability > 0.01"',
+        )
     return match[1], match[2], limit
 
 
@@ -366,6 +392,8 @@ def _fulfilments(answer: Answer, key: str, sign: str, limit: float) -> Iterator[
         rows = [f" in the row {row}" for row in answer.tables[table].iloc[:, 0]]
     for value, row in zip(values, rows, strict=True):
         if isinstance(value, bool) or not isinstance(value, int | float | None):
-            raise InputError("fail_if", f"{key} is no number", "the key of a number of the answer")
+            raise InputError(
+                "fail_if", f"{key} is no number", "the key of a number of the answer"
+            )
         if value is not None and COMPARISONS[sign](value, limit):
             yield f"{key} = {value:g} {sign} {limit:g}{row}"

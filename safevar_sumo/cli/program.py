@@ -60,7 +60,9 @@ COMMANDS_BY_GROUP = {
 }
 """The function of each command, by the title of its group, in the order of the help."""
 COMMANDS = {
-    name: function for group in COMMANDS_BY_GROUP.values() for name, function in group.items()
+    name: function
+    for group in COMMANDS_BY_GROUP.values()
+    for name, function in group.items()
 }
 ENDED_COMMANDS = {
     "rating": "study euro_ncap_pedestrian, and Euro NCAP's own calculator for its points"
@@ -98,9 +100,18 @@ class LazyCommands(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Suggest the nearest command if the name is unknown, or what stands in its place."""
         if args and args[0] in ENDED_COMMANDS:
-            raise InputError(args[0], "a command of releases before 0.5", ENDED_COMMANDS[args[0]])
-        if args and args[0] not in COMMANDS and not args[0].startswith("-") and ":" not in args[0]:
-            ctx.fail(f"there is no command {args[0]!r}{did_you_mean(args[0], COMMANDS)}")
+            raise InputError(
+                args[0], "a command of releases before 0.5", ENDED_COMMANDS[args[0]]
+            )
+        if (
+            args
+            and args[0] not in COMMANDS
+            and not args[0].startswith("-")
+            and ":" not in args[0]
+        ):
+            ctx.fail(
+                f"there is no command {args[0]!r}{did_you_mean(args[0], COMMANDS)}"
+            )
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -123,11 +134,16 @@ class LazyCommands(click.Group):
             error.legal = ARGUMENT.sub(to_flag, error.legal)
             raise
 
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    def format_commands(
+        self, ctx: click.Context, formatter: click.HelpFormatter
+    ) -> None:
         for title, group in COMMANDS_BY_GROUP.items():
             with formatter.section(title):
                 formatter.write_dl(
-                    [(name, first_paragraph(function)) for name, function in group.items()]
+                    [
+                        (name, first_paragraph(function))
+                        for name, function in group.items()
+                    ]
                 )
 
 
@@ -135,7 +151,8 @@ def command_function(command: str) -> Callable[..., Any]:
     """The function of a command, by its name."""
     module, _, name = COMMANDS[command].partition(":")
     return cast(
-        "Callable[..., Any]", getattr(importlib.import_module(f"safevar_sumo.{module}"), name)
+        "Callable[..., Any]",
+        getattr(importlib.import_module(f"safevar_sumo.{module}"), name),
     )
 
 

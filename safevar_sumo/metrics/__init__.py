@@ -49,9 +49,9 @@ OPTIONAL_METRICS = {
     )
 }
 """Metrics that only the studies have that name them."""
-OBJECTIVES = {objective.name: objective for objective in (F_SAFE, F_DIFF, F_NUM_DIFF)} | {
-    SAFETY_DEGREE_METRIC.name: F_SAFE
-}
+OBJECTIVES = {
+    objective.name: objective for objective in (F_SAFE, F_DIFF, F_NUM_DIFF)
+} | {SAFETY_DEGREE_METRIC.name: F_SAFE}
 """What the objectives of a search may name besides metrics."""
 PUBLISHED_SCORING = Scoring(
     metrics=tuple(metric.facts for metric in METRICS.values()),

@@ -11,7 +11,13 @@ from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, UserCodeError, check_name
 from safevar_sumo.plugins import FINITE, Legal, UserCode, quoted
-from safevar_sumo.records import QUANTITIES, BoolArray, Evaluations, FloatArray, SimulationRuns
+from safevar_sumo.records import (
+    QUANTITIES,
+    BoolArray,
+    Evaluations,
+    FloatArray,
+    SimulationRuns,
+)
 from safevar_sumo.study import ORIGINAL_DEGREE, MetricsTable
 
 if TYPE_CHECKING:
@@ -142,12 +148,18 @@ def checked_measure(code: UserCode) -> Measure:
     InputError
         If it is not a valid record of a measure.
     """
-    expected = "a safevar_sumo.metrics.Measure(name=..., title=..., unit=..., function=...)"
+    expected = (
+        "a safevar_sumo.metrics.Measure(name=..., title=..., unit=..., function=...)"
+    )
     measure = code.target
     if not (isinstance(measure, Measure) and callable(measure.function)):
-        raise UserCodeError("", f"{code.name} is {quoted(measure)}", expected, code.definition())
+        raise UserCodeError(
+            "", f"{code.name} is {quoted(measure)}", expected, code.definition()
+        )
     try:
-        facts = msgspec.convert(msgspec.to_builtins(replace(measure, function=None)), Measure)
+        facts = msgspec.convert(
+            msgspec.to_builtins(replace(measure, function=None)), Measure
+        )
     except (msgspec.ValidationError, TypeError) as error:
         raise InputError("", f"{code.name}: {error}", expected) from None
     for need in facts.quantities:
@@ -159,7 +171,9 @@ def checked_measure(code: UserCode) -> Measure:
     return replace(facts, function=function)
 
 
-class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
+class Scoring(
+    Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True
+):
     """The metrics of a study and the objectives of its searches; stored in results beside the
     study.
 
@@ -191,7 +205,10 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unkn
     def values(self, evaluations: Evaluations) -> FloatArray:
         """Values of the objectives, smaller being better; shape (M, objectives)."""
         return np.stack(
-            [objective.sign * evaluations.column(objective.name) for objective in self.objectives],
+            [
+                objective.sign * evaluations.column(objective.name)
+                for objective in self.objectives
+            ],
             axis=1,
         )
 
@@ -200,9 +217,13 @@ class Scoring(Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unkn
         shape (M,).
         """
         is_defined = np.isfinite(self.values(evaluations)).all(axis=1)
-        return np.asarray(evaluations.valid & is_defined & (self.violation(evaluations) == 0))
+        return np.asarray(
+            evaluations.valid & is_defined & (self.violation(evaluations) == 0)
+        )
 
 
 F_SAFE = Measure(name="f_safe", title="safety degree", unit="m, -m/s")
 F_DIFF = Measure(name="f_diff", title="largest change", unit="fraction", of="settings")
-F_NUM_DIFF = Measure(name="f_num_diff", title="characteristics changed", unit="-", of="settings")
+F_NUM_DIFF = Measure(
+    name="f_num_diff", title="characteristics changed", unit="-", of="settings"
+)

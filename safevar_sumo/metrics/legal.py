@@ -6,7 +6,12 @@ import numpy as np
 
 from safevar_sumo.metrics.base import Measure, mask_collisions
 from safevar_sumo.metrics.measures import safety_degree
-from safevar_sumo.records import LEAST_CLOSING_SPEED, STANDSTILL, FloatArray, SimulationRuns
+from safevar_sumo.records import (
+    LEAST_CLOSING_SPEED,
+    STANDSTILL,
+    FloatArray,
+    SimulationRuns,
+)
 from safevar_sumo.study import MetricsTable
 
 PEDAL_ROUNDING = 1e-6
@@ -35,7 +40,11 @@ def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatAr
     ]
     _, part, full = pedal[samples, vehicles]
     loss, later_loss = -np.diff(trace.speed[samples, vehicles], axis=0)
-    is_part = (part < full) & (np.abs(full - first_command) <= PEDAL_ROUNDING) & (later_loss > 0)
+    is_part = (
+        (part < full)
+        & (np.abs(full - first_command) <= PEDAL_ROUNDING)
+        & (later_loss > 0)
+    )
     shares = np.maximum(part / full, loss / later_loss)
     share = np.where(is_part, np.minimum(shares, 1.0), 1.0)
 
@@ -59,7 +68,9 @@ STOPPING_DISTANCE = Measure(
 
 def _of_stops(runs: SimulationRuns, values: FloatArray) -> FloatArray:
     """Values of vehicles that have stopped, shape (N,), NaN for others."""
-    return mask_collisions(runs, np.where(runs.trace.speed[-1] <= STANDSTILL, values, np.nan))
+    return mask_collisions(
+        runs, np.where(runs.trace.speed[-1] <= STANDSTILL, values, np.nan)
+    )
 
 
 def stop_from_pedal(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
@@ -90,7 +101,9 @@ MFDD_SHARES = 0.8, 0.1
 
 # Vehicles that do not stop divide by 0.
 @np.errstate(all="ignore")
-def mean_fully_developed_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+def mean_fully_developed_deceleration(
+    runs: SimulationRuns, thresholds: MetricsTable
+) -> FloatArray:
     """Mean fully developed deceleration of UN R13-H, (v_b^2 - v_e^2) / (2 (s_e - s_b)) [m/s^2],
     with the places s_b and s_e where the speed is 80 and 10 % of the first one; shape (N,), NaN for
     a vehicle that does not stop.
@@ -101,7 +114,9 @@ def mean_fully_developed_deceleration(runs: SimulationRuns, thresholds: MetricsT
     squares = trace.speed * trace.speed
     end_squares = np.square(MFDD_SHARES)[:, np.newaxis] * squares[0]
     columns = zip(end_squares.T, squares.T, trace.position.T, strict=True)
-    places = np.array([np.interp(-levels, -square, way) for levels, square, way in columns])
+    places = np.array(
+        [np.interp(-levels, -square, way) for levels, square, way in columns]
+    )
     ways = 2 * (places[:, 1] - places[:, 0])
     return _of_stops(runs, (end_squares[0] - end_squares[1]) / ways)
 

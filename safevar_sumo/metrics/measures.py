@@ -6,8 +6,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from safevar_sumo.metrics.base import Measure, mask_collisions, sampling_stride, sum_in_order
-from safevar_sumo.records import STANDSTILL, TIME_DECIMALS, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.metrics.base import (
+    Measure,
+    mask_collisions,
+    sampling_stride,
+    sum_in_order,
+)
+from safevar_sumo.records import (
+    STANDSTILL,
+    TIME_DECIMALS,
+    FloatArray,
+    Outcome,
+    SimulationRuns,
+)
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
 OF_APPROACH = "speed", "gap", "obstacle_speed"
@@ -23,9 +34,13 @@ def safety_degree(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     Shape (N,); NaN where there was neither an encounter nor a collision.
     """
     is_counted = runs.trace.active & runs.encounter.in_conflict
-    least_separation = np.min(np.where(is_counted, runs.encounter.separation, np.inf), axis=0)
+    least_separation = np.min(
+        np.where(is_counted, runs.encounter.separation, np.inf), axis=0
+    )
     least_separation = np.where(np.isfinite(least_separation), least_separation, np.nan)
-    return np.where(np.isnan(runs.collision_speed), least_separation, -runs.closing_speed)
+    return np.where(
+        np.isnan(runs.collision_speed), least_separation, -runs.closing_speed
+    )
 
 
 SAFETY_DEGREE_METRIC = Measure(
@@ -48,7 +63,10 @@ def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     critical_ttc, interval = _critical_ttc(runs, thresholds)
     return mask_collisions(
         runs,
-        np.round(np.count_nonzero(np.isfinite(critical_ttc), axis=0) * interval, TIME_DECIMALS),
+        np.round(
+            np.count_nonzero(np.isfinite(critical_ttc), axis=0) * interval,
+            TIME_DECIMALS,
+        ),
     )
 
 
@@ -57,17 +75,23 @@ def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArra
     collision.
     """
     critical_ttc, interval = _critical_ttc(runs, thresholds)
-    deficit = np.where(np.isfinite(critical_ttc), thresholds.ttc_threshold - critical_ttc, 0.0)
+    deficit = np.where(
+        np.isfinite(critical_ttc), thresholds.ttc_threshold - critical_ttc, 0.0
+    )
     return mask_collisions(runs, sum_in_order(deficit) * interval)
 
 
-def _critical_ttc(runs: SimulationRuns, thresholds: MetricsTable) -> tuple[FloatArray, float]:
+def _critical_ttc(
+    runs: SimulationRuns, thresholds: MetricsTable
+) -> tuple[FloatArray, float]:
     """TTC at every sample, infinite where it is not critical; and the time between two samples
     [s].
     """
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
     ttc = runs.time_to_collision[::stride]
-    return np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf), stride * runs.trace.step
+    return np.where(
+        ttc <= thresholds.ttc_threshold, ttc, np.inf
+    ), stride * runs.trace.step
 
 
 TET = Measure(
@@ -116,8 +140,15 @@ def conflict(runs: SimulationRuns) -> tuple[FloatArray, FloatArray]:
 
     # The time until the vehicle reaches the body, and where the body is then.
     closing_speed = trace.speed - trace.obstacle_speed
-    is_counted = runs.is_approach & (closing_speed > 0) & (trace.gap >= 0) & np.isfinite(trace.gap)
-    ttc = np.divide(trace.gap, closing_speed, out=np.zeros_like(trace.gap), where=is_counted)
+    is_counted = (
+        runs.is_approach
+        & (closing_speed > 0)
+        & (trace.gap >= 0)
+        & np.isfinite(trace.gap)
+    )
+    ttc = np.divide(
+        trace.gap, closing_speed, out=np.zeros_like(trace.gap), where=is_counted
+    )
     at_arrival = trace.lateral + trace.lateral_speed * ttc
     is_met = is_in_path | (np.abs(at_arrival) <= reach)
     ttc = np.where(is_counted & is_met, ttc, np.inf)
@@ -129,7 +160,9 @@ def conflict(runs: SimulationRuns) -> tuple[FloatArray, FloatArray]:
     return closing_speed, np.where(is_one, runs.time_to_collision, ttc)
 
 
-def least_time_to_collision(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+def least_time_to_collision(
+    runs: SimulationRuns, thresholds: MetricsTable
+) -> FloatArray:
     """The least TTC_p(t) [s] (Hayward 1972); shape (N,), NaN on a collision, and for a vehicle that
     approaches nobody in its path.
     """
@@ -138,7 +171,9 @@ def least_time_to_collision(runs: SimulationRuns, thresholds: MetricsTable) -> F
     return mask_collisions(runs, np.where(np.isfinite(smallest), smallest, np.nan))
 
 
-def largest_deceleration_rate(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+def largest_deceleration_rate(
+    runs: SimulationRuns, thresholds: MetricsTable
+) -> FloatArray:
     """The largest deceleration that would just avoid the collision, (v - u)^2 / (2 gap), which is
     (v - u) / (2 TTC_p) [m/s^2] (Cooper and Ferguson 1976; DRAC of SUMO's SSM device), over the
     samples with a TTC_p; shape (N,), NaN as for the least TTC_p.
@@ -149,7 +184,9 @@ def largest_deceleration_rate(runs: SimulationRuns, thresholds: MetricsTable) ->
     """
     closing_speed, ttc = conflict(runs)
     is_counted = np.isfinite(ttc) & (ttc > 0)
-    rate = np.divide(closing_speed, 2 * ttc, out=np.full_like(ttc, np.nan), where=is_counted)
+    rate = np.divide(
+        closing_speed, 2 * ttc, out=np.full_like(ttc, np.nan), where=is_counted
+    )
     largest = np.max(np.where(is_counted, rate, 0.0), axis=0, initial=0.0)
     return mask_collisions(runs, np.where(is_counted.any(axis=0), largest, np.nan))
 
@@ -182,7 +219,9 @@ DRAC = Measure(
 )
 
 
-def post_encroachment_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
+def post_encroachment_time(
+    runs: SimulationRuns, thresholds: MetricsTable
+) -> FloatArray:
     """Time from the first one's leaving the place that both paths share to the second one's
     entering it [s] (Allen, Shin and Cooper 1978); shape (N,), NaN unless the vehicle and a body
     that crosses pass without a stop.
@@ -215,7 +254,9 @@ def post_encroachment_time(runs: SimulationRuns, thresholds: MetricsTable) -> Fl
     rate = np.where(leaves, speed, crossing)
     passes = (runs.outcome == Outcome.PASSED) & (lateral_gap >= 0)
     is_defined = passes & (leaves | comes) & (rate > STANDSTILL)
-    return np.asarray(np.divide(way, rate, out=np.full_like(way, np.nan), where=is_defined))
+    return np.asarray(
+        np.divide(way, rate, out=np.full_like(way, np.nan), where=is_defined)
+    )
 
 
 def reaction_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
@@ -229,7 +270,9 @@ def reaction_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     has_seen = np.logical_or.accumulate(visible, axis=0)
     brakes = trace.active & has_seen & (trace.brake > 0)
     steps = np.argmax(brakes, axis=0) - first_sight
-    return np.where(brakes.any(axis=0), np.round(steps * trace.step, TIME_DECIMALS), np.nan)
+    return np.where(
+        brakes.any(axis=0), np.round(steps * trace.step, TIME_DECIMALS), np.nan
+    )
 
 
 PET = Measure(
@@ -264,7 +307,9 @@ def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> Floa
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
     speed = runs.trace.speed[::stride]
     active = runs.trace.active[::stride]
-    is_braking = active & (runs.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
+    is_braking = (
+        active & (runs.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
+    )
     decelerations = (speed[:-1] - speed[1:]) / (stride * runs.trace.step)
     is_counted = is_braking[1:]
     sample_count = np.count_nonzero(is_counted, axis=0)

@@ -23,7 +23,14 @@ from safevar_sumo.metrics.words import (
     unit_of_degree,
     value_on_side,
 )
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome, Quantity, TextArray
+from safevar_sumo.records import (
+    BoolArray,
+    Evaluations,
+    FloatArray,
+    Outcome,
+    Quantity,
+    TextArray,
+)
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.study.schema import Tables
 
@@ -166,7 +173,9 @@ class Unsafe:
         without repeats.
         """
         rounds = self._rounds(evaluations)
-        return np.stack([self._holds(repeat.outcome, repeat.column) for repeat in rounds])
+        return np.stack(
+            [self._holds(repeat.outcome, repeat.column) for repeat in rounds]
+        )
 
     def _rounds(self, evaluations: Evaluations) -> list[Evaluations]:
         return evaluations.rounds or [evaluations]
@@ -196,13 +205,17 @@ class Unsafe:
         of the collision. Of repeats the worst counts.
         """
         rounds = self._rounds(evaluations)
-        return np.asarray(np.min([self._robustness(repeat) for repeat in rounds], axis=0))
+        return np.asarray(
+            np.min([self._robustness(repeat) for repeat in rounds], axis=0)
+        )
 
     def _robustness(self, evaluations: Evaluations) -> FloatArray:
         robustness = self._excess(evaluations)
         robustness = np.where(np.isnan(robustness), np.inf, robustness)
         is_unsafe = self._holds(evaluations.outcome, evaluations.column)
-        return np.where(is_unsafe, np.minimum(robustness, -LEAST), np.maximum(robustness, 0.0))
+        return np.where(
+            is_unsafe, np.minimum(robustness, -LEAST), np.maximum(robustness, 0.0)
+        )
 
     def _excess(self, evaluations: Evaluations) -> FloatArray:
         """By how much evaluations are on the safe side of the limit; NaN where undefined."""
@@ -222,7 +235,9 @@ class Unsafe:
         """What a single unsafe vehicle does, with its value: `has drac 6.77 > 5.3`, `collides at
         3.21 m/s`, `keeps 0.04 m of clearance, less than 0.3 m`; with repeats, in how many runs.
         """
-        return f"{self._breach_in_words(vehicle)}{runs_in_words(self.runs(vehicle)[:, 0])}"
+        return (
+            f"{self._breach_in_words(vehicle)}{runs_in_words(self.runs(vehicle)[:, 0])}"
+        )
 
     def _breach_in_words(self, vehicle: Evaluations) -> str:
         degree = float(vehicle.f_safe[0])
@@ -457,7 +472,9 @@ class UnsafeImpact(UnsafeMetric):
     def _breach_in_words(self, vehicle: Evaluations) -> str:
         if not vehicle.collided[0]:
             return super()._breach_in_words(vehicle)
-        columns = (vehicle.column(name)[0] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name))
+        columns = (
+            vehicle.column(name)[0] for name in (IMPACT_SPEED.name, IMPACT_EXCESS.name)
+        )
         return f"has an {impact_in_words(*columns)}"
 
 

@@ -30,7 +30,12 @@ from safevar_sumo.errors import (
     describe_error,
 )
 from safevar_sumo.plugins.files import is_user_file
-from safevar_sumo.plugins.process import Interrupt, find_damage, mark_interrupts, this_process
+from safevar_sumo.plugins.process import (
+    Interrupt,
+    find_damage,
+    mark_interrupts,
+    this_process,
+)
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
 UserValue = Any
@@ -60,7 +65,11 @@ def user_errors(source: str) -> Iterator[None]:
                 raise user_error from error
             raise
         for problem in damage:
-            raise UserCodeError(source, problem, "code that leaves streams and descriptors of its process open")
+            raise UserCodeError(
+                source,
+                problem,
+                "code that leaves streams and descriptors of its process open",
+            )
 
 
 def user_error_of(error: BaseException) -> UserCodeError | None:
@@ -128,7 +137,9 @@ class Legal(NamedTuple):
     def __str__(self) -> str:
         if self.kinds == "b":
             return "truth values"
-        bounds = f"{'above' if self.above else 'from'} {self.lowest:g} to {self.highest:g}"
+        bounds = (
+            f"{'above' if self.above else 'from'} {self.lowest:g} to {self.highest:g}"
+        )
         if self.infinite:
             return f"numbers {bounds}"
         return f"numbers {bounds}, finite"
@@ -140,7 +151,12 @@ class Legal(NamedTuple):
         return is_legal | (self.undefined & np.isnan(numbers))
 
 
-FINITE, POSITIVE, SHARE, TRUTH = Legal(), Legal(0.0, above=True), Legal(0.0, 1.0), Legal(kinds="b")
+FINITE, POSITIVE, SHARE, TRUTH = (
+    Legal(),
+    Legal(0.0, above=True),
+    Legal(0.0, 1.0),
+    Legal(kinds="b"),
+)
 
 
 class UserCode(NamedTuple):
@@ -182,7 +198,9 @@ class UserCode(NamedTuple):
             if user_error := user_error_of(error):
                 raise user_error from error
             reason, legal = _reason_of(error)
-            raise UserCodeError("", f"{self.name} raised in {method}: {reason}", legal) from error
+            raise UserCodeError(
+                "", f"{self.name} raised in {method}: {reason}", legal
+            ) from error
 
     def check_numbers(
         self,
@@ -203,14 +221,22 @@ class UserCode(NamedTuple):
         try:
             array = np.asarray(value)
         except ValueError:
-            raise self.wrong(method, f"{quantity} = {quoted(value)}", expected) from None
+            raise self.wrong(
+                method, f"{quantity} = {quoted(value)}", expected
+            ) from None
         if array.dtype.kind not in legal.kinds:
             raise self.wrong(method, f"{quantity} = {quoted(value)}", expected)
-        if shape is not None and array.shape != shape and not (legal.scalar and not array.ndim):
+        if (
+            shape is not None
+            and array.shape != shape
+            and not (legal.scalar and not array.ndim)
+        ):
             raise self.wrong(method, f"{quantity} of shape {array.shape}", expected)
         wrong_rows = open_rows(~legal.holds(array))
         if len(wrong_rows):
-            raise self.wrong(method, f"{quantity} = {float(array.flat[wrong_rows[0]])}", expected)
+            raise self.wrong(
+                method, f"{quantity} = {float(array.flat[wrong_rows[0]])}", expected
+            )
         return array
 
     def checked_function(
@@ -228,7 +254,9 @@ class UserCode(NamedTuple):
             with np.errstate():
                 values = function(*map(read_only, arguments))
             shape = (count(arguments[0]),)
-            return self.check_numbers(method, "values", values, shape, legal).astype(float)
+            return self.check_numbers(method, "values", values, shape, legal).astype(
+                float
+            )
 
         return checked
 
@@ -259,10 +287,18 @@ class Returned(NamedTuple):
         if len(self.parts) <= 1:
             values = (result,)
         elif not (isinstance(result, tuple | list) and len(result) == len(self.parts)):
-            names = " and ".join(", ".join(columns) or "memory" for columns in self.parts)
-            raise code.wrong(method, quoted(result), f"a tuple of {len(self.parts)}: {names}")
+            names = " and ".join(
+                ", ".join(columns) or "memory" for columns in self.parts
+            )
+            raise code.wrong(
+                method, quoted(result), f"a tuple of {len(self.parts)}: {names}"
+            )
 
-        shape = None if self.like is None or not self.parts else _shape_of(arguments[self.like])
+        shape = (
+            None
+            if self.like is None or not self.parts
+            else _shape_of(arguments[self.like])
+        )
         for columns, value in zip(self.parts, values, strict=False):
             for name, legal in columns.items():
                 if name and not hasattr(value, name):
@@ -298,7 +334,9 @@ def checked_class(code: UserCode, base: type) -> type:
                 passed[returned.like] = read_only(arguments[returned.like])
             with np.errstate():
                 result = getattr(super(cls, self), name)(*passed)
-            is_optional = returned.then is None and not hasattr(getattr(base, name), ABSTRACT)
+            is_optional = returned.then is None and not hasattr(
+                getattr(base, name), ABSTRACT
+            )
             if result is None and is_optional:
                 return None
             return returned.check(code, name, result, arguments)
@@ -336,7 +374,9 @@ def violation(candidate: Any, base: type) -> str:
         if hasattr(attribute, ABSTRACT) or not callable(attribute):
             return f"has no method {method}"
         # A static or class method takes no `self`.
-        takes_self = not isinstance(vars(base)[name], classmethod) and inspect.isfunction(
+        takes_self = not isinstance(
+            vars(base)[name], classmethod
+        ) and inspect.isfunction(
             inspect.getattr_static(candidate, name, getattr(base, name))
         )
         try:
@@ -366,10 +406,18 @@ def _methods(base: type) -> dict[str, list[str]]:
     helpers = getattr(base, "HELPERS", ())
     methods = {}
     for name, attribute in vars(base).items():
-        function = attribute.__func__ if isinstance(attribute, classmethod) else attribute
-        if inspect.isfunction(function) and not name.startswith("_") and name not in helpers:
+        function = (
+            attribute.__func__ if isinstance(attribute, classmethod) else attribute
+        )
+        if (
+            inspect.isfunction(function)
+            and not name.startswith("_")
+            and name not in helpers
+        ):
             _, *parameters = inspect.signature(function).parameters.values()
-            methods[name] = [item.name for item in parameters if item.default is item.empty]
+            methods[name] = [
+                item.name for item in parameters if item.default is item.empty
+            ]
     return methods
 
 
@@ -386,7 +434,11 @@ def read_only(value: UserValue) -> Any:
         return tuple(views)
     if is_dataclass(value) and not isinstance(value, type):
         return replace(
-            value, **{field.name: read_only(getattr(value, field.name)) for field in fields(value)}
+            value,
+            **{
+                field.name: read_only(getattr(value, field.name))
+                for field in fields(value)
+            },
         )
     if isinstance(value, Mapping):
         return MappingProxyType({key: read_only(item) for key, item in value.items()})

@@ -42,7 +42,9 @@ def is_user_file(path: str) -> bool:
     package.
     """
     is_in_library = any(name in Path(path).parts for name in LIBRARY_FOLDERS)
-    return os.path.isabs(path) and not path.startswith(KNOWN_FOLDERS) and not is_in_library
+    return (
+        os.path.isabs(path) and not path.startswith(KNOWN_FOLDERS) and not is_in_library
+    )
 
 
 def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
@@ -66,7 +68,9 @@ def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
         paths |= files
         for path in files:
             if path.suffix == ".py":
-                waiting += [(imported, own_folders) for imported in _imported_modules(path)]
+                waiting += [
+                    (imported, own_folders) for imported in _imported_modules(path)
+                ]
     return paths
 
 
@@ -94,7 +98,9 @@ def files_in(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
     files = (file for file in path.rglob("*") if file.is_file())
-    return [file for file in files if not HIDDEN.search(file.relative_to(path).as_posix())]
+    return [
+        file for file in files if not HIDDEN.search(file.relative_to(path).as_posix())
+    ]
 
 
 def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
@@ -114,13 +120,16 @@ def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
 
 def digests_by_name(names: Iterable[str], folders: Sequence[str]) -> Files:
     """Digests of the files with these names, as far as they exist."""
-    return digests((Path(path) for name in names if (path := file_by_name(name, folders))), folders)
+    return digests(
+        (Path(path) for name in names if (path := file_by_name(name, folders))), folders
+    )
 
 
 def name_of_file(path: Path, folders: Sequence[str]) -> str:
     """A file's path relative to the first folder that contains it; its whole path if none does."""
     folder = next(
-        (folder for folder in _naming_folders(folders) if path.is_relative_to(folder)), path.anchor
+        (folder for folder in _naming_folders(folders) if path.is_relative_to(folder)),
+        path.anchor,
     )
     if folder != path.anchor:
         return path.relative_to(folder).as_posix()

@@ -95,21 +95,27 @@ class Lookup:
         if name in shipped:
             return Member(shipped[name])
         expected = (
-            f"{one_of(shipped)}, or package.module:Name" if shipped else "package.module:Name"
+            f"{one_of(shipped)}, or package.module:Name"
+            if shipped
+            else "package.module:Name"
         )
 
         module_name, colon, attribute = name.partition(":")
         if colon and module_name.endswith(".py"):
             dotted = module_name.removesuffix(".py").replace("/", ".")
             raise InputError(
-                "", f"{key} = {name!r} names a file", f"its module: '{dotted}:{attribute}'"
+                "",
+                f"{key} = {name!r} names a file",
+                f"its module: '{dotted}:{attribute}'",
             )
         if not (
             colon
             and attribute.isidentifier()
             and all(part.isidentifier() for part in module_name.split("."))
         ):
-            raise InputError("", f"{key} = {name!r}{did_you_mean(name, shipped)}", expected)
+            raise InputError(
+                "", f"{key} = {name!r}{did_you_mean(name, shipped)}", expected
+            )
 
         code = UserCode(f"{key} = {name!r}")
         module = self._import(module_name, code.name)
@@ -118,12 +124,21 @@ class Lookup:
         try:
             target = getattr(module, attribute)
         except AttributeError:
-            raise InputError("", f"{code.name} cannot be imported: {file_of_module(module_name)} has no"
-                f" {attribute!r}", expected) from None
+            raise InputError(
+                "",
+                f"{code.name} cannot be imported: {file_of_module(module_name)} has no"
+                f" {attribute!r}",
+                expected,
+            ) from None
         return Member(target, code._replace(target=target), self._time_limit)
 
     def class_of(
-        self, shipped: Mapping[str, Any], name: str, key: str, *bases: type, otherwise: str = ""
+        self,
+        shipped: Mapping[str, Any],
+        name: str,
+        key: str,
+        *bases: type,
+        otherwise: str = "",
     ) -> Member:
         """A class by name; a user's class must meet the contract of the first base that it derives
         from, else of that which it meets, else of that of which it has an abstract method, else of
@@ -139,14 +154,19 @@ class Lookup:
         base = _base_of(member.target, bases)
         if reason := violation(member.target, base):
             raise UserCodeError(
-                "", f"{member.code.name} {reason}", "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])]), member.code.definition()
+                "",
+                f"{member.code.name} {reason}",
+                "; or ".join([*map(contract_of, bases), *filter(None, [otherwise])]),
+                member.code.definition(),
             )
         member = self._classes[name, bases] = member._replace(
             target=checked_class(member.code, base)
         )
         return member
 
-    def with_paths(self, member: Member, parameters: Parameters, key: str) -> Parameters:
+    def with_paths(
+        self, member: Member, parameters: Parameters, key: str
+    ) -> Parameters:
         """Parameters of a member; the names of the study's data files become absolute paths: for
         user code all, otherwise that of the parameter `file`.
 
@@ -164,12 +184,19 @@ class Lookup:
 
     def _with_paths(self, value: Any, key: str) -> Any:
         if isinstance(value, dict):
-            return {name: self._with_paths(item, f"{key}.{name}") for name, item in value.items()}
+            return {
+                name: self._with_paths(item, f"{key}.{name}")
+                for name, item in value.items()
+            }
         if isinstance(value, list):
             return [self._with_paths(item, key) for item in value]
         # A network counts anyway.
         is_name = isinstance(value, str) and not key.endswith(".network")
-        if is_name and value not in self.files and file_beside(value, [*self.folders, os.getcwd()]):
+        if (
+            is_name
+            and value not in self.files
+            and file_beside(value, [*self.folders, os.getcwd()])
+        ):
             problem = f"{key} = {value!r}: the study does not name this file"
             table = key.partition(".")[0]
             raise InputError("", problem, f"files = [{value!r}] in its table [{table}]")
@@ -179,7 +206,11 @@ class Lookup:
 
     def _import(self, name: str, key: str) -> ModuleType:
         if name.partition(".")[0] == "__main__":
-            raise InputError("", f"{key}: other processes cannot import from __main__", "a module in a file of its own")
+            raise InputError(
+                "",
+                f"{key}: other processes cannot import from __main__",
+                "a module in a file of its own",
+            )
 
         # Modules beside the study come before those of the working directory.
         folders = list(dict.fromkeys((*self.folders, os.getcwd())))
@@ -197,9 +228,17 @@ class Lookup:
             ):
                 return _import_beside(name, folders) or importlib.import_module(name)
         except (ModuleNotFoundError, UserCodeError) as error:
-            problem = error.problem if isinstance(error, UserCodeError) else describe_error(error)
-            raise UserCodeError("", f"{key} cannot be imported: {problem}", getattr(error, "legal", "")
-                or f"a module in {' or '.join(folders)}, or an installed one") from error
+            problem = (
+                error.problem
+                if isinstance(error, UserCodeError)
+                else describe_error(error)
+            )
+            raise UserCodeError(
+                "",
+                f"{key} cannot be imported: {problem}",
+                getattr(error, "legal", "")
+                or f"a module in {' or '.join(folders)}, or an installed one",
+            ) from error
         finally:
             sys.dont_write_bytecode = dont_write_bytecode
             this_process.modules |= sys.modules.keys() - modules_before
@@ -258,8 +297,14 @@ def add_import_folders(folders: Iterable[str]) -> None:
     """Let modules import from `folders` and the working directory. The folders come directly before
     the working directory on Python's path: what is listed before it keeps precedence.
     """
-    sys.path[:] = [folder for folder in sys.path if folder not in this_process.added_folders]
-    added = [folder for folder in dict.fromkeys((*folders, os.getcwd())) if folder not in sys.path]
+    sys.path[:] = [
+        folder for folder in sys.path if folder not in this_process.added_folders
+    ]
+    added = [
+        folder
+        for folder in dict.fromkeys((*folders, os.getcwd()))
+        if folder not in sys.path
+    ]
     this_process.added_folders = added
     indices = (i for i, folder in enumerate(sys.path) if folder in ("", os.getcwd()))
     start = next(indices, len(sys.path))
@@ -291,7 +336,11 @@ def only_from(folder: str) -> Iterator[None]:
     place = os.getcwd()
     path = ImportPath.here()
     modules = dict(sys.modules)
-    users = {name for name in modules if name != "__main__" and is_user_file(file_of_module(name))}
+    users = {
+        name
+        for name in modules
+        if name != "__main__" and is_user_file(file_of_module(name))
+    }
     for name in users:
         del sys.modules[name]
     ImportPath([*filter(_is_of_libraries, path.folders), folder], []).inherit()
@@ -327,7 +376,11 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> 
     InputError
         If the class does not take the parameters.
     """
-    with user_errors(subject()), np.errstate(), end_if_longer(member.time_limit, "`__init__`"):
+    with (
+        user_errors(subject()),
+        np.errstate(),
+        end_if_longer(member.time_limit, "`__init__`"),
+    ):
         # A class of the package forbids what it does not have.
         if member.code is not None:
             accepted = inspect.signature(member.target).parameters

@@ -195,7 +195,9 @@ def defer_interrupts() -> Iterator[None]:
     for interrupt in INTERRUPTS if is_main else ():
         # A handler that was not set from Python could not be set again.
         if signal.getsignal(interrupt) is not None:
-            handlers[interrupt] = signal.signal(interrupt, lambda number, _: waiting.append(number))
+            handlers[interrupt] = signal.signal(
+                interrupt, lambda number, _: waiting.append(number)
+            )
     try:
         yield
     finally:
@@ -227,11 +229,15 @@ def record_opened(folders: Sequence[str]) -> Iterator[list[str]]:
         this_process.opened = None
     this_process.modules |= sys.modules.keys() - modules
 
-    own_folders = [f"{os.path.abspath(folder)}{os.sep}" for folder in (*folders, os.getcwd())]
+    own_folders = [
+        f"{os.path.abspath(folder)}{os.sep}" for folder in (*folders, os.getcwd())
+    ]
     # Libraries keep such files as lists of fonts there.
     caches = (platformdirs.user_cache_path(), platformdirs.user_config_path())
     not_the_users = (*SYSTEM_FOLDERS, *(f"{path}{os.sep}" for path in caches))
-    data = (path for path in opened if os.path.isfile(path) and not path.endswith(".pyc"))
+    data = (
+        path for path in opened if os.path.isfile(path) and not path.endswith(".pyc")
+    )
     # What is newer than the block was written by the code.
     names.extend(
         sorted(
@@ -240,7 +246,10 @@ def record_opened(folders: Sequence[str]) -> Iterator[list[str]]:
             if is_user_file(path)
             and f"{os.sep}{CACHE}{os.sep}" not in path
             and os.path.getmtime(path) < start
-            and (path.startswith(tuple(own_folders)) or not path.startswith(not_the_users))
+            and (
+                path.startswith(tuple(own_folders))
+                or not path.startswith(not_the_users)
+            )
         )
     )
 
@@ -250,7 +259,10 @@ def file_of_module(name: str) -> str:
     of the interpreter.
     """
     module = sys.modules.get(name)
-    return str(getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), ""))
+    return str(
+        getattr(module, "__file__", None)
+        or next(iter(getattr(module, "__path__", ())), "")
+    )
 
 
 def _listen(event: str, arguments: tuple[Any, ...]) -> None:

@@ -41,7 +41,8 @@ def end_if_longer(time_limit: float, name: str = "a simulation") -> Iterator[Non
         If no user code did.
     """
     has_timer = (
-        hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+        hasattr(signal, "setitimer")
+        and threading.current_thread() is threading.main_thread()
     )
     words = this_process.last_words
     if this_process.is_limited or not (has_timer or words is not None):
@@ -49,7 +50,11 @@ def end_if_longer(time_limit: float, name: str = "a simulation") -> Iterator[Non
         return
     this_process.is_limited = True
     try:
-        with _raise_error(time_limit, name) if words is None else _end_process(time_limit, words):
+        with (
+            _raise_error(time_limit, name)
+            if words is None
+            else _end_process(time_limit, words)
+        ):
             yield
     finally:
         this_process.is_limited = False
@@ -73,7 +78,9 @@ def _raise_error(time_limit: float, name: str) -> Iterator[None]:
                 place = f"{frame.f_code.co_filename}:{frame.f_lineno}"
                 legal = "code that ends, or more time"
                 raise _TimeIsUp(
-                    UserCodeError("search.time_limit", f"{problem} ({place})", legal, place)
+                    UserCodeError(
+                        "search.time_limit", f"{problem} ({place})", legal, place
+                    )
                 )
             frame = frame.f_back
         raise _TimeIsUp(SimulationError(f"{problem}, search.time_limit"))

@@ -67,7 +67,11 @@ class Contents(NamedTuple):
         elif name and rest.isdecimal():
             wanted = name
         if ... not in names and wanted not in names:
-            raise InputError("fail_if", f"the answer has no number {key!r}{did_you_mean(key, self.keys)}", one_of(legal))
+            raise InputError(
+                "fail_if",
+                f"the answer has no number {key!r}{did_you_mean(key, self.keys)}",
+                one_of(legal),
+            )
 
     @property
     def keys(self) -> list[str]:
@@ -96,7 +100,9 @@ def contents(
     table that leads them, and the question that comes next. `OF_ALL` are among the numbers.
     """
     if lead:
-        check_name("contents", f"lead = {lead!r} is no table that it declares", lead, tables)
+        check_name(
+            "contents", f"lead = {lead!r} is no table that it declares", lead, tables
+        )
 
     def declare(function: AnswerFunction) -> AnswerFunction:
         @wraps(function)
@@ -182,7 +188,8 @@ class Answer:
             columns = columns_of(frame).items()
             tables[name] = {
                 "columns": {
-                    key: {"unit": column.unit, "meaning": column.meaning} for key, column in columns
+                    key: {"unit": column.unit, "meaning": column.meaning}
+                    for key, column in columns
                 },
                 "rows": [plain(row) for row in frame.to_dict("records")],
             }
@@ -219,12 +226,16 @@ class Answer:
         remarks = self.tables.get("remarks")
         if remarks is not None:
             is_about_it = (
-                remarks["table"].isin([name, "all"]) if "table" in remarks else slice(None)
+                remarks["table"].isin([name, "all"])
+                if "table" in remarks
+                else slice(None)
             )
             tables["remarks"] = remarks[is_about_it]
         return replace(self, tables=tables, folded=(), lead=name, is_whole=True)
 
-    def render(self, form: str, table: str | None = None, *, details: bool = False) -> str:
+    def render(
+        self, form: str, table: str | None = None, *, details: bool = False
+    ) -> str:
         """The answer, or with one table only, as text, JSON, LaTeX or HTML; one table, by default
         the first, as CSV. Text is one screen, with a table's name or `details` all.
         """
@@ -255,7 +266,8 @@ class Answer:
         """
         # A column, a number, or a number in a list.
         Contents(
-            self.numbers, {name: [*map(str, frame)] for name, frame in self.tables.items()}
+            self.numbers,
+            {name: [*map(str, frame)] for name, frame in self.tables.items()},
         ).check_key(key)
         name, _, rest = key.rpartition(".")
         if name in self.tables:
@@ -274,22 +286,33 @@ class Answer:
 
 def _draw_intervals(answer: Answer) -> Figure:
     """The numbers of the first table with their intervals, a row for each of its rows."""
-    from safevar_sumo.questions.figures import BLUE, FONT_SIZE, escape_dollars, new_figure
+    from safevar_sumo.questions.figures import (
+        BLUE,
+        FONT_SIZE,
+        escape_dollars,
+        new_figure,
+    )
 
     # Columns that have an interval.
     frame = answer.table()
     names = [
-        name for name in map(str, frame) if f"{name}{LOW}" in frame and frame[name].notna().any()
+        name
+        for name in map(str, frame)
+        if f"{name}{LOW}" in frame and frame[name].notna().any()
     ]
     if not names or frame.empty:
-        raise InputError("plot", "the answer has nothing to draw", "the answer as a table")
+        raise InputError(
+            "plot", "the answer has nothing to draw", "the answer as a table"
+        )
 
     # A panel for each column.
     size = (max(2.6 * len(names), 5.2), 1.1 + 0.35 * len(frame))
     figure, axes = new_figure(frame.attrs["title"], 1, len(names), size, sharey=True)
     places = range(len(frame), 0, -1)
     for axis, name in zip(axes[0], names, strict=True):
-        value, low, high = (frame[f"{name}{end}"].to_numpy(float) for end in ("", LOW, HIGH))
+        value, low, high = (
+            frame[f"{name}{end}"].to_numpy(float) for end in ("", LOW, HIGH)
+        )
         axis.errorbar(
             value,
             places,

@@ -37,7 +37,13 @@ from safevar_sumo.questions.options import (
     flag_of,
     options_of,
 )
-from safevar_sumo.questions.subject import Results, part_of, study_in, study_or_case, with_own_set
+from safevar_sumo.questions.subject import (
+    Results,
+    part_of,
+    study_in,
+    study_or_case,
+    with_own_set,
+)
 from safevar_sumo.records import JsonObject
 from safevar_sumo.shipped import PACKAGE, PROGRAM_COMMAND
 from safevar_sumo.study import Study, StudyLike
@@ -84,7 +90,8 @@ class Question:
         parameters = list(inspect.signature(compute).parameters.values())
         if (
             sum(
-                parameter.kind in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
+                parameter.kind
+                in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
                 for parameter in parameters
             )
             < 2
@@ -174,7 +181,9 @@ class Question:
         # Options that it has, with legal values.
         known = {option.name: option for option in self.options}
         for name in values.keys() - known.keys():
-            raise TypeError(f"{self.name}() got an unexpected keyword argument {name!r}")
+            raise TypeError(
+                f"{self.name}() got an unexpected keyword argument {name!r}"
+            )
         if source is None or len(others) != len(self.others):
             names = ["source", *self.others]
             raise InputError(f"{self.name}()", f"takes exactly {' and '.join(names)}")
@@ -189,7 +198,9 @@ class Question:
                 warn(shortfall)
             return part_of(subject, ranges, point, cut)
 
-        from safevar_sumo.campaign.cache import keep_simulations  # SUMO takes long to load
+        from safevar_sumo.campaign.cache import (
+            keep_simulations,  # SUMO takes long to load
+        )
 
         # What it is about, as studies, results or files.
         cuts = {"point": point, "up_to": cut}
@@ -210,9 +221,13 @@ class Question:
             if is_long and progress is True and sys.stderr.isatty():
                 with open_progress(True) as show:
                     part = Parts(show).begin("rough answer")
-                    first = self.answer(subjects, {**values, "quick": True}, **how, progress=part)
+                    first = self.answer(
+                        subjects, {**values, "quick": True}, **how, progress=part
+                    )
                 print_text(Console(stderr=True), f"{first.verdict}\n")
-            answer = self.answer(subjects, values, **how, progress=progress, called=_name(source))
+            answer = self.answer(
+                subjects, values, **how, progress=progress, called=_name(source)
+            )
         return replace(answer, command=command + answer.command)
 
     def answer(
@@ -237,12 +252,16 @@ class Question:
         from safevar_sumo.questions.answer import Answer
         from safevar_sumo.questions.by_criterion import subject_by
         from safevar_sumo.questions.case import Case
-        from safevar_sumo.questions.evaluator import open_evaluator  # SUMO takes long to load
+        from safevar_sumo.questions.evaluator import (
+            open_evaluator,  # SUMO takes long to load
+        )
 
         # Simulations by the criterion that is asked for.
         if values.get(QUICK):
             subjects = [
-                with_own_set(one) if isinstance(one, Case) else replace_in(one, spread={})
+                with_own_set(one)
+                if isinstance(one, Case)
+                else replace_in(one, spread={})
                 for one in subjects
             ]
         study = study_in(subjects[0])
@@ -257,7 +276,9 @@ class Question:
                     evaluator.for_study(subject.study).refuse_other_original(subject)
             unsafe, values, cites = self._criterion(values, study)
             if unsafe is not None:
-                subjects = [subject_by(subject, unsafe, evaluator) for subject in subjects]
+                subjects = [
+                    subject_by(subject, unsafe, evaluator) for subject in subjects
+                ]
                 study = study_in(subjects[0])
                 evaluator = evaluator.for_study(study)
                 evaluator.use(unsafe)
@@ -266,10 +287,16 @@ class Question:
             with user_errors(self.name):
                 answer = self.compute(subjects[0], evaluator, *subjects[1:], **values)
             if not isinstance(answer, Answer):
-                raise InputError(self.name, f"returns {type(answer).__name__}", "an Answer")
+                raise InputError(
+                    self.name, f"returns {type(answer).__name__}", "an Answer"
+                )
 
             # An answer about a driving system that fails by itself begins with that.
-            about = evaluator if answer.study is study else evaluator.for_study(answer.study)
+            about = (
+                evaluator
+                if answer.study is study
+                else evaluator.for_study(answer.study)
+            )
             reason = about.no_verdict
             evaluator.end()
         numbers = {"driven": not reason, **answer.numbers}
@@ -281,18 +308,28 @@ class Question:
             numbers["rough"] = bool(rough or numbers.get("rough"))
         sentences = reason, rough, answer.verdict, cites, account.undefined_in_words
         verdict = " ".join(filter(None, sentences))
-        following = self._following(subjects[0], evaluator, called, values) or answer.next
+        following = (
+            self._following(subjects[0], evaluator, called, values) or answer.next
+        )
         most = account.asked if account.most is None else account.most
         command = "" if most is None else f" --simulations {most}"
-        return replace(answer, verdict=verdict, numbers=numbers, next=following, command=command)
+        return replace(
+            answer, verdict=verdict, numbers=numbers, next=following, command=command
+        )
 
-    def _criterion(self, values: JsonObject, study: Study) -> tuple[Unsafe | None, JsonObject, str]:
+    def _criterion(
+        self, values: JsonObject, study: Study
+    ) -> tuple[Unsafe | None, JsonObject, str]:
         """What is unsafe, the values of options with it, and where it comes from: a study's own
         criterion stands where neither a criterion nor a margin is asked for.
         """
-        option = next((one.name for one in self.options if one.metavar == CRITERION), "")
+        option = next(
+            (one.name for one in self.options if one.metavar == CRITERION), ""
+        )
         # Who states a distance to keep means a collision, whatever the study calls unsafe.
-        if not option or any(values.get(name) is not None for name in (option, "margin")):
+        if not option or any(
+            values.get(name) is not None for name in (option, "margin")
+        ):
             return values.get(option), values, ""
         own = study.unsafe
         cites = (
@@ -338,14 +375,26 @@ class Question:
                 value = CARS_FILE  # a table's contents are none of the command's
             if value == option.default:
                 continue
-            texts = [""] if option.kind is bool else value if option.is_repeated else [value]
+            texts = (
+                [""]
+                if option.kind is bool
+                else value
+                if option.is_repeated
+                else [value]
+            )
             words += [
-                f"{option.flag} {quote(str(text))}".strip() if text != "" else option.flag
+                f"{option.flag} {quote(str(text))}".strip()
+                if text != ""
+                else option.flag
                 for text in texts
             ]
         words += [
             *flags,
-            *(f"{flag_of(name)} {quote(str(text))}" for name, text in part.items() if text),
+            *(
+                f"{flag_of(name)} {quote(str(text))}"
+                for name, text in part.items()
+                if text
+            ),
         ]
         return " ".join(words)
 
@@ -376,7 +425,9 @@ def find_question(name: str) -> Question:
     legal = f"{', '.join(QUESTIONS)}, or module:name of a function with @question"
     if not (":" in name or name in QUESTIONS):
         raise InputError("question", f"there is no {name!r}", legal)
-    module, _, function = name.partition(":") if ":" in name else (QUESTIONS[name], "", name)
+    module, _, function = (
+        name.partition(":") if ":" in name else (QUESTIONS[name], "", name)
+    )
     if ":" in name:
         add_import_folders(
             ()
@@ -391,9 +442,16 @@ def find_question(name: str) -> Question:
         raise InputError("question", f"there is no {name!r}", legal) from None
     found = getattr(imported, function, None)
     if not isinstance(found, Question):
-        known = [name for name, value in vars(imported).items() if isinstance(value, Question)]
+        known = [
+            name
+            for name, value in vars(imported).items()
+            if isinstance(value, Question)
+        ]
         raise unknown_name(
-            "question", f"{module} has no function {function!r} with @question", function, known
+            "question",
+            f"{module} has no function {function!r} with @question",
+            function,
+            known,
         )
     return found
 
@@ -402,4 +460,8 @@ def _name(source: StudyLike | Results) -> str:
     """How a command line names a subject."""
     if isinstance(source, Results):
         return str(source.directory)
-    return source.origin.called or source.name if isinstance(source, Study) else str(source)
+    return (
+        source.origin.called or source.name
+        if isinstance(source, Study)
+        else str(source)
+    )

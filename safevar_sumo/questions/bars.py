@@ -48,7 +48,10 @@ class Bar(NamedTuple):
         for ends, letter in ((self.alone, "▒"), (self.together, "█")):
             if ends:
                 cells[(middles >= ends[0]) & (middles <= ends[1])] = letter
-        for share, letter in (*((share, "|") for share in self.specified), (self.original, "o")):
+        for share, letter in (
+            *((share, "|") for share in self.specified),
+            (self.original, "o"),
+        ):
             cells[min(int(share * CELLS), CELLS - 1)] = letter
         return "".join(cells)
 
@@ -74,7 +77,10 @@ class Bar(NamedTuple):
             rectangle(ends, name)
             for ends, name in ((self.alone, "alone"), (self.together, "together"))
         ]
-        ticks = [f'<path class="tick" d="M{x(share)} 0v{HEIGHT}"/>' for share in self.specified]
+        ticks = [
+            f'<path class="tick" d="M{x(share)} 0v{HEIGHT}"/>'
+            for share in self.specified
+        ]
         parts = [
             *ranges,
             rectangle((0, 1), "domain"),
@@ -106,7 +112,13 @@ def draw_bars(answer: Answer) -> Figure:
     """The bars of a table of limits, a row for each characteristic; `tolerance` keeps them in its
     attribute `bars`.
     """
-    from safevar_sumo.questions.figures import BLUE, SKY_BLUE, VERMILION, escape_dollars, new_figure
+    from safevar_sumo.questions.figures import (
+        BLUE,
+        SKY_BLUE,
+        VERMILION,
+        escape_dollars,
+        new_figure,
+    )
 
     limits = answer.tables["limits"]
     size = (6.4, 1.3 + 0.3 * len(limits))
@@ -114,9 +126,17 @@ def draw_bars(answer: Answer) -> Figure:
     for place, bar in enumerate(limits.attrs["bars"]):
         for ends, colour in ((bar.alone, SKY_BLUE), (bar.together, BLUE)):
             if ends:
-                axis.barh(place, ends[1] - ends[0], height=0.6, left=ends[0], color=colour)
+                axis.barh(
+                    place, ends[1] - ends[0], height=0.6, left=ends[0], color=colour
+                )
         axis.plot(bar.original, place, "o", color="black", markersize=4)
-        axis.plot(bar.specified, [place] * len(bar.specified), "|", color=VERMILION, markersize=14)
+        axis.plot(
+            bar.specified,
+            [place] * len(bar.specified),
+            "|",
+            color=VERMILION,
+            markersize=14,
+        )
     axis.set_yticks(range(len(limits)), map(escape_dollars, limits["characteristic"]))
     axis.invert_yaxis()
     axis.set_xlim(-0.02, 1.02)

@@ -58,25 +58,34 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
         domains = {name: axes[name] for name in axes if len(lists[name]) > 1}
         if test and domains:
             listed = replace_in(test, over={**lists})
-            evaluator = model.evaluator.for_study(in_ranges(study, [(listed, domains)]), verified=0)
+            evaluator = model.evaluator.for_study(
+                in_ranges(study, [(listed, domains)]), verified=0
+            )
             # The original is simulated only where a vehicle fails.
             moving = Model(model.fit, evaluator, model.unsafe, new_car=new_car)
             tests.append(MovingTest(listed, moving))
     return tests
 
 
-def in_ranges(study: Study, tests: Sequence[tuple[MatrixTest, dict[str, Domain]]]) -> Study:
+def in_ranges(
+    study: Study, tests: Sequence[tuple[MatrixTest, dict[str, Domain]]]
+) -> Study:
     """A study of some tests alone, of which some axes may have any value of a domain; all of its
     encounters count.
     """
     moving = []
     for test, domains in tests:
-        over: Axes = {**study.lists_of(test), **{name: axis_of(domains[name]) for name in domains}}
+        over: Axes = {
+            **study.lists_of(test),
+            **{name: axis_of(domains[name]) for name in domains},
+        }
         moving.append(replace_in(test, over=over))
     return replace_in(study.listed().all_count.with_tests(moving), encounters=RANGES)
 
 
-def with_set_axes(study: Study, system: System, changes: Collection[str]) -> tuple[Study, System]:
+def with_set_axes(
+    study: Study, system: System, changes: Collection[str]
+) -> tuple[Study, System]:
     """A study and its system; if axes of its matrix, or the phase, are among the names of what a
     user sets, settings have values of these, in the tests that have all of the axes.
 
@@ -91,7 +100,11 @@ def with_set_axes(study: Study, system: System, changes: Collection[str]) -> tup
     if PHASE in names:
         phased = in_phases(found, assemble(found))
         if phased == found:
-            raise InputError("", f"study {study.name!r} has no {PHASE}", "a study whose actors move on tracks, and react to nobody")
+            raise InputError(
+                "",
+                f"study {study.name!r} has no {PHASE}",
+                "a study whose actors move on tracks, and react to nobody",
+            )
         found = phased
     return found, system if found == study else assemble(found)
 
@@ -114,5 +127,9 @@ def _with_axes(study: Study, system: System, names: set[str]) -> Study:
         if axes <= domains.keys()
     ]
     if not kept:
-        raise InputError("", f"no test has {join_phrases(sorted(axes))} together", "values of one test's axes")
+        raise InputError(
+            "",
+            f"no test has {join_phrases(sorted(axes))} together",
+            "values of one test's axes",
+        )
     return in_ranges(study, kept)

@@ -43,10 +43,15 @@ def find_boundaries(
     high = np.ones(len(lines))
     for number in parts:
         # The bounds between equal parts of what is left of each line.
-        shares = low[:, np.newaxis] + (high - low)[:, np.newaxis] * np.arange(number + 1) / number
+        shares = (
+            low[:, np.newaxis]
+            + (high - low)[:, np.newaxis] * np.arange(number + 1) / number
+        )
         shares[:, -1] = high  # without a rounding error
         inner = on_lines(starts, ends, shares[:, 1:-1])
-        tested = are_unsafe(inner.reshape(-1, starts.shape[1])).reshape(len(lines), number - 1)
+        tested = are_unsafe(inner.reshape(-1, starts.shape[1])).reshape(
+            len(lines), number - 1
+        )
         # Of these parts the one below the first unsafe bound is left.
         is_unsafe = np.column_stack([tested, np.ones(len(lines), dtype=bool)])
         first = np.argmax(is_unsafe, axis=1)

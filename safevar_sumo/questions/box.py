@@ -91,7 +91,9 @@ class Box:
         if not (~of_vehicle & is_open).any():
             return self.at(points)
         points = np.tile(points, (MET_BY_CORNERS // len(points), 1))
-        places = Stream.ENCOUNTERS_AT_CORNERS.generator(seed, attempt).random(points.shape)
+        places = Stream.ENCOUNTERS_AT_CORNERS.generator(seed, attempt).random(
+            points.shape
+        )
         return self.at(np.where(of_vehicle, points, places))
 
 
@@ -163,5 +165,9 @@ def prove(
     safe = samples - failures - not_simulated
     if attempt == 1 and safe == len(settings):
         error = 1 - CONFIDENCE
-    at_most = float(scipy.special.betaincinv(samples - safe + 1, safe, 1 - error)) if safe else 1.0
+    at_most = (
+        float(scipy.special.betaincinv(samples - safe + 1, safe, 1 - error))
+        if safe
+        else 1.0
+    )
     return Proof(samples, failures, at_most, not_simulated), settings[is_unsafe]

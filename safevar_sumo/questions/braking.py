@@ -32,7 +32,9 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
         return None
     trace = runs.trace
     nearest_sample = runs.nearest(column)
-    active = trace.active[: None if nearest_sample is None else nearest_sample + 1, column]
+    active = trace.active[
+        : None if nearest_sample is None else nearest_sample + 1, column
+    ]
     speed = np.where(active, trace.speed[: len(active), column], 0.0)
     brake = np.where(speed > STANDSTILL, trace.brake[: len(active), column], 0.0)
 
@@ -51,9 +53,14 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
 
     # Where the pedals no longer regulate the speed, the brake begins to rise.
     regulation = np.flatnonzero(
-        ((trace.throttle[:sample, column] > 0) | (brake[:sample] > 0)) & ~is_braking[:sample]
+        ((trace.throttle[:sample, column] > 0) | (brake[:sample] > 0))
+        & ~is_braking[:sample]
     )
-    onset = int(braking_samples[braking_samples >= (regulation[-1] if regulation.size else 0)][0])
+    onset = int(
+        braking_samples[braking_samples >= (regulation[-1] if regulation.size else 0)][
+            0
+        ]
+    )
     while onset > 0 and brake[onset - 1] > (
         brake[onset - 2] if onset > 1 else 0
     ):  # the command already rises

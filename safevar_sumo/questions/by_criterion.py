@@ -44,9 +44,15 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     check_name("unsafe", f"study {study.name!r} has no metric {name!r}", name, legal)
     if name not in known:
         metrics = replace_in(metrics, also=[*metrics.also, name])
-    allows = matrix is not None and any(test.allowed_impact_speed for test in matrix.tests)
+    allows = matrix is not None and any(
+        test.allowed_impact_speed for test in matrix.tests
+    )
     if allows and not unsafe.is_of_impacts:
-        raise InputError("unsafe", f"{str(unsafe)!r}: tests of study {study.name!r} allow an impact", "a bound on impact_excess, or collision")
+        raise InputError(
+            "unsafe",
+            f"{str(unsafe)!r}: tests of study {study.name!r} allow an impact",
+            "a bound on impact_excess, or collision",
+        )
 
     # And counts the point that is worst by it.
     if matrix is not None:
@@ -56,7 +62,9 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     return replace_in(study, metrics=metrics, matrix=matrix)
 
 
-def subject_by(subject: Subject | Path, unsafe: Unsafe, evaluator: Evaluator) -> Subject | Path:
+def subject_by(
+    subject: Subject | Path, unsafe: Unsafe, evaluator: Evaluator
+) -> Subject | Path:
     """A subject of a question by a criterion; files stay as they are."""
     if isinstance(subject, Path):
         return subject

@@ -17,7 +17,13 @@ import pandas as pd
 from safevar_sumo.errors import InputError, check_text, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Measure, Scoring, Unsafe
 from safevar_sumo.questions.words import number_of
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, NamedValues, Outcome
+from safevar_sumo.records import (
+    Evaluations,
+    FloatArray,
+    JsonObject,
+    NamedValues,
+    Outcome,
+)
 from safevar_sumo.results import failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Origin, Study, Weather
@@ -96,7 +102,9 @@ class Case:
         """The solutions, of equal ones the first."""
         return self.solutions.drop_duplicates([*self.characteristics.names])
 
-    def simulated_as(self, study: Study, scoring: Scoring, evaluations: Evaluations) -> Case:
+    def simulated_as(
+        self, study: Study, scoring: Scoring, evaluations: Evaluations
+    ) -> Case:
         """The case of another form of its study, in which its settings have been simulated
         again.
         """
@@ -118,7 +126,9 @@ class Case:
                 metric.name: float(evaluations.metrics[metric.name][0])
                 for metric in scoring.metrics
             },
-            solutions=solutions.assign(**{name: values[1:] for name, values in columns.items()}),
+            solutions=solutions.assign(
+                **{name: values[1:] for name, values in columns.items()}
+            ),
         )
 
     @property
@@ -135,7 +145,10 @@ class Case:
     @property
     def algorithms(self) -> tuple[str, ...]:
         """Algorithms that have solutions or a finished run, in the study's order."""
-        names = {*self.solutions["algorithm"], *(algorithm for algorithm, _ in self.finished_runs)}
+        names = {
+            *self.solutions["algorithm"],
+            *(algorithm for algorithm, _ in self.finished_runs),
+        }
         return tuple(
             name
             for name in dict.fromkeys([*self.study.search.labels, *sorted(names)])
@@ -148,7 +161,9 @@ class Case:
         """
         own = solutions.get(ORIGINAL_DEGREE)
         return (
-            pd.Series(self.original[SAFETY_DEGREE], index=solutions.index) if own is None else own
+            pd.Series(self.original[SAFETY_DEGREE], index=solutions.index)
+            if own is None
+            else own
         )
 
     @property
@@ -167,7 +182,9 @@ class Case:
                 f"in none of {number_of(len(self.evaluations), 'encounter')} the original vehicle"
                 f" keeps at least {margin:g} m of clearance (scenario.margin)"
             )
-        valid = feasible.dropna(subset=[objective.name for objective in self.scoring.objectives])
+        valid = feasible.dropna(
+            subset=[objective.name for objective in self.scoring.objectives]
+        )
         return (
             f"the algorithms returned none of {number_of(len(valid), 'setting')} that have a value"
             " of every objective; of these,"
@@ -262,7 +279,9 @@ def solutions_for_metric(solutions: pd.DataFrame, metric: Measure) -> pd.DataFra
     """The solutions that count for a metric; for TET and TIT only those without collision
     (docs/method.md, section 4).
     """
-    return solutions if metric.over_collisions else solutions[~are_collisions(solutions)]
+    return (
+        solutions if metric.over_collisions else solutions[~are_collisions(solutions)]
+    )
 
 
 def are_collisions(solutions: pd.DataFrame) -> pd.Series[bool]:
@@ -281,11 +300,15 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
     # Each directory once.
     paths = [Path(check_text("directory", directory)) for directory in directories]
     duplicates = [
-        path for path, count in Counter(path.resolve() for path in paths).items() if count > 1
+        path
+        for path, count in Counter(path.resolve() for path in paths).items()
+        if count > 1
     ]
     if duplicates:
         raise InputError(
-            "directories", f"{duplicates[0]} is given twice", "each results directory once"
+            "directories",
+            f"{duplicates[0]} is given twice",
+            "each results directory once",
         )
 
     # What each directory holds, as a case.
@@ -294,7 +317,9 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
         try:
             manifest, evaluations, solutions, finished, failures = load_runs(path)
             study = msgspec.convert(manifest["study"], Study)
-            study = msgspec.structs.replace(study, origin=Origin(places=folders_of(path, manifest)))
+            study = msgspec.structs.replace(
+                study, origin=Origin(places=folders_of(path, manifest))
+            )
             scoring = (
                 msgspec.convert(manifest["scoring"], Scoring)
                 if "scoring" in manifest
@@ -310,7 +335,11 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
                     scoring=scoring,
                     has_runs="imported" not in manifest,
                     failures=tuple(failures),
-                    **{name: manifest[name] for name in OF_ALGORITHMS if name in manifest},
+                    **{
+                        name: manifest[name]
+                        for name in OF_ALGORITHMS
+                        if name in manifest
+                    },
                 )
             )
         except (TypeError, ValueError, KeyError, ArithmeticError) as error:
@@ -342,7 +371,8 @@ def build_case(
     names = [metric.name for metric in scoring.metrics]
     columns = [*names, *(objective.name for objective in scoring.objectives)]
     metrics = {
-        name: np.nan if original.get(name) is None else float(original[name]) for name in names
+        name: np.nan if original.get(name) is None else float(original[name])
+        for name in names
     }
 
     def with_all_columns(frame: pd.DataFrame) -> pd.DataFrame:

@@ -38,7 +38,9 @@ if TYPE_CHECKING:
 
 NAME: Columns = {"name": "name in a study"}
 DESCRIBED: Columns = NAME | {"description": "what it is"}
-SCENARIO: Columns = DESCRIBED | {"search": "axes of its encounters, and their widest ranges"}
+SCENARIO: Columns = DESCRIBED | {
+    "search": "axes of its encounters, and their widest ranges"
+}
 STUDIES: Columns = NAME | {
     key: f"its {key}" for key in ("title", "vehicle", "ads", "scenario", "weather")
 }
@@ -64,7 +66,9 @@ CHARACTERISTICS: Columns = {
     "remedy": Column("", "what to do with a vehicle beyond its limit", is_shown=False),
     "workshop": "how a workshop measures it, and what to do with a vehicle beyond its limit",
 }
-METRICS_TITLE = "Metrics; TET and TIT use TTC = L_s / v_L, ttc_min and drac TTC_p = gap / (v - u)"
+METRICS_TITLE = (
+    "Metrics; TET and TIT use TTC = L_s / v_L, ttc_min and drac TTC_p = gap / (v - u)"
+)
 WEATHER: Columns = NAME | {
     "road_friction": "factor on the tyres' friction",
     "visibility": "factor on the distance at which sensors detect an obstacle",
@@ -89,7 +93,10 @@ FINDINGS: Columns = {
     "check": "name of the check",
     "advice": "what to do",
 }
-BLOCK: Columns = {"part": "where, found, expected, what to do", "text": "this part of a finding"}
+BLOCK: Columns = {
+    "part": "where, found, expected, what to do",
+    "text": "this part of a finding",
+}
 
 
 CACHE: Columns = {
@@ -126,38 +133,58 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
     if kind == "cache" and study is None:
         return _list_cache()
     if study is not None:
-        raise InputError("study", f"{kind} of {study!r}", "a study after characteristics alone")
+        raise InputError(
+            "study", f"{kind} of {study!r}", "a study after characteristics alone"
+        )
 
     # The user's own scenario, or everything.
     own = {}
     if kind is not None and ":" in kind:
-        own[kind] = Lookup().class_of(SCENARIOS, kind, "KIND", TrackScenario, WorldScenario).target
+        own[kind] = (
+            Lookup()
+            .class_of(SCENARIOS, kind, "KIND", TrackScenario, WorldScenario)
+            .target
+        )
         kind = "scenarios"
-    effects = ["none" if equals_clear(weather) else "yes" for weather in WEATHERS.values()]
-    weathers = pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values())).assign(effect=effects)
+    effects = [
+        "none" if equals_clear(weather) else "yes" for weather in WEATHERS.values()
+    ]
+    weathers = pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values())).assign(
+        effect=effects
+    )
     metrics = (
-        (name, metric.description) for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()
+        (name, metric.description)
+        for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()
     )
 
     # A table for each kind.
     tables = {
         "studies": tabulate("Studies", STUDIES, _studies()),
-        "vehicles": tabulate("Characteristics of vehicles", VEHICLES, _characteristics()),
+        "vehicles": tabulate(
+            "Characteristics of vehicles", VEHICLES, _characteristics()
+        ),
         "ads": tabulate("ADSs", DESCRIBED, _described(ADS)),
         "scenarios": tabulate("Scenarios", SCENARIO, _scenarios(own or SCENARIOS)),
         "weathers": tabulate("Weathers", WEATHER, weathers),
         "algorithms": tabulate("Algorithms", DESCRIBED, DESCRIPTIONS.items()),
         "metrics": tabulate(METRICS_TITLE, DESCRIBED, metrics),
         "objectives": tabulate(
-            "Objectives; every metric can be one, too", DESCRIBED, FURTHER_OBJECTIVES.items()
+            "Objectives; every metric can be one, too",
+            DESCRIBED,
+            FURTHER_OBJECTIVES.items(),
         ),
     }
     if kind is not None:
         check_name(
-            "kind", f"there is no {kind!r} to list", kind, [*tables, "characteristics", "cache"]
+            "kind",
+            f"there is no {kind!r} to list",
+            kind,
+            [*tables, "characteristics", "cache"],
         )
         tables = {kind: tables[kind]}
-    counts = ", ".join(f"{frame.iloc[:, 0].nunique()} {name}" for name, frame in tables.items())
+    counts = ", ".join(
+        f"{frame.iloc[:, 0].nunique()} {name}" for name, frame in tables.items()
+    )
     verdict = f"A study can name {', '.join(own) or counts}."
     no_study: Any = None
     return Answer(
@@ -173,7 +200,9 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
 def _list_characteristics(name: str | None) -> Answer:
     """The characteristics of a study, with how a workshop measures them."""
     if name is None:
-        raise InputError("study", "no study", "its name or file, as in list characteristics wear")
+        raise InputError(
+            "study", "no study", "its name or file, as in list characteristics wear"
+        )
     study = read_study(name)
     items = CharacteristicSet.of(study).vehicle
     rows = [
@@ -200,7 +229,9 @@ def _list_cache() -> Answer:
     verdict = f"Simulations are not kept: {variable} is {simulations.OFF}."
     rows = []
     if folder is not None:
-        entries, size = simulations.Cache(folder).extent() if folder.is_dir() else (0, 0)
+        entries, size = (
+            simulations.Cache(folder).extent() if folder.is_dir() else (0, 0)
+        )
         rows = [(str(folder), entries, size / 1e6, limit)]
         verdict = (
             f"The folder {folder} keeps earlier simulations ({size / 1e6:.1f} MB of at most"
@@ -229,7 +260,9 @@ def _in_a_workshop(item: Characteristic) -> str | None:
 
 def _studies() -> Iterator[tuple[str, ...]]:
     for study in map(read_study, study_names()):
-        weather = study.weather if isinstance(study.weather, str) else study.weather.name
+        weather = (
+            study.weather if isinstance(study.weather, str) else study.weather.name
+        )
         yield (
             study.name,
             study.title,
@@ -281,7 +314,9 @@ LONG = 10.0
 
 
 @contents("passed", "vehicles", "points", lead="block", block=BLOCK, findings=FINDINGS)
-def check(name: str, *, vehicles: Annotated[int | None, Range(1, 10_000)] = None) -> Answer:
+def check(
+    name: str, *, vehicles: Annotated[int | None, Range(1, 10_000)] = None
+) -> Answer:
     """Check whether your own code (a driving system, vehicle, scenario, metric, objective or
     algorithm) keeps the rules on which results rest. NAME is a study, or a driving system such as
     my_ads:Careful. The exit code is 0 without findings, 1 with findings, and 2 if NAME cannot be
@@ -307,16 +342,29 @@ def check(name: str, *, vehicles: Annotated[int | None, Range(1, 10_000)] = None
         """How long it takes, if it takes long."""
         extents.append(extent)
         if extent.seconds > LONG:
-            warn(f"{number_of(extent.vehicles, 'vehicle')}, about {extent.seconds:.0f} s")
+            warn(
+                f"{number_of(extent.vehicles, 'vehicle')}, about {extent.seconds:.0f} s"
+            )
 
-    in_new_process = find_in_new_process(study)  # first, as a simulator may end its process
+    in_new_process = find_in_new_process(
+        study
+    )  # first, as a simulator may end its process
     with open_progress(True) as progress:
         findings = check_study(study, vehicles=vehicles, progress=progress, tell=tell)
     if not findings:
-        check_algorithms(study, assemble(study))  # what the command `study` would refuse
+        check_algorithms(
+            study, assemble(study)
+        )  # what the command `study` would refuse
         findings = in_new_process
     rows = [
-        (item.finding, item.where, item.input, item.expected, item.check, CHECKS[item.check])
+        (
+            item.finding,
+            item.where,
+            item.input,
+            item.expected,
+            item.check,
+            CHECKS[item.check],
+        )
         for item in findings
     ]
     blocks = [

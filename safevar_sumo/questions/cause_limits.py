@@ -75,7 +75,10 @@ def find_cause_limits(
     original = characteristics.with_original_vehicle(settings)
     is_changed = settings != original
     # A cause has a line on which all its changes are scaled, then a line for each change by itself.
-    groups = [np.vstack([flags, np.eye(len(flags), dtype=bool)[flags]]) for flags in is_changed]
+    groups = [
+        np.vstack([flags, np.eye(len(flags), dtype=bool)[flags]])
+        for flags in is_changed
+    ]
     line_counts = list(map(len, groups))
     is_scaled = np.concatenate(groups)
     ends = np.repeat(settings, line_counts, axis=0)
@@ -101,7 +104,9 @@ def find_cause_limits(
     first_lines = np.cumsum([0, *line_counts])
     return [
         Limits(
-            boundary=dict(zip(cause.changes, limits[first, flags].tolist(), strict=True)),
+            boundary=dict(
+                zip(cause.changes, limits[first, flags].tolist(), strict=True)
+            ),
             single_boundary=dict(
                 zip(
                     cause.changes,
@@ -136,7 +141,11 @@ def _first_unsafe_shares(
     """
     # The first unsafe share of each line.
     found = find_boundaries(
-        starts, ends, lambda rows: unsafe.of(evaluator.evaluate(rows, BOUNDARIES)), parts, lowest
+        starts,
+        ends,
+        lambda rows: unsafe.of(evaluator.evaluate(rows, BOUNDARIES)),
+        parts,
+        lowest,
     )
 
     # What ends the line on the safe side.

@@ -78,7 +78,11 @@ def find_minimal_causes(
                 for columns, of_row in zip(changed, found, strict=True)
                 if not of_row
             )
-            if size > complete and evaluator.left is not None and number > evaluator.left:
+            if (
+                size > complete
+                and evaluator.left is not None
+                and number > evaluator.left
+            ):
                 break
             subsets = (
                 (row, list(columns))
@@ -89,7 +93,9 @@ def find_minimal_causes(
             )
             while chunk := list(islice(subsets, MAX_SUBSETS)):
                 partial_settings = originals[[row for row, _ in chunk]]
-                for partial, (row, columns) in zip(partial_settings, chunk, strict=True):
+                for partial, (row, columns) in zip(
+                    partial_settings, chunk, strict=True
+                ):
                     partial[columns] = settings[row, columns]
                 evaluations = evaluator.evaluate(partial_settings, SUBSETS)
                 of_runs = unsafe.runs(evaluations).mean(axis=0)
@@ -100,7 +106,9 @@ def find_minimal_causes(
                         changes={names[column]: values[column] for column in columns},
                         outcome=str(evaluations.outcome[index]),
                         safety_degree=float(evaluations.f_safe[index]),
-                        encounter={names[column]: values[column] for column in of_scenario},
+                        encounter={
+                            names[column]: values[column] for column in of_scenario
+                        },
                         unsafe_runs=float(of_runs[index]),
                     )
                     causes[row].append(cause)
@@ -113,11 +121,15 @@ def largest_complete(numbers: Sequence[int], limit: int) -> int:
     about `limit` settings altogether; at least 1.
     """
     sizes = range(2, max(numbers, default=1) + 1)
-    affordable = takewhile(lambda size: sum(_subset_counts(numbers, size)) <= limit, sizes)
+    affordable = takewhile(
+        lambda size: sum(_subset_counts(numbers, size)) <= limit, sizes
+    )
     return max(affordable, default=1)
 
 
-def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) -> BoolArray:
+def are_causes(
+    evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe
+) -> BoolArray:
     """Whether each of M causes is one with an evaluator's parameters: its changes alone are unsafe,
     and safe if any one of them is left out.
     """
@@ -127,18 +139,24 @@ def are_causes(evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe) ->
         is_changed = (setting != characteristics.original) & characteristics.of_vehicle
         is_left_out = np.diag(is_changed)[is_changed]  # in a row for each change
         groups.append(
-            np.vstack([setting, np.where(is_left_out, characteristics.original, setting)])
+            np.vstack(
+                [setting, np.where(is_left_out, characteristics.original, setting)]
+            )
         )
     starts = np.cumsum([0, *map(len, groups[:-1])])
     is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), OTHER_SETS))
     # The first setting of a group, with all changes, is the only unsafe one.
-    return np.asarray(is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1))
+    return np.asarray(
+        is_unsafe[starts] & (np.add.reduceat(is_unsafe, starts, dtype=int) == 1)
+    )
 
 
 def _subset_counts(numbers: Sequence[int], most: int | None = None) -> list[int]:
     """How many subsets of at most so many of each number of changes there are; of all of them."""
     return [
-        sum(comb(number, size) for size in range((number if most is None else most) + 1))
+        sum(
+            comb(number, size) for size in range((number if most is None else most) + 1)
+        )
         for number in numbers
     ]
 
@@ -155,7 +173,9 @@ def select_affordable_rows(
     if costs.sum() <= max_evaluations:
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.seed).permutation(len(settings))
-    least = int(evaluator.left is not None and len(evaluator.characteristics) < max_evaluations)
+    least = int(
+        evaluator.left is not None and len(evaluator.characteristics) < max_evaluations
+    )
     number = max(least, np.count_nonzero(np.cumsum(costs[order]) <= max_evaluations))
     return sorted(order[:number].tolist())
 
@@ -194,7 +214,9 @@ def count_needed(
     needed = np.zeros(len(names))
     in_some = np.zeros(len(names))
     for group in filter(None, causes):
-        is_in_cause = np.array([[name in cause.changes for name in names] for cause in group])
+        is_in_cause = np.array(
+            [[name in cause.changes for name in names] for cause in group]
+        )
         needed += is_in_cause.all(axis=0)
         in_some += is_in_cause.any(axis=0)
 
@@ -212,11 +234,16 @@ def count_needed(
     }
     frame = pd.DataFrame(shares).head(len(names) if len(changed) else 0)
     return frame.sort_values(
-        ["needed", "in_some", "changed"], ascending=False, kind="stable", ignore_index=True
+        ["needed", "in_some", "changed"],
+        ascending=False,
+        kind="stable",
+        ignore_index=True,
     )
 
 
-def directions(characteristics: CharacteristicSet, changes: NamedValues) -> tuple[str, ...]:
+def directions(
+    characteristics: CharacteristicSet, changes: NamedValues
+) -> tuple[str, ...]:
     """The directions of changes, without their sizes, such as ('mass up', 'tireFric down')."""
     return tuple(
         f"{item.name} {'up' if changes[item.name] > item.original else 'down'}"
@@ -238,7 +265,9 @@ def count_distinct_causes(
     """
     counts = Counter[tuple[str, ...]]()
     for of_failure in causes:
-        counts.update({directions(characteristics, cause.changes) for cause in of_failure})
+        counts.update(
+            {directions(characteristics, cause.changes) for cause in of_failure}
+        )
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
     rows = [(key, counts[key], counts[key] / len(causes)) for key in order]
     return pd.DataFrame(rows, columns=["cause", "failures", "share"])
@@ -257,12 +286,15 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     keys = ["algorithm", "run"]
     order = [F_NUM_DIFF.name, F_DIFF.name]
     names = [*evaluator.characteristics.names]
-    failures = case.solutions[case.unsafe.rows(case.solutions)].drop_duplicates([*keys, *names])
+    failures = case.solutions[case.unsafe.rows(case.solutions)].drop_duplicates(
+        [*keys, *names]
+    )
     examined = failures.sort_values(order, kind="stable").groupby(keys).head(limit)
     settings = examined[[*names, F_NUM_DIFF.name]].drop_duplicates()
     price = sum(_subset_counts(settings.pop(F_NUM_DIFF.name).astype(int).tolist()))
     print_text(
-        Console(stderr=True), f"{case.name}: the minimal causes take at most {price:,} simulations."
+        Console(stderr=True),
+        f"{case.name}: the minimal causes take at most {price:,} simulations.",
     )
 
     # Kinds of causes: which characteristics change, and in which direction.
@@ -291,12 +323,15 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     return frame.fillna(0).astype(int).reset_index()
 
 
-def settings_of(characteristics: CharacteristicSet, causes: Sequence[Cause]) -> FloatArray:
+def settings_of(
+    characteristics: CharacteristicSet, causes: Sequence[Cause]
+) -> FloatArray:
     """The original vehicle with the changes of each of M causes only, in its encounter; shape (M,
     n).
     """
     of_causes = [cause.changes | cause.encounter for cause in causes]
     values = [
-        [values.get(item.name, item.original) for item in characteristics] for values in of_causes
+        [values.get(item.name, item.original) for item in characteristics]
+        for values in of_causes
     ]
     return np.array(values).reshape(-1, len(characteristics))

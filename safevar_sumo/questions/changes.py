@@ -19,7 +19,10 @@ CHANGE_FORMS = (
 
 
 def read_changes(
-    changes: Sequence[str], characteristics: CharacteristicSet, *, beyond: bool | None = None
+    changes: Sequence[str],
+    characteristics: CharacteristicSet,
+    *,
+    beyond: bool | None = None,
 ) -> NamedValues:
     """Parse changes into the value of each named characteristic; without `beyond`, an error does
     not suggest this option.
@@ -40,12 +43,16 @@ def read_changes(
             raise InputError("", repr(change), CHANGE_FORMS)
         if name in values:
             raise InputError("", f"{name} is set twice", "each characteristic once")
-        check_name("", f"there is no characteristic {name!r}", name, characteristics.names)
+        check_name(
+            "", f"there is no characteristic {name!r}", name, characteristics.names
+        )
         characteristic = characteristics.members[characteristics.names.index(name)]
         values[name] = _parse(change, text, characteristic.original)
         is_relative = SIGNED_NUMBER.fullmatch(text) and characteristic.original
         hint = f", or {name}={text}% of the original" if is_relative else ""
-        characteristic.check(values[name], beyond=bool(beyond), otherwise=hint, switch=switch)
+        characteristic.check(
+            values[name], beyond=bool(beyond), otherwise=hint, switch=switch
+        )
     return values
 
 
@@ -54,7 +61,9 @@ def _parse(change: str, text: str, original: float) -> float:
     if percentage := PERCENTAGE.fullmatch(text):
         if not original:
             raise InputError(
-                "", f"{change!r}: the original is 0", "NAME=VALUE in the characteristic's unit"
+                "",
+                f"{change!r}: the original is 0",
+                "NAME=VALUE in the characteristic's unit",
             )
         return original + abs(original) * float(percentage[1]) / 100
     if re.fullmatch(NUMBER_PATTERN, text):

@@ -16,7 +16,13 @@ from safevar_sumo.questions.causes import find_minimal_causes
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.words import EXACT, join_phrases
-from safevar_sumo.records import KMH_PER_MS, Evaluations, FloatArray, JsonObject, NamedValues
+from safevar_sumo.records import (
+    KMH_PER_MS,
+    Evaluations,
+    FloatArray,
+    JsonObject,
+    NamedValues,
+)
 from safevar_sumo.results import choose_handle, row_of_handle
 from safevar_sumo.scenarios import (
     FROM_CENTRES,
@@ -81,8 +87,12 @@ def describe(
             ]
         )
         found = failures_at(model, rows)
-        failures |= {name: found[row] for row, name in enumerate(waiting) if row in found}
-        waiting = {name: setting for name, setting in waiting.items() if name not in failures}
+        failures |= {
+            name: found[row] for row, name in enumerate(waiting) if row in found
+        }
+        waiting = {
+            name: setting for name, setting in waiting.items() if name not in failures
+        }
     return failures
 
 
@@ -93,7 +103,9 @@ def values_as_printed(
     are where it prints none, and but for one characteristic of each if `only` names them.
     """
     members = model.characteristics
-    settings = {str(row): members.setting(one, beyond=True) for row, one in enumerate(vehicles)}
+    settings = {
+        str(row): members.setting(one, beyond=True) for row, one in enumerate(vehicles)
+    }
     printed = describe(model, settings, only=dict(zip(settings, only, strict=False)))
     settings |= {name: failure.setting for name, failure in printed.items()}
     return [members.named(one) for one in settings.values()]
@@ -154,9 +166,17 @@ def as_printed(
             upper = within.upper[column]
         if value not in (item.original, lower, upper) and only in ("", item.name):
             scale = 10.0 ** (item.digits + further)
-            away = np.round if item.is_scenario else np.ceil if value > item.original else np.floor
+            away = (
+                np.round
+                if item.is_scenario
+                else np.ceil
+                if value > item.original
+                else np.floor
+            )
             # What is a rounding error of the scaled value is none of the value.
-            printed[column] = min(max(away(np.round(value * scale, 6)) / scale, lower), upper)
+            printed[column] = min(
+                max(away(np.round(value * scale, 6)) / scale, lower), upper
+            )
     return printed
 
 
@@ -165,7 +185,9 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     points = model.evaluator.system.points
     members = model.characteristics
     runs = model.evaluate(settings, STAGE)
-    is_unsafe = model.evaluator.region.feasible(settings) & (model.robustness_by(runs) < 0)
+    is_unsafe = model.evaluator.region.feasible(settings) & (
+        model.robustness_by(runs) < 0
+    )
     fit = f" (parameter set {model.fit})" if model.fit else ""
     failures = dict[int, Failure]()
     for row in np.flatnonzero(is_unsafe).tolist():
@@ -189,7 +211,9 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     return failures
 
 
-def _command(model: Model, setting: FloatArray, point: Point, values: Mapping[str, float]) -> str:
+def _command(
+    model: Model, setting: FloatArray, point: Point, values: Mapping[str, float]
+) -> str:
     """The command that simulates a setting, shape (n,), in the encounter with these values of
     searched parameters, where the place of a matrix can be set.
     """
@@ -214,7 +238,10 @@ def where_in_words(
     them; empty where there is but one.
     """
     own = dict(point.parameters)
-    numbers = {**{name: value for name, value in own.items() if name not in OF_ENCOUNTER}, **values}
+    numbers = {
+        **{name: value for name, value in own.items() if name not in OF_ENCOUNTER},
+        **values,
+    }
     if not numbers.get(PHASE, 1):
         del numbers[PHASE]
     texts = texts_of(point, numbers)
@@ -244,13 +271,19 @@ def texts_of(point: Point, values: JsonObject) -> dict[str, str]:
     }
 
 
-def _failure_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float) -> str:
+def _failure_in_words(
+    scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float
+) -> str:
     """A failure at a safety degree, such as `the car hits a pedestrian at 12 km/h`."""
     if unsafe.bound is not None and not collided:
         return f"the car has {unsafe.bound}"
     if collided:
-        impact_speed = -KMH_PER_MS * degree  # nearly 0 at the limit itself: then it says nothing
-        impact = "" if impact_speed < 1 else f" at {float(f'{impact_speed:.2g}'):g} km/h"
+        impact_speed = (
+            -KMH_PER_MS * degree
+        )  # nearly 0 at the limit itself: then it says nothing
+        impact = (
+            "" if impact_speed < 1 else f" at {float(f'{impact_speed:.2g}'):g} km/h"
+        )
         return f"the car hits {scenario.obstacle()}{impact}"
     measured = FROM_CENTRES if unsafe.contact and unsafe.degree else ""
     return (

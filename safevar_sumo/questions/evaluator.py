@@ -134,15 +134,21 @@ class Evaluator:
             return self._simulate_shown(rows, stage, verified, selection)
         infeasible = rows[~is_feasible]
         changes = self.characteristics.change_objectives(infeasible[:, :n])
-        not_simulated = Evaluations.undefined(infeasible, Outcome.INFEASIBLE, METRICS, **changes)
+        not_simulated = Evaluations.undefined(
+            infeasible, Outcome.INFEASIBLE, METRICS, **changes
+        )
         if not is_feasible.any():
             return not_simulated
         simulated = self._simulate_shown(rows[is_feasible], stage, verified, selection)
         both = Evaluations.concatenate([simulated, not_simulated])
-        rows_of_both = np.concatenate([np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)])
+        rows_of_both = np.concatenate(
+            [np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)]
+        )
         return both.take(np.argsort(rows_of_both))  # in the order of the settings
 
-    def begin(self, settings: NamedValues, least: int = 1, *, of_list: bool = False) -> None:
+    def begin(
+        self, settings: NamedValues, least: int = 1, *, of_list: bool = False
+    ) -> None:
         """Begin a question of these phases, each with the number of settings that it is expected to
         simulate; below the `least` number there is no answer. One about a list of vehicles says how
         long it takes where a simulation is short, too.
@@ -173,12 +179,16 @@ class Evaluator:
         account = self.account
         return None if account.most is None else int(account.left) // self._each
 
-    def limit(self, simulations: int | None, questions: int, *, quick: bool = False) -> None:
+    def limit(
+        self, simulations: int | None, questions: int, *, quick: bool = False
+    ) -> None:
         """Let the question do so many simulations, with those that check a simulator's class; it is
         one of so many that share the time. A quick one searches less.
         """
         seconds = sum(np.max(point.scenario.duration) for point in self.system.points)
-        self.account.effort = float(np.clip(QUICK_SECONDS / seconds, *QUICK)) if quick else 1.0
+        self.account.effort = (
+            float(np.clip(QUICK_SECONDS / seconds, *QUICK)) if quick else 1.0
+        )
         self.account.asked = self.account.most = simulations
         self.account.questions = questions
         self.account.is_question = True
@@ -201,7 +211,9 @@ class Evaluator:
     def _each(self) -> int:
         return simulations_of_setting(self.system)
 
-    def evaluate_selection(self, rows: FloatArray, selection: Selection, stage: str) -> Evaluations:
+    def evaluate_selection(
+        self, rows: FloatArray, selection: Selection, stage: str
+    ) -> Evaluations:
         """Evaluate M settings as `selection` says: at some points, and with values of P parameters
         of the ADS.
 
@@ -211,7 +223,11 @@ class Evaluator:
         return self._evaluate_feasible(rows, stage, 0, selection)
 
     def _simulate_shown(
-        self, settings: FloatArray, stage: str, verified: int, selection: Selection = EVERYTHING
+        self,
+        settings: FloatArray,
+        stage: str,
+        verified: int,
+        selection: Selection = EVERYTHING,
     ) -> Evaluations:
         """Evaluate settings while progress is shown."""
         if not len(settings):
@@ -257,7 +273,9 @@ class Evaluator:
         return replace(
             evaluations,
             outcome=np.where(
-                is_left_out & ~evaluations.failed, Outcome.INFEASIBLE.value, evaluations.outcome
+                is_left_out & ~evaluations.failed,
+                Outcome.INFEASIBLE.value,
+                evaluations.outcome,
             ),
             metrics={**metrics, ORIGINAL_DEGREE: evaluations.column(ORIGINAL_DEGREE)},
         )
@@ -278,7 +296,9 @@ class Evaluator:
             -1, settings.shape[1]
         )
         evaluations = self.evaluate(pairs, stage)
-        worst = np.argmin(unsafe.robustness(evaluations).reshape(-1, len(encounters)), axis=1)
+        worst = np.argmin(
+            unsafe.robustness(evaluations).reshape(-1, len(encounters)), axis=1
+        )
         return evaluations.take((np.arange(len(settings)) * len(encounters)) + worst)
 
     @cached_property
@@ -302,7 +322,9 @@ class Evaluator:
             return 0.0
         originals = self._originals
         is_possible = self.region.feasible(originals.settings)
-        return float(np.mean(~originals.valid[is_possible])) if is_possible.any() else 0.0
+        return (
+            float(np.mean(~originals.valid[is_possible])) if is_possible.any() else 0.0
+        )
 
     @cached_property
     def _originals(self) -> Evaluations:
@@ -310,7 +332,8 @@ class Evaluator:
         # Of few simulations an eighth chooses encounters, and the others are of vehicles there.
         drawn = sobol_settings(self.characteristics, self.at_most(CANDIDATES, 8))
         return self.evaluate(
-            self.characteristics.with_original_vehicle(drawn), "encounters of the original"
+            self.characteristics.with_original_vehicle(drawn),
+            "encounters of the original",
         )
 
     def feasible_settings(self, number: int) -> FloatArray:
@@ -336,11 +359,15 @@ class Evaluator:
             If encounters are ranges, and the original vehicle is not safe in the original
             encounter.
         """
-        evaluations = self.evaluate(self.characteristics.original_settings, "original vehicle")
+        evaluations = self.evaluate(
+            self.characteristics.original_settings, "original vehicle"
+        )
         if len(self.characteristics.scenario) and evaluations.infeasible[0]:
             raise InputError(
-                self.study.source, "encounters: the original vehicle is not safe in the encounter of the original"
-                " values", "original values with which it is, as in all results"
+                self.study.source,
+                "encounters: the original vehicle is not safe in the encounter of the original"
+                " values",
+                "original values with which it is, as in all results",
             )
         if not evaluations.valid[0]:
             raise SimulationError(
@@ -359,7 +386,9 @@ class Evaluator:
         if not self.system.mover.is_exact:
             jobs = [(Task(study=study), self.characteristics.original_settings)]
             self.account.spend(self._each)
-            now = record(carry_out(evaluate_settings, jobs, self._pool)[0], 0)  # nothing kept
+            now = record(
+                carry_out(evaluate_settings, jobs, self._pool)[0], 0
+            )  # nothing kept
             refuse_other_original(Path(case.name), case.original, now)
 
     @cached_property
@@ -370,7 +399,10 @@ class Evaluator:
         return ask_why_no_verdict(self.study, self._pool, begin=self._compile)
 
     def choose_criterion(
-        self, stated: Unsafe | None, source: Subject, original: Evaluations | None = None
+        self,
+        stated: Unsafe | None,
+        source: Subject,
+        original: Evaluations | None = None,
     ) -> Unsafe:
         """The criterion that is stated, or else the default for the solutions of results, or for
         settings over the whole domain of a study.
@@ -412,8 +444,14 @@ class Evaluator:
         """Refuse what is measured in an encounter, as a distance, where nobody else is on the
         road.
         """
-        if self.system.meets_nobody and np.isnan(self.evaluate_original().column(measure)[0]):
-            raise InputError("unsafe", "nobody else is on the road, so that no vehicle collides or is too close", 'a metric with a limit, such as "stopping_distance > 100"')
+        if self.system.meets_nobody and np.isnan(
+            self.evaluate_original().column(measure)[0]
+        ):
+            raise InputError(
+                "unsafe",
+                "nobody else is on the road, so that no vehicle collides or is too close",
+                'a metric with a limit, such as "stopping_distance > 100"',
+            )
 
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""

@@ -115,7 +115,9 @@ def falsify_all(
     def go_on(number: int, robustness: FloatArray | None) -> None:
         step = steps[number]
         try:
-            waiting[number] = next(step) if robustness is None else step.send(robustness)
+            waiting[number] = (
+                next(step) if robustness is None else step.send(robustness)
+            )
         except StopIteration as end:
             found[number] = end.value
 
@@ -159,7 +161,9 @@ def _steps(
     seen = set[tuple[int, bytes]]()
     generations_left = 1 + MORE_GENERATIONS
     settings = np.concatenate([empty, *known])
-    numbers = np.repeat(np.arange(len(known)), [len(rows) for rows in known]).astype(np.intp)
+    numbers = np.repeat(np.arange(len(known)), [len(rows) for rows in known]).astype(
+        np.intp
+    )
     least = np.full(n_judges, np.inf)
     generation = 0
     if len(found.settings):
@@ -171,7 +175,9 @@ def _steps(
         # The first generation holds all known settings, and random ones; more known settings than
         # a generation get as many random ones beside them.
         is_large = generation == 0 and len(settings) > size
-        number = min(len(settings) + size if is_large else size, budget - found.simulated)
+        number = min(
+            len(settings) + size if is_large else size, budget - found.simulated
+        )
         choice = np.arange(n_judges) if generation == 0 else _pair(least, generation)
         settings, numbers = _new_ones(box, settings, numbers, choice, number, seen, rng)
         if not len(settings):
@@ -225,7 +231,10 @@ def _new_ones(
 
 
 def _worst(
-    found: Falsification, settings: FloatArray, numbers: IntArray, robustness: FloatArray
+    found: Falsification,
+    settings: FloatArray,
+    numbers: IntArray,
+    robustness: FloatArray,
 ) -> Falsification:
     """The falsification after a generation, with the worst settings that count, and all unsafe
     ones.
@@ -243,7 +252,9 @@ def _worst(
     )
 
 
-def _children(box: Box, found: Falsification, number: int, rng: np.random.Generator) -> FloatArray:
+def _children(
+    box: Box, found: Falsification, number: int, rng: np.random.Generator
+) -> FloatArray:
     """A number of children; none before a setting counts."""
     parents = found.settings[:PARENTS]
     if not len(parents):
@@ -256,7 +267,9 @@ def _children(box: Box, found: Falsification, number: int, rng: np.random.Genera
     # Of a child's values, 0.4 on average are drawn anew, 0.4 make a step, and 0.4 go to an end.
     draw = rng.random(shape) * max(int(np.count_nonzero(box.lower < box.upper)), 1)
     mutated = np.select(
-        [draw < 0.4, draw < 0.8, draw < 1.2], [random, mixed + STEP * (random - mixed), ends], mixed
+        [draw < 0.4, draw < 0.8, draw < 1.2],
+        [random, mixed + STEP * (random - mixed), ends],
+        mixed,
     )
     worse = parents[np.minimum(first, second)]  # the worst parents come first
     moved = (

@@ -46,8 +46,16 @@ def new_figure(
     import matplotlib.style
     from matplotlib.figure import Figure
 
-    texts = ("font.size", "axes.labelsize", "axes.titlesize", "xtick.labelsize", "ytick.labelsize")
-    with matplotlib.style.context(["seaborn-v0_8-whitegrid", dict.fromkeys(texts, FONT_SIZE)]):
+    texts = (
+        "font.size",
+        "axes.labelsize",
+        "axes.titlesize",
+        "xtick.labelsize",
+        "ytick.labelsize",
+    )
+    with matplotlib.style.context(
+        ["seaborn-v0_8-whitegrid", dict.fromkeys(texts, FONT_SIZE)]
+    ):
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, **options)
     figure.suptitle(escape_dollars(title), fontsize=FONT_SIZE + 2)
@@ -90,10 +98,14 @@ def save(figure: Figure, path: Path, option: str = "out") -> None:
 
     try:
         with (
-            matplotlib.rc_context({"svg.hashsalt": "safevar_sumo", "pdf.fonttype": TRUETYPE}),
+            matplotlib.rc_context(
+                {"svg.hashsalt": "safevar_sumo", "pdf.fonttype": TRUETYPE}
+            ),
             whole_file(path) as file,
         ):
-            figure.savefig(file, dpi=DPI, metadata=PICTURE_METADATA.get(path.suffix.lower()))
+            figure.savefig(
+                file, dpi=DPI, metadata=PICTURE_METADATA.get(path.suffix.lower())
+            )
     except (OSError, ValueError) as error:
         raise InputError(
             option,

@@ -12,7 +12,14 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import F_SAFE, Unsafe
-from safevar_sumo.questions.answer import HIGH, LOW, Column, Columns, tabulate, with_interval
+from safevar_sumo.questions.answer import (
+    HIGH,
+    LOW,
+    Column,
+    Columns,
+    tabulate,
+    with_interval,
+)
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
@@ -48,7 +55,11 @@ def _problem(names: Sequence[str]) -> JsonObject:
     that it gets numbers.
     """
     numbers = [str(number) for number in range(len(names))]
-    return {"num_vars": len(names), "names": numbers, "bounds": [[0.0, 1.0]] * len(names)}
+    return {
+        "num_vars": len(names),
+        "names": numbers,
+        "bounds": [[0.0, 1.0]] * len(names),
+    }
 
 
 def _seed(evaluator: Evaluator) -> int:
@@ -92,7 +103,10 @@ def sobol_indices(
         conf_level=confidence,
         seed=_seed(evaluator),
     )
-    kinds = {"first": ("S1", "first order"), "total": ("ST", "total, with all interactions")}
+    kinds = {
+        "first": ("S1", "first order"),
+        "total": ("ST", "total, with all interactions"),
+    }
     return _table(names, evaluations.take(is_complete), criterion, indices_of, kinds)
 
 
@@ -115,11 +129,15 @@ def given_data_indices(
         with warnings.catch_warnings(), patch.object(warnings, "formatwarning"):
             settings = evaluations.settings[:, varies]
             seed = _seed(evaluator)
-            indices: Indices = analysis.analyze(problem, settings, output, seed=seed, **options)
+            indices: Indices = analysis.analyze(
+                problem, settings, output, seed=seed, **options
+            )
         return indices
 
     first = "S1", "first order, with everything that depends on it"
-    return _table(names, evaluations, criterion, indices_of, {"first": first, "total": UNDEFINED})
+    return _table(
+        names, evaluations, criterion, indices_of, {"first": first, "total": UNDEFINED}
+    )
 
 
 def _table(
@@ -152,7 +170,9 @@ def _table(
         found["unsafe"] = indices_of(is_unsafe)
 
     # An index of each output, with its interval.
-    columns: Columns = {"characteristic": "characteristic of the vehicle, or of its encounter"}
+    columns: Columns = {
+        "characteristic": "characteristic of the vehicle, or of its encounter"
+    }
     values = dict[str, FloatArray]()
     undefined = np.full(len(names), np.nan)
     for output, of_what in output_names.items():
@@ -161,18 +181,28 @@ def _table(
             name = f"{output}_{index}"
             value = np.asarray(of_output.get(key, undefined), dtype=float)
             half = np.asarray(of_output.get(f"{key}_conf", undefined), dtype=float)
-            ends = {name: value, f"{name}{LOW}": value - half, f"{name}{HIGH}": value + half}
+            ends = {
+                name: value,
+                f"{name}{LOW}": value - half,
+                f"{name}{HIGH}": value + half,
+            }
             # An estimate may lie beyond what a share can be.
             values |= {key: np.clip(end, 0, 1) for key, end in ends.items()}
-            head = f"{of_what.removeprefix('the ')}: {index}" if output == "degree" else ""
+            head = (
+                f"{of_what.removeprefix('the ')}: {index}" if output == "degree" else ""
+            )
             meaning = f"share of the variance of {of_what}: {meaning}"
-            column = Column("-", meaning, ".2f", head=head, is_detail=output == "unsafe")
+            column = Column(
+                "-", meaning, ".2f", head=head, is_detail=output == "unsafe"
+            )
             columns |= with_interval(name, column)
 
     # The characteristic that decides most comes first.
     frame = pd.DataFrame({"characteristic": names, **values})
     last = "degree_first" if kinds["total"] == UNDEFINED else "degree_total"
     frame = frame.sort_values(last, ascending=False, kind="stable", ignore_index=True)
-    table = tabulate("What decides: shares of the variance (Sobol indices)", columns, frame)
+    table = tabulate(
+        "What decides: shares of the variance (Sobol indices)", columns, frame
+    )
     table.attrs[OF_WHAT] = output_names
     return table

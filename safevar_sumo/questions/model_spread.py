@@ -57,7 +57,9 @@ class ModelSpread(NamedTuple):
     collisions: int
 
 
-def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -> list[ModelSpread]:
+def compute_model_spreads(
+    study: Study, settings: FloatArray, point: str = ""
+) -> list[ModelSpread]:
     """The model's uncertainty for each of M settings, shape (M, n); the filter is not applied.
 
     In a matrix, all settings are simulated at `point`; if no point is named, each setting at its
@@ -71,12 +73,18 @@ def compute_model_spreads(study: Study, settings: FloatArray, point: str = "") -
     evaluations = evaluate_sets(study, settings, point)
     collisions = np.sum([prediction.collided for prediction in evaluations], axis=0)
     return [
-        ModelSpread(len(evaluations), finite_or_none(low), finite_or_none(high), int(count))
-        for low, high, count in zip(*band_of(study, evaluations), collisions, strict=True)
+        ModelSpread(
+            len(evaluations), finite_or_none(low), finite_or_none(high), int(count)
+        )
+        for low, high, count in zip(
+            *band_of(study, evaluations), collisions, strict=True
+        )
     ]
 
 
-def band_of(study: Study, evaluations: Sequence[Evaluations]) -> tuple[FloatArray, FloatArray]:
+def band_of(
+    study: Study, evaluations: Sequence[Evaluations]
+) -> tuple[FloatArray, FloatArray]:
     """Lower and upper ends, shape (M,) each, of the band of the sets' predictions for M
     settings.
     """
@@ -118,10 +126,15 @@ def prediction_band(
     shares = [(1 - BAND_SHARE) / 2, (1 + BAND_SHARE) / 2]
     ends[:, is_defined] = np.nanquantile(safety_degrees[:, is_defined], shares, axis=0)
     lower, upper = ends
-    return lower - HALF_WIDTH * repeatability - error, upper + HALF_WIDTH * repeatability + error
+    return (
+        lower - HALF_WIDTH * repeatability - error,
+        upper + HALF_WIDTH * repeatability + error,
+    )
 
 
-def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[Evaluations]:
+def evaluate_sets(
+    study: Study, settings: FloatArray, point: str = ""
+) -> list[Evaluations]:
     """Evaluate settings, shape (M, n), in this process with each parameter set, first with the
     study's values.
     """
@@ -130,7 +143,9 @@ def evaluate_sets(study: Study, settings: FloatArray, point: str = "") -> list[E
     systems = []
     for k, other in enumerate(studies_of_sets(study)):
         called = f"{study.source}: spread: set {k}" if k else study.source
-        systems.append(assemble(replace(other, origin=replace(other.origin, called=called))))
+        systems.append(
+            assemble(replace(other, origin=replace(other.origin, called=called)))
+        )
     return [drive_and_score(system, settings) for system in systems]
 
 
@@ -151,11 +166,18 @@ def studies_of_sets(study: Study) -> list[Study]:
 
     # Parameters outside the sets keep their values.
     outside_names = parameters_outside_sets(study)
-    sets = {key: values[1:] for key, values in study.spread.items() if key not in outside_names}
+    sets = {
+        key: values[1:]
+        for key, values in study.spread.items()
+        if key not in outside_names
+    }
     number = len(next(iter(study.spread.values()))) - 1
     return [
         study,
-        *(with_values(study, {key: sets[key][k] for key in sets}) for k in range(number)),
+        *(
+            with_values(study, {key: sets[key][k] for key in sets})
+            for k in range(number)
+        ),
     ]
 
 
@@ -172,7 +194,9 @@ def parameters_outside_sets(study: Study) -> list[str]:
     return [
         key
         for key, values in study.spread.items()
-        if not np.isclose(value_of(study, key), values[0], rtol=ROUNDING_TOLERANCE, atol=0)
+        if not np.isclose(
+            value_of(study, key), values[0], rtol=ROUNDING_TOLERANCE, atol=0
+        )
     ]
 
 

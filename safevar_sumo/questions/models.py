@@ -69,7 +69,9 @@ class Model(NamedTuple):
         failing = np.flatnonzero(robustness < 0)
         if self.new_car is not None and len(failing):
             members = self.characteristics
-            originals = self.evaluate(members.with_original_vehicle(settings[failing]), stage)
+            originals = self.evaluate(
+                members.with_original_vehicle(settings[failing]), stage
+            )
             counts = originals.valid & ~self.new_car.of(originals)
             robustness[failing[~counts]] = np.inf
         return robustness
@@ -112,7 +114,9 @@ def limit_criterion(
     scenario, whose originals keep more.
     """
     is_distance = unsafe is None and margin is not None
-    criterion = evaluator.choose_criterion(Unsafe() if is_distance else unsafe, subject, original)
+    criterion = evaluator.choose_criterion(
+        Unsafe() if is_distance else unsafe, subject, original
+    )
     return keeping_distance(evaluator, criterion, margin, is_stated=unsafe is not None)
 
 
@@ -129,7 +133,9 @@ def keeping_distance(
         return criterion
     study = evaluator.study
     is_searched = margin is None and study.ranges
-    return replace(criterion, keep=SEARCHED_MARGIN if is_searched else margin_of(study, margin))
+    return replace(
+        criterion, keep=SEARCHED_MARGIN if is_searched else margin_of(study, margin)
+    )
 
 
 def check_margin(criterion: Unsafe, margin: float | None) -> None:
@@ -143,7 +149,11 @@ def check_margin(criterion: Unsafe, margin: float | None) -> None:
 
 
 def models_of(
-    evaluator: Evaluator, unsafe: Unsafe, fits: int | None, *, with_unsafe_originals: bool = False
+    evaluator: Evaluator,
+    unsafe: Unsafe,
+    fits: int | None,
+    *,
+    with_unsafe_originals: bool = False,
 ) -> Models:
     """The first `fits` parameter sets of a study, by default all: what is unsafe holds in the
     study's own, and a distance to keep there alone. No other set may collide. Those with an unsafe
@@ -158,7 +168,8 @@ def models_of(
             members.append(model)
             continue
         original = model.evaluator.evaluate(
-            evaluator.characteristics.original_settings, "original with each parameter set"
+            evaluator.characteristics.original_settings,
+            "original with each parameter set",
         )
         if unsafe.of(original)[0] or not original.valid[0]:
             left_out.append(model._replace(unsafe=unsafe))
@@ -169,4 +180,6 @@ def models_of(
 
 def fit_names(fits: Sequence[int]) -> str:
     """Parameter sets in words: `parameter sets 2, 5 and 8`."""
-    return f"parameter set{'' if len(fits) == 1 else 's'} {join_phrases(map(str, fits))}"
+    return (
+        f"parameter set{'' if len(fits) == 1 else 's'} {join_phrases(map(str, fits))}"
+    )

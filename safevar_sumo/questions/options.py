@@ -25,12 +25,17 @@ class Range(NamedTuple):
     def __contains__(self, value: object) -> bool:
         assert isinstance(value, Real)
         number = float(value)
-        return self.low < number < self.high if self.is_open else self.low <= number <= self.high
+        return (
+            self.low < number < self.high
+            if self.is_open
+            else self.low <= number <= self.high
+        )
 
     def __str__(self) -> str:
         before, between = ("between", "and") if self.is_open else ("from", "to")
         ends = [
-            f"{end:,}" if isinstance(end, int) else f"{end:,.12g}" for end in (self.low, self.high)
+            f"{end:,}" if isinstance(end, int) else f"{end:,.12g}"
+            for end in (self.low, self.high)
         ]
         return f"{before} {ends[0]} {between} {ends[1]}"
 
@@ -98,7 +103,9 @@ class Option(NamedTuple):
                 value = [f"{name}={inner}" for name, inner in value.items()]
             values = (value,) if isinstance(value, str) else tuple(value)
             if twice := next((text for text in values if values.count(text) > 1), None):
-                raise InputError(self.name, f"{twice!r} is given twice", "each value once")
+                raise InputError(
+                    self.name, f"{twice!r} is given twice", "each value once"
+                )
             return values
         is_object = self.metavar == CARS_FILE and not isinstance(value, str)
         if value is None or is_object or self.kind is bool:
@@ -109,7 +116,9 @@ class Option(NamedTuple):
             return check_text(self.name, value)
 
         # A number within its limits.
-        number, words = (Integral, "a whole number") if self.kind is int else (Real, "a number")
+        number, words = (
+            (Integral, "a whole number") if self.kind is int else (Real, "a number")
+        )
         words = f"{words} {self.limits}" if self.limits else words
         if (
             isinstance(value, bool)
@@ -121,7 +130,14 @@ class Option(NamedTuple):
 
 
 SIMULATIONS = Option(
-    "simulations", int, get_args(Simulations)[1], (), None, False, None, "the largest number"
+    "simulations",
+    int,
+    get_args(Simulations)[1],
+    (),
+    None,
+    False,
+    None,
+    "the largest number",
 )
 """The option that questions on pages and in packs have, too."""
 
@@ -139,7 +155,11 @@ def options_of(function: Callable[..., Any]) -> list[Option]:
             hint = parameter.annotation  # a text where the module postpones annotations
             meaning = " ".join(texts.get(parameter.name, "").split())
             options.append(
-                _option(parameter, eval(hint, names) if isinstance(hint, str) else hint, meaning)
+                _option(
+                    parameter,
+                    eval(hint, names) if isinstance(hint, str) else hint,
+                    meaning,
+                )
             )
     return options
 
@@ -149,11 +169,24 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
     metavar = None
     if get_origin(hint) is Annotated:
         hint, extra = get_args(hint)
-        limits, metavar = (extra, None) if isinstance(extra, Range) else (None, str(extra))
+        limits, metavar = (
+            (extra, None) if isinstance(extra, Range) else (None, str(extra))
+        )
     is_repeated = any(get_origin(kind) is tuple for kind in (hint, *get_args(hint)))
-    kinds = [kind for kind in (bool, int, float, Path) if kind is hint or kind in get_args(hint)]
+    kinds = [
+        kind
+        for kind in (bool, int, float, Path)
+        if kind is hint or kind in get_args(hint)
+    ]
     kind = str if is_repeated or not kinds else kinds[0]
     choices = get_args(hint) if get_origin(hint) is Literal else ()
     return Option(
-        parameter.name, kind, limits, choices, metavar, is_repeated, parameter.default, meaning
+        parameter.name,
+        kind,
+        limits,
+        choices,
+        metavar,
+        is_repeated,
+        parameter.default,
+        meaning,
     )

@@ -73,7 +73,9 @@ class SharesOverSets(NamedTuple):
         members = np.array([is_first, *groups])[:, is_chosen]
         rows = list[list[tuple[float, float, float]]]()
         if evaluator.left is None and other_sets(evaluator.study, fits):
-            for model in models_of(evaluator, unsafe, fits, with_unsafe_originals=True).members:
+            for model in models_of(
+                evaluator, unsafe, fits, with_unsafe_originals=True
+            ).members:
                 runs = model.evaluator.evaluate(settings[is_chosen], STAGE)
                 of_runs = unsafe.runs(runs).mean(axis=0)
                 rows.append([_share(of_runs[group & runs.valid]) for group in members])
@@ -91,7 +93,9 @@ class SharesOverSets(NamedTuple):
         """The intervals of the shares of all vehicles, by the number of the set."""
         return {INTERVALS: self.intervals[:, 0].tolist()}
 
-    def ends(self, group: int, own: Sequence[float]) -> tuple[float, float, float, float]:
+    def ends(
+        self, group: int, own: Sequence[float]
+    ) -> tuple[float, float, float, float]:
         """The least and the greatest share of a group, and the ends of their intervals; `own` are
         the share and interval of more of its vehicles with the study's own set.
         """
@@ -114,7 +118,9 @@ class SharesOverSets(NamedTuple):
                 " were not simulated."
             )
         shares = self.shares[:, 0]
-        least, greatest = map(self._in_words, (np.nanargmin(shares), np.nanargmax(shares)))
+        least, greatest = map(
+            self._in_words, (np.nanargmin(shares), np.nanargmax(shares))
+        )
         range_in_words = f"ranges from {least} to {greatest} over"
         if least == greatest:
             range_in_words = f"is {least} in each of"
@@ -129,7 +135,9 @@ class SharesOverSets(NamedTuple):
         low, high = self.intervals[number, 0]
         is_apart = ((others[:, 1] < low) | (others[:, 0] > high)).all()
         name = f"set {number}, " if is_apart else ""
-        interval = f"{name}95 % confidence interval {percentage(low)} to {percentage(high)} %"
+        interval = (
+            f"{name}95 % confidence interval {percentage(low)} to {percentage(high)} %"
+        )
         return f"{percentage(self.shares[number, 0])} % ({interval})"
 
 

@@ -18,7 +18,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SIDES = ("a", "b")
-UNSAFE_IN = {"a": "only_a_unsafe", "b": "only_b_unsafe", "both": "both", "neither": "neither"}
+UNSAFE_IN = {
+    "a": "only_a_unsafe",
+    "b": "only_b_unsafe",
+    "both": "both",
+    "neither": "neither",
+}
 """In which systems a setting is unsafe, as the table says it, and the number that counts such
 settings.
 """
@@ -32,7 +37,11 @@ SETTING_COLUMNS: Columns = {
             ("outcome", Column("", f"how the simulation ends in {side.upper()}")),
             (
                 "degree",
-                Column("m", f"safety degree in {side.upper()}; in -m/s on a collision", ".2f"),
+                Column(
+                    "m",
+                    f"safety degree in {side.upper()}; in -m/s on a collision",
+                    ".2f",
+                ),
             ),
         )
     },
@@ -58,7 +67,8 @@ def table_of_pairs(
 def counts_of(settings: pd.DataFrame) -> dict[str, int]:
     """How many settings of a table are unsafe in A only, in B only, in both and in neither."""
     return {
-        number: int((settings["unsafe_in"] == where).sum()) for where, number in UNSAFE_IN.items()
+        number: int((settings["unsafe_in"] == where).sum())
+        for where, number in UNSAFE_IN.items()
     }
 
 
@@ -76,16 +86,30 @@ def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:
 
     # A point for each setting.
     frame = answer.tables["settings"]
-    figure, ((axis,),) = new_figure(f"Unsafe: {answer.numbers['unsafe']}", 1, 1, (4.6, 4.0))
-    for where, colour in {"neither": GREY, "both": SKY_BLUE, "a": BLUE, "b": VERMILION}.items():
+    figure, ((axis,),) = new_figure(
+        f"Unsafe: {answer.numbers['unsafe']}", 1, 1, (4.6, 4.0)
+    )
+    for where, colour in {
+        "neither": GREY,
+        "both": SKY_BLUE,
+        "a": BLUE,
+        "b": VERMILION,
+    }.items():
         rows = frame[frame["unsafe_in"] == where]
         axis.scatter(
-            rows["a_degree"], rows["b_degree"], s=6, color=colour, label=where, rasterized=True
+            rows["a_degree"],
+            rows["b_degree"],
+            s=6,
+            color=colour,
+            label=where,
+            rasterized=True,
         )
 
     # The line on which both agree.
     axis.axline((0, 0), slope=1, color="black", linewidth=0.6)
-    labels = [escape_dollars(f"safety degree in {name} [m, below 0: -m/s]") for name in titles]
+    labels = [
+        escape_dollars(f"safety degree in {name} [m, below 0: -m/s]") for name in titles
+    ]
     axis.set(xlabel=labels[0], ylabel=labels[1])
     axis.legend(title="unsafe in", fontsize=FONT_SIZE - 1)
     return figure

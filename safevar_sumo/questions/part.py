@@ -27,7 +27,9 @@ those up to larger values lie.
 """
 
 
-def part_of_study(study: Study, ranges: bool, point: str | None, up_to: str | None) -> Study:
+def part_of_study(
+    study: Study, ranges: bool, point: str | None, up_to: str | None
+) -> Study:
     """A study in the ranges of its axes, at a test or point, and up to a value of an axis, as far
     as these are given.
 
@@ -39,7 +41,11 @@ def part_of_study(study: Study, ranges: bool, point: str | None, up_to: str | No
     if ranges and study.encounters != RANGES:
         whole = with_ranges(study)
         if whole.encounters != RANGES:
-            raise InputError("ranges", f"no axis of study {study.name!r} has a range", "a study with such an axis")
+            raise InputError(
+                "ranges",
+                f"no axis of study {study.name!r} has a range",
+                "a study with such an axis",
+            )
         study = whole
     if point is not None:
         study = at_point(study, point)
@@ -67,12 +73,17 @@ def at_point(study: Study, name: str) -> Study:
         pairs = zip(points, at_points, strict=True)
         alone = [test for point, test in pairs if point.name == name]
     if not alone:
-        names = [*{test.name: 0 for test in study.tests} | {point.name: 0 for point in points}]
+        names = [
+            *{test.name: 0 for test in study.tests}
+            | {point.name: 0 for point in points}
+        ]
         similar = [one for one in names if name in one] or get_close_matches(
             name, names, N_SIMILAR_POINTS, 0
         )
         legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
-        raise InputError("point", repr(name), legal if points else "a study with a matrix")
+        raise InputError(
+            "point", repr(name), legal if points else "a study with a matrix"
+        )
 
     return replace(reduced.with_tests(alone), origin=replace(study.origin, point=name))
 
@@ -92,7 +103,10 @@ def study_up_to(study: Study, text: str) -> Study:
     """
     name, _, value = (part.strip() for part in text.partition("="))
     axes = [
-        axis for test in study.tests for axis in study.axes_of(test) if _values(study, test, axis)
+        axis
+        for test in study.tests
+        for axis in study.axes_of(test)
+        if _values(study, test, axis)
     ]
     known = [*dict.fromkeys([*study.ranges, *axes])]
     problem = f"study {study.name!r} does not vary {name!r}"
@@ -110,7 +124,11 @@ def study_up_to(study: Study, text: str) -> Study:
         domain = study.ranges[name]
         low, highest, unit = domain.lower, domain.upper, unit_text(domain.unit)
         if not low < high <= highest:
-            raise InputError(OPTION, f"{name}={high:g} is outside the domain of study {study.name!r}", f"a value above {low:g} and up to {highest:g}{unit}")
+            raise InputError(
+                OPTION,
+                f"{name}={high:g} is outside the domain of study {study.name!r}",
+                f"a value above {low:g} and up to {highest:g}{unit}",
+            )
     cut = study if name in study.ranges else _lists_up_to(study, name, high)
     return _ranges_up_to(cut, name, high)
 
@@ -124,10 +142,18 @@ def smaller_cuts(study: Study, text: str | None) -> list[Study]:
     name, _, high = (part.strip() for part in text.partition("="))
     if name in study.ranges:
         domain = study.ranges[name]
-        values = np.linspace(domain.lower, domain.upper, PARTS + 1)[1:].round(DECIMALS).tolist()
+        values = (
+            np.linspace(domain.lower, domain.upper, PARTS + 1)[1:]
+            .round(DECIMALS)
+            .tolist()
+        )
     else:
-        values = sorted({value for test in study.tests for value in _values(study, test, name)})
-    return [study_up_to(study, f"{name}={each}") for each in values if each < float(high)]
+        values = sorted(
+            {value for test in study.tests for value in _values(study, test, name)}
+        )
+    return [
+        study_up_to(study, f"{name}={each}") for each in values if each < float(high)
+    ]
 
 
 def names_left_out(study: Study, cut: Study) -> list[str]:
@@ -166,7 +192,11 @@ def _lists_up_to(study: Study, name: str, high: float) -> Study:
     if not min(driven) <= high <= max(driven):
         units = [searchable_in(points[0].scenario) for _, points in by_test]
         unit = next((unit_text(each[name].unit) for each in units if name in each), "")
-        raise InputError(OPTION, f"{name}={high:g} is not among the values that study {study.name!r} drives", f"a value from {min(driven):g} to {max(driven):g}{unit}")
+        raise InputError(
+            OPTION,
+            f"{name}={high:g} is not among the values that study {study.name!r} drives",
+            f"a value from {min(driven):g} to {max(driven):g}{unit}",
+        )
     tests = list[MatrixTest]()
     for test, points in by_test:
         values = _values(study, test, name)
@@ -178,7 +208,9 @@ def _lists_up_to(study: Study, name: str, high: float) -> Study:
     return study.with_tests(tests)
 
 
-def _with_list(study: Study, test: MatrixTest, name: str, values: list[float]) -> MatrixTest:
+def _with_list(
+    study: Study, test: MatrixTest, name: str, values: list[float]
+) -> MatrixTest:
     """A test with other values of an axis."""
     axis = replace(study.axes_of(test)[name], at=values)
     is_plain = axis.range is None

@@ -46,15 +46,25 @@ def in_phases(study: Study, system: System) -> Study:
     some point have none, as bodies do not move on tracks.
     """
     has_phases = all(point.scenario.has_phase for point in system.points)
-    if not has_phases or reason_against_scenes(system) or PHASE in system.characteristics.names:
+    if (
+        not has_phases
+        or reason_against_scenes(system)
+        or PHASE in system.characteristics.names
+    ):
         return study
     base = study if study.ranges else study.listed().all_count
     over: Axes = {**base.scenario.over, PHASE: axis_of(DOMAIN)}
-    return replace_in(base, encounters=RANGES, scenario=replace_in(base.scenario, over=over))
+    return replace_in(
+        base, encounters=RANGES, scenario=replace_in(base.scenario, over=over)
+    )
 
 
 def meet_worst_phases(
-    model: Model, judge: Judge, settings: FloatArray, left: FloatArray, is_open: BoolArray
+    model: Model,
+    judge: Judge,
+    settings: FloatArray,
+    left: FloatArray,
+    is_open: BoolArray,
 ) -> tuple[FloatArray, FloatArray]:
     """M settings of a model, shape (M, n), whose last value is the phase, at their worst phases,
     and what they leave there by the judge, shape (M,).
@@ -117,7 +127,9 @@ def at_worst_phases(
     by the judge; `claim` is the model with phases.
     """
     rows = np.column_stack([settings, np.zeros(len(settings))])
-    return meet_worst_phases(claim, judge, rows, judge(rows), np.ones(len(rows), dtype=bool))
+    return meet_worst_phases(
+        claim, judge, rows, judge(rows), np.ones(len(rows), dtype=bool)
+    )
 
 
 def remark_on_phases(claim: Model | None) -> str:

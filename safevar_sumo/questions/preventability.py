@@ -45,7 +45,9 @@ COLUMNS: Columns = {
     "avoided": "collisions that he avoids",
     "no_longer": "collisions that he avoids in the original vehicle, but not in this one",
     "no_verdict": "collisions at points where he collides in the original vehicle, too: no verdict",
-    **with_interval("share", Column("-", "share that he avoids of those with a verdict", ".2f")),
+    **with_interval(
+        "share", Column("-", "share that he avoids of those with a verdict", ".2f")
+    ),
     "no_verdict_points": Column("", "points without a verdict", is_shown=False),
 }
 """The interval is Clopper and Pearson's for a sample (slightly too wide, without a correction for
@@ -107,7 +109,9 @@ def avoided_by(verdicts: Mapping[Any, Any]) -> str:
     `assess_collisions`.
     """
     otherwise = NO_VERDICT if np.isnan(verdicts[FULL]) else NOBODY
-    return next((title for driver, title in TITLES.items() if verdicts[driver] == 1), otherwise)
+    return next(
+        (title for driver, title in TITLES.items() if verdicts[driver] == 1), otherwise
+    )
 
 
 def assess_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataFrame:
@@ -122,15 +126,21 @@ def assess_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataF
     system = evaluator.system
     has_lanes = any(point.scenario.border for point in system.points)
     drivers = [*TITLES, *(OF_LANES if has_lanes else ())]
-    verdicts = pd.DataFrame(np.nan, index=range(len(collisions)), columns=drivers).assign(point="")
+    verdicts = pd.DataFrame(
+        np.nan, index=range(len(collisions)), columns=drivers
+    ).assign(point="")
 
     # Every collision at its own point.
     for index in np.unique(collisions.points).tolist():
         rows = np.flatnonzero(collisions.points == index)
         point = system.points[index]
-        study = at_point(evaluator.study, point.name) if system.matrix else evaluator.study
+        study = (
+            at_point(evaluator.study, point.name) if system.matrix else evaluator.study
+        )
         here = evaluator.for_study(study)
-        settings = here.characteristics.of_others(system.characteristics, collisions.settings[rows])
+        settings = here.characteristics.of_others(
+            system.characteristics, collisions.settings[rows]
+        )
         verdicts.loc[rows, drivers] = _assess_at_point(
             here, here.system.at(here.system.points[0]), settings, drivers
         )
@@ -179,5 +189,11 @@ def approach_parameters(system: System) -> JsonObject | None:
         return {}
     if len(system.characteristics.scenario):
         return None
-    end = min(int(np.argmax(speed)), int(np.argmax(is_braking)) if is_braking.any() else len(speed))
-    return {"cruise_speed": float(speed.max()), "start_throttle": trace.throttle[:end, 0].tolist()}
+    end = min(
+        int(np.argmax(speed)),
+        int(np.argmax(is_braking)) if is_braking.any() else len(speed),
+    )
+    return {
+        "cruise_speed": float(speed.max()),
+        "start_throttle": trace.throttle[:end, 0].tolist(),
+    }

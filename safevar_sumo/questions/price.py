@@ -12,7 +12,12 @@ import numpy as np
 from rich.console import Console
 
 from safevar_sumo.campaign.batches import forget_other, spare
-from safevar_sumo.campaign.evaluation import Selection, Task, carry_out, evaluate_settings
+from safevar_sumo.campaign.evaluation import (
+    Selection,
+    Task,
+    carry_out,
+    evaluate_settings,
+)
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.progress import Phases
@@ -91,7 +96,9 @@ class Account:
     def undefined_in_words(self) -> str:
         """How often the metric was undefined, in a sentence; empty if it never was."""
         of_all = f"{self.undefined:,} of {self.judged:,} simulated settings, which count as safe"
-        remark = f"Remark: {self.measure} is undefined, without a collision, in {of_all}."
+        remark = (
+            f"Remark: {self.measure} is undefined, without a collision, in {of_all}."
+        )
         return remark if self.undefined else ""
 
     def spend(self, simulations: int) -> None:
@@ -105,13 +112,21 @@ class Account:
         self.spent += simulations
         bound = self.asked if self.most is None else self.most
         if bound is not None and self.spent > bound:
-            raise InputError("simulations", f"{bound:,} do not suffice: {self.spent:,} are needed to go on", "a larger number")
+            raise InputError(
+                "simulations",
+                f"{bound:,} do not suffice: {self.spent:,} are needed to go on",
+                "a larger number",
+            )
 
     def require(self, least: int) -> None:
         """Refuse fewer simulations than the least number for an answer."""
         self.least = least
         if self.asked is not None and self.asked < least:
-            raise InputError("simulations", f"{self.asked:,} do not suffice: an answer takes at least {least:,}", f"{least} or more")
+            raise InputError(
+                "simulations",
+                f"{self.asked:,} do not suffice: an answer takes at least {least:,}",
+                f"{least} or more",
+            )
 
     def open(self, expected: float, seconds: float | None, checked: int = 0) -> None:
         """Allow what the user allows, or all if that does not take too long; `expected` simulations
@@ -145,7 +160,9 @@ class Account:
         check = f", {how} {checked:,} for a check of the class" if checked else ""
         if self.asked is not None and checked:
             check += ", which is shorter than usual"
-        print_text(Console(file=sys.stderr), f"{words} (one takes {seconds:.2g} s{check})")
+        print_text(
+            Console(file=sys.stderr), f"{words} (one takes {seconds:.2g} s{check})"
+        )
 
 
 def round_down(number: float) -> int:
@@ -169,7 +186,9 @@ def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | N
     return seconds / (pool.workers * simulations_of_setting(system))
 
 
-def print_price_of_list(study: Study, system: System, pool: Pool, simulations: float) -> None:
+def print_price_of_list(
+    study: Study, system: System, pool: Pool, simulations: float
+) -> None:
     """Print how long a list of vehicles takes, which share batches: by the time of one at a point.
     This number bounds nothing, and what is timed does not count.
     """
@@ -183,7 +202,9 @@ def print_price_of_list(study: Study, system: System, pool: Pool, simulations: f
 def _timed(task: Task, settings: FloatArray, pool: Pool) -> tuple[Evaluations, float]:
     """What settings do, and how long a worker takes for them [s]."""
     jobs = [(task, settings)]
-    carry_out(evaluate_settings, jobs, pool)  # a worker starts, and so does its simulator
+    carry_out(
+        evaluate_settings, jobs, pool
+    )  # a worker starts, and so does its simulator
     start = time.perf_counter()
     (evaluations,) = carry_out(evaluate_settings, jobs, pool)
     return evaluations, time.perf_counter() - start

@@ -66,7 +66,9 @@ class Phases:
         self._show_whole(what, *self._counts())
 
     @contextmanager
-    def stage(self, name: str, settings: float | None = None) -> Iterator[Callable[[float], None]]:
+    def stage(
+        self, name: str, settings: float | None = None
+    ) -> Iterator[Callable[[float], None]]:
         """Within the block, all parts count in one phase, of about so many settings, by default as
         planned; a stage within a stage is a part of it. The function that it yields takes a better
         estimate of how many follow.
@@ -93,7 +95,9 @@ class Phases:
         else:
             # The mean of the rounds so far, and of one as it was planned.
             self._planned_round = self._planned_round or self._expected / most
-            self._expected = done + (most - number + 1) * ((self._planned_round + done) / number)
+            self._expected = done + (most - number + 1) * (
+                (self._planned_round + done) / number
+            )
         self._show()
 
     def _begin(self, name: str, settings: float | None = None) -> None:

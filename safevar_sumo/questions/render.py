@@ -42,9 +42,21 @@ CODE = re.compile("`([^`<>]+)`")
 """What a text quotes as code."""
 SCOPE = "Scope: "
 NOTES = (
-    *(SCOPE, "Remark: ", "Changed: ", "Criterion: ", "Not simulated: ", "Counted as unsafe: "),
+    *(
+        SCOPE,
+        "Remark: ",
+        "Changed: ",
+        "Criterion: ",
+        "Not simulated: ",
+        "Counted as unsafe: ",
+    ),
     "Safe means: ",
-    *("Only encounters count", "Only vehicles that satisfy", "Left out", "If all changes go"),
+    *(
+        "Only encounters count",
+        "Only vehicles that satisfy",
+        "Left out",
+        "If all changes go",
+    ),
 )
 """Beginnings of sentences of a verdict that one screen has below the table."""
 MAX_ROWS = 200
@@ -116,7 +128,9 @@ def _more(answer: Answer, screen: Screen) -> str:
     names = [name for name, frame in screen.others.items() if len(frame)]
     unsaid = number_of(screen.unsaid, "more sentence") if screen.unsaid else ""
     behind = ", ".join(filter(None, [unsaid, *names]))
-    following = f" Next: {answer.next}" if answer.next and answer.numbers.get("driven") else ""
+    following = (
+        f" Next: {answer.next}" if answer.next and answer.numbers.get("driven") else ""
+    )
     return f"More: --details{f' ({behind})' if behind else ''}, --json.{following}"
 
 
@@ -169,12 +183,16 @@ def _print_table(console: Console, frame: pd.DataFrame) -> None:
             console.print(part)
 
 
-def render(answer: Answer, form: str, table: str | None = None, *, details: bool = False) -> str:
+def render(
+    answer: Answer, form: str, table: str | None = None, *, details: bool = False
+) -> str:
     """An answer, or with one table only, as text, JSON, LaTeX or HTML; one table, by default the
     first, as CSV. Text is one screen, with a table's name or `details` all.
     """
     if form == "csv":
-        frame = answer.table(table) if table or answer.listing is None else answer.listing
+        frame = (
+            answer.table(table) if table or answer.listing is None else answer.listing
+        )
         cells = frame.map(csv_cell).rename(columns=csv_cell)
         return cells.to_csv(index=False, lineterminator="\n")
     if table is not None:
@@ -205,7 +223,10 @@ def _html(answer: Answer) -> str:
     parts += [f"<p>{escape(note)}</p>" for note in screen.notes]
 
     # All sentences and tables.
-    folded = [f"<p>{escape(text)}</p>" for text in (answer.verdict, *_details_in_words(answer))]
+    folded = [
+        f"<p>{escape(text)}</p>"
+        for text in (answer.verdict, *_details_in_words(answer))
+    ]
     parts += ["<details><summary>Details</summary>", *folded, *every, "</details>"]
     return _marked(parts)
 
@@ -219,7 +240,9 @@ def _latex(answer: Answer) -> str:
     """All tables that are short, with remarks below them."""
     shown = _short_tables(answer)
     remarks = shown.pop("remarks", None)
-    tables = [latex_table(_label_of(answer, name), frame) for name, frame in shown.items()]
+    tables = [
+        latex_table(_label_of(answer, name), frame) for name, frame in shown.items()
+    ]
     notes = [] if remarks is None else [latex_notes(remarks)]
     if answer.tested:
         notes.append(latex_notes(pd.DataFrame([_tested_in_words(answer)])))
@@ -247,26 +270,44 @@ def _shown_tables(answer: Answer) -> Frames:
     """The tables of all details, by name; without remarks on others, and without a table of no
     remark.
     """
-    shown = {name: frame for name, frame in answer.tables.items() if name not in answer.folded}
+    shown = {
+        name: frame
+        for name, frame in answer.tables.items()
+        if name not in answer.folded
+    }
     remarks = shown.pop("remarks", None)
     if remarks is not None:
-        about = remarks[~remarks["table"].isin(answer.folded)] if "table" in remarks else remarks
+        about = (
+            remarks[~remarks["table"].isin(answer.folded)]
+            if "table" in remarks
+            else remarks
+        )
         if "table" in about:  # "all" would be read as a part of the remark
             about = about.replace({"table": {"all": ""}})
         shown |= {} if about.empty else {"remarks": about}
     return {
-        label: part for name, frame in shown.items() for label, part in reader_tables(name, frame)
+        label: part
+        for name, frame in shown.items()
+        for label, part in reader_tables(name, frame)
     }
 
 
 def _short_tables(answer: Answer) -> Frames:
-    return {name: frame for name, frame in _shown_tables(answer).items() if len(frame) <= MAX_ROWS}
+    return {
+        name: frame
+        for name, frame in _shown_tables(answer).items()
+        if len(frame) <= MAX_ROWS
+    }
 
 
 def _label_of(answer: Answer, table: str) -> str:
     """The label of a table in LaTeX, which tables of other studies, questions and commands do not
     have.
     """
-    digest = f"-{zlib.crc32(answer.command.encode()) % 0x10000:04x}" if answer.command else ""
+    digest = (
+        f"-{zlib.crc32(answer.command.encode()) % 0x10000:04x}"
+        if answer.command
+        else ""
+    )
     study = getattr(answer.study, "name", "safevar")
     return f"{study}-{answer.question.replace(':', '-')}-{table}{digest}"

@@ -33,7 +33,11 @@ from safevar_sumo.questions.indices import (
     sobol_indices,
 )
 from safevar_sumo.questions.options import Count, Fraction
-from safevar_sumo.questions.over_sets import INTERVALS, SharesOverSets, planned_over_sets
+from safevar_sumo.questions.over_sets import (
+    INTERVALS,
+    SharesOverSets,
+    planned_over_sets,
+)
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
@@ -120,7 +124,9 @@ def risk(
         # Few simulations are for the design only where it takes at most half of them.
         has_design = has_design and 2 * of_design <= evaluator.left
         samples = min(samples, evaluator.left - has_design * of_design)
-    drawn = evaluator.evaluate(model.draw(samples, default_rng(study.search.seed)), SAMPLING)
+    drawn = evaluator.evaluate(
+        model.draw(samples, default_rng(study.search.seed)), SAMPLING
+    )
 
     # How many are unsafe.
     simulated = drawn.take(np.flatnonzero(drawn.valid))
@@ -139,7 +145,11 @@ def risk(
         indices, of_whom = sobol_indices, design_of(evaluator, model)
     table = indices(evaluator, of_whom, criterion, confidence)
     numbers = {"unsafe": str(criterion), "samples": total, "failures": failures}
-    numbers |= {"probability": failures / total, "interval": [low, high], "confidence": confidence}
+    numbers |= {
+        "probability": failures / total,
+        "interval": [low, high],
+        "confidence": confidence,
+    }
     numbers |= {"by_set": over_sets.of_all(failures / total), **over_sets.numbers}
 
     # In words.
@@ -218,12 +228,15 @@ def deciding_in_words(table: pd.DataFrame, failures: float) -> str:
     return words
 
 
-def _probability_in_words(study: Study, criterion: Unsafe, failures: float, total: int) -> str:
+def _probability_in_words(
+    study: Study, criterion: Unsafe, failures: float, total: int
+) -> str:
     """The share of unsafe vehicles, and how vehicles vary."""
     share = f"{percentage(failures / total)} %"
     if not study.variation:
         vehicles = (
-            f"{number_of(total, 'vehicle')} that were sampled uniformly over the whole domain"
+            f"{number_of(total, 'vehicle')} that were sampled uniformly over the"
+            " whole domain"
         )
         return f"Of {vehicles}, {criterion.number_in_words(failures)}: {share}"
 
@@ -235,5 +248,7 @@ def _probability_in_words(study: Study, criterion: Unsafe, failures: float, tota
     ]
     rest = ["the others uniform"] if len(variation) < len(study.domains) else []
     manner = join_phrases(variation + rest)
-    vehicles = f"Of {number_of(total, 'vehicle')} that vary as the study says ({manner})"
+    vehicles = (
+        f"Of {number_of(total, 'vehicle')} that vary as the study says ({manner})"
+    )
     return f"{vehicles}, {criterion.number_in_words(failures)}. So the probability is about {share}"

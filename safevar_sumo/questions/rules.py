@@ -17,12 +17,23 @@ import pandas as pd
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics.unsafe import SHARE_DECIMALS
-from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate, with_interval
+from safevar_sumo.questions.answer import (
+    Answer,
+    Column,
+    Columns,
+    contents,
+    tabulate,
+    with_interval,
+)
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.options import Count
-from safevar_sumo.questions.over_sets import INTERVALS, SharesOverSets, planned_over_sets
+from safevar_sumo.questions.over_sets import (
+    INTERVALS,
+    SharesOverSets,
+    planned_over_sets,
+)
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel, sampled_in_words
@@ -57,13 +68,17 @@ ENDS = {
 COLUMNS: Columns = {
     "rule": "region: limits of some characteristics; all others anywhere in their domains",
     **with_interval(
-        "density", Column("-", "share of the vehicles within the region that are unsafe", ".2f")
+        "density",
+        Column("-", "share of the vehicles within the region that are unsafe", ".2f"),
     ),
     **with_interval(
-        "coverage", Column("-", "share of all unsafe vehicles that lie within the region", ".2f")
+        "coverage",
+        Column("-", "share of all unsafe vehicles that lie within the region", ".2f"),
     ),
     **{
-        f"density_{end}": Column("-", f"{meaning} over all parameter sets", ".2f", False)
+        f"density_{end}": Column(
+            "-", f"{meaning} over all parameter sets", ".2f", False
+        )
         for end, meaning in ENDS.items()
     },
 }
@@ -83,7 +98,11 @@ COLUMNS: Columns = {
     rules=COLUMNS,
 )
 def rules(
-    subject: Subject, evaluator: Evaluator, *, samples: Count = 16_384, unsafe: Criterion = None
+    subject: Subject,
+    evaluator: Evaluator,
+    *,
+    samples: Count = 16_384,
+    unsafe: Criterion = None,
 ) -> Answer:
     """Find regions of the domain (ranges of values) in which many vehicles are unsafe. Each region
     is a rule in physical units, such as "tyre friction below 1.07", with the share of unsafe
@@ -103,12 +122,16 @@ def rules(
     """
     study = evaluator.study
     characteristics = evaluator.characteristics
-    evaluator.begin(planned_over_sets(study, SAMPLED_STAGE, samples), least=LEAST_SETTINGS)
+    evaluator.begin(
+        planned_over_sets(study, SAMPLED_STAGE, samples), least=LEAST_SETTINGS
+    )
 
     # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
-    vehicles = VariationModel(study).draw(samples, np.random.default_rng(study.search.seed))
+    vehicles = VariationModel(study).draw(
+        samples, np.random.default_rng(study.search.seed)
+    )
     evaluations = evaluator.evaluate(vehicles, SAMPLED_STAGE)
     is_first_half = np.arange(len(evaluations)) < len(evaluations) // 2
     training = evaluations.take(evaluations.valid & is_first_half)
@@ -123,16 +146,22 @@ def rules(
         )
 
     # Rules are boxes in which unsafe vehicles are dense.
-    trained = np.tile(training.settings, (len(of_runs), 1))  # with repeats, each run is one
+    trained = np.tile(
+        training.settings, (len(of_runs), 1)
+    )  # with repeats, each run is one
     boxes, remark = _boxes(trained, of_runs.ravel(), characteristics)
     groups = [is_within(box, vehicles) & ~is_first_half for box in boxes]
     over_sets = SharesOverSets.of(evaluator, criterion, vehicles, groups)
     rows = []
     for number, box in enumerate(boxes, 1):
         own = shares(box, testing.settings, unsafe_in_test)
-        rows.append((conditions(box, characteristics), *own, *over_sets.ends(number, own[:3])))
+        rows.append(
+            (conditions(box, characteristics), *own, *over_sets.ends(number, own[:3]))
+        )
     frame = pd.DataFrame(rows, columns=[*COLUMNS])
-    frame = frame.sort_values("coverage", ascending=False, kind="stable", ignore_index=True)
+    frame = frame.sort_values(
+        "coverage", ascending=False, kind="stable", ignore_index=True
+    )
     table = tabulate("Regions in which many vehicles are unsafe", COLUMNS, frame)
 
     # The share of unsafe vehicles, and the rule that covers most of them.
@@ -153,9 +182,15 @@ def rules(
         "by_set": over_sets.of_all(failures / total),
         **over_sets.numbers,
     }
-    verdict = with_scope(study, int(evaluations.infeasible.sum()), verdict, criterion.remark)
+    verdict = with_scope(
+        study, int(evaluations.infeasible.sum()), verdict, criterion.remark
+    )
     return Answer(
-        question="rules", study=study, verdict=verdict, numbers=numbers, tables={"rules": table}
+        question="rules",
+        study=study,
+        verdict=verdict,
+        numbers=numbers,
+        tables={"rules": table},
     )
 
 
@@ -169,7 +204,9 @@ def _rule_in_words(table: pd.DataFrame, share: float) -> str:
     rule = denser.iloc[0]
     over_sets = ""
     if rule["density_least"] < rule["density_greatest"]:
-        least, greatest, low, high = (f"{100 * rule[f'density_{end}']:.0f}" for end in ENDS)
+        least, greatest, low, high = (
+            f"{100 * rule[f'density_{end}']:.0f}" for end in ENDS
+        )
         interval = f"with 95 % confidence {low} to {high} %"
         over_sets = f" ({least} to {greatest} % over the parameter sets, {interval})"
     return (
@@ -191,7 +228,9 @@ def conditions(box: FloatArray, characteristics: CharacteristicSet) -> str:
     return join_phrases(texts) if texts else "everywhere"
 
 
-def shares(box: FloatArray, settings: FloatArray, unsafe: FloatArray | BoolArray) -> list[float]:
+def shares(
+    box: FloatArray, settings: FloatArray, unsafe: FloatArray | BoolArray
+) -> list[float]:
     """The unsafe share within a box, and the share of the unsafe settings within it, each with its
     interval; `unsafe` is the share of each setting's runs.
     """
@@ -199,7 +238,9 @@ def shares(box: FloatArray, settings: FloatArray, unsafe: FloatArray | BoolArray
     count = round(float(unsafe[is_inside].sum()), SHARE_DECIMALS)
     values = []
     for total in (int(is_inside.sum()), round(float(unsafe.sum()), SHARE_DECIMALS)):
-        values += [count / total, *clopper_pearson(count, total)] if total else [np.nan] * 3
+        values += (
+            [count / total, *clopper_pearson(count, total)] if total else [np.nan] * 3
+        )
     return values
 
 
@@ -230,14 +271,21 @@ def _find_boxes(
     lower = characteristics.lower
     width = characteristics.upper - characteristics.lower
     tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
-    leaves = list(_boxes_of_leaves(tree, 0, np.repeat(UNLIMITED, len(width), axis=1), lower, width))
+    leaves = list(
+        _boxes_of_leaves(
+            tree, 0, np.repeat(UNLIMITED, len(width), axis=1), lower, width
+        )
+    )
     densest, _ = max(leaves, key=lambda leaf: leaf[1])
     dense_boxes = [box for box, density in leaves if density > 0.5] or [densest]
 
     # Rounded, without conditions that do not help.
-    digits = [LIMIT_DIGITS - 1 - math.floor(math.log10(its_width)) for its_width in width]
+    digits = [
+        LIMIT_DIGITS - 1 - math.floor(math.log10(its_width)) for its_width in width
+    ]
     rounded = [
-        np.array([list(map(round, ends, digits)) for ends in box.tolist()]) for box in dense_boxes
+        np.array([list(map(round, ends, digits)) for ends in box.tolist()])
+        for box in dense_boxes
     ]
     boxes = [_drop_useless_conditions(box, settings, is_unsafe) for box in rounded]
     boxes.sort(key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings)))
@@ -258,7 +306,10 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
     """The smallest tree whose cross-validated Brier score is within a standard error of the best
     score.
     """
-    from sklearn.model_selection import GridSearchCV, StratifiedKFold  # takes a second to load
+    from sklearn.model_selection import (  # takes a second to load
+        GridSearchCV,
+        StratifiedKFold,
+    )
     from sklearn.tree import DecisionTreeClassifier
 
     def smallest_good_enough(results: Any) -> int:
@@ -276,8 +327,12 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
         np.maximum(tree.cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0)
     )
     strengths = strengths[:-1]  # the strongest pruning leaves no condition
-    evenly_spaced = np.unique(np.linspace(0, len(strengths) - 1, MAX_PRUNINGS).round().astype(int))
-    prunings = {"ccp_alpha": strengths[evenly_spaced] if len(strengths) else np.zeros(1)}
+    evenly_spaced = np.unique(
+        np.linspace(0, len(strengths) - 1, MAX_PRUNINGS).round().astype(int)
+    )
+    prunings = {
+        "ccp_alpha": strengths[evenly_spaced] if len(strengths) else np.zeros(1)
+    }
 
     # The smallest tree that predicts about as well as the best.
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
@@ -303,10 +358,14 @@ def _boxes_of_leaves(
     threshold = lower[column] + tree.threshold[node] * width[column]
     above = box.copy()
     above[0, column] = threshold
-    yield from _boxes_of_leaves(tree, int(tree.children_right[node]), above, lower, width)
+    yield from _boxes_of_leaves(
+        tree, int(tree.children_right[node]), above, lower, width
+    )
     below = box.copy()
     below[1, column] = threshold
-    yield from _boxes_of_leaves(tree, int(tree.children_left[node]), below, lower, width)
+    yield from _boxes_of_leaves(
+        tree, int(tree.children_left[node]), below, lower, width
+    )
 
 
 def _drop_useless_conditions(
@@ -317,12 +376,17 @@ def _drop_useless_conditions(
     def least_density(box: FloatArray) -> float:
         inside = is_unsafe[is_within(box, settings)]
         return (
-            clopper_pearson(int(np.count_nonzero(inside)), len(inside))[0] if len(inside) else 0.0
+            clopper_pearson(int(np.count_nonzero(inside)), len(inside))[0]
+            if len(inside)
+            else 0.0
         )
 
     while np.isfinite(box).any():
         columns = np.flatnonzero(np.isfinite(box).any(axis=0))
-        wider = [np.where(np.arange(box.shape[1]) == column, UNLIMITED, box) for column in columns]
+        wider = [
+            np.where(np.arange(box.shape[1]) == column, UNLIMITED, box)
+            for column in columns
+        ]
         best = max(wider, key=least_density)
         if least_density(best) < least_density(box):
             break

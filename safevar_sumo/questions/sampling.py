@@ -28,8 +28,12 @@ class Stream(IntEnum):
     JOINT_LIMITS = 4  # falsification of joint limits
     LIMITS_ALONE = 6  # falsification of the limits of one characteristic alone
     REPAIRED_BOUND = 7  # vehicles within the required range, for the bound of a repair
-    NEAREST_LIMIT = 8  # falsification of a limit in place of a specified one that does not hold
-    WIDER_SCOPE = 9  # falsification of limits in the scope of a wider study, and up to a value
+    NEAREST_LIMIT = (
+        8  # falsification of a limit in place of a specified one that does not hold
+    )
+    WIDER_SCOPE = (
+        9  # falsification of limits in the scope of a wider study, and up to a value
+    )
     EXTENSION = 10  # falsification of joint limits of which one is extended
     SPECIFIED_BETWEEN = 11  # specified limits between the tests of a matrix
     VALIDATION = 15  # further falsifications of joint limits that passed one
@@ -59,7 +63,9 @@ def sobol_settings(characteristics: CharacteristicSet, number: int) -> FloatArra
     return lower + sobol_points(number, len(characteristics), 0) * (upper - lower)
 
 
-def clopper_pearson(count: float, total: float, confidence: float = CONFIDENCE) -> Interval:
+def clopper_pearson(
+    count: float, total: float, confidence: float = CONFIDENCE
+) -> Interval:
     """Exact confidence interval (Clopper and Pearson) of the share `count` / `total`; its ends are
     quantiles of beta distributions, also between whole numbers.
     """
@@ -68,7 +74,9 @@ def clopper_pearson(count: float, total: float, confidence: float = CONFIDENCE) 
     if count != int(count) or total != int(total):
         beta, tail = scipy.stats.beta, 0.5 - confidence / 2
         low = beta.ppf(tail, count, total - count + 1) if count else 0.0
-        return float(low), float(beta.isf(tail, count + 1, total - count)) if count < total else 1.0
+        return float(low), float(
+            beta.isf(tail, count + 1, total - count)
+        ) if count < total else 1.0
     interval = scipy.stats.binomtest(int(count), int(total)).proportion_ci(
         confidence, method="exact"
     )

@@ -63,9 +63,13 @@ def scope_of(study: Study, *, between: bool = True) -> str:
 
     # Tests with the same scenario and parameters share a phrase.
     phrases = []
-    for model, parameters in dict.fromkeys((model, parameters) for model, _, parameters in drives):
+    for model, parameters in dict.fromkeys(
+        (model, parameters) for model, _, parameters in drives
+    ):
         names = [
-            name for other, name, same in drives if (other, same) == (model, parameters) and name
+            name
+            for other, name, same in drives
+            if (other, same) == (model, parameters) and name
         ]
         tests = f" ({join_phrases(names)})" if names else ""
         phrases.append(f"{model}{tests}{f' {parameters}' if parameters else ''}")
@@ -97,7 +101,11 @@ def _parameters_in_words(
 
     # Speeds of tests that state none, first.
     speeds = sorted(
-        {point.scenario.test_speed for point in points if point.scenario.test_speed is not None}
+        {
+            point.scenario.test_speed
+            for point in points
+            if point.scenario.test_speed is not None
+        }
     )
     if SPEED_DIMENSION not in phrases and speeds:
         driven = dict.fromkeys(f"{KMH_PER_MS * speed:.4g}" for speed in speeds)
@@ -121,11 +129,15 @@ def _weather_in_words(weather: Weather) -> str:
     day`, `weather clear (grip of a dry road), by day`.
     """
     is_dry = weather.road_friction == 1 and not weather.water
-    effects = ["grip of a dry road" if is_dry else f"friction {weather.road_friction:g}"]
+    effects = [
+        "grip of a dry road" if is_dry else f"friction {weather.road_friction:g}"
+    ]
     effects += [f"water {weather.water:g} mm"] if weather.water else []
     effects += [f"visibility {weather.visibility:g}"] if weather.visibility != 1 else []
     effects += (
-        [f"recognition {weather.recognition_delay:g} s later"] if weather.recognition_delay else []
+        [f"recognition {weather.recognition_delay:g} s later"]
+        if weather.recognition_delay
+        else []
     )
     name = weather.name.replace("_", " ")
     return f"weather {name} ({', '.join(effects)}), by {weather.light}"

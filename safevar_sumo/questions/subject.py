@@ -106,7 +106,10 @@ def load(directory: str | Path) -> Results:
 
 
 def study_or_case(
-    source: StudyLike | Results, *, as_it_is_now: bool = False, results_only: bool = False
+    source: StudyLike | Results,
+    *,
+    as_it_is_now: bool = False,
+    results_only: bool = False,
 ) -> Subject:
     """The subject of a question: a study, or the case of results; `source` may be a name or a path.
 
@@ -138,7 +141,9 @@ def study_or_case(
         if results_only or (is_directory and not is_study):
             source = load(source)
         elif is_study and os.path.exists(os.path.join(source, MANIFEST)):
-            warn(f"{source} is the study; the results in the directory of this name are ./{source}")
+            warn(
+                f"{source} is the study; the results in the directory of this name are ./{source}"
+            )
         elif not (is_study or os.path.lexists(source) or source in ENDED_STUDIES):
             raise InputError(
                 source,
@@ -147,7 +152,9 @@ def study_or_case(
                 f" written, or {one_of(names)}",
             )
     if isinstance(source, Results):
-        for change in changes_since(source.directory, source.case, as_it_is_now=as_it_is_now):
+        for change in changes_since(
+            source.directory, source.case, as_it_is_now=as_it_is_now
+        ):
             warn(f"{source.directory}: {change}")
         return source.case
     if as_it_is_now:
@@ -159,7 +166,9 @@ def study_or_case(
     return read_study(source)
 
 
-def part_of(subject: Subject, ranges: bool, point: str | None, up_to: str | None) -> Subject:
+def part_of(
+    subject: Subject, ranges: bool, point: str | None, up_to: str | None
+) -> Subject:
     """A study in the ranges of its axes, at a test or point, and up to a value of an axis, as far
     as these are given; results at a test or point alone.
 
@@ -180,7 +189,9 @@ def refuse_part_of_results(*, ranges: bool, up_to: str | None) -> None:
     """Refuse options that results do not have."""
     if ranges or up_to is not None:
         option = "ranges" if ranges else "up_to"
-        raise InputError(option, "of results, whose encounters are those of their study", "a study")
+        raise InputError(
+            option, "of results, whose encounters are those of their study", "a study"
+        )
 
 
 def study_in(subject: Subject) -> Study:
@@ -209,7 +220,9 @@ def case_at(case: Case, point: str) -> Case:
     study = at_point(case.study, point)
     system = assemble(study)
     settings = system.characteristics.of_others(case.characteristics, case.settings)
-    return case.simulated_as(study, system.measuring.scoring, drive_and_score(system, settings))
+    return case.simulated_as(
+        study, system.measuring.scoring, drive_and_score(system, settings)
+    )
 
 
 def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[str]:
@@ -230,12 +243,16 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
     if "imported" in manifest:
         return []
     present = manifest_now(study, assemble(study), manifest.get("files", {}))
-    changes = [text for _, text, matters in manifest_differences(manifest, present) if matters]
+    changes = [
+        text for _, text, matters in manifest_differences(manifest, present) if matters
+    ]
 
     # Without `as_it_is_now` they are refused.
     if changes and not as_it_is_now:
         more = len(changes) - MAX_CHANGES_NAMED
-        named = "; ".join(changes[:MAX_CHANGES_NAMED]) + (f" (and {more} more)" if more > 0 else "")
+        named = "; ".join(changes[:MAX_CHANGES_NAMED]) + (
+            f" (and {more} more)" if more > 0 else ""
+        )
         raise InputError(
             directory / MANIFEST,
             f"{named}: new simulations would not match these results",

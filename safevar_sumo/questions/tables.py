@@ -29,7 +29,8 @@ LEAST_TEXT = 36
 MAX_LEAD_ROWS, MAX_LEAD_COLUMNS = 12, 6
 """Size of the table of one screen."""
 LATEX_PREAMBLE = "% In the preamble: " + " ".join(
-    rf"\usepackage{name}" for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}")
+    rf"\usepackage{name}"
+    for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}")
 )
 FIT_BEGIN = "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%\n"
 LATEX_CODES = str.maketrans(
@@ -121,7 +122,9 @@ def plain(value: Any) -> Any:
         return [plain(inner) for inner in value]
     if hasattr(value, "item"):
         value = value.item()
-    is_undefined = value is pd.NA or (isinstance(value, float) and not math.isfinite(value))
+    is_undefined = value is pd.NA or (
+        isinstance(value, float) and not math.isfinite(value)
+    )
     return None if is_undefined else value
 
 
@@ -138,7 +141,10 @@ def cell_text(value: Any, number_format: str = ".4g") -> str:
         return f"{value:,.0f}" if "e+" in text else text
     if isinstance(value, dict):
         return (
-            ", ".join(f"{name} {cell_text(inner, number_format)}" for name, inner in value.items())
+            ", ".join(
+                f"{name} {cell_text(inner, number_format)}"
+                for name, inner in value.items()
+            )
             or "-"
         )
     if isinstance(value, list):
@@ -184,7 +190,9 @@ def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.Data
         of_value = [f"{value}{end}" for end in ends]
         column = columns[of_value[0]]
         shown = {label: columns[label] for label in wide.labels}
-        shown |= {f"{name}{end}": column._replace(unit="") for name in names for end in ends}
+        shown |= {
+            f"{name}{end}": column._replace(unit="") for name in names for end in ends
+        }
 
         # A row for each combination of labels.
         rows = []
@@ -239,17 +247,23 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
         if not column.is_shown or is_with_value:
             continue
         of_column = ends if is_end else [name]
-        if len(frame) and frame[of_column].isna().all(axis=None):  # undefined in every row
+        if len(frame) and frame[of_column].isna().all(
+            axis=None
+        ):  # undefined in every row
             continue
         texts = [cell_text(value, column.number_format) for value in frame[name]]
         texts = [words.get(text, text) for text in texts]
         if ends[0] in frame:
             pairs = frame[ends].itertuples(index=False)
-            intervals = [_interval_text(low, high, column.number_format) for low, high in pairs]
+            intervals = [
+                _interval_text(low, high, column.number_format) for low, high in pairs
+            ]
             if is_end:
                 texts = intervals
             else:
-                behind = zip(texts, intervals, frame[ends[0]] == frame[ends[1]], strict=True)
+                behind = zip(
+                    texts, intervals, frame[ends[0]] == frame[ends[1]], strict=True
+                )
                 texts = [
                     text if exact or text == "-" else f"{text} ({interval})"
                     for text, interval, exact in behind
@@ -307,10 +321,18 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
     columns = [column for column in every if not column.is_long]
     if long and not any(column.is_number for column in columns) and len(columns) < 2:
         yield frame.attrs.get("title", "")  # lines say it all
-        for first, *others in zip(*(column.texts for column in (*columns, *long)), strict=True):
+        for first, *others in zip(
+            *(column.texts for column in (*columns, *long)), strict=True
+        ):
             yield ": ".join(filter(None, (first, " ".join(filter(None, others)))))
         return
-    if 1 + sum(max(_least_width(column), LEAST_TEXT * column.is_long) for column in every) <= width:
+    if (
+        1
+        + sum(
+            max(_least_width(column), LEAST_TEXT * column.is_long) for column in every
+        )
+        <= width
+    ):
         columns = every
         long = []
 
@@ -336,17 +358,22 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
         )
     for number, block in enumerate(filter(None, blocks)):
         title = "" if number or bars else frame.attrs.get("title", "")
-        yield WholeTable(title, [(column.head, column.is_number, column.texts) for column in block])
+        yield WholeTable(
+            title, [(column.head, column.is_number, column.texts) for column in block]
+        )
     for column in long:
         yield from (
-            f"{label}: {text}" for label, text in zip(columns[0].texts, column.texts, strict=True)
+            f"{label}: {text}"
+            for label, text in zip(columns[0].texts, column.texts, strict=True)
         )
 
 
 def _least_width(column: _ReaderColumn) -> int:
     """The width of a column whose words are whole, with a line beside it [characters]."""
     return 1 + max(
-        len(word) for text in (column.head, *column.texts) for word in text.split() or [""]
+        len(word)
+        for text in (column.head, *column.texts)
+        for word in text.split() or [""]
     )
 
 
@@ -373,7 +400,9 @@ def html_table(frame: pd.DataFrame) -> str:
     # Bars in a column of their own.
     title = escape(frame.attrs.get("title", ""))
     if bars := frame.attrs.get("bars"):
-        heads = f'<th scope="col" class="label" title="{LEGEND["html"]}">range</th>{heads}'
+        heads = (
+            f'<th scope="col" class="label" title="{LEGEND["html"]}">range</th>{heads}'
+        )
         rows = [
             f'<td class="label" data-head="range">{bar.svg}</td>{row}'
             for bar, row in zip(bars, rows, strict=True)
@@ -394,9 +423,13 @@ def html_table(frame: pd.DataFrame) -> str:
 def latex_table(label: str, frame: pd.DataFrame) -> str:
     """A booktabs table that fits into the line."""
     # Cells and columns by kind.
-    readable = pd.DataFrame({column.head: column.texts for column in reader_columns(frame)})
+    readable = pd.DataFrame(
+        {column.head: column.texts for column in reader_columns(frame)}
+    )
     style = (
-        readable.style.hide().format(_escaped_for_latex).format_index(_escaped_for_latex, axis=1)
+        readable.style.hide()
+        .format(_escaped_for_latex)
+        .format_index(_escaped_for_latex, axis=1)
     )
     kinds = (
         "r" if column.is_number else "p{6cm}" if column.is_long else "l"
@@ -405,7 +438,11 @@ def latex_table(label: str, frame: pd.DataFrame) -> str:
     alignment = "".join(kinds)
     caption = _escaped_for_latex(frame.attrs.get("title", ""))
     table = style.to_latex(
-        hrules=True, column_format=alignment, caption=caption, label=f"tab:{label}", position="htbp"
+        hrules=True,
+        column_format=alignment,
+        caption=caption,
+        label=f"tab:{label}",
+        position="htbp",
     )
     return table.replace(r"\begin{tabular}", FIT_BEGIN + r"\begin{tabular}").replace(
         r"\end{tabular}", r"\end{tabular}}"
@@ -421,6 +458,8 @@ def latex_notes(frame: pd.DataFrame) -> str:
 def _escaped_for_latex(text: object) -> str:
     """Plain text as LaTeX, with superscripts and minus signs."""
     escaped = re.sub(
-        r"\\textasciicircum\{\}(-?\d+)", r"\\textsuperscript{\1}", str(text).translate(LATEX_CODES)
+        r"\\textasciicircum\{\}(-?\d+)",
+        r"\\textsuperscript{\1}",
+        str(text).translate(LATEX_CODES),
     )
     return re.sub(r"(?<![\w)-])-(?=\.?\d)", r"\\textminus{}", escaped)

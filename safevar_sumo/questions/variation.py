@@ -36,7 +36,9 @@ class VariationModel:
             study.variation.get(name, Uniform()) for name in self.characteristics.names
         ]
         self._source = study.source
-        self._quantiles = list(map(_quantile_function, self.characteristics, distributions))
+        self._quantiles = list(
+            map(_quantile_function, self.characteristics, distributions)
+        )
 
     def settings(self, probabilities: FloatArray) -> FloatArray:
         """Settings at N points of the unit cube, shape (N, n)."""
@@ -45,10 +47,14 @@ class VariationModel:
             for quantile, column in zip(self._quantiles, probabilities.T, strict=True)
         ]
         return np.clip(
-            np.stack(columns, axis=1), self.characteristics.lower, self.characteristics.upper
+            np.stack(columns, axis=1),
+            self.characteristics.lower,
+            self.characteristics.upper,
         )
 
-    def draw(self, number: int, rng: np.random.Generator, *, filtered: bool = False) -> FloatArray:
+    def draw(
+        self, number: int, rng: np.random.Generator, *, filtered: bool = False
+    ) -> FloatArray:
         """Random vehicles that satisfy the constraints, shape (number, n); if `filtered`, after the
         filter.
         """
@@ -69,7 +75,9 @@ class VariationModel:
 
 def sampled_in_words(study: Study) -> str:
     """How vehicles are sampled: `sampled uniformly over the whole domain`."""
-    manner = "as [variation] says" if study.variation else "uniformly over the whole domain"
+    manner = (
+        "as [variation] says" if study.variation else "uniformly over the whole domain"
+    )
     return f"sampled {manner}"
 
 

@@ -37,7 +37,9 @@ def ending_in_words(outcome: str, safety_degree: float | None, contact: float) -
     The safety degree is in m, or -m/s on a collision; bodies touch at a safety degree of `contact`.
     """
     verb = (
-        "collides" if outcome == Outcome.COLLISION else OUTCOME_VERBS.get(Outcome(outcome), outcome)
+        "collides"
+        if outcome == Outcome.COLLISION
+        else OUTCOME_VERBS.get(Outcome(outcome), outcome)
     )
     if safety_degree is None or math.isnan(safety_degree):
         return verb
@@ -56,7 +58,10 @@ def collision_in_words(closing_speed: float, own_speed: float, digits: int = 2) 
 
 
 def change_texts(
-    characteristics: CharacteristicSet, values: Mapping[str, float], *, are_printed: bool = False
+    characteristics: CharacteristicSet,
+    values: Mapping[str, float],
+    *,
+    are_printed: bool = False,
 ) -> list[str]:
     """The values that differ from the original values, in the order of the study, such as `mass
     2404 -> 2600 kg (+8.2 %)`, without a share of an original that is 0. Values that `are_printed`
@@ -67,7 +72,11 @@ def change_texts(
         original = item.original
         value = values.get(item.name, item.original)
         if value != original:
-            share = f" ({100 * (value - original) / abs(original):+.1f} %)" if original else ""
+            share = (
+                f" ({100 * (value - original) / abs(original):+.1f} %)"
+                if original
+                else ""
+            )
             rounded = item.text(value)
             # Over many decades, or next to the original, its decimals would tell another value.
             error = abs(float(rounded) - value)
@@ -98,13 +107,18 @@ def precise_in_words(items: Iterable[Characteristic]) -> str:
 
 
 def encounter_in_words(
-    characteristics: CharacteristicSet, values: Mapping[str, float], *, are_printed: bool = False
+    characteristics: CharacteristicSet,
+    values: Mapping[str, float],
+    *,
+    are_printed: bool = False,
 ) -> str:
     """The searched parameters of the scenario, such as ` in an encounter with speed 59.5 km/h`;
     empty without any.
     """
     texts = {
-        item: f"{values[item.name]:{EXACT}}" if are_printed else item.text(values[item.name])
+        item: f"{values[item.name]:{EXACT}}"
+        if are_printed
+        else item.text(values[item.name])
         for item in characteristics.scenario
     }
     phrases = [f"{item.short_name} {text}{item.suffix}" for item, text in texts.items()]
@@ -134,16 +148,26 @@ MAX_POINTS_NAMED = 6
 """Maximum number of failing test cases that a sentence names."""
 
 
-def points_in_words(vehicle: str, failing_points: Sequence[str], point_count: int) -> str:
+def points_in_words(
+    vehicle: str, failing_points: Sequence[str], point_count: int
+) -> str:
     """A sentence such as `The original vehicle fails 2 of 72 test cases: CPNA, speed 40,
     impact_location 25; CPLA, speed 60, clear.`
     """
     if not failing_points:
-        tests = f"none of the {point_count} test cases" if point_count > 1 else "no test case"
+        tests = (
+            f"none of the {point_count} test cases"
+            if point_count > 1
+            else "no test case"
+        )
         return f"{vehicle} fails {tests}."
     rest = len(failing_points) - MAX_POINTS_NAMED
-    names = "; ".join(failing_points[:MAX_POINTS_NAMED]) + (f" and {rest} more" if rest > 0 else "")
-    return f"{vehicle} fails {len(failing_points)} of {point_count} test cases: {names}."
+    names = "; ".join(failing_points[:MAX_POINTS_NAMED]) + (
+        f" and {rest} more" if rest > 0 else ""
+    )
+    return (
+        f"{vehicle} fails {len(failing_points)} of {point_count} test cases: {names}."
+    )
 
 
 def share_in_words(share: float) -> str:

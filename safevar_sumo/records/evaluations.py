@@ -60,7 +60,11 @@ class Evaluations:
     @property
     def results(self) -> ResultColumns:
         """Outcomes and metrics by name."""
-        return {"outcome": self.outcome, "collision_speed": self.collision_speed, **self.metrics}
+        return {
+            "outcome": self.outcome,
+            "collision_speed": self.collision_speed,
+            **self.metrics,
+        }
 
     def gaps(self, contact: float) -> FloatArray:
         """Least distances between bodies during the encounter [m], shape (M,); 0 on a collision,
@@ -87,7 +91,9 @@ class Evaluations:
         """Where the setting can be scored: it is feasible, the test was valid, and the simulator
         reported no error.
         """
-        return np.asarray(~self.failed & (self.outcome != Outcome.INVALID_TEST) & ~self.infeasible)
+        return np.asarray(
+            ~self.failed & (self.outcome != Outcome.INVALID_TEST) & ~self.infeasible
+        )
 
     @property
     def infeasible(self) -> BoolArray:
@@ -109,7 +115,9 @@ class Evaluations:
         they collide, and the metrics that are kept of each.
         """
         rounds = list[Evaluations]()
-        while (end := f"_{len(rounds) + 1}") and f"{SAFETY_DEGREE}{end}" in self.metrics:
+        while (
+            end := f"_{len(rounds) + 1}"
+        ) and f"{SAFETY_DEGREE}{end}" in self.metrics:
             metrics = {
                 name: self.metrics[f"{name}{end}"]
                 for name in self.metrics
@@ -120,13 +128,19 @@ class Evaluations:
                 Outcome.COLLISION.value,
                 np.where(self.collided, "", self.outcome),
             )
-            rounds.append(replace(self, outcome=outcome, metrics={**self.metrics, **metrics}))
+            rounds.append(
+                replace(self, outcome=outcome, metrics={**self.metrics, **metrics})
+            )
         return rounds
 
-    def take(self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray) -> Evaluations:
+    def take(
+        self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray
+    ) -> Evaluations:
         """The evaluations of `rows`, in that order."""
         columns = {name: getattr(self, name)[rows] for name in COLUMNS}
-        columns["metrics"] = {name: values[rows] for name, values in self.metrics.items()}
+        columns["metrics"] = {
+            name: values[rows] for name, values in self.metrics.items()
+        }
         if self.worst_points is not None:
             columns["worst_points"] = self.worst_points[rows]
         # User code has a view of the reasons, which no process can send.
@@ -139,7 +153,8 @@ class Evaluations:
             outcome=np.where(is_kept, self.outcome, str(outcome)),
             collision_speed=np.where(is_kept, self.collision_speed, np.nan),
             metrics={
-                name: np.where(is_kept, values, np.nan) for name, values in self.metrics.items()
+                name: np.where(is_kept, values, np.nan)
+                for name, values in self.metrics.items()
             },
         )
 
@@ -184,7 +199,9 @@ class Evaluations:
         worst_points = None
         if any(batch.worst_points is not None for batch in batches):
             worst_points = np.concatenate([batch.points for batch in batches])
-        return cls(**columns, metrics=metrics, reasons=reasons, worst_points=worst_points)
+        return cls(
+            **columns, metrics=metrics, reasons=reasons, worst_points=worst_points
+        )
 
 
 def differences(
@@ -197,7 +214,9 @@ def differences(
         reference = references[name]
         is_same = values == reference
         if values.dtype.kind == "f":
-            is_same |= np.isclose(values, reference, rtol=0, atol=tolerance, equal_nan=True)
+            is_same |= np.isclose(
+                values, reference, rtol=0, atol=tolerance, equal_nan=True
+            )
         if not is_same.all():
             row = int(np.argmin(is_same))
             yield row, f"{name} is {reference[row]} instead of {values[row]}"

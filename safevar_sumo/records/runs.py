@@ -95,8 +95,12 @@ class Trace:
 
     def of(self, vehicles: slice | IntArray) -> Trace:
         """The trace of some of the vehicles."""
-        matrices = {name: value for name, value in vars(self).items() if np.ndim(value) == 2}
-        return replace(self, **{name: value[:, vehicles] for name, value in matrices.items()})
+        matrices = {
+            name: value for name, value in vars(self).items() if np.ndim(value) == 2
+        }
+        return replace(
+            self, **{name: value[:, vehicles] for name, value in matrices.items()}
+        )
 
 
 QUANTITIES: Mapping[str, tuple[str, ...]] = {
@@ -104,7 +108,15 @@ QUANTITIES: Mapping[str, tuple[str, ...]] = {
     "obstacle_speed": ("obstacle_speed", "closing_speed"),
     **{
         name: (name,)
-        for name in ("speed", "separation", "position", "throttle", "brake", "pedal", "gear")
+        for name in (
+            "speed",
+            "separation",
+            "position",
+            "throttle",
+            "brake",
+            "pedal",
+            "gear",
+        )
     },
 }
 """What a metric may need of a run, and the columns of its trace and its encounter that have it. A
@@ -171,7 +183,9 @@ class SimulationRuns:
         """
         trace = self.trace
         has_moved = np.logical_or.accumulate(trace.speed > STANDSTILL, axis=0)
-        has_stopped = np.logical_or.accumulate(has_moved & (trace.speed <= STANDSTILL), axis=0)
+        has_stopped = np.logical_or.accumulate(
+            has_moved & (trace.speed <= STANDSTILL), axis=0
+        )
         return np.asarray(trace.active & self.encounter.in_conflict & ~has_stopped)
 
     @cached_property
@@ -187,7 +201,10 @@ class SimulationRuns:
         _, distance, closing_speed, _ = self.encounter
         is_counted = self.is_approach & (closing_speed > 0) & (distance >= 0)
         return np.divide(
-            distance, closing_speed, out=np.full_like(distance, np.inf), where=is_counted
+            distance,
+            closing_speed,
+            out=np.full_like(distance, np.inf),
+            where=is_counted,
         )
 
     def of(self, vehicles: slice | IntArray) -> SimulationRuns:
@@ -205,7 +222,8 @@ class SimulationRuns:
             return value
 
         return replace(
-            self, **{item.name: select(getattr(self, item.name)) for item in fields(self)}
+            self,
+            **{item.name: select(getattr(self, item.name)) for item in fields(self)},
         )
 
     def lacking(self, *quantities: str) -> BoolArray:
@@ -240,7 +258,11 @@ class SimulationRuns:
         in_conflict = active & self.encounter.in_conflict[:, vehicle]
         if not in_conflict.any():
             return None
-        return int(np.argmin(np.where(in_conflict, self.encounter.separation[:, vehicle], np.inf)))
+        return int(
+            np.argmin(
+                np.where(in_conflict, self.encounter.separation[:, vehicle], np.inf)
+            )
+        )
 
     @property
     def middles_apart(self) -> float:
@@ -257,7 +279,9 @@ class SimulationRuns:
         """Severity of a collision: `collision_speed` minus the struck body's speed along the lane
         at that sample [m/s], shape (N,), at least `LEAST_CLOSING_SPEED`; NaN without a collision.
         """
-        return np.maximum(self.collision_speed - self.contact.speed, LEAST_CLOSING_SPEED)
+        return np.maximum(
+            self.collision_speed - self.contact.speed, LEAST_CLOSING_SPEED
+        )
 
     @cached_property
     def relative_speed(self) -> FloatArray:
@@ -291,7 +315,8 @@ class SimulationRuns:
         )
         distance = np.where(gap_closes, np.maximum(gap_before, 0.0), 0.0)
         squared_speed = (
-            speed_before * speed_before + 2 * (speed_after - speed_before) / trace.step * distance
+            speed_before * speed_before
+            + 2 * (speed_after - speed_before) / trace.step * distance
         )
         min_speed = np.minimum(speed_before, speed_after)
         max_speed = np.maximum(speed_before, speed_after)
@@ -302,5 +327,7 @@ class SimulationRuns:
         # Otherwise the speed at the end of the step.
         at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
         return np.asarray(
-            np.where(gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step)
+            np.where(
+                gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step
+            )
         )

@@ -18,7 +18,13 @@ from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tab
 from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.figures import BLUE, FONT_SIZE, VERMILION, as_formula, new_panels
+from safevar_sumo.questions.figures import (
+    BLUE,
+    FONT_SIZE,
+    VERMILION,
+    as_formula,
+    new_panels,
+)
 from safevar_sumo.questions.research_questions.statistics import rounded_to_rank
 from safevar_sumo.questions.words import two_decimals
 from safevar_sumo.records import Evaluations, FloatArray
@@ -40,19 +46,31 @@ COLUMNS: Columns = {
     "mean_absolute_error": Column(
         "as in column unit", "mean absolute difference from the published value", ".3f"
     ),
-    "bias": Column("as in column unit", "mean difference (here minus published)", ".3f"),
+    "bias": Column(
+        "as in column unit", "mean difference (here minus published)", ".3f"
+    ),
 }
 STAGE = "settings"
 """The phase of progress."""
 SHIPPED_AGREEMENT = Path(__file__).with_name("agreement.csv")
 """Safety degrees of shipped studies and published files: what `validate STUDY FILE` answers."""
-SIMULATION_KEYS = ("scenario", "vehicle", "ads", "weather", "metrics", "step_length", "matrix")
+SIMULATION_KEYS = (
+    "scenario",
+    "vehicle",
+    "ads",
+    "weather",
+    "metrics",
+    "step_length",
+    "matrix",
+)
 """Study keys that affect the metrics of a setting."""
 
 
 @question
 @contents(
-    "rows", *(f"collisions_{where}" for where in ("here", "reference", "both")), agreement=COLUMNS
+    "rows",
+    *(f"collisions_{where}" for where in ("here", "reference", "both")),
+    agreement=COLUMNS,
 )
 def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
     """Compare the simulation with published vehicles and metrics (a CSV file), row by row. You get
@@ -95,14 +113,20 @@ def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
         verdict=verdict,
         numbers={**numbers},
         tables={"agreement": table},
-        draw=partial(_draw, f"{study.title}\nagainst {reference.name}", data, evaluations),
+        draw=partial(
+            _draw, f"{study.title}\nagainst {reference.name}", data, evaluations
+        ),
     )
 
 
-def _draw(title: str, reference: ReferenceData, evaluations: Evaluations, answer: Answer) -> Figure:
+def _draw(
+    title: str, reference: ReferenceData, evaluations: Evaluations, answer: Answer
+) -> Figure:
     """The values here over those in the reference, metric by metric."""
     table = answer.tables["agreement"]
-    figure, axes = new_panels(title, len(table), 4, (3.0, 2.6), min_width=12.0, title_height=0.6)
+    figure, axes = new_panels(
+        title, len(table), 4, (3.0, 2.6), min_width=12.0, title_height=0.6
+    )
     colours = np.where(reference.collided | evaluations.collided, VERMILION, BLUE)
     for axis, name, order in zip(axes, table["metric"], table["spearman"], strict=True):
         published = reference.metrics[name]
@@ -112,14 +136,18 @@ def _draw(title: str, reference: ReferenceData, evaluations: Evaluations, answer
         # A point in the range of the values lets the axes keep theirs.
         defined, _ = defined_pairs(published, simulated)
         origin = float(next(iter(defined), 0.0))
-        axis.axline((origin, origin), slope=1, color="black", linewidth=0.8, linestyle="--")
+        axis.axline(
+            (origin, origin), slope=1, color="black", linewidth=0.8, linestyle="--"
+        )
         axis.set_title(f"rho = {two_decimals(order)}", fontsize=FONT_SIZE)
         axis.set(xlabel=f"reference: {label}", ylabel=f"here: {label}")
     figure.supxlabel("orange: collides in the reference or here", fontsize=FONT_SIZE)
     return figure
 
 
-def agreement_counts(reference: ReferenceData, evaluations: Evaluations) -> dict[str, int]:
+def agreement_counts(
+    reference: ReferenceData, evaluations: Evaluations
+) -> dict[str, int]:
     """Numbers of rows, and of those that collide here, in the reference, and in both."""
     return {
         "rows": len(evaluations),
@@ -129,7 +157,9 @@ def agreement_counts(reference: ReferenceData, evaluations: Evaluations) -> dict
     }
 
 
-def measure_agreement(reference: ReferenceData, evaluations: Evaluations) -> pd.DataFrame:
+def measure_agreement(
+    reference: ReferenceData, evaluations: Evaluations
+) -> pd.DataFrame:
     """The table of `COLUMNS`, a row for each metric; NaN where undefined."""
     rows = []
     for name, values in reference.metrics.items():
@@ -138,11 +168,20 @@ def measure_agreement(reference: ReferenceData, evaluations: Evaluations) -> pd.
         measures = np.nan, np.nan
         if errors.size:
             measures = np.abs(errors).mean(), errors.mean()
-        rows.append((name, METRICS[name].unit, rank_correlation(published, simulated), *measures))
+        rows.append(
+            (
+                name,
+                METRICS[name].unit,
+                rank_correlation(published, simulated),
+                *measures,
+            )
+        )
     return tabulate("Agreement with the reference", COLUMNS, rows)
 
 
-def defined_pairs(values: FloatArray, other_values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def defined_pairs(
+    values: FloatArray, other_values: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Both values of the rows in which both are defined."""
     is_defined = ~np.isnan(values) & ~np.isnan(other_values)
     return values[is_defined], other_values[is_defined]

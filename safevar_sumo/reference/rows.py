@@ -103,14 +103,21 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
             raise ValueError("rows have more values than the header has columns")
         table = lines.rename(columns=str.strip).dropna(how="all")
     except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror or error}", "a CSV file") from None
+        raise InputError(
+            path, f"cannot be read: {error.strerror or error}", "a CSV file"
+        ) from None
     # The errors of pandas are ValueErrors, too.
     except ValueError as error:
         raise InputError(
-            path, f"is not CSV: {str(error).splitlines()[0]}", "a CSV file with a header and rows"
+            path,
+            f"is not CSV: {str(error).splitlines()[0]}",
+            "a CSV file with a header and rows",
         ) from None
     by_plain_name = {_plain_name(str(column)): str(column) for column in table}
-    columns = {name: by_plain_name.get(_plain_name(name), name) for name in characteristics.names}
+    columns = {
+        name: by_plain_name.get(_plain_name(name), name)
+        for name in characteristics.names
+    }
     columns |= COLUMNS
     if columns[OPTIONAL_METRIC] not in table:
         del columns[OPTIONAL_METRIC]
@@ -124,7 +131,9 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     doubled = [column for column in columns.values() if counts[_plain_name(column)] > 1]
     if doubled:
         raise InputError(
-            path, f"has more than one column for {', '.join(doubled)}", "each column once"
+            path,
+            f"has more than one column for {', '.join(doubled)}",
+            "each column once",
         )
     numbers = {
         name: _parse_numbers(path, table[column], *RANGES.get(name, (-np.inf, np.inf)))
@@ -132,7 +141,8 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     }
     settings = np.stack([numbers[name] for name in characteristics.names], axis=1)
     is_in_domain = np.all(
-        (settings >= characteristics.lower) & (settings <= characteristics.upper), axis=1
+        (settings >= characteristics.lower) & (settings <= characteristics.upper),
+        axis=1,
     )
     if not is_in_domain.any():
         raise InputError(
@@ -149,7 +159,9 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     # In the paper a collision has no TET and TIT.
     for name in ("tet", "tit"):
         metrics[name] = np.where(metrics[SAFETY_DEGREE] <= 0, np.nan, metrics[name])
-    return ReferenceData(package_filter(characteristics, settings[is_in_domain]), metrics)
+    return ReferenceData(
+        package_filter(characteristics, settings[is_in_domain]), metrics
+    )
 
 
 def _plain_name(name: str) -> str:
@@ -158,25 +170,35 @@ def _plain_name(name: str) -> str:
     return ALIASES.get(key, key)
 
 
-def _parse_numbers(path: Path, column: pd.Series[str], lowest: float, highest: float) -> FloatArray:
+def _parse_numbers(
+    path: Path, column: pd.Series[str], lowest: float, highest: float
+) -> FloatArray:
     values = pd.to_numeric(column, errors="coerce")
-    for row, cell in column[~(np.isfinite(values) & values.between(lowest, highest))].items():
+    for row, cell in column[
+        ~(np.isfinite(values) & values.between(lowest, highest))
+    ].items():
         legal = f"a number in [{lowest:g}, {highest:g}]"
         if lowest == -np.inf:
             legal = "a finite number"
         fault = f"= {cell!r}"
         if pd.isna(cell):
             fault = "is empty"
-        raise InputError(path, f"row {int(row) + FIRST_ROW}, column {column.name} {fault}", legal)
+        raise InputError(
+            path, f"row {int(row) + FIRST_ROW}, column {column.name} {fault}", legal
+        )
     return values.to_numpy(dtype=float)
 
 
-def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> FloatArray:
+def package_filter(
+    characteristics: CharacteristicSet, settings: FloatArray
+) -> FloatArray:
     """The published package's filter: it keeps a change if its share of the domain, rounded to
     three decimals, is at least beta.
     """
     width = characteristics.upper - characteristics.lower
-    share = np.round(np.abs(settings - characteristics.original) / width, SHARE_DECIMALS)
+    share = np.round(
+        np.abs(settings - characteristics.original) / width, SHARE_DECIMALS
+    )
     return np.where(
         share >= characteristics.threshold / width - ROUNDING_ERROR,
         settings,
@@ -184,7 +206,9 @@ def package_filter(characteristics: CharacteristicSet, settings: FloatArray) -> 
     )
 
 
-def evaluations_of(data: ReferenceData, characteristics: CharacteristicSet) -> Evaluations:
+def evaluations_of(
+    data: ReferenceData, characteristics: CharacteristicSet
+) -> Evaluations:
     """Reference rows as evaluations, with f_diff and f_numDiff of the filtered settings (method
     section 3).
     """
@@ -233,7 +257,9 @@ def import_published(
     arguments = {"nsga2": nsga2, "rs": rs, "safe_fuzzer": safe_fuzzer}
     files = {name: Path(file) for name, file in arguments.items() if file is not None}
     if not files:
-        raise InputError("import", "no file is given", "at least one of nsga2, rs, safe_fuzzer")
+        raise InputError(
+            "import", "no file is given", "at least one of nsga2, rs, safe_fuzzer"
+        )
 
     metrics = {name: loaded_study.published.get(name) for name in METRICS}
     if metrics[SAFETY_DEGREE] is None:
@@ -245,7 +271,9 @@ def import_published(
 
     characteristics = CharacteristicSet.of(loaded_study)
     solutions = {
-        algorithm: evaluations_of(read_reference(path, characteristics), characteristics)
+        algorithm: evaluations_of(
+            read_reference(path, characteristics), characteristics
+        )
         for algorithm, path in files.items()
     }
     names = {algorithm: path.name for algorithm, path in files.items()}

@@ -115,7 +115,9 @@ def animate(comparison: Comparison, path: Path) -> None:
     comparison.refuse_without_position()
     ending = path.suffix.lower()
     if ending not in ENDINGS:
-        raise InputError("animate", str(path), f"a file that ends in {', '.join(ENDINGS)}")
+        raise InputError(
+            "animate", str(path), f"a file that ends in {', '.join(ENDINGS)}"
+        )
     with whole_file(path, "animate") as file:
         if ending == ".gif":
             film, fps = film_of(comparison, MAX_FRAMES, LAST_FRAME_DURATION)
@@ -123,12 +125,17 @@ def animate(comparison: Comparison, path: Path) -> None:
             return
         page = template_environment().get_template("animation.html.j2")
         player = player_of(comparison, 1, MAX_FRAMES, DPI)
-        text = page.render(title=comparison.title, changes=comparison.changes, player=player)
+        text = page.render(
+            title=comparison.title, changes=comparison.changes, player=player
+        )
         file.write_text(printable(text), encoding="utf-8", newline="\n")
 
 
 def player_of(
-    comparison: Comparison, number: int, frames: int = MAX_PAGE_FRAMES, dpi: int = PAGE_DPI
+    comparison: Comparison,
+    number: int,
+    frames: int = MAX_PAGE_FRAMES,
+    dpi: int = PAGE_DPI,
 ) -> Markup:
     """HTML that plays a comparison, with all that this needs, under its number on a page; without
     JavaScript it shows the end.
@@ -149,7 +156,9 @@ def player_of(
     # Matplotlib gives a player a random name.
     (name,) = set(re.findall(r"_anim_img(\w+)", html))
     frame = re.findall(r'"(data:image[^"]*)"', html)[-1]
-    verdicts = (f"{comparison.name(row)} {comparison.verdict(row)}" for row in comparison.rows)
+    verdicts = (
+        f"{comparison.name(row)} {comparison.verdict(row)}" for row in comparison.rows
+    )
     words = escape(f"Seen from above: {', '.join(verdicts)}")
     html = html.replace("<img", f'<img alt="{words}" src="{frame}"', 1)
     return Markup(html.replace(name, str(number)))
@@ -165,7 +174,9 @@ def _with_palette(picture: re.Match[str]) -> str:
     return b64encode(data.getvalue()).decode()
 
 
-def film_of(comparison: Comparison, frames: int, pause: float = 0.0) -> tuple[FuncAnimation, float]:
+def film_of(
+    comparison: Comparison, frames: int, pause: float = 0.0
+) -> tuple[FuncAnimation, float]:
     """At most about so many frames, of which the last one is kept for some time [s], and how many
     there are in a second.
     """
@@ -177,7 +188,9 @@ def film_of(comparison: Comparison, frames: int, pause: float = 0.0) -> tuple[Fu
     fps = 1 / (stride * step)
     samples = [*range(0, end, stride), *[end] * round(1 + pause * fps)]
     figure, show = draw_scene(comparison)
-    film = FuncAnimation(figure, show, samples, init_func=lambda: [], cache_frame_data=False)
+    film = FuncAnimation(
+        figure, show, samples, init_func=lambda: [], cache_frame_data=False
+    )
     return film, fps
 
 
@@ -194,7 +207,10 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
     full_height = PANEL_HEIGHT + height
     figure = Figure(figsize=(WIDTH, full_height))
     axis = figure.add_axes(
-        (0, 0, 1, height / full_height), facecolor=GROUND_COLOUR, yticks=[], ylim=(bottom, top)
+        (0, 0, 1, height / full_height),
+        facecolor=GROUND_COLOUR,
+        yticks=[],
+        ylim=(bottom, top),
     )
     axis.spines[:].set_visible(False)
     _draw_road(axis, comparison, turn, points=72 * WIDTH / width)
@@ -205,10 +221,14 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
         for body in bodies
     ]
     impacts = [axis.plot([], [], **IMPACT_STYLE)[0] for _ in comparison.rows]
-    clock = figure.text(0.014, 1 - 0.12 / full_height, "", fontsize=15, color=TEXT_COLOUR, va="top")
+    clock = figure.text(
+        0.014, 1 - 0.12 / full_height, "", fontsize=15, color=TEXT_COLOUR, va="top"
+    )
     style: Any = {"fontsize": 9.5, "weight": "bold", "va": "top", "family": "monospace"}
     texts = [
-        figure.text(0.12, 1 - (0.12 + 0.23 * row) / full_height, "", color=COLOURS[row], **style)
+        figure.text(
+            0.12, 1 - (0.12 + 0.23 * row) / full_height, "", color=COLOURS[row], **style
+        )
         for row in comparison.rows
     ]
 
@@ -258,7 +278,9 @@ def lay_out(comparison: Comparison) -> tuple[list[DrawnBody], Affine2D]:
         if np.any(distance < MAX_DISTANCE + track.length):
             kind = name == VUT, track.is_person, track.length, track.width
             x, y = turn.transform(place).T
-            bodies.append(DrawnBody(row, *kind, x, y, track.heading[samples, row] - heading))
+            bodies.append(
+                DrawnBody(row, *kind, x, y, track.heading[samples, row] - heading)
+            )
     return bodies, turn
 
 
@@ -282,7 +304,9 @@ def _choose_view(bodies: Sequence[DrawnBody]) -> tuple[FloatArray, float, float,
     return left_ends, width, bottom - padding, top + padding
 
 
-def _draw_road(axis: Axes, comparison: Comparison, turn: Affine2D, points: float) -> None:
+def _draw_road(
+    axis: Axes, comparison: Comparison, turn: Affine2D, points: float
+) -> None:
     """Draw lanes, a metre as so many points, and a mark every ten metres from the start of the
     front bumper.
     """
@@ -293,16 +317,22 @@ def _draw_road(axis: Axes, comparison: Comparison, turn: Affine2D, points: float
     for lane in sorted(comparison.road, key=lambda lane: KINDS.index(lane.kind)):
         if lane.kind == "area":
             colour = LAYERS["path"][0][1]
-            axis.add_patch(Polygon(lane.line, linewidth=0, color=colour, transform=transform))
+            axis.add_patch(
+                Polygon(lane.line, linewidth=0, color=colour, transform=transform)
+            )
             continue
         stripes = STRIPE_LENGTH / lane.width
-        style: Any = {"linestyle": (0, (stripes, stripes)) if lane.kind == "crossing" else "-"}
+        style: Any = {
+            "linestyle": (0, (stripes, stripes)) if lane.kind == "crossing" else "-"
+        }
         for reduction, colour in LAYERS[lane.kind]:
             style |= {"linewidth": (lane.width - reduction) * points, "color": colour}
             axis.plot(*lane.line.T, solid_capstyle="butt", transform=transform, **style)
     axis.xaxis.set_major_locator(MultipleLocator(10))
     axis.xaxis.set_major_formatter("{x:.0f} m")
-    axis.tick_params(axis="x", direction="in", pad=-15, labelsize=8, colors=PALE_TEXT_COLOUR)
+    axis.tick_params(
+        axis="x", direction="in", pad=-15, labelsize=8, colors=PALE_TEXT_COLOUR
+    )
 
 
 def _draw_body(body: DrawnBody, *, is_outline: bool) -> Patch:
@@ -313,7 +343,12 @@ def _draw_body(body: DrawnBody, *, is_outline: bool) -> Patch:
     style: Any = {"color": colour, "zorder": 3}
     if is_outline:
         # It is not on the road with the other.
-        style |= {"fill": False, "linewidth": 2, "linestyle": "--", "zorder": 2 + 2 * body.is_vut}
+        style |= {
+            "fill": False,
+            "linewidth": 2,
+            "linestyle": "--",
+            "zorder": 2 + 2 * body.is_vut,
+        }
     if body.is_person:
         return Circle((0, 0), max(body.length, body.width) / 2, **style)
     side = body.width / 2

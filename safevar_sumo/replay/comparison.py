@@ -17,7 +17,14 @@ from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import METRICS, Measure
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.words import OUTCOME_VERBS, change_texts, collision_in_words
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, Outcome, SimulationRuns, Trace
+from safevar_sumo.records import (
+    Evaluations,
+    FloatArray,
+    JsonObject,
+    Outcome,
+    SimulationRuns,
+    Trace,
+)
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.scenarios import VUT, Point
 from safevar_sumo.study import unit_text
@@ -150,7 +157,9 @@ class Comparison:
         """Every change in words, with its unit and share."""
         characteristics = self.system.characteristics
         # The last row: the original vehicle is alone without a change.
-        return change_texts(characteristics, characteristics.named(self.evaluations.settings[-1]))
+        return change_texts(
+            characteristics, characteristics.named(self.evaluations.settings[-1])
+        )
 
     def verdict(self, row: int) -> str:
         """The end of a run in words: "collides at 3.9 m/s", or "stops with 2.22 m to spare"."""
@@ -158,7 +167,9 @@ class Comparison:
         nearest = self.moments[row].nearest
 
         if not math.isnan(runs.closing_speed[row]):
-            return collision_in_words(runs.closing_speed[row], runs.collision_speed[row], digits=1)
+            return collision_in_words(
+                runs.closing_speed[row], runs.collision_speed[row], digits=1
+            )
         ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             has_gap = self.system.mover.has("roads")
@@ -194,7 +205,10 @@ def films_along(trace: Trace) -> dict[str, Film]:
 
 def lane_below(trace: Trace) -> DrawnLane:
     """The lane on which they are drawn."""
-    ends = float(trace.position.min()) - ROAD_BEHIND, float(trace.position.max()) + ROAD_AHEAD
+    ends = (
+        float(trace.position.min()) - ROAD_BEHIND,
+        float(trace.position.max()) + ROAD_AHEAD,
+    )
     return DrawnLane("road", np.array([[ends[0], 0.0], [ends[1], 0.0]]), LANE_WIDTH)
 
 
@@ -221,7 +235,9 @@ def comparison_of(simulation: Simulation) -> Comparison:
         system=pair.system,
         point=pair.point,
         evaluations=pair.evaluations,
-        runs=replace(pair.runs, trace=replace(trace, throttle=pedals[0], brake=pedals[1])),
+        runs=replace(
+            pair.runs, trace=replace(trace, throttle=pedals[0], brake=pedals[1])
+        ),
         objectives=tuple(metric for metric in scoring.metrics if metric.name in names),
     )
 
@@ -233,7 +249,9 @@ def read_road(network: NetworkFiles) -> tuple[DrawnLane, ...]:
         for lane in edge.iter("lane"):
             # A point is x,y or x,y,z.
             line = [point.split(",")[:2] for point in lane.attrib["shape"].split()]
-            usual = "path" if lane.get("allow", "").split() == ["pedestrian"] else "road"
+            usual = (
+                "path" if lane.get("allow", "").split() == ["pedestrian"] else "road"
+            )
             kinds = {"walkingarea": "area", "crossing": "crossing"}
             kind = kinds.get(edge.get("function", ""), usual)
             # SUMO's lanes are 3.2 m wide by default.

@@ -24,10 +24,20 @@ from safevar_sumo.results import make_directory, write_whole
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import PHASE
-from safevar_sumo.sumo.network import NetworkFiles, built_network, program_of_sumo, run_program
+from safevar_sumo.sumo.network import (
+    NetworkFiles,
+    built_network,
+    program_of_sumo,
+    run_program,
+)
 from safevar_sumo.sumo.system import assemble
 
-ROAD, SCENARIO, SCRIPT, VEHICLE = "road.xodr", "scenario.xosc", "run_in_carla.py", "vehicle.json"
+ROAD, SCENARIO, SCRIPT, VEHICLE = (
+    "road.xodr",
+    "scenario.xosc",
+    "run_in_carla.py",
+    "vehicle.json",
+)
 BLUEPRINT = "vehicle.lincoln.mkz*2017"
 """The Lincoln MKZ of CARLA 0.9.10 (`mkz2017`) and of later versions (`mkz_2017`)."""
 CARLA_PHYSICS = {
@@ -105,7 +115,13 @@ class Poses(NamedTuple):
         x = self.x - distance * np.cos(self.heading)
         y = self.y - distance * np.sin(self.heading)
         return list(
-            zip(self.time.tolist(), x.tolist(), y.tolist(), self.heading.tolist(), strict=True)
+            zip(
+                self.time.tolist(),
+                x.tolist(),
+                y.tolist(),
+                self.heading.tolist(),
+                strict=True,
+            )
         )
 
 
@@ -118,7 +134,9 @@ def poses_of(comparison: Comparison) -> list[Poses]:
     end = comparison.moments[row].end + 1
 
     time = np.round(comparison.runs.trace.time[:end], TIME_DECIMALS)
-    for name, track in sorted(comparison.tracks.items(), key=lambda item: item[0] != VUT):
+    for name, track in sorted(
+        comparison.tracks.items(), key=lambda item: item[0] != VUT
+    ):
         x = track.x[:end, row]
         y = track.y[:end, row]
         is_present = np.isfinite(x)
@@ -136,7 +154,9 @@ def poses_of(comparison: Comparison) -> list[Poses]:
         samples = np.stack([time, x, y, heading])[:, is_present]
         actor = Poses(name, kind, track.length, track.width, *samples)
         if name == VUT:
-            actor = actor._replace(name=EGO, start_speed=float(comparison.runs.trace.speed[0, row]))
+            actor = actor._replace(
+                name=EGO, start_speed=float(comparison.runs.trace.speed[0, row])
+            )
         actors.append(actor)
     return actors
 
@@ -178,10 +198,19 @@ def converted(network: NetworkFiles) -> str:
     """
     netconvert = program_of_sumo("netconvert", f"an export of {network.folder}")
     with temporary_folder() as folder:
-        arguments = ("-s", str(built_network(network)), "--opendrive-output", ROAD, "-o", "net.xml")
+        arguments = (
+            "-s",
+            str(built_network(network)),
+            "--opendrive-output",
+            ROAD,
+            "-o",
+            "net.xml",
+        )
         exit_code, errors = run_program(Path(folder), netconvert, *arguments)
         if exit_code != 0:
-            raise EnvironmentFault(f"{network.folder}: netconvert writes no OpenDRIVE: {errors}")
+            raise EnvironmentFault(
+                f"{network.folder}: netconvert writes no OpenDRIVE: {errors}"
+            )
         root = ElementTree.parse(Path(folder) / ROAD).getroot()
     for element in root.iter():
         for name in DROPPED_ATTRIBUTES.get(element.tag, ()):
@@ -205,7 +234,9 @@ def carla_physics(setting: NamedValues) -> dict[str, NamedValues]:
     if surplus := [name for name in setting if name not in names]:
         verb = "has" if len(surplus) == 1 else "have"
         raise InputError(
-            "", f"{', '.join(surplus)} of its vehicle {verb} no counterpart in CARLA", f"the vehicle `carla`, with {', '.join(names)}; or `to=openscenario`"
+            "",
+            f"{', '.join(surplus)} of its vehicle {verb} no counterpart in CARLA",
+            f"the vehicle `carla`, with {', '.join(names)}; or `to=openscenario`",
         )
     if lacking := [name for name in names if name not in setting]:
         raise InputError(
@@ -237,7 +268,11 @@ def carla_scene(
         "blueprint": BLUEPRINT,
         **physics,
         "step": trace.step,
-        "start": {"x": float(vut.x[0]), "y": float(vut.y[0]), "heading": float(vut.heading[0])},
+        "start": {
+            "x": float(vut.x[0]),
+            "y": float(vut.y[0]),
+            "heading": float(vut.heading[0]),
+        },
         "start_speed": float(trace.speed[0, row]),
         "route": np.stack([vut.x, vut.y], axis=1).tolist(),
         "pedals": pedals,
@@ -289,8 +324,14 @@ def export(
     system.require("roads", "export")
     setting = target.setting(system)
     if system.characteristics.named(setting).get(PHASE):
-        raise InputError(directory, f"solution {solution} has a {PHASE}, which another simulator does not have", "a solution of a study that does not search it")
-    values = system.characteristics.vehicle.named(setting[system.characteristics.of_vehicle])
+        raise InputError(
+            directory,
+            f"solution {solution} has a {PHASE}, which another simulator does not have",
+            "a solution of a study that does not search it",
+        )
+    values = system.characteristics.vehicle.named(
+        setting[system.characteristics.of_vehicle]
+    )
     with about(directory):
         physics = carla_physics(values) if to == "carla" else {}
     comparison = comparison_of(
@@ -301,7 +342,11 @@ def export(
 
 
 def write_files(
-    comparison: Comparison, to: str, out: Path, handle: str, physics: Mapping[str, NamedValues]
+    comparison: Comparison,
+    to: str,
+    out: Path,
+    handle: str,
+    physics: Mapping[str, NamedValues],
 ) -> None:
     """Write the last run of a comparison into a new directory: for "carla", with its `physics`, or
     "openscenario".

@@ -37,9 +37,14 @@ def draw_comparison(comparison: Comparison) -> Figure:
     comparison.refuse_without_position()
 
     with matplotlib.style.context(
-        ["seaborn-v0_8-whitegrid", {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE}]
+        [
+            "seaborn-v0_8-whitegrid",
+            {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE},
+        ]
     ):
-        figure = Figure(figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08))
+        figure = Figure(
+            figsize=(9.6, 6.2), layout=ConstrainedLayoutEngine(h_pad=0.06, w_pad=0.08)
+        )
         axes = figure.subplots(2, 2, sharex=True).ravel()
 
     runs = comparison.runs
@@ -66,7 +71,9 @@ def draw_comparison(comparison: Comparison) -> Figure:
                 zorder=3 + row,
             )
         if divergence_time is not None:
-            axis.axvline(divergence_time, color="0.35", linewidth=0.9, linestyle="-.", zorder=1)
+            axis.axvline(
+                divergence_time, color="0.35", linewidth=0.9, linestyle="-.", zorder=1
+            )
 
     speed_axis, gap_axis, pedal_axis, ttc_axis = axes
     for row in comparison.rows:
@@ -76,16 +83,23 @@ def draw_comparison(comparison: Comparison) -> Figure:
     gap_axis.set_ylim(-0.22 * gap_axis.get_ylim()[1], None)
     pedal_axis.set(ylim=(-1.08, 1.08), xlabel="time [s]")
     pedal_axis.set_yticks([-1, -0.5, 0, 0.5, 1], ["1", "0.5", "0", "0.5", "1"])
-    ttc_axis.set(ylim=(0, None), xlim=(None, _end_time(comparison) * 1.25), xlabel="time [s]")
+    ttc_axis.set(
+        ylim=(0, None), xlim=(None, _end_time(comparison) * 1.25), xlabel="time [s]"
+    )
     ttc_axis.axhline(
-        comparison.system.metrics_table.ttc_threshold, color="0.4", linewidth=0.9, linestyle=":"
+        comparison.system.metrics_table.ttc_threshold,
+        color="0.4",
+        linewidth=0.9,
+        linestyle=":",
     )
     figure.suptitle(_heading(comparison).replace("$", r"\$"), fontsize=FONT_SIZE + 1)
     _draw_legend(figure, comparison, divergence_time)
     return figure
 
 
-def _mark_moments(speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row: int) -> None:
+def _mark_moments(
+    speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row: int
+) -> None:
     """Mark where a vehicle begins to brake, is nearest, and collides. The original's marks are
     larger, to show behind the changed vehicle's.
     """
@@ -132,9 +146,21 @@ def _mark_moments(speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row:
             ha="left",
         )
     if nearest is not None and np.isfinite(gap := trace.gap[nearest, row]):
-        is_largest = np.argmax(np.where(trace.active, trace.gap, np.inf).min(axis=0)) == row
-        mark, text = (IMPACT_MARK, "impact") if has_impact else (NEAREST_MARK, f"{gap:.2f} m")
-        draw(gap_axis, nearest, gap, mark, text, xytext=(0, 9 if is_largest else -17), ha="center")
+        is_largest = (
+            np.argmax(np.where(trace.active, trace.gap, np.inf).min(axis=0)) == row
+        )
+        mark, text = (
+            (IMPACT_MARK, "impact") if has_impact else (NEAREST_MARK, f"{gap:.2f} m")
+        )
+        draw(
+            gap_axis,
+            nearest,
+            gap,
+            mark,
+            text,
+            xytext=(0, 9 if is_largest else -17),
+            ha="center",
+        )
 
 
 def _end_time(comparison: Comparison) -> float:
@@ -143,11 +169,15 @@ def _end_time(comparison: Comparison) -> float:
     last_moving = np.flatnonzero(
         (runs.trace.active & (runs.trace.speed > STANDSTILL)).any(axis=1)
     ).max(initial=0)
-    last_sample = max(last_moving, *(moments.nearest or 0 for moments in comparison.moments))
+    last_sample = max(
+        last_moving, *(moments.nearest or 0 for moments in comparison.moments)
+    )
     return float(runs.trace.time[min(last_sample + 1, len(runs.trace.time) - 1)])
 
 
-def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float | None) -> None:
+def _draw_legend(
+    figure: Figure, comparison: Comparison, divergence_time: float | None
+) -> None:
     """Draw the legend: vehicles, marks, and lines."""
     from matplotlib.lines import Line2D
 
@@ -166,7 +196,9 @@ def _draw_legend(figure: Figure, comparison: Comparison, divergence_time: float 
         add(label, marker=mark, linestyle="", markersize=7)
     if divergence_time is not None:
         add("speeds diverge (by 0.1 m/s)", linestyle="-.", linewidth=0.9)
-    threshold = f"TTC* = {comparison.system.metrics_table.ttc_threshold:g} s: critical below"
+    threshold = (
+        f"TTC* = {comparison.system.metrics_table.ttc_threshold:g} s: critical below"
+    )
     add(threshold, color="0.4", linestyle=":", linewidth=0.9)
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
 
@@ -176,7 +208,9 @@ def find_divergence(runs: SimulationRuns) -> int | None:
     None if they never do, or if nothing is changed.
     """
     trace = runs.trace
-    have_diverged = trace.active.all(axis=1) & (np.ptp(trace.speed, axis=1) > MIN_DIVERGENCE)
+    have_diverged = trace.active.all(axis=1) & (
+        np.ptp(trace.speed, axis=1) > MIN_DIVERGENCE
+    )
     if have_diverged.any():
         return int(np.argmax(have_diverged))
     return None
@@ -187,5 +221,8 @@ def _heading(comparison: Comparison) -> str:
     # No line breaks at "\0", which stands for the spaces of a change.
     changes = ", ".join(change.replace(" ", "\0") for change in comparison.changes)
     line = f"changed: {changes}" if changes else "the original vehicle"
-    lines = [*textwrap.wrap(comparison.title, LINE_LENGTH), *textwrap.wrap(line, LINE_LENGTH)]
+    lines = [
+        *textwrap.wrap(comparison.title, LINE_LENGTH),
+        *textwrap.wrap(line, LINE_LENGTH),
+    ]
     return "\n".join(lines).replace("\0", " ")

@@ -84,7 +84,9 @@ def show_in_gui(comparison: Comparison, pictures: Path | None = None) -> None:
             start += PAUSE
         time.sleep(max(0.0, start + (sample + 1) * runs.trace.step - time.monotonic()))
 
-    drive_again(comparison.system, comparison.evaluations.settings, runs, watch, _open_view)
+    drive_again(
+        comparison.system, comparison.evaluations.settings, runs, watch, _open_view
+    )
 
 
 def _look_at(world: SumoWorld) -> None:

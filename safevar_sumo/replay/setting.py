@@ -8,12 +8,22 @@ import pandas as pd
 from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
-from safevar_sumo.questions.words import EXACT, change_texts, join_phrases, points_in_words
+from safevar_sumo.questions.words import (
+    EXACT,
+    change_texts,
+    join_phrases,
+    points_in_words,
+)
 from safevar_sumo.records import FloatArray
 from safevar_sumo.results import SolutionId
 from safevar_sumo.scenarios import pre_crash_sentence
 from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE
-from safevar_sumo.sumo.matrix import PointResult, point_record, simulate_all_points, vehicle_remarks
+from safevar_sumo.sumo.matrix import (
+    PointResult,
+    point_record,
+    simulate_all_points,
+    vehicle_remarks,
+)
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.without_effect import without_effect
 from safevar_sumo.vehicles import CharacteristicSet
@@ -37,14 +47,22 @@ POINTS: Columns = {
     "point": "point of the study's matrix",
     "outcome": "how the simulation ends",
     "impact_speed": Column("m/s", "speed of the vehicle at the collision", ".2f"),
-    "relative_impact_speed": Column("m/s", "relative speed of the impact", ".2f", is_shown=False),
-    SAFETY_DEGREE: Column("m", "safety degree; minus a collision's closing speed in m/s", ".2f"),
+    "relative_impact_speed": Column(
+        "m/s", "relative speed of the impact", ".2f", is_shown=False
+    ),
+    SAFETY_DEGREE: Column(
+        "m", "safety degree; minus a collision's closing speed in m/s", ".2f"
+    ),
     "gap": Column("m", "least distance between bodies", ".2f", is_shown=False),
-    STOPPING_DISTANCE.name: Column("m", "distance from the first brake force to standstill", ".1f"),
+    STOPPING_DISTANCE.name: Column(
+        "m", "distance from the first brake force to standstill", ".1f"
+    ),
     "test_speed_error": Column(
         "km/h", "deviation from the test speed before the driving system acts", "+.1f"
     ),
-    "warning_ttc": Column("s", "time to collision at the first warning", is_shown=False),
+    "warning_ttc": Column(
+        "s", "time to collision at the first warning", is_shown=False
+    ),
     "side": Column("", "side of the vehicle that touches", is_shown=False),
     "place": Column("%", "position of the contact along that side", is_shown=False),
 }
@@ -75,7 +93,9 @@ def _meets(system: System, setting: FloatArray) -> list[str]:
     if places:
         sentences.append(f"The encounter has {join_phrases(places)}.")
     if phase := values.get(PHASE):
-        sentences.append(f"The encounter begins {phase:g} steps of the driving system later.")
+        sentences.append(
+            f"The encounter begins {phase:g} steps of the driving system later."
+        )
     return sentences
 
 
@@ -86,13 +106,17 @@ def _fails(system: System, result: PointResult) -> bool:
     criterion = system.with_contact(system.criterion)
     bound = criterion.bound
     evaluations = result.evaluations
-    if not criterion.is_collision and (bound is None or bound.measure in evaluations.metrics):
+    if not criterion.is_collision and (
+        bound is None or bound.measure in evaluations.metrics
+    ):
         return bool(criterion.of(evaluations)[0])
     is_allowed = result.runs.relative_speed[0] <= result.point.allowed_impact_speed
     return bool(evaluations.collided[0] and not is_allowed)
 
 
-def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId | None) -> Answer:
+def answer_of_setting(
+    system: System, simulation: Simulation, handle: SolutionId | None
+) -> Answer:
     """A setting beside the original: its values, outcome, metrics and objectives, and the points of
     a matrix; of a solution its handle.
     """
@@ -113,7 +137,9 @@ def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId
     original = simulation.original.numbers
     simulated = simulation.numbers
     units = {"outcome": "", **simulation.units}
-    results = [(name, unit, original[name], simulated[name]) for name, unit in units.items()]
+    results = [
+        (name, unit, original[name], simulated[name]) for name, unit in units.items()
+    ]
     frame = _without_repetition(tabulate("Results", RESULTS, results), simulation)
     names = frame["result"]
     frame.attrs["words"] = {name: name.replace("_", " ") for name in names}
@@ -125,11 +151,15 @@ def answer_of_setting(system: System, simulation: Simulation, handle: SolutionId
         tables["points"], failing = _points(system, setting)
         is_changed = simulation.setting != simulation.original.setting
         vehicle = "changed" if is_changed else "original"
-        verdict.append(points_in_words(f"The {vehicle} vehicle", failing, len(system.matrix)))
+        verdict.append(
+            points_in_words(f"The {vehicle} vehicle", failing, len(system.matrix))
+        )
 
     rows = [(remark,) for remark in dict.fromkeys(remarks)]
     tables["remarks"] = tabulate("Remarks", REMARKS, rows)
-    if texts := change_texts(system.characteristics.vehicle, system.characteristics.named(setting)):
+    if texts := change_texts(
+        system.characteristics.vehicle, system.characteristics.named(setting)
+    ):
         verdict.append(f"Changed: {', '.join(texts)}.")
     verdict += _meets(system, setting)
     numbers = simulation.numbers
@@ -168,12 +198,16 @@ def _without_repetition(frame: pd.DataFrame, simulation: Simulation) -> pd.DataF
 
 
 def _characteristics(simulation: Simulation) -> pd.DataFrame:
-    pairs = zip(CharacteristicSet.of(simulation.study), simulation.setting.values(), strict=True)
+    pairs = zip(
+        CharacteristicSet.of(simulation.study), simulation.setting.values(), strict=True
+    )
     rows = (
         (item.name, item.unit, item.original, value, value != item.original, item.words)
         for item, value in pairs
     )
-    return _without_repetition(tabulate(simulation.study.title, CHARACTERISTICS, rows), simulation)
+    return _without_repetition(
+        tabulate(simulation.study.title, CHARACTERISTICS, rows), simulation
+    )
 
 
 def _verdict(simulation: Simulation, point_count: int) -> list[str]:
@@ -197,7 +231,10 @@ def _verdict(simulation: Simulation, point_count: int) -> list[str]:
     if simulation.setting == simulation.original.setting:
         verdict = [f"{where} {original}{worst}."]
     elif worst:
-        verdict = [f"The {changed}{worst}.", f"In the same test case the {original}: {comparison}."]
+        verdict = [
+            f"The {changed}{worst}.",
+            f"In the same test case the {original}: {comparison}.",
+        ]
     else:
         verdict = [f"{where} {original}.", f"The {changed}: {comparison}."]
 
@@ -231,4 +268,9 @@ def _safety_comparison(simulation: Simulation) -> str:
 def _remarks_of(system: System) -> list[str]:
     remarks = [remark for point in system.points for remark in point.scenario.remarks()]
     pre_crash = pre_crash_sentence(system.points)
-    return [*remarks, *without_effect(system), *vehicle_remarks(system), *filter(None, [pre_crash])]
+    return [
+        *remarks,
+        *without_effect(system),
+        *vehicle_remarks(system),
+        *filter(None, [pre_crash]),
+    ]

@@ -18,10 +18,18 @@ from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.options import PointName, Range, UpTo
 from safevar_sumo.questions.part import part_of_study
-from safevar_sumo.questions.subject import refuse_part_of_results, study_in, study_or_case
+from safevar_sumo.questions.subject import (
+    refuse_part_of_results,
+    study_in,
+    study_or_case,
+)
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.replay import animation
-from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
+from safevar_sumo.replay.comparison import (
+    comparison_of,
+    list_differences,
+    why_different,
+)
 from safevar_sumo.replay.figure import draw_comparison
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.replay.setting import (
@@ -32,7 +40,13 @@ from safevar_sumo.replay.setting import (
     RESULTS,
     answer_of_setting,
 )
-from safevar_sumo.results import CHOICES, SOLUTIONS, SolutionId, choose_handle, row_of_handle
+from safevar_sumo.results import (
+    CHOICES,
+    SOLUTIONS,
+    SolutionId,
+    choose_handle,
+    row_of_handle,
+)
 from safevar_sumo.study import PHASE, PHASE_DECIMALS, Study
 from safevar_sumo.sumo.encounters import where_met
 from safevar_sumo.sumo.system import System, assemble
@@ -53,7 +67,9 @@ class Target(NamedTuple):
         if self.row is None:
             return system.characteristics.original
         values = system.characteristics.named(system.characteristics.original)
-        return np.array([self.row.get(name, value) for name, value in values.items()], dtype=float)
+        return np.array(
+            [self.row.get(name, value) for name, value in values.items()], dtype=float
+        )
 
 
 @contents(
@@ -116,7 +132,9 @@ def show_simulation(
         Use the present files and versions, although the results were computed with other files or
         versions. Default: an error.
     """
-    target = load_target(source, solution, as_it_is_now, point, ranges=ranges, up_to=up_to)
+    target = load_target(
+        source, solution, as_it_is_now, point, ranges=ranges, up_to=up_to
+    )
     study = _with_set(target.study, fit)
     system = assemble(study)
     changes = set
@@ -130,7 +148,9 @@ def show_simulation(
         requested = np.array([*{**target_values, **values}.values()])
         # What a study or results hold has been checked.
         if changes and not beyond:
-            system.region.check(requested[np.newaxis], otherwise=", or any with --beyond")
+            system.region.check(
+                requested[np.newaxis], otherwise=", or any with --beyond"
+            )
 
     # Files that cannot be written are refused first.
     if trace is not None:
@@ -163,7 +183,9 @@ def _where_met(system: System, setting: FloatArray) -> System:
     """The system at the points that a setting, shape (n,), meets; a warning names other tests."""
     reduced = where_met(system, setting)
     if names := sorted(_tests_of(system) - _tests_of(reduced)):
-        warn(f"not driven, as their ranges do not have this encounter: {', '.join(names)}")
+        warn(
+            f"not driven, as their ranges do not have this encounter: {', '.join(names)}"
+        )
     return reduced
 
 
@@ -188,7 +210,9 @@ def load_target(
     InputError
         If there is no such study, directory, solution or point.
     """
-    subject = study_or_case(source, as_it_is_now=as_it_is_now, results_only=solution is not None)
+    subject = study_or_case(
+        source, as_it_is_now=as_it_is_now, results_only=solution is not None
+    )
     if not isinstance(subject, Study):
         if subject.shortfall:
             warn(subject.shortfall)
@@ -223,7 +247,9 @@ def _with_set(study: Study, fit: int) -> Study:
     return sets[fit]
 
 
-def _warn_of_differences(target: Target, row: JsonObject, simulation: Simulation) -> None:
+def _warn_of_differences(
+    target: Target, row: JsonObject, simulation: Simulation
+) -> None:
     why = why_different(is_imported="run" not in row)
     for difference in list_differences(simulation.evaluation, row):
         warn(f"{target.handle} of {target.source}: {difference}; {why}")

@@ -49,8 +49,14 @@ def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str,
         samples.add(sample)
 
     times, repeats = BESIDES
-    remaining_simulations -= len(free) * (times * simulations_of_setting(system) + repeats)
+    remaining_simulations -= len(free) * (
+        times * simulations_of_setting(system) + repeats
+    )
     part = remaining_simulations // max(len(costly), 1)
     if part < 1:
-        raise InputError("simulations", f"{simulations:,} do not suffice for {len(costly) + len(free)} questions", "a larger number, or fewer questions (--ask)")
+        raise InputError(
+            "simulations",
+            f"{simulations:,} do not suffice for {len(costly) + len(free)} questions",
+            "a larger number, or fewer questions (--ask)",
+        )
     return {**dict.fromkeys([*costly, *free], part), REPLAYS: replays}

@@ -37,7 +37,13 @@ from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.report.budget import REPLAYS
-from safevar_sumo.report.pack import DESCRIPTION, PACK, PackedManifest, PackedStudy, json_of
+from safevar_sumo.report.pack import (
+    DESCRIPTION,
+    PACK,
+    PackedManifest,
+    PackedStudy,
+    json_of,
+)
 from safevar_sumo.report.page import make_page, usual_questions
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.report.sheet import with_answers
@@ -51,7 +57,14 @@ from safevar_sumo.results import (
     manifest_of,
     record,
 )
-from safevar_sumo.study import Origin, Study, convert_table, tables_of, user_code_names, write_study
+from safevar_sumo.study import (
+    Origin,
+    Study,
+    convert_table,
+    tables_of,
+    user_code_names,
+    write_study,
+)
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Parts, Progress
 
@@ -127,14 +140,20 @@ class Packed:
         with about(MANIFEST):
             manifest = convert_table(self.manifest, PackedManifest)
         study = manifest.study
-        for key, _, _ in changed_values(self.manifest["study"], tables_of(study), "study"):
-            raise ValueError(f"{MANIFEST}: {key} is not as the command `study` writes it")
+        for key, _, _ in changed_values(
+            self.manifest["study"], tables_of(study), "study"
+        ):
+            raise ValueError(
+                f"{MANIFEST}: {key} is not as the command `study` writes it"
+            )
         study = msgspec.structs.replace(study, origin=Origin(places=tuple(places)))
         self._check_claims(study)
         solutions = read_table(files[SOLUTIONS])
         self._check_solutions(study, solutions)
         outcomes = packed.outcomes
-        codes = np.repeat(np.arange(len(outcomes), dtype=np.int8), list(outcomes.values()))
+        codes = np.repeat(
+            np.arange(len(outcomes), dtype=np.int8), list(outcomes.values())
+        )
         evaluations = pd.DataFrame(
             {"outcome": pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))}
         )
@@ -154,25 +173,34 @@ class Packed:
             raise ValueError(f"there is no outcome {min(unknown)!r}")
         if not set(runs) <= set(all_runs(study)) or len(runs) > len({*runs}):
             raise ValueError(f"the study has no such runs: {runs[:3]}")
-        if (total := sum(outcomes.values())) > SURPLUS * len(runs) * study.search.evaluations:
+        total = sum(outcomes.values())
+        if total > SURPLUS * len(runs) * study.search.evaluations:
             raise ValueError(
                 f"{total:,} evaluations are far more than {number_of(len(runs), 'run')} may have"
             )
 
         # No question writes a file, or takes for ever.
-        words = [word for text in self.packed.questions for word in split(text.replace("=", " "))]
+        words = split(" ".join(self.packed.questions).replace("=", " "))
         numbers = [int(word) for word in words if WHOLE_NUMBER.fullmatch(word.strip())]
         total = sum(map(abs, [*numbers, *self.packed.simulations.values()]))
         if total > MAX_ASKED:
-            raise InputError("ask", f"its questions ask for {total:,} vehicles and simulations", f"at most {MAX_ASKED:,} in a pack")
+            raise InputError(
+                "ask",
+                f"its questions ask for {total:,} vehicles and simulations",
+                f"at most {MAX_ASKED:,} in a pack",
+            )
         for text in self.packed.questions:
             if "--out" in split(text):
-                raise InputError("ask", f"{text!r} writes a file", "a question without --out")
+                raise InputError(
+                    "ask", f"{text!r} writes a file", "a question without --out"
+                )
 
         named = [*filter(None, map(list_in, self.packed.questions))]
         packed = [name for name in self.files if name.startswith(f"{LISTS}/")]
         if sorted(named) != sorted(packed):
-            raise ValueError(f"{LISTS}: {packed or 'nothing'} instead of {named or 'nothing'}")
+            raise ValueError(
+                f"{LISTS}: {packed or 'nothing'} instead of {named or 'nothing'}"
+            )
 
     def _check_solutions(self, study: Study, solutions: pd.DataFrame) -> None:
         """Refuse a table of solutions with columns or rows that are missing, new or there twice."""
@@ -182,13 +210,17 @@ class Packed:
         }
         # Pandas calls a second column x "x.1".
         if wrong := expected ^ {*solutions}:
-            raise ValueError(f"{SOLUTIONS}: the column {min(wrong)} is missing, new or there twice")
+            raise ValueError(
+                f"{SOLUTIONS}: the column {min(wrong)} is missing, new or there twice"
+            )
         if count_solutions(solutions, self.packed.runs) != self.packed.solutions:
             raise ValueError(f"{SOLUTIONS} has other rows than {DESCRIPTION} says")
         different = solutions.drop_duplicates(["algorithm", "run", *study.domains])
         for outcome, count in different["outcome"].value_counts().items():
             if count > (stated := self.packed.outcomes.get(str(outcome), 0)):
-                raise ValueError(f"{count} solutions of {stated} simulations have {outcome}")
+                raise ValueError(
+                    f"{count} solutions of {stated} simulations have {outcome}"
+                )
 
     @cached_property
     def judged_case(self) -> Case:
@@ -205,7 +237,9 @@ class Packed:
         """The criterion of the pack."""
         return None if self.packed.unsafe is None else Unsafe.parse(self.packed.unsafe)
 
-    def answer(self, text: str, parsed: tuple[Question, JsonObject] | None = None) -> Answer:
+    def answer(
+        self, text: str, parsed: tuple[Question, JsonObject] | None = None
+    ) -> Answer:
         """The answer to a question of the pack, or to another one under a name."""
         if text in self._answers:
             return self._answers[text]
@@ -266,7 +300,11 @@ class Packed:
         """A study file with all that the study extends."""
         with temporary_folder() as folder:
             path = Path(folder, f"{self.case.study.name}.toml")
-            write_study(path, self.case.study, "The study as it was run, with all that it extends.")
+            write_study(
+                path,
+                self.case.study,
+                "The study as it was run, with all that it extends.",
+            )
             # Its first line has the path of the schema on this machine.
             return path.read_bytes().partition(b"\n")[2]
 
@@ -279,7 +317,9 @@ class Packed:
         evaluations = evaluate_with_workers(
             self.case.study, settings, jobs=self._jobs, progress=self._progress
         )
-        frame = evaluations_frame(names, [(("", 0), evaluations.take(range(1, len(settings))))])
+        frame = evaluations_frame(
+            names, [(("", 0), evaluations.take(range(1, len(settings))))]
+        )
         frame[["algorithm", "run"]] = solutions[["algorithm", "run"]].to_numpy()
         return json_bytes(record(evaluations, row=0)), csv_of(in_order(frame, names))
 
@@ -290,7 +330,11 @@ class Packed:
             study = self.case.study
             runs = self.packed.runs
             results = run(
-                study, Path(folder, "results"), jobs=self._jobs, progress=self._progress, only=runs
+                study,
+                Path(folder, "results"),
+                jobs=self._jobs,
+                progress=self._progress,
+                only=runs,
             )
             return json_bytes(count_outcomes(results.case)), csv_of(results.solutions)
 
@@ -310,16 +354,23 @@ class Packed:
         yield Claim(
             "inputs",
             b"",
-            lambda: "; ".join(changes_since(folder, self.case, as_it_is_now=True)).encode(),
+            lambda: "; ".join(
+                changes_since(folder, self.case, as_it_is_now=True)
+            ).encode(),
         )
         yield Claim("study", self.files[STUDY], self.study_file)
-
         yield Claim(
-            "original vehicle", json_bytes(self.manifest["original"]), lambda: self.simulated[0]
+            "original vehicle",
+            json_bytes(self.manifest["original"]),
+            lambda: self.simulated[0],
         )
         yield Claim("solutions", solutions, lambda: self.simulated[1])
-        for text, answer in zip(self.packed.questions, json_of(self.files[ANSWERS]), strict=True):
-            yield Claim(f"answer {text}", json_bytes(answer), partial(self._answer_json, text))
+        for text, answer in zip(
+            self.packed.questions, json_of(self.files[ANSWERS]), strict=True
+        ):
+            yield Claim(
+                f"answer {text}", json_bytes(answer), partial(self._answer_json, text)
+            )
         yield Claim("report", self.files[PAGE], self.page)
 
         outcomes = "search: outcomes", json_bytes(self.packed.outcomes)
@@ -402,12 +453,18 @@ def count_outcomes(case: Case) -> dict[str, int]:
     }
 
 
-def count_solutions(solutions: pd.DataFrame, runs: Sequence[tuple[str, int]]) -> list[int]:
+def count_solutions(
+    solutions: pd.DataFrame, runs: Sequence[tuple[str, int]]
+) -> list[int]:
     """The numbers of solutions of each run, of all, and of different ones: a run may return a
     setting twice.
     """
     counts = Counter(zip(solutions["algorithm"], solutions["run"], strict=True))
-    return [*(counts[run] for run in runs), len(solutions), len(solutions.drop_duplicates())]
+    return [
+        *(counts[run] for run in runs),
+        len(solutions),
+        len(solutions.drop_duplicates()),
+    ]
 
 
 def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
@@ -423,7 +480,9 @@ def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
 
     # Lines may be long: the text around the first character that differs is enough.
     lines = claim.packed.decode().splitlines(keepends=True)
-    pairs = zip_longest(lines, computed.decode().splitlines(keepends=True), fillvalue="nothing")
+    pairs = zip_longest(
+        lines, computed.decode().splitlines(keepends=True), fillvalue="nothing"
+    )
     pair = next(pair for pair in pairs if len(set(pair)) > 1)
     line = _shown(*pair)
     counterpart = _shown(*pair[::-1])

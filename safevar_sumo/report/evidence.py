@@ -17,7 +17,12 @@ from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.errors import InputError, describe_error
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable, temporary_folder
-from safevar_sumo.plugins import code_files, file_by_name, is_of_shipped_network, only_from
+from safevar_sumo.plugins import (
+    code_files,
+    file_by_name,
+    is_of_shipped_network,
+    only_from,
+)
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion
 from safevar_sumo.questions.by_criterion import cases_by
@@ -139,10 +144,13 @@ def evidence(
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
         for number, directory in enumerate(directories, 1):
             part = simulations and simulations // len(directories)
-            described, study_files = _pack_study(number, directory, ask, unsafe, how, show, part)
+            described, study_files = _pack_study(
+                number, directory, ask, unsafe, how, show, part
+            )
             studies.append(described)
             files |= {
-                f"{described.folder}/{name}": content for name, content in study_files.items()
+                f"{described.folder}/{name}": content
+                for name, content in study_files.items()
             }
     write_pack(out, studies, files)
     return f"{out} ({out.stat().st_size / 1e6:.2f} MB, sha256 {digest_of(out)})"
@@ -162,12 +170,18 @@ def _pack_study(
     assert isinstance(case, Case)
     if not case.has_runs:
         raise InputError(
-            directory, "holds imported solutions, which have no identity", "results of `study`"
+            directory,
+            "holds imported solutions, which have no identity",
+            "results of `study`",
         )
     study = case.study
     # `verify` compares or names what a pack has of the manifest.
     stored = {**read_manifest(directory), "study": tables_of(study)}
-    manifest = {name: stored[name] for name in PackedManifest.__struct_fields__ if name in stored}
+    manifest = {
+        name: stored[name]
+        for name in PackedManifest.__struct_fields__
+        if name in stored
+    }
 
     (judged,) = cases_by([case], unsafe, progress=show_no_progress, **how)
     questions, lists = _with_lists(list(dict.fromkeys(ask or usual_questions(judged))))
@@ -176,20 +190,37 @@ def _pack_study(
     parts = dict[str, int]()
     if simulations is not None:
         system = assemble(judged.study)
-        spent = len(case.settings) * (judged.study != case.study) * simulations_of_setting(system)
+        spent = (
+            len(case.settings)
+            * (judged.study != case.study)
+            * simulations_of_setting(system)
+        )
         parts = divided(with_speed_part(questions, case), simulations - spent, system)
     outcomes = count_outcomes(case)
     solutions = count_solutions(case.solutions, runs)
     described = PackedStudy(
-        folder, questions, runs, outcomes, solutions, str(unsafe) if unsafe else None, parts
+        folder,
+        questions,
+        runs,
+        outcomes,
+        solutions,
+        str(unsafe) if unsafe else None,
+        parts,
     )
 
     code = _files_of_user(study, manifest["files"], questions)
-    files = {MANIFEST: json_bytes(manifest), SOLUTIONS: csv_of(case.solutions), **lists, **code}
+    files = {
+        MANIFEST: json_bytes(manifest),
+        SOLUTIONS: csv_of(case.solutions),
+        **lists,
+        **code,
+    }
     show_part = Parts(progress).begin(study.name)
     with open_pool(**how) as pool:
         pool.shared = {} if simulations and assemble(study).mover.takes_long else None
-        packed = Packed(described, files, study.origin.places, how["jobs"], show_part, pool)
+        packed = Packed(
+            described, files, study.origin.places, how["jobs"], show_part, pool
+        )
         answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
         packed.ask_speed()
         opened = {name: "" for names in pool.opened.values() for name in names}
@@ -226,25 +257,48 @@ def _files_of_user(
     # What a study names beside itself is there in a pack, too.
     beside = [*data_files(study), *(name for _, name in fmus_of(study))]
     paths_beside = [os.path.abspath(Path(places[0], name)) for name in beside]
-    outside = [path for path in paths_beside if not Path(path).is_relative_to(places[0])]
+    outside = [
+        path for path in paths_beside if not Path(path).is_relative_to(places[0])
+    ]
     for name in [*outside, *filter(os.path.isabs, names)]:
-        raise InputError(name, "lies outside the study's folders, so that no pack can hold it", "a copy beside the study, which then names the copy")
+        raise InputError(
+            name,
+            "lies outside the study's folders, so that no pack can hold it",
+            "a copy beside the study, which then names the copy",
+        )
 
     # SUMO does not start without the views that a network names.
     for name in [name for name in names if Path(name).name == OPTIONS_FILE]:
-        if view := options_in(Path(file_by_name(name, places))).get("gui-settings-file"):
+        if view := options_in(Path(file_by_name(name, places))).get(
+            "gui-settings-file"
+        ):
             names.append(str(Path(name).with_name(view)))
-    paths = {name: Path(place) for name in names if (place := file_by_name(name, places))}
+    paths = {
+        name: Path(place) for name in names if (place := file_by_name(name, places))
+    }
 
-    modules = [text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]]
+    modules = [
+        text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]
+    ]
     folders = [folder for folder in (*places, os.getcwd(), *sys.path) if folder]
     for path in code_files(modules, places):
-        folder = max((folder for folder in folders if path.is_relative_to(folder)), key=len)
+        folder = max(
+            (folder for folder in folders if path.is_relative_to(folder)), key=len
+        )
         paths[path.relative_to(folder).as_posix()] = path
     return {f"{CODE}/{name}": path.read_bytes() for name, path in sorted(paths.items())}
 
 
-@contents("passed", "sha256", "claims", "same", "differs", "cannot", "unchecked", claims=CLAIMS)
+@contents(
+    "passed",
+    "sha256",
+    "claims",
+    "same",
+    "differs",
+    "cannot",
+    "unchecked",
+    claims=CLAIMS,
+)
 def verify(
     pack: str | Path,
     *,
@@ -287,18 +341,28 @@ def verify(
             place = Path(folder, str(number))
             studies[place] = _unpack(path, described, files, place, jobs, show)
         names_of_studies = {
-            f"{packed.packed.folder}/{name}" for packed in studies.values() for name in packed.files
+            f"{packed.packed.folder}/{name}"
+            for packed in studies.values()
+            for name in packed.files
         }
         if unknown := files.keys() - names_of_studies:
             raise InputError(path, f"{min(unknown)} belongs to no study", PACK)
 
         # Its code runs only if the user trusts it.
-        if not run_code and (code := [name for packed in studies.values() for name in packed.code]):
-            raise InputError(path, f"`verify` would run code of the pack: {', '.join(code)}", "`run_code=True`, if you trust it")
+        if not run_code and (
+            code := [name for packed in studies.values() for name in packed.code]
+        ):
+            raise InputError(
+                path,
+                f"`verify` would run code of the pack: {', '.join(code)}",
+                "`run_code=True`, if you trust it",
+            )
 
         names = ", ".join(packed.case.study.name for packed in studies.values())
         of_files = Claim(
-            "files", json_bytes(description.files), lambda: json_bytes(digests_of(files))
+            "files",
+            json_bytes(description.files),
+            lambda: json_bytes(digests_of(files)),
         )
         rows = [compare_claim(names, of_files)]
         for place, packed in studies.items():
@@ -328,11 +392,17 @@ def verify(
     )
 
 
-def _not_compared(description: Description, studies: Iterable[Packed], unchecked: int) -> str:
+def _not_compared(
+    description: Description, studies: Iterable[Packed], unchecked: int
+) -> str:
     """Sentences on what a pack says that `verify` does not check or compare, each after a space."""
     # Versions and machines may differ, as their results are compared.
-    pairs = {DESCRIPTION: ({"versions": description.versions}, {"versions": versions_here()})}
-    pairs |= {f"{packed.packed.folder}/{MANIFEST}": packed.versions for packed in studies}
+    pairs = {
+        DESCRIPTION: ({"versions": description.versions}, {"versions": versions_here()})
+    }
+    pairs |= {
+        f"{packed.packed.folder}/{MANIFEST}": packed.versions for packed in studies
+    }
     parts = [
         f"{key} of {file}: {stated} ({present} here)"
         for file, versions in pairs.items()
@@ -368,7 +438,11 @@ def _unpack(
         for name, content in files.items()
         if name.startswith(prefix)
     }
-    code = {name: content for name, content in own_files.items() if name.startswith(f"{CODE}/")}
+    code = {
+        name: content
+        for name, content in own_files.items()
+        if name.startswith(f"{CODE}/")
+    }
     lists = {name for name in own_files if name.startswith(f"{LISTS}/")}
 
     # Anybody may have edited a pack: its files are checked before one of them is used.
@@ -383,11 +457,17 @@ def _unpack(
         for name in FILES:
             own_files[name].decode()
         if len(json_of(own_files[ANSWERS])) != len(described.questions):
-            raise ValueError(f"{ANSWERS} answers other questions than {DESCRIPTION} names")
+            raise ValueError(
+                f"{ANSWERS} answers other questions than {DESCRIPTION} names"
+            )
         for name in json_of(own_files[MANIFEST])["files"]:
             if not (is_of_shipped_network(name) or f"{CODE}/{name}" in code):
-                raise ValueError(f"{name}, on which the results depend, is not in the pack")
-        return Packed(described, own_files, [str(folder / CODE)] if code else [], jobs, progress)
+                raise ValueError(
+                    f"{name}, on which the results depend, is not in the pack"
+                )
+        return Packed(
+            described, own_files, [str(folder / CODE)] if code else [], jobs, progress
+        )
     except (*MALFORMED, InputError) as error:
         raise InputError(
             path, f"{described.folder} is damaged: {describe_error(error)}", PACK

@@ -82,9 +82,13 @@ class Description(Struct, frozen=True, forbid_unknown_fields=True):
     studies: Annotated[list[PackedStudy], Meta(min_length=1)]
 
 
-def write_pack(path: Path, studies: list[PackedStudy], files: Mapping[str, bytes]) -> None:
+def write_pack(
+    path: Path, studies: list[PackedStudy], files: Mapping[str, bytes]
+) -> None:
     """Write a pack; equal contents give equal bytes."""
-    described = msgspec.json.encode(Description(versions_here(), digests_of(files), studies))
+    described = msgspec.json.encode(
+        Description(versions_here(), digests_of(files), studies)
+    )
     texts = {DESCRIPTION: msgspec.json.format(described, indent=1) + b"\n", **files}
     with whole_file(path, "out") as file, zipfile.ZipFile(file, "w") as archive:
         for name in sorted(texts):
@@ -99,7 +103,10 @@ def versions_here() -> dict[str, str]:
     """Versions of Python and of the packages with which a pack's answers and page are computed."""
     # Matplotlib and Pillow draw the pictures of the page.
     packages = (*PACKAGES, "matplotlib", "pillow")
-    return {**{name: version(name) for name in packages}, "python": sys.version.split()[0]}
+    return {
+        **{name: version(name) for name in packages},
+        "python": sys.version.split()[0],
+    }
 
 
 def json_of(content: bytes) -> Any:
@@ -143,9 +150,13 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         with zipfile.ZipFile(io.BytesIO(read_file(path, MAX_UNPACKED))) as archive:
             _check_entries(path, archive.infolist())
             _check_layout(path, archive.infolist())
-            files = {entry.filename: archive.read(entry) for entry in archive.infolist()}
+            files = {
+                entry.filename: archive.read(entry) for entry in archive.infolist()
+            }
     except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror or error}", PACK) from None
+        raise InputError(
+            path, f"cannot be read: {error.strerror or error}", PACK
+        ) from None
     except (
         zipfile.BadZipFile,
         ValueError,
@@ -174,7 +185,11 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         if described.versions.get(name) != present[name]
     ]
     if changed:
-        raise InputError(path, f"was made with {', '.join(changed)}", f"a pack of this version: {', '.join(map(' '.join, present.items()))}")
+        raise InputError(
+            path,
+            f"was made with {', '.join(changed)}",
+            f"a pack of this version: {', '.join(map(' '.join, present.items()))}",
+        )
     return described, files
 
 
@@ -197,10 +212,14 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
             _refuse(path, f"{name!r} is a symbolic link")
 
     if len(names) > MAX_FILES or len(names) != len(set(names)):
-        _refuse(path, f"holds {len(names)} files, at most {MAX_FILES} are allowed, each once")
+        _refuse(
+            path,
+            f"holds {len(names)} files, at most {MAX_FILES} are allowed, each once",
+        )
     if (size := sum(entry.file_size for entry in entries)) > MAX_UNPACKED:
         _refuse(
-            path, f"unpacked it has {size / 1e9:.1f} GB, at most {MAX_UNPACKED / 1e9:g} are allowed"
+            path,
+            f"unpacked it has {size / 1e9:.1f} GB, at most {MAX_UNPACKED / 1e9:g} are allowed",
         )
 
 

@@ -26,7 +26,13 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.ask import Question
 from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case, load_cases
-from safevar_sumo.questions.options import CRITERION, Cluster, Jobs, PointName, Simulations
+from safevar_sumo.questions.options import (
+    CRITERION,
+    Cluster,
+    Jobs,
+    PointName,
+    Simulations,
+)
 from safevar_sumo.questions.subject import Results, case_at, changes_since, with_own_set
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.animation import template_environment
@@ -44,7 +50,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SMALLEST = "explain --of-study"
-USUAL_QUESTIONS = ("tolerance", SMALLEST, "explain", "risk --samples 4000", "rules --samples 4000")
+USUAL_QUESTIONS = (
+    "tolerance",
+    SMALLEST,
+    "explain",
+    "risk --samples 4000",
+    "rules --samples 4000",
+)
 """Questions of a page, whose first verdict decides; samples are smaller than those of commands."""
 LEAST_COST = 40_000
 USUAL_COSTS = {"tolerance": 500_000, "repair": 500_000, "explain": 100_000}
@@ -56,7 +68,11 @@ TEMPLATE_FOLDER = Path(__file__).parent / "web"
 LONG_DECIMALS = re.compile(r"(\d\.\d\d)\d+")
 """Coordinates with more decimals than a screen can show."""
 TAG = re.compile(r"<[^>]*>")
-SVG_STYLE = {"svg.fonttype": "none", "svg.hashsalt": "safevar_sumo", "font.family": ["sans-serif"]}
+SVG_STYLE = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "safevar_sumo",
+    "font.family": ["sans-serif"],
+}
 
 
 def report(
@@ -133,16 +149,25 @@ def report(
     out = Path(check_text("out", out))
     check_writable(out, "out", (".html", ".htm"))
 
-    paths = [Path(check_text("results", getattr(place, "directory", place))) for place in results]
+    paths = [
+        Path(check_text("results", getattr(place, "directory", place)))
+        for place in results
+    ]
     cases = load_cases(paths)
     joint = _joint_questions(ask, len(cases))
     alone = [text for text in ask if text not in joint]
     later_changes = _later_changes(paths, cases, as_it_is_now=as_it_is_now)
     at_point = _simulated(cases, point, quick=quick)
     key = f"report {paths} {point} {ask} {unsafe} {quick}"
-    with open_progress(progress) as show, keep_simulations(key, fresh=fresh), ExitStack() as stack:
+    with (
+        open_progress(progress) as show,
+        keep_simulations(key, fresh=fresh),
+        ExitStack() as stack,
+    ):
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
-        questions = [alone] * len(cases) if ask else [*map(usual_questions, by_criterion)]
+        questions = (
+            [alone] * len(cases) if ask else [*map(usual_questions, by_criterion)]
+        )
         texts = [*chain(*map(with_speed_part, questions, by_criterion)), *joint]
         budgets = _budgets(cases, at_point, by_criterion, questions, joint, simulations)
         pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
@@ -159,8 +184,14 @@ def report(
             subjects = by_criterion if values.get("unsafe") == unsafe else at_point
             name = f"question {next(numbers)} of {len(texts)}, {question.name}"
             about = subjects[chosen], paths[chosen], point, jobs, parts.begin(name)
-            how: JsonObject = {"as_it_is_now": as_it_is_now, "pool": pool, "questions": len(texts)}
-            return answer_about(question, values, *about, is_asked=bool(ask) and not parsed, **how)
+            how: JsonObject = {
+                "as_it_is_now": as_it_is_now,
+                "pool": pool,
+                "questions": len(texts),
+            }
+            return answer_about(
+                question, values, *about, is_asked=bool(ask) and not parsed, **how
+            )
 
         studies = []
         for number, path in enumerate(paths):
@@ -220,7 +251,11 @@ def _budgets(
 
 
 def _pool_of(
-    stack: ExitStack, cases: Sequence[Case], jobs: int | None, cluster: str | None, counts: bool
+    stack: ExitStack,
+    cases: Sequence[Case],
+    jobs: int | None,
+    cluster: str | None,
+    counts: bool,
 ) -> Pool | None:
     """The pool that the questions of a page share, with what simulators have simulated, where they
     take long; None if each opens its own.
@@ -275,16 +310,23 @@ def usual_questions(case: Case) -> list[str]:
     return questions
 
 
-def make_page(studies: Sequence[ReportedStudy], parts: Parts, shared: Sequence[Answer] = ()) -> str:
+def make_page(
+    studies: Sequence[ReportedStudy], parts: Parts, shared: Sequence[Answer] = ()
+) -> str:
     """The page about studies, with answers about all of them."""
     names = ", ".join(study.case.name for study in studies)
     of_shared = [
-        (f"The answer {answer.question}", answer.command) for answer in shared if answer.command
+        (f"The answer {answer.question}", answer.command)
+        for answer in shared
+        if answer.command
     ]
     template = template_environment(TEMPLATE_FOLDER).get_template("report.html.j2")
     page = template.render(
         title=f"Safety report: {names}",
-        studies=[_study_parts(number, study, parts) for number, study in enumerate(studies, 1)],
+        studies=[
+            _study_parts(number, study, parts)
+            for number, study in enumerate(studies, 1)
+        ],
         shared=list(_sections("all", shared)),
         commands=[*chain(*map(page_commands, studies)), *of_shared],
         css=Markup((TEMPLATE_FOLDER / "report.css").read_text(encoding="utf-8")),
@@ -344,7 +386,9 @@ def _picture(figure: Figure) -> JsonObject:
     with matplotlib.rc_context(SVG_STYLE):  # type: ignore[arg-type]
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     # Only coordinates, which stand in tags, are shortened: texts keep their digits.
-    svg = TAG.sub(lambda tag: LONG_DECIMALS.sub(r"\1", tag[0]), buffer.getvalue().decode())
+    svg = TAG.sub(
+        lambda tag: LONG_DECIMALS.sub(r"\1", tag[0]), buffer.getvalue().decode()
+    )
     words = (
         f"{figure.get_suptitle()}: {axis.get_ylabel() or 'values'} over"
         f" {axis.get_xlabel() or 'characteristics'}"

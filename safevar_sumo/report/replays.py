@@ -14,7 +14,11 @@ from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.words import change_texts, replay_command
 from safevar_sumo.records import FloatArray, JsonObject, NamedValues
 from safevar_sumo.replay.animation import player_of
-from safevar_sumo.replay.comparison import comparison_of, list_differences, why_different
+from safevar_sumo.replay.comparison import (
+    comparison_of,
+    list_differences,
+    why_different,
+)
 from safevar_sumo.report.sections import ReportedStudy
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.terminal import Progress
@@ -27,7 +31,9 @@ vehicle; and, where encounters are ranges, the column of their encounters.
 """
 
 
-def replays(study: ReportedStudy, progress: Progress, start: int = 0) -> Iterator[JsonObject]:
+def replays(
+    study: ReportedStudy, progress: Progress, start: int = 0
+) -> Iterator[JsonObject]:
     """Replays of chosen solutions, and of settings that answers name by their `CHANGES`: one for
     each set of changed characteristics. Their players have numbers from `start` on.
     """
@@ -62,7 +68,9 @@ def replays(study: ReportedStudy, progress: Progress, start: int = 0) -> Iterato
     for number, (name, setting) in enumerate(settings.items()):
         progress("replays", number, len(settings))
         comparison = comparison_of(
-            simulate_with_original(study.case.study, study.system, setting, filtered=False)
+            simulate_with_original(
+                study.case.study, study.system, setting, filtered=False
+            )
         )
         # Nothing can be shown if a simulator of the user's own logs no positions.
         if not comparison.has_position:
@@ -73,7 +81,9 @@ def replays(study: ReportedStudy, progress: Progress, start: int = 0) -> Iterato
         if name in study.choices:
             title += f" ({study.choices[name]})"
             recorded: dict[Any, Any] = study.chosen_solutions.loc[name].to_dict()
-            differences = list_differences(comparison.evaluations.take([index]), recorded)
+            differences = list_differences(
+                comparison.evaluations.take([index]), recorded
+            )
         if differences:
             different.append(name)
         yield {
@@ -112,4 +122,7 @@ def page_commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
             yield f"The answer {answer.question}", answer.command + flag
     for handle in study.choices:
         simulate = f"{replay_command(directory, study.point)} --solution {handle}"
-        yield f"The replay of {handle}", f"{simulate} --plot it.png --animate it.html{flag}"
+        yield (
+            f"The replay of {handle}",
+            f"{simulate} --plot it.png --animate it.html{flag}",
+        )

@@ -15,7 +15,13 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate, with_interval
+from safevar_sumo.questions.answer import (
+    Answer,
+    Column,
+    Columns,
+    tabulate,
+    with_interval,
+)
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.catalogue import description_of
 from safevar_sumo.questions.explain.failures import REASONS
@@ -88,7 +94,9 @@ PUBLISHED: Columns = {
     "metric": "safety metric of the original vehicle",
     "published": "its published value",
     "here": "its value here",
-    "difference": Column("%", "here minus published, in per cent of the published value", ".1f"),
+    "difference": Column(
+        "%", "here minus published, in per cent of the published value", ".1f"
+    ),
 }
 
 
@@ -160,7 +168,9 @@ class ReportedStudy:
     @property
     def chosen_settings(self) -> FloatArray:
         """Their settings, shape (M, n)."""
-        return self.chosen_solutions[list(self.case.characteristics.names)].to_numpy(float)
+        return self.chosen_solutions[list(self.case.characteristics.names)].to_numpy(
+            float
+        )
 
 
 def tested(study: ReportedStudy) -> Answer:
@@ -177,7 +187,15 @@ def tested(study: ReportedStudy) -> Answer:
     ]
 
     rows = [
-        (item.name, item.unit, item.original, item.lower, item.upper, item.threshold, item.words)
+        (
+            item.name,
+            item.unit,
+            item.original,
+            item.lower,
+            item.upper,
+            item.threshold,
+            item.words,
+        )
         for item in case.characteristics
     ]
     remarks = [*case.remarks, *vehicle_remarks(study.system)]
@@ -193,7 +211,9 @@ def tested(study: ReportedStudy) -> Answer:
         verdict=" ".join(filter(None, sentences)),
         numbers={},
         tables={
-            "characteristics": tabulate("Characteristics and their domains", CHARACTERISTICS, rows),
+            "characteristics": tabulate(
+                "Characteristics and their domains", CHARACTERISTICS, rows
+            ),
             "remarks": _remarks(remarks),
         },
         lead=None,
@@ -201,7 +221,9 @@ def tested(study: ReportedStudy) -> Answer:
 
 
 def _remarks(texts: Sequence[str]) -> pd.DataFrame:
-    return tabulate("Remarks", {"remark": "what to bear in mind"}, [(text,) for text in texts])
+    return tabulate(
+        "Remarks", {"remark": "what to bear in mind"}, [(text,) for text in texts]
+    )
 
 
 def _conditions(study: ReportedStudy) -> str:
@@ -225,11 +247,15 @@ def _conditions(study: ReportedStudy) -> str:
         )
     if not points:
         return f"weather: {weather.name}"
-    tests = Counter(f"{dict(point.parameters)['test']}, {point.weather.name}" for point in points)
+    tests = Counter(
+        f"{dict(point.parameters)['test']}, {point.weather.name}" for point in points
+    )
     described = "; ".join(
         f"{test}: {number_of(count, 'test case')}" for test, count in tests.items()
     )
-    return f"every vehicle drives all {len(points)} test cases of a matrix ({described})"
+    return (
+        f"every vehicle drives all {len(points)} test cases of a matrix ({described})"
+    )
 
 
 def _search(study: ReportedStudy) -> str:
@@ -239,7 +265,10 @@ def _search(study: ReportedStudy) -> str:
     if not case.has_runs:
         return f"The {len(case.solutions)} solutions are imported ({versions})."
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)
-    names = [f"{case.title_of(name)} ({number_of(count, 'run')})" for name, count in runs.items()]
+    names = [
+        f"{case.title_of(name)} ({number_of(count, 'run')})"
+        for name, count in runs.items()
+    ]
     return (
         f"The search has {', '.join(names) or 'no finished run'}, with at most"
         f" {search.evaluations} simulations in a run. All runs together simulated"
@@ -261,7 +290,9 @@ def trust(study: ReportedStudy) -> Answer:
     """
     case = study.case
     tables = dict[str, pd.DataFrame]()
-    fitted = "Published data were used to fit the vehicle. " if case.study.spread else ""
+    fitted = (
+        "Published data were used to fit the vehicle. " if case.study.spread else ""
+    )
     verdict = (
         f"{fitted}The simulations of this study were not compared with published ones. Nobody knows"
         " whether another simulator or a real vehicle behaves in the same way."
@@ -298,7 +329,9 @@ def trust(study: ReportedStudy) -> Answer:
         for name, value in case.study.published.items()
         if not math.isnan(metric := case.original.get(name, math.nan))
     ]
-    tables["original"] = tabulate("The original vehicle, published and here", PUBLISHED, published)
+    tables["original"] = tabulate(
+        "The original vehicle, published and here", PUBLISHED, published
+    )
 
     counts = Counter(case.evaluations["outcome"])
     remarks = [
@@ -308,5 +341,9 @@ def trust(study: ReportedStudy) -> Answer:
     ]
     tables["remarks"] = _remarks([*remarks, *GENERAL_LIMITS])
     return Answer(
-        question="limits and trust", study=case.study, verdict=verdict, numbers={}, tables=tables
+        question="limits and trust",
+        study=case.study,
+        verdict=verdict,
+        numbers={},
+        tables=tables,
     )

@@ -84,12 +84,18 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         for item in items
         if not item.is_for_workshop
     ]
-    domains = [f"{item.short_name} {_domain_in_words(item)}" for item in items if item.name in rows]
+    domains = [
+        f"{item.short_name} {_domain_in_words(item)}"
+        for item in items
+        if item.name in rows
+    ]
     return {
         "missing": problem,
         "up_to": up_to,
         "is_screening": is_screening,
-        "is_signed": not (problem or numbers["rough"] or study.later_changes or is_screening),
+        "is_signed": not (
+            problem or numbers["rough"] or study.later_changes or is_screening
+        ),
         "unsafe": unsafe,
         "parts": Markup(html_table(tabulate("Items and their limits", PARTS, parts))),
         "others": unmeasured,
@@ -112,7 +118,13 @@ def _row_of_part(item: Characteristic, row: JsonObject | None) -> tuple[str, ...
     name = item.meaning or item.short_name
     limit = _limit_in_words(item, row)
     blank = f"{BLANK}{item.suffix}"
-    return name[:1].upper() + name[1:], item.measurement, limit, blank, item.remedy or UNSAID
+    return (
+        name[:1].upper() + name[1:],
+        item.measurement,
+        limit,
+        blank,
+        item.remedy or UNSAID,
+    )
 
 
 def speed_values(study: ReportedStudy) -> JsonObject:
@@ -120,7 +132,12 @@ def speed_values(study: ReportedStudy) -> JsonObject:
     drive; none where nobody may work by the sheet, or the study varies no speed.
     """
     limits = _limits_of(study)
-    if limits is None or study.point or _why_no_limits(study, limits) or not speeds_of(study.case):
+    if (
+        limits is None
+        or study.point
+        or _why_no_limits(study, limits)
+        or not speeds_of(study.case)
+    ):
         return {}
     unsafe = Unsafe.parse(limits.numbers["unsafe"])
     margin = limits.numbers["margin"]
@@ -155,7 +172,9 @@ def with_answers(
 
 
 def _limits_of(study: ReportedStudy) -> Answer | None:
-    return next((answer for answer in study.answers if answer.question == "tolerance"), None)
+    return next(
+        (answer for answer in study.answers if answer.question == "tolerance"), None
+    )
 
 
 def _rows_of(limits: Answer) -> dict[str, JsonObject]:
@@ -187,11 +206,19 @@ def _greatest_speed(
     span = speeds_of(study.case)
     assert span is not None
     failing = [row["fails_at"] or {} for row in ranges if not row["kept"]]
-    speeds = [math.ceil(at[SPEED_DIMENSION]) - 1 for at in failing if SPEED_DIMENSION in at]
+    speeds = [
+        math.ceil(at[SPEED_DIMENSION]) - 1 for at in failing if SPEED_DIMENSION in at
+    ]
     greatest = min([*speed.tables["cars"]["up_to"].astype(float), *speeds])
     if greatest >= span.low:
-        return f"{greatest:g} {span.unit} (simulated from {span.low:g} {span.unit} on)", ""
-    return "", f"Vehicles within its limits are not safe even at {span.low:g} {span.unit}."
+        return (
+            f"{greatest:g} {span.unit} (simulated from {span.low:g} {span.unit} on)",
+            "",
+        )
+    return (
+        "",
+        f"Vehicles within its limits are not safe even at {span.low:g} {span.unit}.",
+    )
 
 
 def _is_relative(case: Case, unsafe: Unsafe) -> bool:
@@ -217,7 +244,9 @@ def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
     rows = _rows_of(limits)
     measured = [item for item in items if item.is_for_workshop]
     vague = [
-        item for item in measured if not item.is_decidable(*_together(item, rows.get(item.name)))
+        item
+        for item in measured
+        if not item.is_decidable(*_together(item, rows.get(item.name)))
     ]
     if vague:
         return undecidable_in_words(vague)

@@ -33,7 +33,9 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     except ValueError:
         # Nothing, or a quotation mark without its second one.
         raise InputError(
-            "ask", repr(text), 'a question with its options, such as "risk --samples 4000"'
+            "ask",
+            repr(text),
+            'a question with its options, such as "risk --samples 4000"',
         ) from None
     question = find_question(name)
 
@@ -50,7 +52,9 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
             if value is not True:
                 value = option.kind(value)
         except (TypeError, ValueError):
-            raise InputError(f"ask: {name} {flag}", repr(value), option.kind.__name__) from None
+            raise InputError(
+                f"ask: {name} {flag}", repr(value), option.kind.__name__
+            ) from None
         if option.is_repeated:
             value = *values.get(option.name, ()), value
         values[option.name] = option.check(value)
@@ -58,13 +62,20 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
 
 
 def completed(
-    question: Question, values: JsonObject, unsafe: Unsafe | None, part: int | None, *, quick: bool
+    question: Question,
+    values: JsonObject,
+    unsafe: Unsafe | None,
+    part: int | None,
+    *,
+    quick: bool,
 ) -> JsonObject:
     """Values of a question with what it does not state itself: a criterion, its part of the
     simulations, and whether its answer is rough.
     """
     usual: JsonObject = {SIMULATIONS.name: part}
-    if unsafe is not None and any(option.metavar == CRITERION for option in question.options):
+    if unsafe is not None and any(
+        option.metavar == CRITERION for option in question.options
+    ):
         usual["unsafe"] = unsafe
     if quick and question.has_rough_answer:
         usual[QUICK] = True
@@ -96,8 +107,14 @@ def answer_about(
     simulations = options.pop(SIMULATIONS.name, None)
     try:
         if len(question.others) + 1 != len(cases):
-            raise InputError("ask", f"{question.name} cannot be asked about {len(cases)}", f"{len(question.others) + 1} results directories")
-        command = question.command_line([*map(str, directories)], {"point": point}, options)
+            raise InputError(
+                "ask",
+                f"{question.name} cannot be asked about {len(cases)}",
+                f"{len(question.others) + 1} results directories",
+            )
+        command = question.command_line(
+            [*map(str, directories)], {"point": point}, options
+        )
         answer = question.answer(
             cases,
             options,
@@ -113,5 +130,7 @@ def answer_about(
             raise
         verdict = f"No answer: {error.problem} (expected: {error.legal})."
         study = cases[0].study
-        return Answer(question=question.name, study=study, verdict=verdict, numbers={}, tables={})
+        return Answer(
+            question=question.name, study=study, verdict=verdict, numbers={}, tables={}
+        )
     return replace(answer, command=command + answer.command)

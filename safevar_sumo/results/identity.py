@@ -66,7 +66,9 @@ def packages_of(study: Study) -> tuple[str, ...]:
     has_pymoo = any(name.startswith(PYMOO) for name in study.search.algorithms)
     has_pymoo = has_pymoo and find_spec("pymoo") is not None
     packages = [*PACKAGES]
-    packages += [LIBRARIES[key] for key in (study.ads.model, study.ads.kind) if key in LIBRARIES]
+    packages += [
+        LIBRARIES[key] for key in (study.ads.model, study.ads.kind) if key in LIBRARIES
+    ]
     if has_pymoo:
         packages += PYMOO_PACKAGES
     return tuple(packages)
@@ -121,12 +123,18 @@ def identity_digest(manifest: JsonObject) -> str:
     """
     layers = identity_in(manifest)
     versions = {
-        name: value for name, value in layers["versions"].items() if name not in PYMOO_PACKAGES
+        name: value
+        for name, value in layers["versions"].items()
+        if name not in PYMOO_PACKAGES
     }
-    return sha256(json.dumps({**layers, "versions": versions}, sort_keys=True).encode()).hexdigest()
+    return sha256(
+        json.dumps({**layers, "versions": versions}, sort_keys=True).encode()
+    ).hexdigest()
 
 
-def manifest_differences(stored: JsonObject, now: JsonObject) -> Iterator[tuple[str, str, bool]]:
+def manifest_differences(
+    stored: JsonObject, now: JsonObject
+) -> Iterator[tuple[str, str, bool]]:
     """The differences between the inputs of two manifests: of stored results, and of now.
 
     Yields, for each, its layer of `IDENTITY`, a text, and whether it may change simulations. Other

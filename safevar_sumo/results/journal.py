@@ -43,7 +43,12 @@ def journal_head(study: str, run: str, characteristics: Iterable[str]) -> JsonOb
     """The first line of a journal: what it belongs to, the digest of a study's identity and the
     name of a run; and the characteristics.
     """
-    return {"format": FORMAT, "study": study, "run": run, "characteristics": list(characteristics)}
+    return {
+        "format": FORMAT,
+        "study": study,
+        "run": run,
+        "characteristics": list(characteristics),
+    }
 
 
 class JournalContent(NamedTuple):
@@ -110,14 +115,18 @@ class Journal:
         If another live process works on the run, or the file cannot be locked or written.
     """
 
-    def __init__(self, path: Path, head: JsonObject, *, retry_failed: bool = False) -> None:
+    def __init__(
+        self, path: Path, head: JsonObject, *, retry_failed: bool = False
+    ) -> None:
         self.path = path
         self._characteristics = head["characteristics"]
         self._file = open_and_lock(path)
         try:
             with disk_errors(path, "read"):
                 self._file.seek(0)
-                self.content = _read(self._file.read(), path, head, until_failure=retry_failed)
+                self.content = _read(
+                    self._file.read(), path, head, until_failure=retry_failed
+                )
                 self._file.truncate(self.content.size)
             self._checksum = self.content.checksum
             if not self.content.size:
@@ -133,7 +142,9 @@ class Journal:
         line = {
             POSITION: list(positions),
             OUTCOME: evaluations.outcome.tolist(),
-            **dict(zip(self._characteristics, evaluations.settings.T.tolist(), strict=True)),
+            **dict(
+                zip(self._characteristics, evaluations.settings.T.tolist(), strict=True)
+            ),
         }
         for name in OBJECTIVE_COLUMNS:
             line[name] = getattr(evaluations, name).tolist()
@@ -143,7 +154,8 @@ class Journal:
             line[POINT] = evaluations.worst_points.tolist()
         if evaluations.reasons:
             reasons = [
-                evaluations.reasons.get(setting.tobytes()) for setting in evaluations.settings
+                evaluations.reasons.get(setting.tobytes())
+                for setting in evaluations.settings
             ]
             if any(reasons):
                 line[REASON] = reasons
@@ -173,7 +185,9 @@ class Journal:
                 remainder = remainder[self._file.write(remainder) :]
 
 
-def read_journal(path: Path, head: JsonObject, *, head_only: bool = False) -> JournalContent:
+def read_journal(
+    path: Path, head: JsonObject, *, head_only: bool = False
+) -> JournalContent:
     """The contents of a journal that another process may be writing; arguments as of `Journal`.
     With `head_only`, only its owner is checked.
 
@@ -246,7 +260,9 @@ def open_and_lock(path: Path) -> IO[bytes]:
     SafevarError
         If another live process works on the run, or the file cannot be locked or written.
     """
-    lock = portalocker.Lock(path, "a+b", PATIENCE, SECONDS_BETWEEN_ATTEMPTS, buffering=0)
+    lock = portalocker.Lock(
+        path, "a+b", PATIENCE, SECONDS_BETWEEN_ATTEMPTS, buffering=0
+    )
     with disk_errors(path, "opened"):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -339,7 +355,9 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
         if name not in (POSITION, OUTCOME, REASON, POINT)
     }
     settings = np.stack([columns.pop(name) for name in characteristics], axis=1)
-    reasons = zip(map(bytes, settings), line.get(REASON, [None] * len(settings)), strict=True)
+    reasons = zip(
+        map(bytes, settings), line.get(REASON, [None] * len(settings)), strict=True
+    )
     worst_points = None
     if POINT in line:
         worst_points = np.array(line[POINT], dtype=np.intp)

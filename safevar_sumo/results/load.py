@@ -36,7 +36,9 @@ def failure_lines(failures: Sequence[tuple[str, str]]) -> list[str]:
     firsts = {reason: place for place, reason in reversed(failures)}
     counts = Counter(reason for _, reason in failures)
     return [
-        f"{firsts[reason]}: {reason} (and {count - 1} more)".removesuffix(" (and 0 more)")
+        f"{firsts[reason]}: {reason} (and {count - 1} more)".removesuffix(
+            " (and 0 more)"
+        )
         for reason, count in counts.items()
     ]
 
@@ -103,7 +105,9 @@ def load_runs(directory: str | Path) -> StoredResults:
             place = f"{key[0]}:{key[1]}, evaluation {positions[row]}"
             failures.append((place, evaluations.reason(row)))
         if budget in content.results:
-            solutions_of_runs.append((key, content.take_positions(content.results[budget])))
+            solutions_of_runs.append(
+                (key, content.take_positions(content.results[budget]))
+            )
 
     # The rows of the frame are in the order of their runs, as the positions are.
     frame = evaluations_frame(characteristics, evaluations_of_runs)
@@ -219,7 +223,9 @@ def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str) -> Solut
         if table.empty:
             problem = "these results hold no solution"
         raise InputError(
-            "", problem, "other results, the most severe solution, or a solution by its handle"
+            "",
+            problem,
+            "other results, the most severe solution, or a solution by its handle",
         )
     position = candidates.sort_values(CHOICES[choice], kind="stable").index[0]
     return handles_of(table)[int(position)]

@@ -59,7 +59,9 @@ def journal_file(directory: Path, run: str) -> Path:
     path = directory / RUNS / f"{run}.jsonl"
     if path.exists() and not path.is_file():
         raise InputError(
-            path, "is no file", "the journal that was there, or no file: the run then begins anew"
+            path,
+            "is no file",
+            "the journal that was there, or no file: the run then begins anew",
         )
     return path
 
@@ -81,7 +83,9 @@ def make_directory(path: Path) -> None:
         if path.is_symlink() and not path.exists():
             problem = "it is a link whose target does not exist"
         raise InputError(
-            "out", f"cannot write to {path}: {problem}", "a directory that can be written"
+            "out",
+            f"cannot write to {path}: {problem}",
+            "a directory that can be written",
         ) from None
     for name, kind, is_right in (
         (MANIFEST, "file", Path.is_file),
@@ -89,7 +93,9 @@ def make_directory(path: Path) -> None:
         (RUNS, "folder", Path.is_dir),
     ):
         if (path / name).exists() and not is_right(path / name):
-            raise InputError(path / name, f"is no {kind}", "nothing of this name, or another `out`")
+            raise InputError(
+                path / name, f"is no {kind}", "nothing of this name, or another `out`"
+            )
 
 
 def write_whole(path: Path, text: str) -> None:
@@ -123,7 +129,9 @@ def disk_errors(path: Path, action: str) -> Iterator[None]:
 
 def write_manifest(directory: Path, manifest: JsonObject) -> None:
     """Write a manifest."""
-    write_whole(directory / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n")
+    write_whole(
+        directory / MANIFEST, json.dumps(manifest, indent=2, allow_nan=False) + "\n"
+    )
 
 
 class _Manifest(Struct):
@@ -156,8 +164,17 @@ def read_manifest(directory: Path) -> JsonObject:
         problem = f"is not a results directory: there is no {MANIFEST}"
         if likely_path != directory and likely_path.is_dir():
             problem += f"; did you mean {likely_path}?"
-        raise InputError(directory, problem, "a directory written by the command `study`") from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(
+            directory, problem, "a directory written by the command `study`"
+        ) from None
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+    ) as error:
         raise InputError(
             file,
             f"cannot be read, is torn or was edited: {error!r}",
@@ -177,7 +194,9 @@ def read_manifest(directory: Path) -> JsonObject:
         for key in ("wider", "correlations"):
             study.pop(key, None)
         if "search" in (study.get("scenario") or ()):
-            raise InputError(directory, "holds results of a study with [scenario.search]", legal)
+            raise InputError(
+                directory, "holds results of a study with [scenario.search]", legal
+            )
     with about(file):
         convert_table(manifest, _Manifest)
     return dict(manifest)

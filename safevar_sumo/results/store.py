@@ -85,7 +85,9 @@ class ResultsDirectory:
     ) -> None:
         self.path = path
         self._study = study
-        folders = [os.path.relpath(folder, path.resolve()) for folder in study.origin.places]
+        folders = [
+            os.path.relpath(folder, path.resolve()) for folder in study.origin.places
+        ]
         self.manifest = {**manifest, "folders": folders}
         if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
@@ -111,14 +113,18 @@ class ResultsDirectory:
         if self._study.scenario.repeats == 1:
             refuse_other_original(self.path, earlier_manifest.get("original", {}), now)
         write_manifest(self.path, manifest)
-        if earlier_manifest and search_extent_of(earlier_manifest) != search_extent_of(manifest):
+        if earlier_manifest and search_extent_of(earlier_manifest) != search_extent_of(
+            manifest
+        ):
             with disk_errors(self.path / SOLUTIONS, "removed"):
                 (self.path / SOLUTIONS).unlink(missing_ok=True)
 
     def finish(self, solutions: Mapping[RunKeyT, Evaluations]) -> None:
         """Write the solutions of every run, by (algorithm, run)."""
         frame = solutions_frame(self._study.domains, solutions.items())
-        write_whole(self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
+        write_whole(
+            self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n")
+        )
 
     def extent_remarks(self, names: Collection[str]) -> list[str]:
         """Remarks on earlier results: runs of another length, and runs that the study, with runs of
@@ -139,7 +145,9 @@ class ResultsDirectory:
             )
         stored = {path.stem for path in (self.path / RUNS).glob("*.jsonl")}
         if other_runs := ", ".join(sorted(stored - {*names})):
-            remarks.append(f"{self.path}: earlier runs are left out of the results: {other_runs}")
+            remarks.append(
+                f"{self.path}: earlier runs are left out of the results: {other_runs}"
+            )
         return remarks
 
     def _earlier_manifest(self) -> JsonObject:
@@ -151,7 +159,9 @@ class ResultsDirectory:
         stored = read_manifest(self.path)
         problem = "holds results of another study"
         if "imported" in stored:
-            raise InputError(self.path, f"{problem}: they are imported", "another `out`")
+            raise InputError(
+                self.path, f"{problem}: they are imported", "another `out`"
+            )
         for layer, text, _ in manifest_differences(stored, self.manifest):
             raise InputError(
                 self.path, f"{problem}: {text}", f"another `out`, or {IDENTITY[layer]}"
@@ -178,7 +188,8 @@ def stored_journals(
 
 
 def solutions_frame(
-    characteristics: Collection[str], solutions: Iterable[tuple[tuple[str, int], Evaluations]]
+    characteristics: Collection[str],
+    solutions: Iterable[tuple[tuple[str, int], Evaluations]],
 ) -> pd.DataFrame:
     """One row per solution of every run, in a fixed order; columns as in `evaluations_frame`."""
     return in_order(evaluations_frame(characteristics, solutions), characteristics)
@@ -191,7 +202,8 @@ def in_order(solutions: pd.DataFrame, characteristics: Collection[str]) -> pd.Da
 
 
 def evaluations_frame(
-    characteristics: Collection[str], runs: Iterable[tuple[tuple[str, int], Evaluations]]
+    characteristics: Collection[str],
+    runs: Iterable[tuple[tuple[str, int], Evaluations]],
 ) -> pd.DataFrame:
     """One row per evaluation.
 
@@ -258,7 +270,9 @@ def refuse_other_original(
         else:
             # A value that is undefined, None, becomes NaN.
             pair = np.array([old, new], dtype=float)
-            is_same = bool(np.isclose(pair[0], pair[1], ROUNDING, ROUNDING, equal_nan=True))
+            is_same = bool(
+                np.isclose(pair[0], pair[1], ROUNDING, ROUNDING, equal_nan=True)
+            )
         if not is_same:
             raise InputError(
                 directory,
@@ -300,7 +314,9 @@ def write_imported(
     if (path / RUNS).exists():
         raise InputError(path, "holds results of a campaign", "another directory")
 
-    runs = (((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items())
+    runs = (
+        ((algorithm, 0), evaluations) for algorithm, evaluations in solutions.items()
+    )
     frame = solutions_frame(study.vehicle.characteristics, runs).drop(columns="run")
     manifest = {
         "format": FORMAT,
@@ -325,7 +341,15 @@ def read_imported(path: Path, characteristics: Collection[str]) -> pd.DataFrame:
 
     file = path / SOLUTIONS
     numbers = dict.fromkeys([*characteristics, "f_safe", "f_diff", *METRICS], float)
-    columns = ["algorithm", *characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS, "outcome"]
+    columns = [
+        "algorithm",
+        *characteristics,
+        "f_safe",
+        "f_diff",
+        "f_num_diff",
+        *METRICS,
+        "outcome",
+    ]
     try:
         frame = pd.read_csv(
             BytesIO(read_file(file)),

@@ -19,7 +19,10 @@ from safevar_sumo.scenarios.base import (
 )
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.lane_change import CutIn, CutOut
-from safevar_sumo.scenarios.point import SPEED_DIMENSION as SPEED_DIMENSION, Point as Point
+from safevar_sumo.scenarios.point import (
+    SPEED_DIMENSION as SPEED_DIMENSION,
+    Point as Point,
+)
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.scenarios.recorded_tracks import RecordedTracks
 from safevar_sumo.scenarios.roads import Lane as Lane, World as World

@@ -74,7 +74,10 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields
     impact_location: Annotated[
         ImpactLocation,
         searched(
-            0.0, 100.0, "%", "impact location, share of the vehicle's front from its left corner"
+            0.0,
+            100.0,
+            "%",
+            "impact location, share of the vehicle's front from its left corner",
         ),
     ] = 50.0
 
@@ -143,7 +146,9 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     test: Literal["CPLA", "CBLA"] = "CPLA"
     target: Literal["adult", "child", "cyclist"] | None = None
     target_speed: (
-        Annotated[float, Meta(ge=0, le=60), searched(1.0, 40.0, "km/h", "speed of the target")]
+        Annotated[
+            float, Meta(ge=0, le=60), searched(1.0, 40.0, "km/h", "speed of the target")
+        ]
         | None
     ) = None
     acceleration_distance: Metres | None = None
@@ -168,7 +173,9 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     @property
     def gap(self) -> Quantity:
         """Gap to the target at the start, which closes in the time to impact [m]."""
-        return self.test_speed * self.time_to_impact - self._profile.travelled(self.time_to_impact)
+        return self.test_speed * self.time_to_impact - self._profile.travelled(
+            self.time_to_impact
+        )
 
     @property
     def target_speed_at(self) -> Callable[[Quantity], Quantity]:
@@ -228,13 +235,20 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
     headway: (
         Annotated[
             Seconds,
-            searched(0.5, 10.0, "s", "headway, gap at the start divided by the vehicle's speed"),
+            searched(
+                0.5,
+                10.0,
+                "s",
+                "headway, gap at the start divided by the vehicle's speed",
+            ),
         ]
         | None
     ) = None
     brakes_at: Annotated[float, Meta(ge=0, le=60)] = 3.0
     target_deceleration: Annotated[
-        float, Meta(gt=0, le=12), searched(0.5, 10.0, "m/s^2", "deceleration of the target")
+        float,
+        Meta(gt=0, le=12),
+        searched(0.5, 10.0, "m/s^2", "deceleration of the target"),
     ] = 4.0
     final_speed: Annotated[float, Meta(ge=0, le=150)] = 2.0
     heading: Heading = 0.0
@@ -247,7 +261,9 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         end = self._time_to_impact()
         if self._target_brakes:
             speed_drop = self._target_speed - self.target_speed_at(math.inf)
-            end = np.maximum(end, self.brakes_at + speed_drop / self.target_deceleration)
+            end = np.maximum(
+                end, self.brakes_at + speed_drop / self.target_deceleration
+            )
         return end + self.time_after
 
     @property
@@ -331,12 +347,18 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         closed_by_braking = (closing_speed + speed_lost / 2) * speed_lost / b
         gap_after_braking = gap_at_braking - closed_by_braking
         after_braking = (
-            self.brakes_at + speed_lost / b + gap_after_braking / (closing_speed + speed_lost)
+            self.brakes_at
+            + speed_lost / b
+            + gap_after_braking / (closing_speed + speed_lost)
         )
         root = np.sqrt(closing_speed * closing_speed + 2 * b * gap_at_braking)
         in_braking = self.brakes_at + (root - closing_speed) / b
-        braking = np.where(gap_at_braking > closed_by_braking, after_braking, in_braking)
-        return np.where(gap_at_braking <= 0, gap / np.float64(closing_speed), braking)[()]
+        braking = np.where(
+            gap_at_braking > closed_by_braking, after_braking, in_braking
+        )
+        return np.where(gap_at_braking <= 0, gap / np.float64(closing_speed), braking)[
+            ()
+        ]
 
 
 def next_lane(test: LaneTest, headways: Sequence[float] = HEADWAYS) -> NamedScenarios:
@@ -346,7 +368,10 @@ def next_lane(test: LaneTest, headways: Sequence[float] = HEADWAYS) -> NamedScen
     width = test.vut_width
     place = 100 * (LANE_WIDTH / width + 0.5)
     beside = CarToCar(
-        speed=test.speed, vut_length=test.vut_length, vut_width=width, impact_location=place
+        speed=test.speed,
+        vut_length=test.vut_length,
+        vut_width=width,
+        impact_location=place,
     )
     for headway in headways:
         yield (

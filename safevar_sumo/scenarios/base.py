@@ -13,7 +13,15 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.plugins import TRUTH, Legal, Returned, UserCode, quoted
-from safevar_sumo.records import ALL_TRUE, ZERO, BoolArray, Encounter, FloatArray, Quantity, Trace
+from safevar_sumo.records import (
+    ALL_TRUE,
+    ZERO,
+    BoolArray,
+    Encounter,
+    FloatArray,
+    Quantity,
+    Trace,
+)
 from safevar_sumo.scenarios.roads import Roads, World
 
 VUT = "vut"
@@ -68,23 +76,31 @@ LEGAL_ENCOUNTER = {
 }
 
 
-def check_encounter(code: UserCode, method: str, encounter: Encounter, trace: Trace) -> Encounter:
+def check_encounter(
+    code: UserCode, method: str, encounter: Encounter, trace: Trace
+) -> Encounter:
     """Refuse an encounter that is undefined while it counts, or that never has a separation: its
     metrics would be undefined or infinite.
     """
     is_counted = encounter.in_conflict & trace.active
     for name, values in zip(Encounter._fields, encounter, strict=True):
         if np.isnan(values[is_counted]).any():
-            raise code.wrong(method, f"{name} = nan", "numbers wherever in_conflict is true")
+            raise code.wrong(
+                method, f"{name} = nan", "numbers wherever in_conflict is true"
+            )
     least_separation = np.where(is_counted, encounter.separation, np.inf).min(axis=0)
     if (is_counted.any(axis=0) & (least_separation == np.inf)).any():
         raise code.wrong(
-            method, "separation = inf", "a finite number at some time that in_conflict is true"
+            method,
+            "separation = inf",
+            "a finite number at some time that in_conflict is true",
         )
     return encounter
 
 
-def check_changes(code: UserCode, method: str, changes: Any, roads: Roads) -> XmlChanges:
+def check_changes(
+    code: UserCode, method: str, changes: Any, roads: Roads
+) -> XmlChanges:
     """Refuse changes to a network or its traffic that are no mapping; values become texts."""
     if not isinstance(changes, Mapping):
         raise code.wrong(method, quoted(changes), "a mapping from XPaths to attributes")

@@ -27,7 +27,15 @@ from safevar_sumo.scenarios.euro_ncap import (
     TargetProfile,
     lateral_offset,
 )
-from safevar_sumo.scenarios.tracks import BODIES, KMH, PERSONS, SCREEN, BodySize, Speed, Track
+from safevar_sumo.scenarios.tracks import (
+    BODIES,
+    KMH,
+    PERSONS,
+    SCREEN,
+    BodySize,
+    Speed,
+    Track,
+)
 from safevar_sumo.study import searched
 
 PARKED_GAP = 1.0
@@ -119,9 +127,13 @@ class _Start(NamedTuple):
             time = test.time_to_impact or np.maximum(
                 TIME_TO_IMPACT, np.ceil(shortest_time / ROUNDING_STEP) * ROUNDING_STEP
             )
-            profile = TargetProfile.with_arrival(distance, time - test.lead, speed, run_up)
+            profile = TargetProfile.with_arrival(
+                distance, time - test.lead, speed, run_up
+            )
         extent = direction.extent(BODIES[test.parameter("target")])
-        return cls(side, direction, extent, side * impact_lateral, distance, time, profile)
+        return cls(
+            side, direction, extent, side * impact_lateral, distance, time, profile
+        )
 
 
 class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -187,11 +199,13 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
       the near side; the calculator chooses a side at random.
     """
 
-    test: Literal["CPFA", "CPNA", "CPNCO", "CBNA", "CBFA", "CBNAO", "CCCscp", "CMCscp"] = "CPFA"
+    test: Literal[
+        "CPFA", "CPNA", "CPNCO", "CBNA", "CBFA", "CBNAO", "CCCscp", "CMCscp"
+    ] = "CPFA"
     target: Literal["adult", "child", "cyclist", "motorcyclist", "car"] | None = None
-    speed: Annotated[Speed, searched(10.0, 80.0, "km/h", "speed of the vehicle at the start")] = (
-        40.0
-    )
+    speed: Annotated[
+        Speed, searched(10.0, 80.0, "km/h", "speed of the vehicle at the start")
+    ] = 40.0
     impact_location: Annotated[
         ImpactLocation,
         searched(
@@ -202,7 +216,11 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         ),
     ] = 50.0
     target_speed: (
-        Annotated[float, Meta(gt=0, le=150), searched(3.0, 60.0, "km/h", "speed of the target")]
+        Annotated[
+            float,
+            Meta(gt=0, le=150),
+            searched(3.0, 60.0, "km/h", "speed of the target"),
+        ]
         | None
     ) = None
     side: Literal["near", "far"] | None = None
@@ -221,7 +239,9 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """Position at which a pedestrian stops, past the middle of the lane [m]."""
         if self.short is None:
             return STOP_DISTANCE
-        return -(self.vut_width + BODIES[self.parameter("target")].length) / 2 - self.short
+        return (
+            -(self.vut_width + BODIES[self.parameter("target")].length) / 2 - self.short
+        )
 
     @property
     def pre_crash(self) -> PreCrash:
@@ -262,7 +282,9 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         impact = self.start_speed * start.time_to_impact + start.extent.length / 2
         x = impact + start.direction.along * path
         y = start.impact_left + start.direction.left * path
-        crossing = Track("target", target, *BODIES[target], x, y, *start.direction, speed)
+        crossing = Track(
+            "target", target, *BODIES[target], x, y, *start.direction, speed
+        )
         if not self.parameter("hidden"):
             return [crossing]
         return [crossing, *self._parked_cars(impact)]
@@ -272,20 +294,39 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         lane.
         """
         row = f"{self.test}, {self.speed:g} km/h"
-        if self.is_on_foot and self.parameter("lateral_start") is not None and not self.heading:
+        if (
+            self.is_on_foot
+            and self.parameter("lateral_start") is not None
+            and not self.heading
+        ):
             middle = replace(self, impact_location=50.0, start_share=1.0)
             for short in SHORT_OF_PATH:
                 yield f"{row}, stops {short:g} m short", replace(middle, short=short)
             for lead in LEADS:
-                yield f"{row}, leaves {lead:g} s before", replace(middle, hidden=False, lead=lead)
+                yield (
+                    f"{row}, leaves {lead:g} s before",
+                    replace(middle, hidden=False, lead=lead),
+                )
         yield from next_lane(self, HEADWAYS[::4])
 
     def _parked_cars(self, impact: Quantity) -> list[Track]:
         """The parked cars beside the lane, and the row that hides the target."""
         front = impact - PARKED_GAP
         y = -self.vut_width / 2 - PARKED_GAP - PARKED_WIDTH / 2
-        cars = [Track.of("row", SCREEN, front - ROW_LENGTH / 2, y, size=(ROW_LENGTH, PARKED_WIDTH))]
+        cars = [
+            Track.of(
+                "row",
+                SCREEN,
+                front - ROW_LENGTH / 2,
+                y,
+                size=(ROW_LENGTH, PARKED_WIDTH),
+            )
+        ]
         for name, length in PARKED_LENGTHS.items():
-            cars.append(Track.of(name, "car", front - length / 2, y, size=(length, PARKED_WIDTH)))
+            cars.append(
+                Track.of(
+                    name, "car", front - length / 2, y, size=(length, PARKED_WIDTH)
+                )
+            )
             front = front - length - PARKED_GAP
         return cars

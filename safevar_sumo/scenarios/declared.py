@@ -12,7 +12,12 @@ import msgspec
 
 from safevar_sumo.errors import InputError, about, warn
 from safevar_sumo.plugins import Lookup
-from safevar_sumo.scenarios import SCENARIO_BASES, SCENARIOS, WEATHER_PARAMETERS, weather_of
+from safevar_sumo.scenarios import (
+    SCENARIO_BASES,
+    SCENARIOS,
+    WEATHER_PARAMETERS,
+    weather_of,
+)
 from safevar_sumo.study import (
     RANGES,
     TESTS,
@@ -44,8 +49,12 @@ def read_study(study: StudyLike, **changes: Any) -> Study:
     for remark in raw.remarks:
         warn(remark)
     for name in complete_study.scenario.over:
-        if complete_study.tests and all(name in test.over for test in complete_study.tests):
-            warn(f"scenario.over.{name} has no effect: each test has an axis of this name")
+        if complete_study.tests and all(
+            name in test.over for test in complete_study.tests
+        ):
+            warn(
+                f"scenario.over.{name} has no effect: each test has an axis of this name"
+            )
     return complete_study
 
 
@@ -55,7 +64,9 @@ def with_ranges(study: Study) -> Study:
     """
     if study.encounters == RANGES:
         return study
-    tables = _with_declared({**tables_of(study), "encounters": RANGES}, study.origin.places)
+    tables = _with_declared(
+        {**tables_of(study), "encounters": RANGES}, study.origin.places
+    )
     tests = tables.get("matrix", {}).get("tests", [])
     places = [tables["scenario"], *tests]
     axes = [axis for place in places for axis in place.get("over", {}).values()]
@@ -74,7 +85,9 @@ def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
     if not isinstance(scenario, dict):
         return tables
     # A matrix without tests drops those of a study that it extends.
-    if matrix is not None and not (isinstance(matrix, dict) and matrix.get("tests") == []):
+    if matrix is not None and not (
+        isinstance(matrix, dict) and matrix.get("tests") == []
+    ):
         convert_table(matrix, MatrixTable, "matrix")
     tests = (matrix or {}).get("tests", [])
     is_range = tables.get("encounters", TESTS) == RANGES
@@ -90,7 +103,10 @@ def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
     result = {**tables}
     if isinstance(shared := scenario.get("over"), dict):
         test: Parameters = next(iter(tests), {})
-        result["scenario"] = {**scenario, "over": completed(shared, "scenario.over", test)}
+        result["scenario"] = {
+            **scenario,
+            "over": completed(shared, "scenario.over", test),
+        }
     completed_tests = []
     for test in tests:
         if "over" in test:
@@ -149,10 +165,16 @@ class _Declared:
         if isinstance(original, int | float):
             declared["original"] = original
         if values and are_numbers(values):
-            declared |= {"lower": min(values), "upper": max(values), "original": values[0]}
+            declared |= {
+                "lower": min(values),
+                "upper": max(values),
+                "original": values[0],
+            }
         return {**declared, **table}
 
-    def _parameter(self, name: str, test: Parameters) -> tuple[FreeParameter | None, Any]:
+    def _parameter(
+        self, name: str, test: Parameters
+    ) -> tuple[FreeParameter | None, Any]:
         """What is declared of a parameter, and the value that a test has of it."""
         if name in WEATHER_PARAMETERS:
             return WEATHER_PARAMETERS[name], self._weather[name]
@@ -163,7 +185,9 @@ class _Declared:
         stated = test.get("parameters", {})
         if model == self._scenario.get("model"):
             stated = {**self._scenario.get("parameters", {}), **stated}
-        member = self._lookup.class_of(SCENARIOS, model, "scenario.model", *SCENARIO_BASES)
+        member = self._lookup.class_of(
+            SCENARIOS, model, "scenario.model", *SCENARIO_BASES
+        )
         default = stated.get(name, _defaults(member.target).get(name))
         return free_parameters(member.target).get(name), default
 

@@ -43,14 +43,16 @@ class Direction(NamedTuple):
         angle = math.radians(heading)
         cosine, sine = round(math.cos(angle), 12), round(math.sin(angle), 12)
         return Direction(
-            self.along * cosine - self.left * sine, self.left * cosine + self.along * sine
+            self.along * cosine - self.left * sine,
+            self.left * cosine + self.along * sine,
         )
 
     def extent(self, body: BodySize) -> BodySize:
         """Size along the lane and across it of a body that faces in this direction [m]."""
         cosine, sine = abs(self.along), abs(self.left)
         return BodySize(
-            body.length * cosine + body.width * sine, body.length * sine + body.width * cosine
+            body.length * cosine + body.width * sine,
+            body.length * sine + body.width * cosine,
         )
 
 
@@ -198,12 +200,16 @@ class ProtocolTest(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         remarks = []
         if not row.slowest <= self.speed <= row.fastest:
             tested = f"{row.slowest:g} to {row.fastest:g} km/h"
-            remarks.append(f"speed = {self.speed:g} km/h is outside the protocol's {tested}")
+            remarks.append(
+                f"speed = {self.speed:g} km/h is outside the protocol's {tested}"
+            )
         if self.impact_location not in row.locations:
             tested = ", ".join(f"{location:g}" for location in row.locations)
             remarks.append(
                 f"impact_location = {self.impact_location:g} % is none of the protocol's {tested} %"
             )
         if self.grade:
-            remarks.append(f"grade = {self.grade:g} %, and the protocol's road is level")
+            remarks.append(
+                f"grade = {self.grade:g} %, and the protocol's road is level"
+            )
         return [f"{self.test}: {remark}" for remark in remarks]

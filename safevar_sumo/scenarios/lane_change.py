@@ -36,7 +36,9 @@ BEGINS_AT = 1.0
 MotorwaySpeed = Annotated[float, Meta(gt=0, le=130), VEHICLE_SPEED]
 """Speed of the vehicle under test [km/h], up to that of the regulation's 01 series."""
 Gap = Annotated[
-    float, Meta(gt=0, le=500), searched(5.0, 120.0, "m", "gap when the lateral movement begins")
+    float,
+    Meta(gt=0, le=500),
+    searched(5.0, 120.0, "m", "gap when the lateral movement begins"),
 ]
 LateralSpeed = Annotated[
     float, Meta(gt=0, le=5), searched(0.5, 3.0, "m/s", "speed of the lateral movement")
@@ -67,7 +69,9 @@ class LaneChange(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     def moved(self, times: FloatArray) -> Quantity:
         """Distance that the car has moved sideways [m]."""
-        return np.minimum(self.lateral_speed * np.maximum(times - BEGINS_AT, 0.0), LANE_WIDTH)
+        return np.minimum(
+            self.lateral_speed * np.maximum(times - BEGINS_AT, 0.0), LANE_WIDTH
+        )
 
     @property
     def sign(self) -> float:
@@ -143,7 +147,9 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """The car that cuts in."""
         arrives = BEGINS_AT + LANE_WIDTH / self.lateral_speed
         speed = np.maximum(
-            self.first_speed - self.target_deceleration * np.maximum(times - arrives, 0.0), 0.0
+            self.first_speed
+            - self.target_deceleration * np.maximum(times - arrives, 0.0),
+            0.0,
         )
         first_gap = self.gap + (self.start_speed - self.first_speed) * BEGINS_AT
         x = first_gap + CAR.length / 2 + travelled(speed, times)
@@ -189,7 +195,10 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def duration(self) -> Quantity:
         """Length of a run [s]."""
         return (
-            BEGINS_AT + self.headway + (CAR.length + self.gap) / self.start_speed + self.time_after
+            BEGINS_AT
+            + self.headway
+            + (CAR.length + self.gap) / self.start_speed
+            + self.time_after
         )
 
     def tracks(self, times: FloatArray) -> list[Track]:
@@ -213,6 +222,8 @@ class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
         front = self.headway * speed + CAR.length
         x = front - CAR.length / 2 + speed * times
-        leader = Track("leader", "car", *CAR, x, self.sign * self.moved(times), 1.0, 0.0, speed)
+        leader = Track(
+            "leader", "car", *CAR, x, self.sign * self.moved(times), 1.0, 0.0, speed
+        )
         standing = front + speed * BEGINS_AT + self.gap + CAR.length / 2
         return [leader, Track.of("target", "car", standing, 0.0, size=CAR)]

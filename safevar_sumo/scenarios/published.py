@@ -12,7 +12,14 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import KMH_PER_MS, BoolArray, Encounter, FloatArray, Quantity, Trace
+from safevar_sumo.records import (
+    KMH_PER_MS,
+    BoolArray,
+    Encounter,
+    FloatArray,
+    Quantity,
+    Trace,
+)
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.base import (
     CROSSING_LANE,
@@ -131,12 +138,18 @@ class PedestrianCrossing(
         | None
     ) = None
     walking_speed: (
-        Annotated[_Positive, searched(0.5, 2.5, "m/s", "speed of the pedestrian")] | None
+        Annotated[_Positive, searched(0.5, 2.5, "m/s", "speed of the pedestrian")]
+        | None
     ) = None
     lateral_start: (
         Annotated[
             _Positive,
-            searched(4.0, 13.0, "m", "start of the pedestrian, to the right of the lane's middle"),
+            searched(
+                4.0,
+                13.0,
+                "m",
+                "start of the pedestrian, to the right of the lane's middle",
+            ),
         ]
         | None
     ) = None
@@ -148,13 +161,19 @@ class PedestrianCrossing(
         """The vehicle, the pedestrian's start and speed, as far as the study sets them."""
         changes = {}
         if self.distance is not None:
-            changes["vehicle[@id='vut']"] = {"departPos": _place(self._front(roads), "distance")}
+            changes["vehicle[@id='vut']"] = {
+                "departPos": _place(self._front(roads), "distance")
+            }
         if self.lateral_start is not None:
-            _, footpath = approach(roads).lane_coordinates(roads.lane(FOOTPATH_LANE).start)
+            _, footpath = approach(roads).lane_coordinates(
+                roads.lane(FOOTPATH_LANE).start
+            )
             start = _place(-footpath - self.lateral_start, "lateral_start")
             changes["person[@id='pedestrian']"] = {"departPos": start}
         if self.walking_speed is not None:
-            changes["person[@id='pedestrian']/walk"] = {"speed": as_text(self.walking_speed)}
+            changes["person[@id='pedestrian']/walk"] = {
+                "speed": as_text(self.walking_speed)
+            }
         return changes
 
     def _front(self, roads: Roads) -> Quantity:
@@ -169,7 +188,9 @@ class PedestrianCrossing(
         """Pedestrians at this one's speed, near those that vehicles reach him with, who cross for
         nobody.
         """
-        adult = Crossing(test="CPNA", target_speed=WALKING_SPEED * KMH_PER_MS, time_to_impact=7.0)
+        adult = Crossing(
+            test="CPNA", target_speed=WALKING_SPEED * KMH_PER_MS, time_to_impact=7.0
+        )
         for walk, speed in product((adult, replace(adult, test="CPFA")), SLOW_SPEEDS):
             yield from replace(walk, speed=speed).benign()
 
@@ -207,14 +228,20 @@ class PedestrianCrossing(
         half_width = world.person_width(PEDESTRIAN) / 2
         clear_point = path + half_width + world.vehicle_length(VUT)
         return _Memory(
-            frame, path - half_width, clear_point, lateral, np.zeros(len(lateral), dtype=bool)
+            frame,
+            path - half_width,
+            clear_point,
+            lateral,
+            np.zeros(len(lateral), dtype=bool),
         )
 
-    def observe(self, world: World, step: float, memory: _Memory) -> tuple[Scene, _Memory]:
+    def observe(
+        self, world: World, step: float, memory: _Memory
+    ) -> tuple[Scene, _Memory]:
         vehicle_positions = world.vehicle_positions(VUT)
-        lateral = memory.frame.left(world.person_positions(PEDESTRIAN)) - memory.frame.left(
-            vehicle_positions
-        )
+        lateral = memory.frame.left(
+            world.person_positions(PEDESTRIAN)
+        ) - memory.frame.left(vehicle_positions)
         lateral_speed = (lateral - memory.last_lateral) / step
         if self.turns_after is not None:
             turns_now = ~memory.has_turned & (
@@ -225,10 +252,16 @@ class PedestrianCrossing(
                 memory = memory._replace(has_turned=memory.has_turned | turns_now)
         front = memory.frame.along(vehicle_positions)
         moves_away = lateral * lateral_speed > 0
-        over = ((np.abs(lateral) > self.lane_width / 2) & moves_away) | (front > memory.clear_point)
+        over = ((np.abs(lateral) > self.lane_width / 2) & moves_away) | (
+            front > memory.clear_point
+        )
         width = np.array(world.person_width(PEDESTRIAN))
         scene = Scene(
-            memory.conflict_point - front, lateral, lateral_speed, over, obstacle_width=width
+            memory.conflict_point - front,
+            lateral,
+            lateral_speed,
+            over,
+            obstacle_width=width,
         )
         return scene, memory._replace(last_lateral=lateral)
 
@@ -241,8 +274,12 @@ class PedestrianCrossing(
         """
         half_length = trace.vehicle_length / 2
         centre_gap = trace.gap + half_length
-        centre_distance = np.sqrt(centre_gap * centre_gap + trace.lateral * trace.lateral)
-        approach = trace.speed * centre_gap + np.abs(trace.lateral_speed * trace.lateral)
+        centre_distance = np.sqrt(
+            centre_gap * centre_gap + trace.lateral * trace.lateral
+        )
+        approach = trace.speed * centre_gap + np.abs(
+            trace.lateral_speed * trace.lateral
+        )
         return Encounter(
             separation=trace.gap,
             distance=centre_distance - half_length,
@@ -294,7 +331,10 @@ class LeadVehicleStopped(
         Annotated[
             _Positive,
             searched(
-                10.0, 75.0, "m", "gap at the start, from the front bumper to the parked vehicle"
+                10.0,
+                75.0,
+                "m",
+                "gap at the start, from the front bumper to the parked vehicle",
             ),
         ]
         | None
@@ -329,14 +369,20 @@ class LeadVehicleStopped(
         frame = Frame.through_origin(world.lane_of(VUT))
         length = world.vehicle_length(PARKED_VEHICLE)
         return _Parked(
-            frame, frame.along(world.vehicle_positions(PARKED_VEHICLE)) - length, np.array(length)
+            frame,
+            frame.along(world.vehicle_positions(PARKED_VEHICLE)) - length,
+            np.array(length),
         )
 
-    def observe(self, world: World, step: float, memory: _Parked) -> tuple[Scene, _Parked]:
+    def observe(
+        self, world: World, step: float, memory: _Parked
+    ) -> tuple[Scene, _Parked]:
         gap = memory.rear - memory.frame.along(world.vehicle_positions(VUT))
         zeros = np.zeros_like(gap)
         never = zeros > 0
-        return Scene(gap, zeros, zeros, over=never, obstacle_length=memory.length), memory
+        return Scene(
+            gap, zeros, zeros, over=never, obstacle_length=memory.length
+        ), memory
 
     def encounter(self, trace: Trace) -> Encounter:
         """Safety degree: distance between the centres of two vehicles; TTC = gap / v

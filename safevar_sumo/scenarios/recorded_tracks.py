@@ -34,7 +34,12 @@ DIGITS = 9
 
 
 class RecordedTracks(
-    TrackScenario, Struct, dict=True, frozen=True, kw_only=True, forbid_unknown_fields=True
+    TrackScenario,
+    Struct,
+    dict=True,
+    frozen=True,
+    kw_only=True,
+    forbid_unknown_fields=True,
 ):
     """Others move as a table says, whatever the vehicle does. It begins at the first row of `ego`,
     with that body's size, and drives straight on. For `speed` and `grade` see `LaneTest`.
@@ -82,7 +87,11 @@ class RecordedTracks(
     @property
     def duration(self) -> float:
         """The time from the start to the last row of the others [s]."""
-        ends = [rows["time"].iloc[-1] for name, rows in self._bodies.items() if name != self.ego]
+        ends = [
+            rows["time"].iloc[-1]
+            for name, rows in self._bodies.items()
+            if name != self.ego
+        ]
         return float(max(ends, default=-np.inf) - self._start["time"])
 
     @property
@@ -141,10 +150,15 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
     # Texts, so that errors show what stands in the file.
     try:
         table = pd.read_csv(
-            BytesIO(read_file(Path(file))), dtype=str, keep_default_na=False, skipinitialspace=True
+            BytesIO(read_file(Path(file))),
+            dtype=str,
+            keep_default_na=False,
+            skipinitialspace=True,
         )
     except (OSError, ValueError) as error:
-        raise InputError("", f"{key_of(file)}: cannot be read: {error}", "a CSV file") from None
+        raise InputError(
+            "", f"{key_of(file)}: cannot be read: {error}", "a CSV file"
+        ) from None
     for name in COLUMNS:
         if name not in table:
             raise InputError(
@@ -166,7 +180,9 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
         if name == "name":
             expected = "a name"
         raise InputError(
-            "", f"{key_of(file)}: row {row + 1}: {name} = {table[name].iloc[row]!r}", expected
+            "",
+            f"{key_of(file)}: row {row + 1}: {name} = {table[name].iloc[row]!r}",
+            expected,
         )
 
     groups = values.groupby(table["name"], sort=False)
@@ -185,7 +201,9 @@ def _check_steps(body: str, times: FloatArray, longest: float) -> None:
     """Refuse two rows at one time, and a step longer than the longest one."""
     steps = np.diff(times)
     for row in np.flatnonzero(steps <= 0)[:1]:
-        raise InputError("", f"{body} has two rows at {times[row]:g} s", "one row at a time")
+        raise InputError(
+            "", f"{body} has two rows at {times[row]:g} s", "one row at a time"
+        )
     for row in np.flatnonzero(steps > longest + SAME)[:1]:
         raise InputError(
             "",

@@ -33,7 +33,12 @@ OWN_SIMULATOR = Mover(
 )
 """A class with `simulate`, which drives one vehicle after another; see `Simulator`."""
 SPEED = Legal(0.0, 1000.0)
-TIME, OUTCOME, IMPACT_SPEED, STRUCK_SPEED = "time", "outcome", "impact_speed", "struck_speed"
+TIME, OUTCOME, IMPACT_SPEED, STRUCK_SPEED = (
+    "time",
+    "outcome",
+    "impact_speed",
+    "struck_speed",
+)
 SAMPLED = {TIME: Legal(0.0), "speed": SPEED, "separation": Legal(0.0, infinite=True)}
 """What a trace has at each sample."""
 ALSO_SAMPLED = {
@@ -62,14 +67,18 @@ STEP_TOLERANCE = 1e-6
 """Largest difference between two time steps of a trace [s]."""
 
 
-def check_result(code: UserCode, method: str, result: Any, setting: Any) -> Mapping[str, Any]:
+def check_result(
+    code: UserCode, method: str, result: Any, setting: Any
+) -> Mapping[str, Any]:
     """Refuse a result that lacks a quantity, has an unknown one, or has illegal numbers.
 
     Arrays have float elements afterwards. A result without `time` is one of a rig that logs no
     trace: names of its metrics are checked where the study's are known.
     """
     if not isinstance(result, Mapping):
-        raise code.wrong(method, quoted(result), f"a mapping with {', '.join(SAMPLED)}, {OUTCOME}")
+        raise code.wrong(
+            method, quoted(result), f"a mapping with {', '.join(SAMPLED)}, {OUTCOME}"
+        )
     check = _checked_metrics
     names = [SAFETY_DEGREE]
     if TIME in result:
@@ -85,8 +94,13 @@ def check_result(code: UserCode, method: str, result: Any, setting: Any) -> Mapp
             )
     outcome = str(result[OUTCOME])
     if outcome not in OUTCOMES:
-        raise code.wrong(method, f"{OUTCOME} = {quoted(result[OUTCOME])}", ", ".join(OUTCOMES))
-    return {**check(code, method, result, outcome == Outcome.COLLISION), OUTCOME: outcome}
+        raise code.wrong(
+            method, f"{OUTCOME} = {quoted(result[OUTCOME])}", ", ".join(OUTCOMES)
+        )
+    return {
+        **check(code, method, result, outcome == Outcome.COLLISION),
+        OUTCOME: outcome,
+    }
 
 
 def _checked_trace(
@@ -120,19 +134,28 @@ def _checked_trace(
     if has_collided:
         if IMPACT_SPEED not in result:
             raise code.wrong(
-                method, f"a collision without {IMPACT_SPEED}", "the speed at impact [m/s]"
+                method,
+                f"a collision without {IMPACT_SPEED}",
+                "the speed at impact [m/s]",
             )
         ends = {name: result.get(name, 0.0) for name in OF_COLLISION}
         numbers = _numbers(code, method, ends, OF_COLLISION)
-    if contradiction := _contradiction(str(result[OUTCOME]), columns, numbers, steps[0]):
+    if contradiction := _contradiction(
+        str(result[OUTCOME]), columns, numbers, steps[0]
+    ):
         raise code.wrong(
-            method, contradiction, "an end that the trace allows within one of its steps"
+            method,
+            contradiction,
+            "an end that the trace allows within one of its steps",
         )
     return {**columns, **numbers}
 
 
 def _contradiction(
-    outcome: str, columns: Mapping[str, FloatArray], ends: Mapping[str, float], step: float
+    outcome: str,
+    columns: Mapping[str, FloatArray],
+    ends: Mapping[str, float],
+    step: float,
 ) -> str:
     """What a trace says of the end of its run that its samples exclude, by more than may happen
     within one step [s]; "" if nothing.
@@ -166,7 +189,10 @@ def unit_contradiction(trace: Trace) -> str:
     if active.sum() < 2:
         return ""
     speed, gap = trace.speed[active, 0], trace.gap[active, 0]
-    position, obstacle_speed = trace.position[active, 0], trace.obstacle_speed[active, 0]
+    position, obstacle_speed = (
+        trace.position[active, 0],
+        trace.obstacle_speed[active, 0],
+    )
     # Nobody is seen at an infinite gap.
     gap = np.where(np.isfinite(gap), gap, np.nan)
     driven = float(np.sum(speed[1:] + speed[:-1]) * trace.step / 2)
@@ -225,7 +251,9 @@ class Simulator(Scenario):
     """
 
     __slots__ = ()
-    RETURNS: ClassVar[Mapping[str, Returned]] = {"simulate": Returned(then=check_result)}
+    RETURNS: ClassVar[Mapping[str, Returned]] = {
+        "simulate": Returned(then=check_result)
+    }
     mover: ClassVar[Mover] = OWN_SIMULATOR
     UNITS: ClassVar[Mapping[str, str]]
     OPTIONAL: ClassVar[tuple[str, ...]] = ()

@@ -13,7 +13,9 @@ from safevar_sumo.scenarios.roads import Frame, Roads, World
 from safevar_sumo.scenarios.tracks import KMH, Speed
 
 
-class Stop(WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Stop(
+    WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
     """The vehicle brakes fully from a speed until it stands; the driving system is not asked.
 
     The metric `stopping_distance` says how far it went from the first brake force on.

@@ -18,7 +18,13 @@ from msgspec import Meta, Struct
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.plugins import Legal, Returned, UserCode, quoted
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Quantity
-from safevar_sumo.scenarios.base import MAX_TEST_SPEED, Grade, Scenario, XmlChanges, as_text
+from safevar_sumo.scenarios.base import (
+    MAX_TEST_SPEED,
+    Grade,
+    Scenario,
+    XmlChanges,
+    as_text,
+)
 from safevar_sumo.scenarios.roads import Roads
 from safevar_sumo.study import PHASE, free_parameters
 
@@ -124,7 +130,9 @@ def travelled(speeds: Quantity, times: FloatArray) -> FloatArray:
     """
     at_times = speeds + np.zeros_like(times)
     covered = (at_times[1:] + at_times[:-1]) / 2 * (times[1:] - times[:-1])
-    return np.concatenate([np.zeros_like(at_times[:1]), np.add.accumulate(covered, axis=0)])
+    return np.concatenate(
+        [np.zeros_like(at_times[:1]), np.add.accumulate(covered, axis=0)]
+    )
 
 
 def first_in_strip(body: Track, half_width: float) -> Quantity:
@@ -138,7 +146,9 @@ def first_in_strip(body: Track, half_width: float) -> Quantity:
         for side in (-half_width, half_width):
             crosses = (np.minimum(y, to_y) < side) & (side < np.maximum(y, to_y))
             share = (side - y) / np.where(crosses, to_y - y, 1.0)
-            first_x = np.where(crosses, np.minimum(first_x, x + (to_x - x) * share), first_x)
+            first_x = np.where(
+                crosses, np.minimum(first_x, x + (to_x - x) * share), first_x
+            )
     beside = np.minimum.reduce(np.broadcast_arrays(*(x for x, _ in corners)))
     return np.where(np.isinf(first_x), beside, first_x)[()]
 
@@ -156,7 +166,9 @@ def corners_of(body: Track) -> list[tuple[Quantity, Quantity]]:
     ]
 
 
-def check_tracks(code: UserCode, method: str, tracks: Any, times: FloatArray) -> Sequence[Track]:
+def check_tracks(
+    code: UserCode, method: str, tracks: Any, times: FloatArray
+) -> Sequence[Track]:
     """Refuse what a user's scenario returns if it is no list of tracks, or if a track has no
     number.
     """
@@ -166,12 +178,16 @@ def check_tracks(code: UserCode, method: str, tracks: Any, times: FloatArray) ->
         or not tracks
     ):
         raise code.wrong(
-            method, quoted(tracks), "a list of safevar_sumo.scenarios.Track, of one at least"
+            method,
+            quoted(tracks),
+            "a list of safevar_sumo.scenarios.Track, of one at least",
         )
     for track in tracks:
         for name, value in zip(Track._fields[2:], track[2:], strict=True):
             if np.asarray(value).dtype.kind not in "biuf":
-                raise code.wrong(method, f"{name} = {quoted(value)} of {track.name!r}", "numbers")
+                raise code.wrong(
+                    method, f"{name} = {quoted(value)} of {track.name!r}", "numbers"
+                )
     return tracks
 
 
@@ -286,7 +302,9 @@ class TrackScenario(Scenario):
         }
 
 
-class LaneTest(TrackScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LaneTest(
+    TrackScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
     """Base of tests on a straight lane, at whose speed a robot holds the vehicle until its driving
     system acts.
 

@@ -2,7 +2,11 @@
 
 from collections.abc import Mapping
 
-from safevar_sumo.search.base import Algorithm as Algorithm, Problem as Problem, Search as Search
+from safevar_sumo.search.base import (
+    Algorithm as Algorithm,
+    Problem as Problem,
+    Search as Search,
+)
 from safevar_sumo.search.baselines import RandomSearch, SafeFuzzer
 from safevar_sumo.search.genetic import Nsga2
 from safevar_sumo.search.pymoo import (
@@ -21,7 +25,8 @@ ALGORITHMS: Mapping[str, type[Algorithm]] = {
 _PYMOO_NAMES = ", ".join(name.removeprefix(PYMOO) for name in PYMOO_ALGORITHMS)
 DESCRIPTIONS = {
     **{
-        name: (algorithm.__doc__ or "").partition("\n")[0] for name, algorithm in ALGORITHMS.items()
+        name: (algorithm.__doc__ or "").partition("\n")[0]
+        for name, algorithm in ALGORITHMS.items()
     },
     "pymoo:NAME": f"An algorithm of pymoo (extra `pymoo`): {_PYMOO_NAMES}.",
 }

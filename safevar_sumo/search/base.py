@@ -14,7 +14,14 @@ import numpy as np
 
 from safevar_sumo.errors import subject
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
-from safevar_sumo.plugins import Legal, Returned, UserCode, quoted, read_only, user_errors
+from safevar_sumo.plugins import (
+    Legal,
+    Returned,
+    UserCode,
+    quoted,
+    read_only,
+    user_errors,
+)
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
@@ -75,7 +82,9 @@ class Problem:
     def nondominated(self, evaluations: Evaluations) -> Evaluations:
         """The valid evaluations that no other one of them dominates."""
         valid = evaluations.take(self.scoring.valid(evaluations))
-        return valid.take(moocore.is_nondominated(self.scoring.values(valid), keep_weakly=True))
+        return valid.take(
+            moocore.is_nondominated(self.scoring.values(valid), keep_weakly=True)
+        )
 
 
 def check_search(
@@ -103,14 +112,23 @@ def check_search(
         answer = read_only((yield settings))
 
 
-def _checked_settings(code: UserCode, output: Any, problem: Problem, budget: int) -> FloatArray:
+def _checked_settings(
+    code: UserCode, output: Any, problem: Problem, budget: int
+) -> FloatArray:
     characteristics = problem.characteristics
     shape = (
-        f"shape (k, {len(characteristics)}) with k from 1 to the {budget} evaluations that are left"
+        f"shape (k, {len(characteristics)}) with k from 1 to the {budget}"
+        " evaluations that are left"
     )
     is_matrix = isinstance(output, np.ndarray) and output.ndim == 2
-    if not is_matrix or output.shape[1] != len(characteristics) or not 1 <= len(output) <= budget:
-        raise code.wrong("search", f"settings = {quoted(output)}", f"an array of {shape}")
+    if (
+        not is_matrix
+        or output.shape[1] != len(characteristics)
+        or not 1 <= len(output) <= budget
+    ):
+        raise code.wrong(
+            "search", f"settings = {quoted(output)}", f"an array of {shape}"
+        )
     for characteristic, values in zip(characteristics, output.T, strict=True):
         code.check_numbers(
             "search",
@@ -169,7 +187,9 @@ class Algorithm:
     __slots__ = ()
     title: str = ""
     stops_by_itself: ClassVar[bool] = False
-    RETURNS: ClassVar[Mapping[str, Returned]] = {"search": Returned(like=0, then=check_search)}
+    RETURNS: ClassVar[Mapping[str, Returned]] = {
+        "search": Returned(like=0, then=check_search)
+    }
 
     @abstractmethod
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:

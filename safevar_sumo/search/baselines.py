@@ -17,17 +17,23 @@ from safevar_sumo.search.base import Algorithm, Problem, Search
 from safevar_sumo.study import ORIGINAL_DEGREE
 
 
-class RandomSearch(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class RandomSearch(
+    Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
     """Samples uniformly in the domains; the result is the non-dominated archive over all
     evaluations.
     """
 
     def search(self, problem: Problem, rng: Generator) -> Search:
-        settings = problem.characteristics.filter(problem.uniform(problem.evaluations, rng))
+        settings = problem.characteristics.filter(
+            problem.uniform(problem.evaluations, rng)
+        )
         archive = problem.original.take([])
         for start in range(0, len(settings), problem.population):
             evaluated = yield settings[start : start + problem.population]
-            archive = problem.nondominated(Evaluations.concatenate([archive, evaluated]))
+            archive = problem.nondominated(
+                Evaluations.concatenate([archive, evaluated])
+            )
         return archive
 
 
@@ -36,7 +42,9 @@ MAX_REDRAWS = 100
 PositiveCount = Annotated[int, Meta(ge=1, le=1_000_000)]
 
 
-class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SafeFuzzer(
+    Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
     """Changes a few characteristics of the original vehicle, in ranges that narrow towards less
     safe settings.
 
@@ -72,8 +80,13 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
         scores = []
         lowest_score = np.inf
         used = unimproved = last_update = 0
-        while used < problem.evaluations and unimproved < self.generations_without_improvement:
-            evaluated = yield ranges.draw(min(self.generation, problem.evaluations - used), rng)
+        while (
+            used < problem.evaluations
+            and unimproved < self.generations_without_improvement
+        ):
+            evaluated = yield ranges.draw(
+                min(self.generation, problem.evaluations - used), rng
+            )
             used += len(evaluated)
             generations.append(evaluated)
 
@@ -87,7 +100,10 @@ class SafeFuzzer(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fi
             lowest_score = min(lowest_score, lowest_in_generation)
 
             # Ranges narrow to the best settings of the last generations.
-            if used >= self.warm_up and len(generations) % self.generations_between_updates == 0:
+            if (
+                used >= self.warm_up
+                and len(generations) % self.generations_between_updates == 0
+            ):
                 ranges.narrow(Evaluations.concatenate(generations[last_update:]))
                 last_update = len(generations)
         best = np.argsort(np.concatenate(scores), kind="stable")[: self.kept]
@@ -176,12 +192,17 @@ class Ranges:
         """The first objective of the original vehicle; in its own encounter, if that is a safety
         degree there.
         """
-        if self._scoring.safe_original is not None and self._scoring.objectives[0] == F_SAFE:
+        if (
+            self._scoring.safe_original is not None
+            and self._scoring.objectives[0] == F_SAFE
+        ):
             return window.column(ORIGINAL_DEGREE)
         return np.full(len(window), self._original_objective)
 
 
-def _scores(evaluations: Evaluations, scoring: Scoring, safety_weight: float) -> FloatArray:
+def _scores(
+    evaluations: Evaluations, scoring: Scoring, safety_weight: float
+) -> FloatArray:
     """The scores of a generation, less being better, by default (6 SD_norm + f_diff + num_norm) /
     8; NaN if invalid.
 

@@ -43,7 +43,9 @@ def fitness_class(objective_count: int) -> type:
             self.values = values
 
     return type(
-        "Fitness", (base.Fitness,), {"weights": (-1.0,) * objective_count, "__init__": initialise}
+        "Fitness",
+        (base.Fitness,),
+        {"weights": (-1.0,) * objective_count, "__init__": initialise},
     )
 
 
@@ -89,23 +91,34 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     tournament_size: TournamentSize = 2
 
     def search(
-        self, problem: Problem, rng: np.random.Generator, generation: FloatArray | None = None
+        self,
+        problem: Problem,
+        rng: np.random.Generator,
+        generation: FloatArray | None = None,
     ) -> Search:
         reproduction = Reproduction(self, problem, rng)
         if generation is None:
-            generation = problem.uniform(min(problem.population, problem.evaluations), rng)
+            generation = problem.uniform(
+                min(problem.population, problem.evaluations), rng
+            )
         offspring = [*map(Individual, generation.tolist())]
         survivors = list[Individual]()
         used = 0
 
         while offspring:
             used += yield from request_evaluations(offspring, problem)
-            alive = [individual for individual in offspring if not individual.has_failed]
+            alive = [
+                individual for individual in offspring if not individual.has_failed
+            ]
             survivors = select_survivors(survivors + alive, problem.population)
             offspring = reproduction.draw_offspring(
                 survivors, min(problem.population, problem.evaluations - used)
             )
-        batches = [individual.evaluation for individual in survivors if individual.standing[0] == 0]
+        batches = [
+            individual.evaluation
+            for individual in survivors
+            if individual.standing[0] == 0
+        ]
         front = [evaluations.take([row]) for evaluations, row in batches]
         return Evaluations.concatenate([problem.original.take([]), *front])
 
@@ -113,7 +126,9 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 class Reproduction:
     """Draws offspring of one run. DEAP draws from the global `random`: see `_randomness`."""
 
-    def __init__(self, operators: Nsga2, problem: Problem, rng: np.random.Generator) -> None:
+    def __init__(
+        self, operators: Nsga2, problem: Problem, rng: np.random.Generator
+    ) -> None:
         characteristics = problem.characteristics
         self._problem = problem
         self._operators = operators
@@ -141,7 +156,9 @@ class Reproduction:
                 self._random_state = random.getstate()
                 random.setstate(state_of_caller)
 
-    def draw_offspring(self, population: list[Individual], number: int) -> list[Individual]:
+    def draw_offspring(
+        self, population: list[Individual], number: int
+    ) -> list[Individual]:
         """Draw `number` new individuals, in pairs: two tournaments, crossover, mutation."""
         offspring = list[Individual]()
         operators = self._operators
@@ -153,10 +170,15 @@ class Reproduction:
                     for _ in range(2)
                 ]
                 if random.random() <= operators.crossover_probability:
-                    tools.cxSimulatedBinaryBounded(*pair, operators.crossover_index, *domains)
+                    tools.cxSimulatedBinaryBounded(
+                        *pair, operators.crossover_index, *domains
+                    )
                 for child in pair:
                     tools.mutPolynomialBounded(
-                        child, operators.mutation_index, *domains, self._mutation_probability
+                        child,
+                        operators.mutation_index,
+                        *domains,
+                        self._mutation_probability,
                     )
                 offspring += self._feasible_children(pair)
         return offspring[:number]
@@ -178,7 +200,9 @@ class Reproduction:
             self._misses = 0
         if self._misses > MAX_MISSES:
             self._misses = 0
-            return [*map(Individual, self._problem.repaired(np.array(children)).tolist())]
+            return [
+                *map(Individual, self._problem.repaired(np.array(children)).tolist())
+            ]
         return [*compress(children, feasible)]
 
 
@@ -190,7 +214,9 @@ def request_evaluations(
     scoring = problem.scoring
     fitness = fitness_class(len(problem.scoring.objectives))
     violations = scoring.violation(evaluated)
-    failed = ~np.where(violations > 0, np.isfinite(violations), scoring.valid(evaluated))
+    failed = ~np.where(
+        violations > 0, np.isfinite(violations), scoring.valid(evaluated)
+    )
     columns = scoring.values(evaluated).tolist(), violations.tolist(), failed.tolist()
 
     for row, (individual, values, violation, has_failed) in enumerate(
@@ -214,7 +240,9 @@ def select_survivors(individuals: list[Individual], number: int) -> list[Individ
     for place, individual in enumerate(infeasible):
         individual.standing = len(individuals) + place, 0.0
     best_first = sorted(
-        filterfalse(by_violation, individuals), key=attrgetter("fitness.wvalues"), reverse=True
+        filterfalse(by_violation, individuals),
+        key=attrgetter("fitness.wvalues"),
+        reverse=True,
     )
     best = []
     for rank, front in enumerate(sort_into_fronts(best_first)):

@@ -82,7 +82,13 @@ TYPES: dict[str, Any] = {
     "F": float | list[float],
 }
 """Types of arguments whose default value in pymoo does not tell them."""
-HIDDEN = {"verb_log", "cmaes_verbose", "maxfevals", "n_diffs", "advance_after_initial_infill"}
+HIDDEN = {
+    "verb_log",
+    "cmaes_verbose",
+    "maxfevals",
+    "n_diffs",
+    "advance_after_initial_infill",
+}
 """Arguments that write files, print, or are no choice of the user's."""
 LEAST_POPULATION = 4
 """With fewer individuals GDE3 and NSDE draw for ever."""
@@ -90,7 +96,9 @@ FAILED = 1e9
 """Objectives and violation, for pymoo, of a setting that could not be scored."""
 
 
-class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PymooAlgorithm(
+    Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
     """An algorithm of pymoo; its fields are those arguments of pymoo's class that are plain values.
 
     A population that has a size by default has the study's. `ref_dirs` are reference directions, or
@@ -139,8 +147,12 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
                         Population.merge(optimum, batch), least_infeasible=True
                     )
         evaluations = Evaluations.concatenate(batches)
-        rows = {setting.tobytes(): row for row, setting in enumerate(evaluations.settings)}
-        optimal_rows = [rows[setting.tobytes()] for setting in _settings(optimum, problem)]
+        rows = {
+            setting.tobytes(): row for row, setting in enumerate(evaluations.settings)
+        }
+        optimal_rows = [
+            rows[setting.tobytes()] for setting in _settings(optimum, problem)
+        ]
         result = evaluations.take(optimal_rows)
         return result.take(problem.scoring.valid(result))
 
@@ -176,7 +188,9 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
             if value is not UNSET:
                 arguments[name] = value
         if arguments.get("pop_size", LEAST_POPULATION) < LEAST_POPULATION:
-            raise ValueError(f"pop_size = {arguments['pop_size']} is below {LEAST_POPULATION}")
+            raise ValueError(
+                f"pop_size = {arguments['pop_size']} is below {LEAST_POPULATION}"
+            )
         if "ref_dirs" in defaults:
             partitions = arguments.get("ref_dirs", PARTITIONS)
             if isinstance(partitions, int):
@@ -190,7 +204,9 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
                 )
             number = len(arguments["ref_dirs"])
             if arguments.get("pop_size", np.inf) < number:
-                raise ValueError(f"pop_size is less than the {number} reference directions")
+                raise ValueError(
+                    f"pop_size is less than the {number} reference directions"
+                )
         lower = problem.characteristics.lower
         upper = problem.characteristics.upper
         # MOEAD refuses constraints.
@@ -203,7 +219,9 @@ class PymooAlgorithm(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknow
         )
         # Without a copy, runs would share the defaults of pymoo's classes.
         algorithm = copy.deepcopy(_class_of(self.name)(**arguments))
-        return algorithm.setup(task, termination=("n_eval", problem.evaluations), seed=seed)
+        return algorithm.setup(
+            task, termination=("n_eval", problem.evaluations), seed=seed
+        )
 
 
 def _settings(population: Any, problem: Problem) -> FloatArray:
@@ -214,15 +232,21 @@ def _settings(population: Any, problem: Problem) -> FloatArray:
     return characteristics.filter(problem.repaired(values))
 
 
-def _score(population: Any, evaluations: Evaluations, problem: Problem, algorithm: Any) -> None:
+def _score(
+    population: Any, evaluations: Evaluations, problem: Problem, algorithm: Any
+) -> None:
     """Give pymoo's individuals their objectives and violations."""
     scoring = problem.scoring
     valid = scoring.valid(evaluations)
     violations = scoring.violation(evaluations)
     values = np.where(
-        valid[:, np.newaxis], scoring.values(evaluations)[:, : algorithm.problem.n_obj], FAILED
+        valid[:, np.newaxis],
+        scoring.values(evaluations)[:, : algorithm.problem.n_obj],
+        FAILED,
     )
-    violations = np.where(valid | (violations > 0), np.minimum(violations, FAILED), FAILED)
+    violations = np.where(
+        valid | (violations > 0), np.minimum(violations, FAILED), FAILED
+    )
     population.set("F", values, "G", violations[:, np.newaxis])
     population.apply(lambda individual: individual.evaluated.update("FGH"))
     algorithm.evaluator.n_eval += len(evaluations)
@@ -315,7 +339,9 @@ def _plain_arguments(name: str) -> dict[str, Any]:
     algorithm = _class_of(name)
     arguments = dict[str, inspect.Parameter]()
     # The arguments of DE are those of a class Variant.
-    variant = getattr(importlib.import_module(algorithm.__module__), "Variant", algorithm)
+    variant = getattr(
+        importlib.import_module(algorithm.__module__), "Variant", algorithm
+    )
     for ancestor in (*algorithm.__mro__[:-2], variant):
         arguments = {**inspect.signature(ancestor.__init__).parameters, **arguments}
 
@@ -325,5 +351,7 @@ def _plain_arguments(name: str) -> dict[str, Any]:
         argument: parameter.default
         for argument, parameter in arguments.items()
         if argument not in HIDDEN
-        and (argument in TYPES or isinstance(parameter.default, bool | int | float | str))
+        and (
+            argument in TYPES or isinstance(parameter.default, bool | int | float | str)
+        )
     }

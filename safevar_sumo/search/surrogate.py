@@ -31,14 +31,18 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
     is the non-dominated archive over all evaluations.
     """
 
-    def search(self, problem: Problem, rng: np.random.Generator, _: object = None) -> Search:
+    def search(
+        self, problem: Problem, rng: np.random.Generator, _: object = None
+    ) -> Search:
         draw = Ranges(problem).draw
         predicted = replace(problem, population=100, evaluations=1500)
         archive = yield draw(min(problem.population, problem.evaluations), rng)
         while budget := problem.evaluations - len(archive):
             predict = _learn(archive, problem, int(rng.integers(2**31)))
             best = problem.nondominated(archive).settings
-            search = super().search(predicted, rng, np.concatenate([best, draw(100, rng)]))
+            search = super().search(
+                predicted, rng, np.concatenate([best, draw(100, rng)])
+            )
             settings = next(search)
             try:
                 while True:
@@ -53,7 +57,9 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
             rows = [*new.values()]
             number = 10 + len(archive) // 10
             promising = number * 4 // 5
-            rows[promising:] = sorted(rows[promising:], key=front.column("certainty").__getitem__)
+            rows[promising:] = sorted(
+                rows[promising:], key=front.column("certainty").__getitem__
+            )
 
             # Random settings if they are too few; a smaller budget begins as a larger one does.
             candidates = np.concatenate([front.settings[rows], draw(number, rng)])
@@ -81,14 +87,20 @@ def _learn(
         for name, values in archive.metrics.items()
     ]
     columns = np.stack([*targets, targets[0]], axis=1)
-    bag = BaggingRegressor(Ridge(0.1), 20, random_state=seed).fit(archive.settings, columns)
+    bag = BaggingRegressor(Ridge(0.1), 20, random_state=seed).fit(
+        archive.settings, columns
+    )
 
     # Further decimals differ between libraries of linear algebra, and so would searches.
     def predict(settings: FloatArray) -> Evaluations:
-        values = np.array([model.predict(settings).T for model in bag.estimators_]).round(6)
+        values = np.array(
+            [model.predict(settings).T for model in bag.estimators_]
+        ).round(6)
         metrics = dict(zip(archive.metrics, values.mean(axis=0), strict=False))
         metrics["certainty"] = -values.std(axis=0)[0]
         exact = problem.characteristics.change_objectives(settings)
-        return replace(Evaluations.undefined(settings, "", (), **exact), metrics=metrics)
+        return replace(
+            Evaluations.undefined(settings, "", (), **exact), metrics=metrics
+        )
 
     return predict

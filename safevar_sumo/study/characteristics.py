@@ -50,9 +50,14 @@ class Domain(Table, frozen=True, kw_only=True):
                 f"numbers up to {MAX_MAGNITUDE:g}",
             )
         if self.lower >= self.upper:
-            raise mistake(f"lower = {self.lower} and upper = {self.upper}", "lower < upper")
+            raise mistake(
+                f"lower = {self.lower} and upper = {self.upper}", "lower < upper"
+            )
         if not self.lower <= self.original <= self.upper:
-            raise mistake(f"original = {self.original}", f"a value in [{self.lower}, {self.upper}]")
+            raise mistake(
+                f"original = {self.original}",
+                f"a value in [{self.lower}, {self.upper}]",
+            )
 
 
 class Precision(Table, frozen=True, kw_only=True):
@@ -145,7 +150,9 @@ class Fixed(_Distribution, frozen=True, kw_only=True, tag="fixed"):
 Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
 
 
-def check_variation(rows: Mapping[str, Domain], variation: Mapping[str, Distribution]) -> None:
+def check_variation(
+    rows: Mapping[str, Domain], variation: Mapping[str, Distribution]
+) -> None:
     """Refuse distributions that do not fit the characteristics' domains."""
     for name, distribution in variation.items():
         _check_characteristic("variation.", name, rows)
@@ -169,15 +176,23 @@ def _check_distribution(key: str, row: Domain, distribution: Distribution) -> No
     for field, value in stated.items():
         if field not in ("deviation", "sigma") and not row.lower <= value <= row.upper:
             raise InputError(
-                "", f"{key}.{field} = {value:g}", _number_within(row.lower, row.upper, row)
+                "",
+                f"{key}.{field} = {value:g}",
+                _number_within(row.lower, row.upper, row),
             )
     if lower >= upper:
-        raise InputError("", f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper")
+        raise InputError(
+            "", f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper"
+        )
     if isinstance(distribution, Triangular) and not lower <= mode <= upper:
-        raise InputError("", f"{key}.mode = {mode:g}", _number_within(lower, upper, row))
+        raise InputError(
+            "", f"{key}.mode = {mode:g}", _number_within(lower, upper, row)
+        )
     if isinstance(distribution, Lognormal) and row.lower <= 0:
         raise InputError(
-            "", f"{key}: lognormal, with a domain that begins at {row.lower:g}", "a domain above 0"
+            "",
+            f"{key}: lognormal, with a domain that begins at {row.lower:g}",
+            "a domain above 0",
         )
 
 
@@ -236,7 +251,9 @@ class Constraint(Table, frozen=True, kw_only=True):
         unit = unit_text(self.unit_of(rows))
         bounds = {"at least": self.at_least, "at most": self.at_most}
         return " and ".join(
-            f"{word} {value:g}{unit}" for word, value in bounds.items() if value is not None
+            f"{word} {value:g}{unit}"
+            for word, value in bounds.items()
+            if value is not None
         )
 
 
@@ -253,10 +270,14 @@ def check_bounds(at_least: float | None, at_most: float | None) -> None:
     if at_least is None and at_most is None:
         raise mistake("neither at_least nor at_most", "one of them, or both")
     if at_least is not None and at_most is not None and at_least > at_most:
-        raise mistake(f"at_least = {at_least:g} and at_most = {at_most:g}", "at_least <= at_most")
+        raise mistake(
+            f"at_least = {at_least:g} and at_most = {at_most:g}", "at_least <= at_most"
+        )
 
 
-def check_constraints(rows: Mapping[str, Domain], constraints: Sequence[Constraint]) -> None:
+def check_constraints(
+    rows: Mapping[str, Domain], constraints: Sequence[Constraint]
+) -> None:
     """Refuse constraints that name unknown characteristics or add quantities of different units."""
     for index, constraint in enumerate(constraints):
         key = f"constraints[{index}]"
@@ -267,7 +288,9 @@ def check_constraints(rows: Mapping[str, Domain], constraints: Sequence[Constrai
         legal_units = units | {"-"}
         if is_mixed:
             legal_units |= {row.unit for row in rows.values()}
-        if constraint.unit not in legal_units and (constraint.unit is not None or is_mixed):
+        if constraint.unit not in legal_units and (
+            constraint.unit is not None or is_mixed
+        ):
             terms = ", ".join(f"{name} [{rows[name].unit}]" for name in constraint.sum)
             raise InputError(
                 "",
@@ -331,7 +354,9 @@ def check_unmeasured(rows: Mapping[str, Domain], values: Mapping[str, float]) ->
 
 
 def limits_of(
-    texts: Iterable[str], rows: Mapping[str, Domain], stated: Mapping[str, Limit] | None = None
+    texts: Iterable[str],
+    rows: Mapping[str, Domain],
+    stated: Mapping[str, Limit] | None = None,
 ) -> dict[str, Limit]:
     """Limits by characteristic, in the order of `rows`: those of `texts`, such as `treadDepth >=
     3`, and where a text does not replace them, those `stated` in a study.
@@ -364,7 +389,9 @@ def limits_of(
     return {name: limits[name] for name in rows if name in limits}
 
 
-def check_limits(rows: Mapping[str, Domain], limits: Mapping[str, Limit], table: str = "") -> None:
+def check_limits(
+    rows: Mapping[str, Domain], limits: Mapping[str, Limit], table: str = ""
+) -> None:
     """Refuse limits of unknown characteristics, outside the domain, or that exclude the
     original.
     """

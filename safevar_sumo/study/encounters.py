@@ -140,7 +140,9 @@ class Weather(Table, frozen=True, kw_only=True):
     recognition_delay: Annotated[
         float,
         Meta(ge=0, le=5),
-        searched(0.0, 2.0, "s", "additional time that the sensors need in this weather"),
+        searched(
+            0.0, 2.0, "s", "additional time that the sensors need in this weather"
+        ),
     ] = 0.0
     light: Literal["day", "night"] = "day"
     water: Annotated[float, Meta(ge=0, le=20)] = 0.0
@@ -206,7 +208,9 @@ class MatrixTest(Table, frozen=True, kw_only=True):
 
 def at_values(test: MatrixTest, values: Mapping[str, Any]) -> MatrixTest:
     """A test with one value of each of these axes."""
-    return replace(test, over={**test.over, **{name: [value] for name, value in values.items()}})
+    return replace(
+        test, over={**test.over, **{name: [value] for name, value in values.items()}}
+    )
 
 
 class MatrixTable(Table, frozen=True, kw_only=True):
@@ -217,10 +221,14 @@ class MatrixTable(Table, frozen=True, kw_only=True):
     """
 
     tests: Annotated[list[MatrixTest], Meta(min_length=1)]
-    aggregate: Annotated[str, Meta(pattern=r"^(worst|[A-Za-z][A-Za-z0-9_]{0,63} [<>])\Z")] = WORST
+    aggregate: Annotated[
+        str, Meta(pattern=r"^(worst|[A-Za-z][A-Za-z0-9_]{0,63} [<>])\Z")
+    ] = WORST
 
     def __post_init__(self) -> None:
-        if self.aggregate != BY_EXCESS and any(test.allowed_impact_speed for test in self.tests):
+        if self.aggregate != BY_EXCESS and any(
+            test.allowed_impact_speed for test in self.tests
+        ):
             raise mistake(
                 f"aggregate = {self.aggregate!r}, and a test allows an impact",
                 f"{BY_EXCESS!r}, or no allowed_impact_speed",
@@ -279,7 +287,9 @@ class Encounters(Table, frozen=True, kw_only=True):
         tests = [test.name for test in self.tests]
         for constraint in self.constraints:
             for name in constraint.tests:
-                check_name("", f"constraints.tests: there is no test {name!r}", name, tests)
+                check_name(
+                    "", f"constraints.tests: there is no test {name!r}", name, tests
+                )
 
     @property
     def tests(self) -> list[MatrixTest]:
@@ -356,7 +366,9 @@ class Encounters(Table, frozen=True, kw_only=True):
         lists = self.lists_of(test)
         weathers = [[weather] for weather in test.weathers] or [[]]
         return [
-            replace(at_values(test, dict(zip(lists, values, strict=True))), weathers=weather)
+            replace(
+                at_values(test, dict(zip(lists, values, strict=True))), weathers=weather
+            )
             for values in product(*lists.values())
             for weather in weathers
         ]
@@ -366,7 +378,11 @@ class Encounters(Table, frozen=True, kw_only=True):
 
         def changed(over: Axes) -> Axes:
             axes = as_axes(change(as_axes(over)))
-            lists = {name: axis.at for name, axis in axes.items() if axis == AxisTable(at=axis.at)}
+            lists = {
+                name: axis.at
+                for name, axis in axes.items()
+                if axis == AxisTable(at=axis.at)
+            }
             return {**axes, **lists}
 
         matrix = self.matrix

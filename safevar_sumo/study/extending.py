@@ -75,7 +75,9 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
         for key, value in base.tables.items()
         if isinstance(value, dict) and key not in named_keys
     ]
-    for name in sorted(_scenario_parameters(base.tables) - _scenario_parameters(tables)):
+    for name in sorted(
+        _scenario_parameters(base.tables) - _scenario_parameters(tables)
+    ):
         dropped.append(f"{name} of [scenario]")
     if parts and dropped:
         differences = " and a different ".join(parts).replace("ads", "ADS")
@@ -93,7 +95,9 @@ def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:
     if "weather" in overrides:
         names -= {*WEATHER}
     tests = _tables_in(table_in(overrides, "matrix"), "tests")
-    if tests and all(test.get("model") not in (None, scenario.get("model")) for test in tests):
+    if tests and all(
+        test.get("model") not in (None, scenario.get("model")) for test in tests
+    ):
         names &= {*WEATHER}
     return {**scenario, "over": {name: axes[name] for name in axes if name in names}}
 

@@ -88,12 +88,16 @@ def study_path(study: str) -> Path:
             "the name of a study, or the path of its file (TOML)",
         )
     if study.endswith(".xosc"):
-        raise InputError("study", f"{study!r}: such files are not read any more", RECORDED)
+        raise InputError(
+            "study", f"{study!r}: such files are not read any more", RECORDED
+        )
     if os.path.exists(study):
         return Path(study)
     if study in ENDED_STUDIES:
         raise InputError(
-            "study", f"{study!r} is a study of releases before 0.5", ENDED_STUDIES[study]
+            "study",
+            f"{study!r} is a study of releases before 0.5",
+            ENDED_STUDIES[study],
         )
     problem = f"there is no study or file {study!r}"
     names = study_names()
@@ -111,10 +115,14 @@ def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
     raw = _raw_study(study)
     # Other encounters are another view of the study, and not another study.
     if "encounters" in changes:
-        raw = raw._replace(tables={**raw.tables, "encounters": changes.pop("encounters")})
+        raw = raw._replace(
+            tables={**raw.tables, "encounters": changes.pop("encounters")}
+        )
     if changes:
         arguments = ", ".join(f"{name}=..." for name in changes)
-        raw = with_overrides(raw, plain_values(changes), f"{raw.source} with {arguments}")
+        raw = with_overrides(
+            raw, plain_values(changes), f"{raw.source} with {arguments}"
+        )
     with about(raw.source):
         if "origin" in raw.tables:
             raise InputError("", "origin: there is no such key")
@@ -187,7 +195,8 @@ def _without_characteristics(model: object) -> InputError:
         models.add(tables.get("vehicle", {}).get("model"))
     models.discard(None)
     problem = (
-        f"vehicle.model = {model!r} has no characteristics: vehicle.characteristics is missing"
+        f"vehicle.model = {model!r} has no characteristics:"
+        " vehicle.characteristics is missing"
     )
     return InputError(
         "",
@@ -235,12 +244,16 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
     origin = Origin()
     if path.parent != STUDIES:
         origin = Origin(
-            called=str(path), places=(str(path.resolve().parent),), files=(os.path.abspath(path),)
+            called=str(path),
+            places=(str(path.resolve().parent),),
+            files=(os.path.abspath(path),),
         )
     return _with_base(StudyTables(path, tables, origin), path, visited_paths)
 
 
-def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
+def _with_base(
+    raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]
+) -> StudyTables:
     """The tables of `raw`, over those of the study that it extends, if any; with the folders of
     both.
     """
@@ -249,7 +262,9 @@ def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) ->
     if base is None:
         return raw
     if not isinstance(base, str):
-        raise InputError(raw.source, f"extends = {base!r}", "the name or path of a study")
+        raise InputError(
+            raw.source, f"extends = {base!r}", "the name or path of a study"
+        )
 
     # A study takes its file's name, and its base may stand beside it.
     if "name" not in tables and re.fullmatch(NAME_PATTERN, path.stem):
@@ -260,7 +275,9 @@ def _with_base(raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]) ->
     try:
         base_path = study_path(name_or_path)
     except InputError as error:
-        raise InputError(raw.source, f"extends = {base!r}: {error.problem}", error.legal) from None
+        raise InputError(
+            raw.source, f"extends = {base!r}: {error.problem}", error.legal
+        ) from None
     if base_path in (*visited_paths, path):
         raise InputError(
             raw.source, f"extends = {base!r} leads back to {base_path}", "another study"

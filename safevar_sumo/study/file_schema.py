@@ -30,7 +30,9 @@ def schema_text() -> str:
     tables["Study"]["properties"]["extends"] = EXTENDS
     tables["SearchTable"]["additionalProperties"] = {"type": "object"}
     rows = tables["VehicleTable"]["properties"]["characteristics"]
-    rows["additionalProperties"] = {"anyOf": [rows["additionalProperties"], {"const": False}]}
+    rows["additionalProperties"] = {
+        "anyOf": [rows["additionalProperties"], {"const": False}]
+    }
     tables["RepairTable"]["additionalProperties"] = {"$ref": "#/$defs/FreeParameter"}
     return json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
 

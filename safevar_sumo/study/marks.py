@@ -45,7 +45,9 @@ fields_of = cache(msgspec.structs.fields)
 def keys_with(mark: Meta, record: type[Table]) -> tuple[str, ...]:
     """The keys of a record's fields that have a mark."""
     return tuple(
-        field.name for field in fields_of(record) if mark in getattr(field.type, "__metadata__", ())
+        field.name
+        for field in fields_of(record)
+        if mark in getattr(field.type, "__metadata__", ())
     )
 
 

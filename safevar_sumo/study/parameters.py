@@ -39,7 +39,9 @@ def searched(lower: float, upper: float, unit: str, meaning: str) -> Meta:
     """
     return Meta(
         description=meaning,
-        extra={"free": FreeParameter(lower=lower, upper=upper, unit=unit, meaning=meaning)},
+        extra={
+            "free": FreeParameter(lower=lower, upper=upper, unit=unit, meaning=meaning)
+        },
     )
 
 

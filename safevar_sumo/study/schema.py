@@ -46,7 +46,8 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
 Name = Annotated[
     str,
     Meta(
-        pattern=NAME_PATTERN, description="letters, digits, _, . and -, the first a letter or digit"
+        pattern=NAME_PATTERN,
+        description="letters, digits, _, . and -, the first a letter or digit",
     ),
 ]
 SPREAD_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
@@ -211,15 +212,25 @@ class Study(Encounters, frozen=True, kw_only=True):
     step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
     published: Annotated[dict[str, float], WITHOUT_EFFECT, OF_SYSTEM, WHOLE] = {}
     repeatability: Annotated[
-        dict[str, Annotated[float, Meta(gt=0, le=1e6)]], WITHOUT_EFFECT, OF_SYSTEM, WHOLE
+        dict[str, Annotated[float, Meta(gt=0, le=1e6)]],
+        WITHOUT_EFFECT,
+        OF_SYSTEM,
+        WHOLE,
     ] = {}
-    spread: Annotated[dict[str, list[float]], WITHOUT_EFFECT, OF_VEHICLE_AND_ADS, WHOLE] = {}
+    spread: Annotated[
+        dict[str, list[float]], WITHOUT_EFFECT, OF_VEHICLE_AND_ADS, WHOLE
+    ] = {}
     model_error: Annotated[
-        dict[str, Annotated[float, Meta(ge=0, le=1e6)]], WITHOUT_EFFECT, OF_VEHICLE_AND_ADS, WHOLE
+        dict[str, Annotated[float, Meta(ge=0, le=1e6)]],
+        WITHOUT_EFFECT,
+        OF_VEHICLE_AND_ADS,
+        WHOLE,
     ] = {}
     variation: Annotated[dict[str, Distribution], WITHOUT_EFFECT] = {}
     limits: Annotated[dict[str, Limit], WITHOUT_EFFECT] = {}
-    unmeasured: Annotated[dict[str, float | UnmeasuredValue], WITHOUT_EFFECT, OF_STUDY] = {}
+    unmeasured: Annotated[
+        dict[str, float | UnmeasuredValue], WITHOUT_EFFECT, OF_STUDY
+    ] = {}
     repair: Annotated[RepairTable, WITHOUT_EFFECT] = RepairTable()
     unsafe: Annotated[UnsafeTable, WITHOUT_EFFECT] = UnsafeTable()
     origin: Origin = Origin()
@@ -230,7 +241,9 @@ class Study(Encounters, frozen=True, kw_only=True):
             raise InputError("", "vehicle.characteristics: none", "at least one")
         if self.scenario.kind:
             raise InputError(
-                "", f"scenario.kind = {self.scenario.kind!r}", "no kind: a scenario is no FMU"
+                "",
+                f"scenario.kind = {self.scenario.kind!r}",
+                "no kind: a scenario is no FMU",
             )
         check_variation(self.domains, self.variation)
         check_limits(rows, self.limits, table="limits.")
@@ -244,7 +257,9 @@ class Study(Encounters, frozen=True, kw_only=True):
                 "a list for each parameter, all of one length",
             )
         if 0 in self.published.values():
-            raise InputError("", f"published = {self.published}", "numbers other than 0")
+            raise InputError(
+                "", f"published = {self.published}", "numbers other than 0"
+            )
 
     @property
     def shared_constraints(self) -> list[Constraint]:
@@ -256,7 +271,8 @@ class Study(Encounters, frozen=True, kw_only=True):
         return [
             constraint
             for constraint in self.constraints
-            if constraint.sum.keys() <= names and tests <= {*(constraint.tests or tests)}
+            if constraint.sum.keys() <= names
+            and tests <= {*(constraint.tests or tests)}
         ]
 
     @property

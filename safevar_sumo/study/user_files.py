@@ -40,7 +40,9 @@ def user_modules(study: Study) -> list[str]:
 def user_code(study: Study) -> list[tuple[str, str]]:
     """Keys and names of a study's user code."""
     tests = [test.model for test in study.tests]
-    algorithms = [name for name in study.search.algorithms if not name.startswith(PYMOO)]
+    algorithms = [
+        name for name in study.search.algorithms if not name.startswith(PYMOO)
+    ]
     names_by_key = {
         "vehicle.model": [study.vehicle.model],
         "ads.model": [study.ads.model],
@@ -96,5 +98,8 @@ def _scenario_files(study: Study) -> list[str]:
             axes = study.axes_of(test)
             if "file" in axes:
                 texts += axes["file"].at
-            texts += [study.scenario.parameters.get("file"), test.parameters.get("file")]
+            texts += [
+                study.scenario.parameters.get("file"),
+                test.parameters.get("file"),
+            ]
     return [*dict.fromkeys(text for text in texts if isinstance(text, str))]

@@ -96,11 +96,15 @@ def _mistake(raw: Any, table: Any, prefix: Sequence[str], message: str) -> Input
     problem, _, location = message.partition(" - at `$")
     place = _place(raw, table, prefix, location)
     if field := re.match(r"Object contains unknown field `(.*)`", problem):
-        return _unknown_key(_path_text([*place.path, field[1]]), field[1], place.kind, table)
+        return _unknown_key(
+            _path_text([*place.path, field[1]]), field[1], place.kind, table
+        )
     if field := re.match(r"Object missing required field `(.*)`", problem):
         return _missing_key(place, field[1])
     if problem.startswith("Invalid enum value"):
-        return unknown_name("", place.text, place.value, filter(None, get_args(place.kind)))
+        return unknown_name(
+            "", place.text, place.value, filter(None, get_args(place.kind))
+        )
     # The value is that of the key that names the kind of table.
     if problem.startswith("Invalid value"):
         tags = [kind.__struct_config__.tag for kind in get_args(place.declared[-2])]
@@ -109,7 +113,9 @@ def _mistake(raw: Any, table: Any, prefix: Sequence[str], message: str) -> Input
         return InputError("", place.text, _expected_in_words(place, expected[1]))
     # The message of a `__post_init__` has what is expected on its second line.
     problem, _, legal = problem.partition("\n")
-    return InputError("", f"{_path_text(place.path)}: {problem}".removeprefix(": "), legal)
+    return InputError(
+        "", f"{_path_text(place.path)}: {problem}".removeprefix(": "), legal
+    )
 
 
 def _missing_key(place: _Place, key: str) -> InputError:
@@ -117,16 +123,22 @@ def _missing_key(place: _Place, key: str) -> InputError:
     for a new one.
     """
     names = [
-        name for name, table in place.siblings.items() if isinstance(table, dict) and key in table
+        name
+        for name, table in place.siblings.items()
+        if isinstance(table, dict) and key in table
     ]
-    keys = ", ".join(field.name for field in msgspec.structs.fields(place.kind) if field.required)
+    keys = ", ".join(
+        field.name for field in msgspec.structs.fields(place.kind) if field.required
+    )
     legal = f"{keys} for what is new here"
     hint = ""
     if names:
         hint = did_you_mean(place.path[-1], names)
         legal += f"; else {', '.join(names)}"
     return InputError(
-        "", f"{_path_text(place.path)}: {key} is missing{hint}".removeprefix(": "), legal
+        "",
+        f"{_path_text(place.path)}: {key} is missing{hint}".removeprefix(": "),
+        legal,
     )
 
 
@@ -137,7 +149,9 @@ def _expected_in_words(place: _Place, expected: str) -> str:
     for meta in getattr(place.declared[-1], "__metadata__", ()):
         if meta.pattern and meta.description:
             return str(meta.description)
-    legal = re.sub(r"\b(?:" + "|".join(WORDS) + r")\b", lambda word: WORDS[word[0]], expected)
+    legal = re.sub(
+        r"\b(?:" + "|".join(WORDS) + r")\b", lambda word: WORDS[word[0]], expected
+    )
     return legal.replace("`", "").replace(" | ", " or ")
 
 
@@ -172,7 +186,8 @@ def _intended_type(kind: Any, value: Any) -> Any:
         member
         for member in get_args(kind)
         if member is not NoneType
-        and (_is_record(member) or get_origin(member) is dict) == isinstance(value, dict)
+        and (_is_record(member) or get_origin(member) is dict)
+        == isinstance(value, dict)
     ]
     for record in filter(_is_record, kinds):
         config = record.__struct_config__
@@ -227,7 +242,9 @@ def _short_text(value: object) -> str:
     return f"{text[: MAX_QUOTE - 3]}..."
 
 
-def _infinite_numbers(value: object, path: Sequence[str | int]) -> Iterator[tuple[str, float]]:
+def _infinite_numbers(
+    value: object, path: Sequence[str | int]
+) -> Iterator[tuple[str, float]]:
     """Numbers in tables that are not finite, with their paths."""
     if isinstance(value, list | tuple):
         value = dict(enumerate(value))

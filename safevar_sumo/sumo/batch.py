@@ -13,11 +13,22 @@ import numpy as np
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
-from safevar_sumo.scenarios import WEATHER_PARAMETERS, Point, Scenario, TrackScenario, WorldScenario
+from safevar_sumo.scenarios import (
+    WEATHER_PARAMETERS,
+    Point,
+    Scenario,
+    TrackScenario,
+    WorldScenario,
+)
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.drive import Listener, drive, last_sample_of
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
-from safevar_sumo.sumo.engine import Start, open_in_process, open_varied_world, open_world
+from safevar_sumo.sumo.engine import (
+    Start,
+    open_in_process,
+    open_varied_world,
+    open_world,
+)
 from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.network import copied_network, networks_for
 from safevar_sumo.sumo.perception import Observer, SceneObserver
@@ -70,10 +81,16 @@ def reason_against_scenes(system: System) -> str:
         return "a controller written for TraCI reads the running simulation"
     searched = {*system.characteristics.scenario.names} - WEATHER_PARAMETERS.keys()
     played = (
-        point.scenario for point in system.points if isinstance(point.scenario, WorldScenario)
+        point.scenario
+        for point in system.points
+        if isinstance(point.scenario, WorldScenario)
     )
-    if searched and any(type(scenario).layout is WorldScenario.layout for scenario in played):
-        return f"each encounter has traffic of its own, by {', '.join(sorted(searched))}"
+    if searched and any(
+        type(scenario).layout is WorldScenario.layout for scenario in played
+    ):
+        return (
+            f"each encounter has traffic of its own, by {', '.join(sorted(searched))}"
+        )
     return system.scenes.reason_against_scenes(system.points)
 
 
@@ -111,12 +128,16 @@ def drive_all(
                 observer = observer_of(scenario, sumo_world, traffic)
                 runs = drive(on_road, vehicles, sumo_world, observer, listen)
         elif traffic is not None:
-            lane = LaneWorld(traffic, _start_speeds(on_road.points, len(settings)), traffic.step)
+            lane = LaneWorld(
+                traffic, _start_speeds(on_road.points, len(settings)), traffic.step
+            )
             vehicles = np.tile(vehicles, (len(system.points), 1))
             runs = drive(on_road, vehicles, lane, traffic, listen)
         else:
             world = _recorded_world(system, encounters, scenario)
-            runs = drive(on_road, vehicles, world, observer_of(scenario, world, None), listen)
+            runs = drive(
+                on_road, vehicles, world, observer_of(scenario, world, None), listen
+            )
     return runs
 
 
@@ -137,10 +158,14 @@ def _recorded_world(
     size = _vehicles_per_encounter(encounters)
     scenario = system.at_encounters(encounters[::size]).points[0].scenario
     assert isinstance(scenario, WorldScenario)
-    return RecordedWorld(scenes_of_encounters(scene, scenario, len(encounters) // size), size)
+    return RecordedWorld(
+        scenes_of_encounters(scene, scenario, len(encounters) // size), size
+    )
 
 
-def observer_of(scenario: Scenario, world: SceneWorld, traffic: Traffic | None) -> Observer:
+def observer_of(
+    scenario: Scenario, world: SceneWorld, traffic: Traffic | None
+) -> Observer:
     """Who observes for the vehicles: bodies on tracks, or else the scenario itself."""
     if traffic is not None:
         return traffic
@@ -160,7 +185,9 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
 
     # An encounter that several vehicles meet is there once: its bodies are computed once.
     if encounters.shape[1]:
-        _, distinct, group = np.unique(encounters, axis=0, return_index=True, return_inverse=True)
+        _, distinct, group = np.unique(
+            encounters, axis=0, return_index=True, return_inverse=True
+        )
         if len(distinct) == len(encounters):
             distinct = group = np.arange(len(encounters))
         points = system.at_encounters(encounters[distinct]).points
@@ -170,26 +197,35 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
     step = system.scenes.step_of(points[0].scenario)
     last_sample = max(float(np.max(last_sample_of(point, step))) for point in points)
     n_samples = round(last_sample + longer / step) + 1
-    return Traffic(points, group, n_encounters=n_encounters, n_samples=n_samples, step=step)
+    return Traffic(
+        points, group, n_encounters=n_encounters, n_samples=n_samples, step=step
+    )
 
 
 def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:
     """The speeds at the start of n vehicles at each point."""
-    return np.concatenate([np.zeros(n) + point.scenario.start_speed for point in points])
+    return np.concatenate(
+        [np.zeros(n) + point.scenario.start_speed for point in points]
+    )
 
 
 def _vehicles_per_encounter(encounters: FloatArray) -> int:
     """How many vehicles in a row meet the same encounter: 2 if a variant and the original take
     turns, else 1.
     """
-    is_paired = len(encounters) % 2 == 0 and np.array_equal(encounters[::2], encounters[1::2])
+    is_paired = len(encounters) % 2 == 0 and np.array_equal(
+        encounters[::2], encounters[1::2]
+    )
     if is_paired:
         return 2
     return 1
 
 
 def open_points_world(
-    system: System, encounters: FloatArray, traffic: Traffic | None, start: Start = open_in_process
+    system: System,
+    encounters: FloatArray,
+    traffic: Traffic | None,
+    start: Start = open_in_process,
 ) -> AbstractContextManager[SumoWorld]:
     """Start SUMO on a copy of the network of the system's only point for each of N encounters,
     shape (N, k).
@@ -209,7 +245,10 @@ def open_points_world(
     if traffic is not None:
         speeds = _start_speeds(system.at_encounters(encounters).points, n)
         create = partial(
-            TrafficWorld, traffic=traffic, start_speeds=speeds, start=start_frame(networks[0], step)
+            TrafficWorld,
+            traffic=traffic,
+            start_speeds=speeds,
+            start=start_frame(networks[0], step),
         )
     if n_searched:
         return open_varied_world(networks, step, create, start)

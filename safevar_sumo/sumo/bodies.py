@@ -90,7 +90,9 @@ class BodyPairs(NamedTuple):
     obstacle: Body
 
 
-def distance_covered(old_speed: FloatArray, new_speed: FloatArray, step: float) -> FloatArray:
+def distance_covered(
+    old_speed: FloatArray, new_speed: FloatArray, step: float
+) -> FloatArray:
     """Distance [m] covered in a time step at constant acceleration, by the operations of SUMO's
     `MSVehicle::getDeltaPos`.
     """
@@ -134,7 +136,9 @@ class VehicleWorld(Protocol):
     def frame(self) -> Frame:
         """The coordinates in which the vehicles' positions are along their lane."""
 
-    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> VehicleStates:
+    def enter(
+        self, types: SumoType | None, *, keeps_drivers: bool = False
+    ) -> VehicleStates:
         """Put the vehicles onto the road and return their first motion; called once, first.
 
         Without `types` any speed is possible. With `keeps_drivers` SUMO's drivers keep the
@@ -191,7 +195,9 @@ class FirstContacts:
     def __init__(self, n: int, is_tested: BoolArray) -> None:
         self._is_tested = is_tested
         self._was_inside = np.zeros(n, dtype=bool)
-        self.first = Contact(np.full(n, "", dtype="U5"), np.full(n, np.nan), np.zeros(n))
+        self.first = Contact(
+            np.full(n, "", dtype="U5"), np.full(n, np.nan), np.zeros(n)
+        )
 
     def count(
         self, world: VehicleWorld, hits: Mapping[int, float], scene: Scene
@@ -209,7 +215,9 @@ class FirstContacts:
             if not self._is_tested[copy] or side[copy] == FRONT
         }
 
-    def check(self, world: SceneWorld, scene: Scene, is_open: BoolArray, time: float) -> None:
+    def check(
+        self, world: SceneWorld, scene: Scene, is_open: BoolArray, time: float
+    ) -> None:
         """Refuse a scene in which the front of an open run's vehicle drives into a body and no
         collision is reported.
 
@@ -249,10 +257,14 @@ class FirstContacts:
     def _locate(self, pairs: BodyPairs, scene: Scene) -> None:
         copies, body, obstacle = pairs
         touches = find_touches(body, obstacle)
-        lateral_speed = np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[copies]
+        lateral_speed = np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[
+            copies
+        ]
         lateral = scene.lateral[copies] - lateral_speed * touches.age
         is_at_end = (touches.side == FRONT) | (touches.side == REAR)
-        share = np.where(is_at_end, lateral / body.width + 0.5, touches.behind_front / body.length)
+        share = np.where(
+            is_at_end, lateral / body.width + 0.5, touches.behind_front / body.length
+        )
         self.first.side[copies] = touches.side
         self.first.speed[copies] = obstacle.speed * np.round(
             (body.along * obstacle.along).sum(axis=1), COSINE_DECIMALS
@@ -260,12 +272,16 @@ class FirstContacts:
         self.first.place[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
 
 
-def distance_between(body: Track, middle: FloatArray, length: float, width: float) -> FloatArray:
+def distance_between(
+    body: Track, middle: FloatArray, length: float, width: float
+) -> FloatArray:
     """Distances [m] of a body and of vehicles of this size in the lane's middle, with their middles
     at `middle`: the least distance of a corner of either rectangle to the other one; 0 if they
     overlap.
     """
-    squares = [_square_outside(x - middle, y, length, width) for x, y in corners_of(body)]
+    squares = [
+        _square_outside(x - middle, y, length, width) for x, y in corners_of(body)
+    ]
     # In the body's axes the four corners of a vehicle are its middle plus what all vehicles share.
     x = middle - body.x
     lengthwise = x * body.along - body.y * body.left
@@ -278,7 +294,9 @@ def distance_between(body: Track, middle: FloatArray, length: float, width: floa
     ):
         dx = end * body.along + side * body.left
         dy = side * body.along - end * body.left
-        squares.append(_square_outside(lengthwise + dx, across + dy, body.length, body.width))
+        squares.append(
+            _square_outside(lengthwise + dx, across + dy, body.length, body.width)
+        )
     cosine = np.abs(body.along)
     sine = np.abs(body.left)
     # Bodies that cross each other have no corner in the other one.
@@ -294,7 +312,9 @@ def distance_between(body: Track, middle: FloatArray, length: float, width: floa
     return np.where(overlaps, 0.0, np.sqrt(nearest))
 
 
-def _square_outside(x: Quantity, y: Quantity, length: Quantity, width: Quantity) -> Quantity:
+def _square_outside(
+    x: Quantity, y: Quantity, length: Quantity, width: Quantity
+) -> Quantity:
     """The square of how far points are outside a rectangle around the origin [m^2]."""
     dx = np.maximum(np.abs(x) - length / 2, 0.0)
     dy = np.maximum(np.abs(y) - width / 2, 0.0)
@@ -330,14 +350,18 @@ def find_touches(body: Body, obstacle: Body) -> Touches:
 
     # Sides that do not approach each other were never apart: they touched infinitely long ago.
     ages = np.where(
-        is_closing, np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0), np.inf
+        is_closing,
+        np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0),
+        np.inf,
     )
     approaches = is_closing.any(axis=0)
     is_lengthwise = np.where(approaches, ages[0] < ages[1], overlap[0] < overlap[1])
     age = np.where(approaches, np.min(ages, axis=0), 0.0)
 
     is_ahead, is_left = distance > 0
-    side = np.where(is_lengthwise, np.where(is_ahead, FRONT, REAR), np.where(is_left, LEFT, RIGHT))
+    side = np.where(
+        is_lengthwise, np.where(is_ahead, FRONT, REAR), np.where(is_left, LEFT, RIGHT)
+    )
     return Touches(side, age, body.length / 2 - (distance[0] + age * speed[0]))
 
 
@@ -355,12 +379,16 @@ def _overlaps_along(body: Body, obstacle: Body) -> FloatArray:
     """The overlaps in that direction of the own bodies in which they are less deep [m]."""
     axes = _axes_of(body)
     distance = _dot(obstacle.middle - body.middle, axes)
-    return np.asarray(np.minimum(*(_joint_extent(body, obstacle, axes) - np.abs(distance))))
+    return np.asarray(
+        np.minimum(*(_joint_extent(body, obstacle, axes) - np.abs(distance)))
+    )
 
 
 def _axes_of(body: Body) -> FloatArray:
     """The directions along and across M bodies, unit vectors, shape (2, M, 2)."""
-    return np.stack([body.along, np.stack([-body.along[:, 1], body.along[:, 0]], axis=1)])
+    return np.stack(
+        [body.along, np.stack([-body.along[:, 1], body.along[:, 0]], axis=1)]
+    )
 
 
 def _joint_extent(body: Body, obstacle: Body, axes: FloatArray) -> FloatArray:

@@ -100,10 +100,14 @@ def write_roads(root: ElementTree.Element, n: int, file: Path) -> None:
     blocks = []
     for tag, children in groupby(root, key=lambda child: child.tag):
         if tag in SHARED_ELEMENTS:
-            blocks += [ElementTree.tostring(child, encoding="unicode") for child in children]
+            blocks += [
+                ElementTree.tostring(child, encoding="unicode") for child in children
+            ]
         else:
             elements = "".join(_marked_xml(child, ROAD_IDS) for child in children)
-            blocks += [elements.replace(_COPY_PLACEHOLDER, str(copy)) for copy in range(n)]
+            blocks += [
+                elements.replace(_COPY_PLACEHOLDER, str(copy)) for copy in range(n)
+            ]
     _write(root, blocks, file)
 
 
@@ -117,7 +121,11 @@ def write_demand(roots: Sequence[ElementTree.Element], n: int, file: Path) -> No
         If an element cannot be copied.
     """
     traffics = [[*_departures(root)] for root in roots]
-    copies = [(time, copy, text) for copy in range(n) for time, text in traffics[copy % len(roots)]]
+    copies = [
+        (time, copy, text)
+        for copy in range(n)
+        for time, text in traffics[copy % len(roots)]
+    ]
     copies.sort(key=itemgetter(0))
     blocks = [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies]
     _write(roots[0], blocks, file)
@@ -159,10 +167,14 @@ def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:
     for part in element.iter():
         if part.tag not in ids:
             raise InputError(
-                "", f"has a {part.tag!r}, which cannot be copied for every vehicle", ", ".join(ids)
+                "",
+                f"has a {part.tag!r}, which cannot be copied for every vehicle",
+                ", ".join(ids),
             )
         for name in set(ids[part.tag]) & part.attrib.keys():
-            ids_in_copy = (copied_id(_COPY_PLACEHOLDER, id_) for id_ in part.attrib[name].split())
+            ids_in_copy = (
+                copied_id(_COPY_PLACEHOLDER, id_) for id_ in part.attrib[name].split()
+            )
             part.set(name, " ".join(ids_in_copy))
     return ElementTree.tostring(element, encoding="unicode")
 
@@ -171,13 +183,18 @@ def _write(root: ElementTree.Element, blocks: Sequence[str], file: Path) -> None
     """Write a file with the root's tag and attributes, without those of a namespace, and `blocks`
     of XML in it.
     """
-    attributes = {name: value for name, value in root.attrib.items() if not name.startswith("{")}
+    attributes = {
+        name: value for name, value in root.attrib.items() if not name.startswith("{")
+    }
     empty_text = ElementTree.tostring(
-        ElementTree.Element(root.tag, attributes), encoding="unicode", short_empty_elements=False
+        ElementTree.Element(root.tag, attributes),
+        encoding="unicode",
+        short_empty_elements=False,
     )
     head, _, tail = empty_text.rpartition("</")
     file.write_text(
-        f"<?xml version='1.0' encoding='utf-8'?>\n{head}{''.join(blocks)}</{tail}", encoding="utf-8"
+        f"<?xml version='1.0' encoding='utf-8'?>\n{head}{''.join(blocks)}</{tail}",
+        encoding="utf-8",
     )
 
 

@@ -32,7 +32,12 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import VUT, Point, Scene
 from safevar_sumo.sumo.bodies import FirstContacts, VehicleStates, VehicleWorld
 from safevar_sumo.sumo.driving_robot import DrivingRobot
-from safevar_sumo.sumo.perception import Observer, Perception, SceneObserver, per_vehicle
+from safevar_sumo.sumo.perception import (
+    Observer,
+    Perception,
+    SceneObserver,
+    per_vehicle,
+)
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traffic import OVERTIME, Traffic
@@ -78,7 +83,9 @@ def drive(
     last_samples = [np.zeros(size) + last_sample_of(point, step) for point in points]
     last_sample = np.round(np.concatenate(last_samples)).astype(int)
     may_go_on = np.repeat([point.scenario.goes_on for point in points], size)
-    log = _Log(world, int(last_sample.max()) + 1 + round(may_go_on.any() * OVERTIME / step))
+    log = _Log(
+        world, int(last_sample.max()) + 1 + round(may_go_on.any() * OVERTIME / step)
+    )
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.capacity):
             time = sample * step
@@ -86,27 +93,40 @@ def drive(
             scene = observer.observe(motion, outcomes.is_open)
             # Who sees nobody drives through everybody: its run ends at the place of the encounter.
             if system.sees_nobody:
-                scene = scene._replace(visible=np.array(False), over=scene.over | (scene.gap <= 0))
+                scene = scene._replace(
+                    visible=np.array(False), over=scene.over | (scene.gap <= 0)
+                )
             collisions = contacts.count(world, motion.hits, scene)
             # SUMO misses contacts in some places; bodies on tracks touch wherever they overlap.
             if isinstance(observer, SceneObserver):
-                contacts.check(observer.world, scene, outcomes.is_open & ~scene.over, time)
+                contacts.check(
+                    observer.world, scene, outcomes.is_open & ~scene.over, time
+                )
             # Tracks go on, and so may a run among them; a scene ends by its time.
             if isinstance(observer, Traffic):
                 ends = may_go_on & outcomes.is_open & (sample == last_sample)
                 if ends.any():
                     may_go_on &= ~_go_on(observer, motion, ends, last_sample)
-            active = outcomes.note_sample(speed, scene.over, collisions, sample >= last_sample)
+            active = outcomes.note_sample(
+                speed, scene.over, collisions, sample >= last_sample
+            )
 
             observation = perception.observe(time, speed, scene)
-            observation = observation._replace(throttle=state.throttle, brake=state.brake)
+            observation = observation._replace(
+                throttle=state.throttle, brake=state.brake
+            )
             observation, state = vehicle.sense(prepared, state, observation)
             if listen is not None:
                 listen(observation)
             command, memory = ads.drive(observation, memory)
             outcomes.note_warnings(ads.warns(memory), speed, scene)
             command, state = robot.drive(command, state, outcomes.is_open)
-            values = {"speed": speed, "gear": state.gear, "active": active, "pedal": state.brake}
+            values = {
+                "speed": speed,
+                "gear": state.gear,
+                "active": active,
+                "pedal": state.brake,
+            }
             log.write(motion.fronts, scene, command, **values)
             if not np.count_nonzero(outcomes.is_open):
                 break
@@ -177,11 +197,17 @@ def enter(system: System, settings: FloatArray, world: VehicleWorld) -> RoadVehi
     n = len(settings)
 
     characteristics = system.characteristics.columns(settings)
-    prepared = vehicle.prepare(characteristics, *_roads(system.points, n, world.step_length))
+    prepared = vehicle.prepare(
+        characteristics, *_roads(system.points, n, world.step_length)
+    )
     types = vehicle.sumo_type(prepared)
 
     # A controller that was written for SUMO drives in it, beside SUMO's own driver.
-    ads = FullBrake() if system.points[0].scenario.brakes_fully else with_tau(system.ads, types.tau)
+    ads = (
+        FullBrake()
+        if system.points[0].scenario.brakes_fully
+        else with_tau(system.ads, types.tau)
+    )
     if not isinstance(ads, TraciController):
         return RoadVehicles(prepared, ads, world.enter(types))
     motion = world.enter(ads.known_types(system.nominal, types), keeps_drivers=True)
@@ -203,7 +229,9 @@ def _check_finite(
     for copy in open_rows(~is_finite)[:1]:
         changes = [
             f"{characteristic.name} = {value:g}"
-            for characteristic, value in zip(characteristics, settings[copy], strict=True)
+            for characteristic, value in zip(
+                characteristics, settings[copy], strict=True
+            )
             if value != characteristic.original
         ]
         values = ", ".join(changes) or "the original's values"
@@ -238,7 +266,9 @@ def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
     (point,) = system.points
     latency, reach, scale = system.vehicle.sensors(prepared) or Sensors.perfect(n)
     # Nobody is within a negative range.
-    reach_in_weather = np.full(n, -1.0) if system.sees_nobody else reach * point.weather.visibility
+    reach_in_weather = (
+        np.full(n, -1.0) if system.sees_nobody else reach * point.weather.visibility
+    )
     return Sensors(latency + point.weather.recognition_delay, reach_in_weather, scale)
 
 
@@ -258,8 +288,12 @@ class _Log:
 
         # Truths keep one byte instead of eight.
         names = (field.name for field in fields(Trace) if field.name not in OF_ALL_RUNS)
-        self._columns: dict[str, Any] = {name: np.zeros((capacity, world.n)) for name in names}
-        self._columns |= {name: np.zeros((capacity, world.n), dtype=bool) for name in TRUTHS}
+        self._columns: dict[str, Any] = {
+            name: np.zeros((capacity, world.n)) for name in names
+        }
+        self._columns |= {
+            name: np.zeros((capacity, world.n), dtype=bool) for name in TRUTHS
+        }
 
     def write(
         self,
@@ -333,11 +367,15 @@ class _Outcomes:
         self.is_open &= ~over & ~np.asarray(is_last)
         return active
 
-    def note_warnings(self, warns: BoolArray | None, speed: FloatArray, scene: Scene) -> None:
+    def note_warnings(
+        self, warns: BoolArray | None, speed: FloatArray, scene: Scene
+    ) -> None:
         """Note the time to collision, not as it is sensed, of each open run's first warning."""
         if warns is not None:
             closing_speed = speed - scene.obstacle_speed
-            is_first = warns & self.is_open & np.isnan(self.warning_ttc) & (closing_speed > 0)
+            is_first = (
+                warns & self.is_open & np.isnan(self.warning_ttc) & (closing_speed > 0)
+            )
             np.copyto(self.warning_ttc, scene.gap / closing_speed, where=is_first)
 
     def classify(self) -> TextArray:

@@ -62,8 +62,12 @@ class DrivingRobot:
         n = len(state.speed)
         size = n // len(points)
         # Without a test the speed is None, which becomes NaN.
-        speeds = (np.asarray(point.scenario.test_speed, dtype=float) for point in points)
-        self._test_speed = np.concatenate([np.broadcast_to(speed, size) for speed in speeds])
+        speeds = (
+            np.asarray(point.scenario.test_speed, dtype=float) for point in points
+        )
+        self._test_speed = np.concatenate(
+            [np.broadcast_to(speed, size) for speed in speeds]
+        )
         self.has_test_speed: BoolArray = ~np.isnan(self._test_speed)
         """Which vehicles are in a scenario with a `test_speed`."""
         self._is_driving = self.has_test_speed.copy()
@@ -84,7 +88,9 @@ class DrivingRobot:
         # The error divided by the tolerance in its direction, which differs from the other's [-].
         self._error_share = np.zeros(n)
 
-    def drive(self, command: Command, state: State, is_open: BoolArray) -> tuple[Command, State]:
+    def drive(
+        self, command: Command, state: State, is_open: BoolArray
+    ) -> tuple[Command, State]:
         """The command of the robot while it drives, otherwise of the system; and the state, with
         the gear held while the robot drives.
 
@@ -107,19 +113,35 @@ class DrivingRobot:
         system_pedal = command.throttle - command.brake
         self._max_system_pedal = np.maximum(self._max_system_pedal, system_pedal)
         self._is_driving = ~self._has_braked & (
-            system_pedal >= np.minimum(self._max_system_pedal, self._start_pedal) - ACTION_THRESHOLD
+            system_pedal
+            >= np.minimum(self._max_system_pedal, self._start_pedal) - ACTION_THRESHOLD
         )
 
         error = np.where(self._is_driving, error, 0.0)
         self._integral = np.minimum(
-            np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN), 1 / INTEGRAL_GAIN
+            np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN),
+            1 / INTEGRAL_GAIN,
         )
-        pedal = self._start_pedal - PROPORTIONAL_GAIN * error + INTEGRAL_GAIN * self._integral
+        pedal = (
+            self._start_pedal
+            - PROPORTIONAL_GAIN * error
+            + INTEGRAL_GAIN * self._integral
+        )
         robot_command = Command(
-            np.where(self._is_driving, np.minimum(np.maximum(pedal, 0.0), 1.0), command.throttle),
-            np.where(self._is_driving, np.minimum(np.maximum(-pedal, 0.0), 1.0), command.brake),
+            np.where(
+                self._is_driving,
+                np.minimum(np.maximum(pedal, 0.0), 1.0),
+                command.throttle,
+            ),
+            np.where(
+                self._is_driving,
+                np.minimum(np.maximum(-pedal, 0.0), 1.0),
+                command.brake,
+            ),
         )
-        return robot_command, self._vehicle.hold_gear(self._prepared, state, self._is_driving)
+        return robot_command, self._vehicle.hold_gear(
+            self._prepared, state, self._is_driving
+        )
 
     @property
     def invalid(self) -> BoolArray:

@@ -114,7 +114,9 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     )
 
     # Cruise controls brake to hold a speed, but take little off it.
-    if ((brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)).any():
+    if (
+        (brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)
+    ).any():
         return EmptyRoadFault(Reason.BRAKES, "brakes without an obstacle")
 
     approach = speed[-1] - obstacle_speed[-1]

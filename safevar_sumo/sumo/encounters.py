@@ -18,7 +18,14 @@ from msgspec.structs import replace as replace_fields
 
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import IMPACT_EXCESS
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, IntArray, Outcome, Quantity
+from safevar_sumo.records import (
+    BoolArray,
+    Evaluations,
+    FloatArray,
+    IntArray,
+    Outcome,
+    Quantity,
+)
 from safevar_sumo.scenarios import (
     VUT,
     WEATHER_PARAMETERS,
@@ -54,7 +61,9 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
             if widest.unit and domain.unit != widest.unit:
                 raise InputError("", f"{key}.unit = {domain.unit!r}", repr(widest.unit))
             if domain.lower < widest.lower or domain.upper > widest.upper:
-                problem = f"{key}: lower = {domain.lower:g} and upper = {domain.upper:g}"
+                problem = (
+                    f"{key}: lower = {domain.lower:g} and upper = {domain.upper:g}"
+                )
                 part = f"[{widest.lower:g}, {widest.upper:g}]{unit_text(widest.unit)}"
                 raise InputError("", problem, f"a part of {part}")
             first_weather = points[0].weather
@@ -63,7 +72,11 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
                 weather, name
             ):
                 weathers = f"{first_weather.name} and {weather.name}"
-                raise InputError("", f"{key}: weathers {weathers} of the matrix set {name}, too", "a range, or values in the weathers")
+                raise InputError(
+                    "",
+                    f"{key}: weathers {weathers} of the matrix set {name}, too",
+                    "a range, or values in the weathers",
+                )
         _check_corners(study, point, ranges)
 
 
@@ -82,7 +95,9 @@ def _check_corners(study: Study, point: Point, ranges: Mapping[str, Domain]) -> 
             if isinstance(scenario, TrackScenario):
                 scenario.tracks(np.zeros((1, 1)))
     except InputError as error:
-        raise InputError("", f"over: {error.problem}", error.legal or "narrower ranges") from None
+        raise InputError(
+            "", f"over: {error.problem}", error.legal or "narrower ranges"
+        ) from None
 
 
 def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
@@ -91,8 +106,12 @@ def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
     """
     values = point.own(values)
     phase = values.pop(PHASE, point.phase) if point.scenario.has_phase else point.phase
-    of_weather = {name: value for name, value in values.items() if name in WEATHER_PARAMETERS}
-    of_scenario = {name: value for name, value in values.items() if name not in of_weather}
+    of_weather = {
+        name: value for name, value in values.items() if name in WEATHER_PARAMETERS
+    }
+    of_scenario = {
+        name: value for name, value in values.items() if name not in of_weather
+    }
     weather = replace_fields(point.weather, **of_weather)
     scenario = point.scenario.at(of_scenario) if of_scenario else point.scenario
     return point._replace(scenario=scenario, weather=weather, phase=phase)
@@ -101,14 +120,22 @@ def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
 def original_encounter(point: Point, ranges: Mapping[str, Domain]) -> Point:
     """A point at the original values of its own ranges, or of all."""
     point_ranges = ranges if point.ranges is None else point.ranges
-    return encounter(point, {name: domain.original for name, domain in point_ranges.items()})
+    return encounter(
+        point, {name: domain.original for name, domain in point_ranges.items()}
+    )
 
 
-def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) -> Recording:
+def scenes_of_encounters(
+    recording: Recording, scenario: WorldScenario, n: int
+) -> Recording:
     """The scenes of N vehicles whose scenario has arrays as parameters, from a recorded scene."""
-    samples = 1 + int(np.max(np.round(np.asarray(scenario.duration) / recording.step_length)))
+    samples = 1 + int(
+        np.max(np.round(np.asarray(scenario.duration) / recording.step_length))
+    )
     layout = scenario.layout(recording, recording.step_length, samples)
-    tracks = {name: _extended(track, samples) for name, track in recording.tracks.items()}
+    tracks = {
+        name: _extended(track, samples) for name, track in recording.tracks.items()
+    }
 
     if layout.pedestrian:
         track = recording.tracks[layout.pedestrian]
@@ -123,7 +150,9 @@ def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) 
         tracks[layout.pedestrian] = track._replace(motion=np.stack(columns, axis=-1))
     return replace(
         recording,
-        start=np.broadcast_to(recording.start if layout.front is None else layout.front, n),
+        start=np.broadcast_to(
+            recording.start if layout.front is None else layout.front, n
+        ),
         speed=np.broadcast_to(recording.speed, n),
         tracks=tracks,
     )
@@ -132,7 +161,9 @@ def scenes_of_encounters(recording: Recording, scenario: WorldScenario, n: int) 
 def _extended(track: Film, samples: int) -> Film:
     """The track of an actor who stands, for at least this number of samples."""
     shortage = max(samples - len(track.motion), 0)
-    return track._replace(motion=np.pad(track.motion, ((0, shortage), (0, 0)), mode="edge"))
+    return track._replace(
+        motion=np.pad(track.motion, ((0, shortage), (0, 0)), mode="edge")
+    )
 
 
 def where_met(system: System, setting: FloatArray) -> System:
@@ -145,7 +176,9 @@ def where_met(system: System, setting: FloatArray) -> System:
     """
     settings = setting[np.newaxis]
     points = tuple(
-        point for point in system.points if not point.name or met_at(point, system, settings).all()
+        point
+        for point in system.points
+        if not point.name or met_at(point, system, settings).all()
     )
     if not points:
         raise InputError(
@@ -203,7 +236,9 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
             measures = -measures
         measures = np.where(np.isnan(measures), np.inf, measures)
         # An impact may be allowed: then the measure says how bad a collision is.
-        values = np.where(~has_collided | (name == IMPACT_EXCESS.name), measures, safety_degrees)
+        values = np.where(
+            ~has_collided | (name == IMPACT_EXCESS.name), measures, safety_degrees
+        )
 
     values[is_invalid & ~has_collided] = -np.inf
     return np.asarray(order[np.argmin(values, axis=0)])

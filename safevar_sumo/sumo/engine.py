@@ -52,7 +52,10 @@ OWN_OPTIONS = {
 its speeds, and what a collision is, depends on no user's file, and nobody who collides or waits
 leaves his place.
 """
-OUTPUT, NO_FILE = re.compile(r"(.+[.-])?output|netstate-dump|((error|message)-)?log"), "NUL"
+OUTPUT, NO_FILE = (
+    re.compile(r"(.+[.-])?output|netstate-dump|((error|message)-)?log"),
+    "NUL",
+)
 """SUMO's options that name a file to write, which would grow beside the user's network; and its
 name of no file.
 """
@@ -78,7 +81,9 @@ def open_in_process(options: Sequence[str]) -> Iterator[Api]:
         try:
             libsumo.start(["sumo", *options])
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-            raise EnvironmentFault(f"SUMO does not start: {str(error).strip()}") from None
+            raise EnvironmentFault(
+                f"SUMO does not start: {str(error).strip()}"
+            ) from None
         yield libsumo
 
 
@@ -97,7 +102,9 @@ def open_window(options: Sequence[str]) -> Iterator[Api]:
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     ):
         raise InputError(
-            "gui", "sumo-gui needs a display", "a desktop session, or DISPLAY in the environment"
+            "gui",
+            "sumo-gui needs a display",
+            "a desktop session, or DISPLAY in the environment",
         )
     program = program_of_sumo("sumo-gui", "gui")
 

@@ -39,9 +39,13 @@ class Kept:
         """
         kind = type(scenario)
         name = f"{kind.__module__}:{kind.__qualname__}"
-        has_worker = getattr_static(kind, "open_worker") is not Simulator.__dict__["open_worker"]
+        has_worker = (
+            getattr_static(kind, "open_worker") is not Simulator.__dict__["open_worker"]
+        )
         edited = (
-            Path(inspect.getfile(kind.open_worker)).stat().st_mtime_ns if has_worker else id(kind)
+            Path(inspect.getfile(kind.open_worker)).stat().st_mtime_ns
+            if has_worker
+            else id(kind)
         )
         if name in self._handles and self._handles[name][0] != edited:
             self._close(name)
@@ -53,7 +57,9 @@ class Kept:
         # Nothing that a run changes stays in the scenario. Without `open_worker`, what the run
         # before opened and put into the object is handed on.
         is_struct = isinstance(scenario, msgspec.Struct)
-        set_field: Any = msgspec.structs.force_setattr if is_struct else object.__setattr__
+        set_field: Any = (
+            msgspec.structs.force_setattr if is_struct else object.__setattr__
+        )
         simulator = copy(scenario)
         for field, value in _attributes(scenario).items():
             if has_worker or is_struct or isinstance(value, PLAIN):
@@ -66,7 +72,9 @@ class Kept:
                 kind.worker = property(lambda self: handle)
         elif not is_struct:
             for field, value in _attributes(self._last.get(name, simulator)).items():
-                if getattr(simulator, field, None) is None and not isinstance(value, PLAIN):
+                if getattr(simulator, field, None) is None and not isinstance(
+                    value, PLAIN
+                ):
                     set_field(simulator, field, value)
         self._last[name] = simulator
         return simulator

@@ -25,7 +25,9 @@ class LaneWorld:
         self._speed = start_speeds
         self._sample = 0
 
-    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> VehicleStates:
+    def enter(
+        self, types: SumoType | None, *, keeps_drivers: bool = False
+    ) -> VehicleStates:
         return self._motion(np.ones(self.n, dtype=bool))
 
     def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:

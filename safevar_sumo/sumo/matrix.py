@@ -129,7 +129,10 @@ def drive_and_score(
     if len(settings) > size:
         batches = np.split(settings, range(size, len(settings), size))
         return Evaluations.concatenate(
-            [drive_and_score(system, batch, with_originals=with_originals) for batch in batches]
+            [
+                drive_and_score(system, batch, with_originals=with_originals)
+                for batch in batches
+            ]
         )
 
     vehicles = settings
@@ -149,7 +152,11 @@ def drive_and_score(
         changes = system.characteristics.change_objectives(vehicles)
         reasons = {row.tobytes(): reason for row in vehicles}
         evaluations = Evaluations.undefined(
-            vehicles, Outcome.SIMULATOR_ERROR, system.measuring.measures, reasons=reasons, **changes
+            vehicles,
+            Outcome.SIMULATOR_ERROR,
+            system.measuring.measures,
+            reasons=reasons,
+            **changes,
         )
     if not takes_pairs:
         return evaluations
@@ -180,7 +187,8 @@ def evaluate_matrix(system: System, settings: FloatArray) -> Evaluations:
     take gigabytes.
     """
     results = {
-        result.point.name: result.evaluations for result in simulate_points(system, settings)
+        result.point.name: result.evaluations
+        for result in simulate_points(system, settings)
     }
     at_points = [results[point.name] for point in system.points]
     numbers = worst_points(system, at_points)
@@ -238,7 +246,9 @@ def simulate_all_points(system: System, settings: FloatArray) -> list[PointResul
     """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the
     errors of `drive_all`.
     """
-    by_name = {result.point.name: result for result in simulate_points(system, settings)}
+    by_name = {
+        result.point.name: result for result in simulate_points(system, settings)
+    }
     return [by_name[point.name] for point in system.points]
 
 
@@ -256,7 +266,9 @@ def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResul
         # Settings that have no encounter of these points keep their rows, for the others' sake.
         is_met = met_at(points[0], system, settings)
         vehicles = (
-            settings if is_met.all() else in_place_of_unmet(points[0], system, settings, is_met)
+            settings
+            if is_met.all()
+            else in_place_of_unmet(points[0], system, settings, is_met)
         )
         runs = drive_all(replace(system, points=points), vehicles)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
@@ -274,7 +286,10 @@ def worst_point(system: System, setting: FloatArray) -> Point:
     """The worst point of a setting, shape (n,); see `worst_points`."""
     if not system.matrix:
         return system.points[0]
-    at_points = [result.evaluations for result in simulate_all_points(system, setting[np.newaxis])]
+    at_points = [
+        result.evaluations
+        for result in simulate_all_points(system, setting[np.newaxis])
+    ]
     return system.points[int(worst_points(system, at_points)[0])]
 
 

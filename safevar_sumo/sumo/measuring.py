@@ -73,9 +73,15 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
 
     for name in study.metrics.also:
         if name in METRICS:
-            raise InputError("", f"metrics.also = {study.metrics.also}: every study has {name!r}", f"{one_of(OPTIONAL_METRICS)}, or package.module:Name")
+            raise InputError(
+                "",
+                f"metrics.also = {study.metrics.also}: every study has {name!r}",
+                f"{one_of(OPTIONAL_METRICS)}, or package.module:Name",
+            )
         if named.look_up(name, "metrics.also", metrics).of == "settings":
-            raise InputError("", f"metrics.also = {name!r} measures settings", "a measure of runs")
+            raise InputError(
+                "", f"metrics.also = {name!r} measures settings", "a measure of runs"
+            )
 
     if (bound := own_criterion(study).bound) is not None:
         measures = OPTIONAL_METRICS | named.computed
@@ -95,9 +101,17 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)
     for names in texts.values():
         if len(names) > 1:
-            raise InputError("", f"{OBJECTIVES_KEY}: {' and '.join(names)} are the same objective", "each objective once")
-    of_runs = tuple(measure.facts for measure in named.computed.values() if measure.of == "runs")
-    return Measuring(named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives)))
+            raise InputError(
+                "",
+                f"{OBJECTIVES_KEY}: {' and '.join(names)} are the same objective",
+                "each objective once",
+            )
+    of_runs = tuple(
+        measure.facts for measure in named.computed.values() if measure.of == "runs"
+    )
+    return Measuring(
+        named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives))
+    )
 
 
 def own_criterion(study: Study) -> Unsafe:
@@ -111,7 +125,9 @@ def own_criterion(study: Study) -> Unsafe:
     try:
         return Unsafe.parse(study.unsafe.criterion or COLLISION)
     except InputError as error:
-        raise InputError("", f"{CRITERION_KEY} = {error.problem}", error.legal) from None
+        raise InputError(
+            "", f"{CRITERION_KEY} = {error.problem}", error.legal
+        ) from None
 
 
 class _Named:
@@ -141,7 +157,9 @@ class _Named:
             measure = checked_measure(member.code)
             if measure.name in self._reserved_names:
                 raise InputError(
-                    "", f"{key} = {name!r}: the name {measure.name!r} is taken", "a unique name"
+                    "",
+                    f"{key} = {name!r}: the name {measure.name!r} is taken",
+                    "a unique name",
                 )
             self._own |= {name: measure, measure.name: measure}
             self._reserved_names.add(measure.name)

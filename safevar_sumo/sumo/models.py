@@ -13,7 +13,15 @@ from typing import Any
 
 import msgspec
 
-from safevar_sumo.ads import ADS, MAX_INSTANCES, Ads, Fmu, FmuAds, PerVehicleAds, ScalarAds
+from safevar_sumo.ads import (
+    ADS,
+    MAX_INSTANCES,
+    Ads,
+    Fmu,
+    FmuAds,
+    PerVehicleAds,
+    ScalarAds,
+)
 from safevar_sumo.errors import InputError, about, subject
 from safevar_sumo.output import file_beside
 from safevar_sumo.plugins import Lookup, Member, UserCode, instance_of
@@ -38,7 +46,11 @@ from safevar_sumo.study import (
 )
 from safevar_sumo.sumo.network import is_network, is_shipped
 from safevar_sumo.sumo.simulated_study import check_tables
-from safevar_sumo.sumo.traci_controller import Controller, TraciController, substitute_traci
+from safevar_sumo.sumo.traci_controller import (
+    Controller,
+    TraciController,
+    substitute_traci,
+)
 from safevar_sumo.vehicles import VEHICLES, SimulatedVehicle, Vehicle
 
 CONTROLLER_FORMS = (
@@ -105,7 +117,9 @@ def matrix_points(study: Study, lookup: Lookup) -> tuple[Point, ...]:
     """The points of a study's matrix; raises an error if several points share a name."""
     points: list[Point] = []
     shared = study.shared_constraints
-    constraints = [constraint for constraint in study.constraints if constraint not in shared]
+    constraints = [
+        constraint for constraint in study.constraints if constraint not in shared
+    ]
     for test in study.tests:
         with about(f"{subject()}: test {test.name!r}"):
             points += _points_of(test, study, constraints, lookup)
@@ -130,17 +144,23 @@ def _points_of(
     shared = study.scenario.parameters if model == study.scenario.model else {}
     lists, ranges = study.lists_of(test), study.ranges_of(test)
     constraints = tuple(
-        constraint for constraint in of_tests if test.name in (constraint.tests or [test.name])
+        constraint
+        for constraint in of_tests
+        if test.name in (constraint.tests or [test.name])
     )
     for number, alone in enumerate(study.points_of(test)):
         over = {name: alone.axes[name].at[0] for name in lists}
         # All weathers of an encounter share a scenario.
         if number % max(len(test.weathers), 1) == 0:
-            table = ModelTable(model=model, parameters={**shared, **test.parameters, **over})
+            table = ModelTable(
+                model=model, parameters={**shared, **test.parameters, **over}
+            )
             scenario = create_scenario(table, lookup)
             if not ranges:
                 scenario.check()
-            _check_listed({**table.parameters, **dict.fromkeys(ranges, None)}, constraints)
+            _check_listed(
+                {**table.parameters, **dict.fromkeys(ranges, None)}, constraints
+            )
         (weather,) = map(weather_of, alone.weathers or [study.weather])
         words = [test.name, *(f"{key} {value}" for key, value in over.items())]
         words += [weather.name] if scenario.mover.has("weather") else []
@@ -158,7 +178,9 @@ def _points_of(
 
 def _check_listed(values: Mapping[str, Any], constraints: Sequence[Constraint]) -> None:
     """Refuse a listed encounter that violates a constraint."""
-    numbers = {name: value for name, value in values.items() if isinstance(value, int | float)}
+    numbers = {
+        name: value for name, value in values.items() if isinstance(value, int | float)
+    }
     for constraint in constraints:
         if not constraint.allows(numbers):
             where = ", ".join(f"{name} = {numbers[name]:g}" for name in constraint.sum)
@@ -176,7 +198,9 @@ def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
     A folder with sources has priority, because a results directory beside the study may have the
     same name.
     """
-    paths = [path for folder in folders if is_network(path := Path(folder, scenario.network))]
+    paths = [
+        path for folder in folders if is_network(path := Path(folder, scenario.network))
+    ]
     if not (paths and scenario.mover.has("roads")) or is_shipped(scenario.network):
         return scenario
     with_sources = [path for path in paths if path.is_file() or any(path.glob("*.xml"))]
@@ -198,7 +222,9 @@ def _class_and_creator(
     table's parameters.
     """
     traci = f'with ads.kind = "traci" {CONTROLLER_FORMS}' if kind == "ads" else ""
-    member = lookup.class_of(shipped, table.model, f"{kind}.model", *bases, otherwise=traci)
+    member = lookup.class_of(
+        shipped, table.model, f"{kind}.model", *bases, otherwise=traci
+    )
     parameters = lookup.with_paths(member, table.parameters, f"{kind}.parameters")
     name = f"{kind}.model = {table.model!r}"
     return member, partial(instance_of, member, parameters, name, f"{kind}.parameters")
@@ -208,16 +234,22 @@ def create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
     """A study's vehicle; raises an InputError."""
     member, create = _class_and_creator("vehicle", VEHICLES, table, lookup, Vehicle)
     vehicle: Vehicle = create()
-    if member.code is not None and not isinstance(getattr(vehicle, "UNITS", None), Mapping):
+    if member.code is not None and not isinstance(
+        getattr(vehicle, "UNITS", None), Mapping
+    ):
         raise member.code.wrong(
-            "__init__", "an object without UNITS", "units of the characteristics by name"
+            "__init__",
+            "an object without UNITS",
+            "units of the characteristics by name",
         )
     return vehicle
 
 
 def create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
     """A scenario that a study names, with its parameters; raises an InputError."""
-    member, create = _class_and_creator("scenario", SCENARIOS, table, lookup, *SCENARIO_BASES)
+    member, create = _class_and_creator(
+        "scenario", SCENARIOS, table, lookup, *SCENARIO_BASES
+    )
     scenario: Scenario = create()
     if member.code is not None:
         further = LEGAL_FIELDS if isinstance(scenario, TrackScenario) else {}
@@ -234,7 +266,9 @@ def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
         path = file_beside(table.model, lookup.folders)
         if not path:
             raise InputError(
-                "", f"ads.model = {table.model!r}: there is no such file", "the path of an FMU"
+                "",
+                f"ads.model = {table.model!r}: there is no such file",
+                "the path of an FMU",
             )
         code = UserCode(f"ads.model = {table.model!r}")
         fleet = PerVehicleAds(partial(FmuAds, Fmu(path, table, code)), code)
@@ -246,10 +280,14 @@ def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
     ads: Ads = create()
     if not isinstance(ads, ScalarAds):
         return ads
-    return PerVehicleAds(create, member.code or UserCode(f"ads.model = {table.model!r}"))
+    return PerVehicleAds(
+        create, member.code or UserCode(f"ads.model = {table.model!r}")
+    )
 
 
-def create_driven(study: Study, lookup: Lookup, scenario: Scenario) -> tuple[Vehicle, Ads]:
+def create_driven(
+    study: Study, lookup: Lookup, scenario: Scenario
+) -> tuple[Vehicle, Ads]:
     """The vehicle of a study and its driving system; in a simulator of the user's own, only the
     vehicle's characteristics. Raises an InputError.
     """

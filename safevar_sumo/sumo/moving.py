@@ -92,7 +92,9 @@ class Moving(NamedTuple):
         edge = rear
         is_lengthwise = _rotated(track) & (cosine > sine)
         if is_lengthwise.any():
-            edge = np.where(is_lengthwise, first_in_strip(track, vehicle_width / 2), rear)
+            edge = np.where(
+                is_lengthwise, first_in_strip(track, vehicle_width / 2), rear
+            )
 
         vx = slim(track.speed * track.along)
         vy = slim(np.diff(track.y, axis=0, prepend=track.y[:1]) / step)
@@ -138,8 +140,16 @@ class Moving(NamedTuple):
             self.faces_along
             and body.faces_along
             and len(track.x) == len(track.y) == 1
-            and bool((np.abs(track.x - cover.x) <= (cover.length - track.length) / 2 + TIE).all())
-            and bool((np.abs(track.y - cover.y) <= (cover.width - track.width) / 2 + TIE).all())
+            and bool(
+                (
+                    np.abs(track.x - cover.x) <= (cover.length - track.length) / 2 + TIE
+                ).all()
+            )
+            and bool(
+                (
+                    np.abs(track.y - cover.y) <= (cover.width - track.width) / 2 + TIE
+                ).all()
+            )
         )
 
     def is_covered_by(self, bodies: Sequence[Moving]) -> bool:
@@ -176,7 +186,11 @@ def row(column: Sampled, sample: int, group: IntArray | None) -> Sampled:
 
 
 def tracks_of(
-    points: Sequence[Point], times: FloatArray, n_encounters: int, step: float, vehicle: Body
+    points: Sequence[Point],
+    times: FloatArray,
+    n_encounters: int,
+    step: float,
+    vehicle: Body,
 ) -> list[Track]:
     """The bodies at K points, each in N encounters, with columns; body b is that of all scenarios'
     bodies b. `vehicle` is the vehicle under test at the start.
@@ -208,7 +222,9 @@ def _joined(tracks: Sequence[Track], width: int) -> Track:
     for values in zip(*(track[2:] for track in tracks), strict=True):
         parts = [np.atleast_2d(np.asarray(value, dtype=float)) for value in values]
         length = max(len(part) for part in parts)
-        widened = [np.broadcast_to(part, (length, max(width, part.shape[1]))) for part in parts]
+        widened = [
+            np.broadcast_to(part, (length, max(width, part.shape[1]))) for part in parts
+        ]
         columns.append(slim(np.concatenate(widened, axis=1)))
     body = next(track for track in tracks if track is not NOBODY)
     return Track(body.name, body.kind, *columns)

@@ -22,7 +22,13 @@ from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
-from safevar_sumo.errors import EnvironmentFault, InputError, about, did_you_mean, missing_extra
+from safevar_sumo.errors import (
+    EnvironmentFault,
+    InputError,
+    about,
+    did_you_mean,
+    missing_extra,
+)
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.scenarios import Lane, Scenario
 from safevar_sumo.scenarios.base import XmlChanges
@@ -31,7 +37,11 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo import copies
 from safevar_sumo.sumo.copies import ensure_cached, parse_xml, write_demand, write_roads
 
-TRAFFIC_FILE, OPTIONS_FILE, NETWORK_FILE = "traffic.rou.xml", "scenario.sumocfg", "network.net.xml"
+TRAFFIC_FILE, OPTIONS_FILE, NETWORK_FILE = (
+    "traffic.rou.xml",
+    "scenario.sumocfg",
+    "network.net.xml",
+)
 NETWORK_ENDING, RECIPE_ENDING = ".net.xml", ".netccfg"
 LEGAL_FOLDERS = (
     f"a folder with a recipe of netconvert (*{RECIPE_ENDING}) or a *{NETWORK_ENDING}, "
@@ -102,7 +112,9 @@ def open_network(network: str) -> NetworkFiles:
             f"there is no network {network!r}{did_you_mean(network, names)}",
             f"one of {', '.join(names)}, or {LEGAL_FOLDERS}",
         )
-    folder, roads_file = (path, _roads_in(path)) if path.is_dir() else (path.parent, path.name)
+    folder, roads_file = (
+        (path, _roads_in(path)) if path.is_dir() else (path.parent, path.name)
+    )
 
     names = [roads_file, *_sources_of(folder / roads_file), TRAFFIC_FILE, OPTIONS_FILE]
     if (folder / OPTIONS_FILE).is_file():
@@ -111,7 +123,9 @@ def open_network(network: str) -> NetworkFiles:
         if not (folder / name).is_file():
             raise InputError(folder, f"{name} is missing", LEGAL_FOLDERS)
     digests = tuple((name, _digest((folder / name).read_bytes())) for name in names)
-    return NetworkFiles(folder, NETWORK_FILE if is_shipped(network) else roads_file, digests)
+    return NetworkFiles(
+        folder, NETWORK_FILE if is_shipped(network) else roads_file, digests
+    )
 
 
 def is_shipped(network: str) -> bool:
@@ -167,7 +181,9 @@ def _sources_of(file: Path) -> list[str]:
     if file.name.endswith(NETWORK_ENDING):
         return []
     values = [
-        value for option, value in options_in(file).items() if SOURCE_OPTION.fullmatch(option)
+        value
+        for option, value in options_in(file).items()
+        if SOURCE_OPTION.fullmatch(option)
     ]
     return [name.strip() for value in values for name in value.split(",")]
 
@@ -193,17 +209,26 @@ def copied_network(network: NetworkFiles, n: int) -> CopiedNetwork:
     """
     # Few sizes of networks serve all batches: 1, 2, 5, 10, 20, 50, ...
     size = next(
-        size for power in count() for factor in (1, 2, 5) if (size := factor * 10**power) >= n
+        size
+        for power in count()
+        for factor in (1, 2, 5)
+        if (size := factor * 10**power) >= n
     )
     traffic_file = network.path(TRAFFIC_FILE)
 
     def copy_roads(into: Path) -> None:
-        with about(network.path(network.roads_file) if network.is_built else network.folder):
+        with about(
+            network.path(network.roads_file) if network.is_built else network.folder
+        ):
             write_roads(parse_xml(built_network(network)), size, into / NETWORK_FILE)
 
     def copy_traffic(into: Path) -> None:
         with about(traffic_file):
-            write_demand([_changed(traffic_file, network.traffic_changes)], n, into / TRAFFIC_FILE)
+            write_demand(
+                [_changed(traffic_file, network.traffic_changes)],
+                n,
+                into / TRAFFIC_FILE,
+            )
 
     roads = cache_folder_name(network, size, road_digests(network))
     traffic = cache_folder_name(
@@ -225,7 +250,9 @@ def varied_network(networks: Sequence[NetworkFiles]) -> Iterator[CopiedNetwork]:
     traffic_file = networks[0].path(TRAFFIC_FILE)
     with temporary_folder() as folder:
         file = Path(folder, TRAFFIC_FILE)
-        roots = [_changed(traffic_file, network.traffic_changes) for network in networks]
+        roots = [
+            _changed(traffic_file, network.traffic_changes) for network in networks
+        ]
         with about(traffic_file):
             write_demand(roots, len(roots), file)
         yield files._replace(traffic=file)
@@ -241,12 +268,16 @@ def built_network(network: NetworkFiles) -> Path:
 
     def build(into: Path) -> None:
         if network.lane_changes:
-            content = ElementTree.tostring(_changed(built_network(original), network.lane_changes))
+            content = ElementTree.tostring(
+                _changed(built_network(original), network.lane_changes)
+            )
             (into / NETWORK_FILE).write_bytes(content)
         else:
             _run_netconvert(network, into / NETWORK_FILE)
 
-    return ensure_cached(cache_folder_name(network, 0, road_digests(network)), NETWORK_FILE, build)
+    return ensure_cached(
+        cache_folder_name(network, 0, road_digests(network)), NETWORK_FILE, build
+    )
 
 
 @cache
@@ -318,13 +349,17 @@ def _digest(content: bytes) -> str:
 
 @cache
 def _code_digest() -> str:
-    return _digest(Path(__file__).read_bytes() + Path(str(copies.__file__)).read_bytes())
+    return _digest(
+        Path(__file__).read_bytes() + Path(str(copies.__file__)).read_bytes()
+    )
 
 
 def road_digests(network: NetworkFiles) -> list[str]:
     """Digests of a network's roads: of its sources, the file as it was built, and its changes."""
     digests = [
-        digest for name, digest in network.digests if name not in (TRAFFIC_FILE, OPTIONS_FILE)
+        digest
+        for name, digest in network.digests
+        if name not in (TRAFFIC_FILE, OPTIONS_FILE)
     ]
     if network.is_built:
         digests.append(_digest(network.path(network.roads_file).read_bytes()))
@@ -335,7 +370,11 @@ def _run_netconvert(network: NetworkFiles, file: Path) -> None:
     netconvert = program_of_sumo("netconvert", network.path(network.roads_file))
     arguments = ("-c", network.roads_file, "-o", str(file), "--no-warnings", "true")
     exit_code, errors = run_program(network.folder, netconvert, *arguments)
-    if exit_code < 0 or "bad_alloc" in errors or ("Could not" in errors and "output" in errors):
+    if (
+        exit_code < 0
+        or "bad_alloc" in errors
+        or ("Could not" in errors and "output" in errors)
+    ):
         raise EnvironmentFault(
             f"{network.folder}: netconvert fails: {errors or f'exit code {exit_code}'}"
         )
@@ -367,12 +406,18 @@ def networks_for(scenarios: Sequence[Scenario]) -> list[NetworkFiles]:
     """
     names = {scenario.network for scenario in scenarios}
     networks = {name: open_network(name) for name in names}
-    return [_network_for(scenario, networks[scenario.network]) for scenario in scenarios]
+    return [
+        _network_for(scenario, networks[scenario.network]) for scenario in scenarios
+    ]
 
 
 def _network_for(scenario: Scenario, network: NetworkFiles) -> NetworkFiles:
-    network = network._replace(lane_changes=_frozen(scenario.lanes(_BuiltRoads(network))))
-    return network._replace(traffic_changes=_frozen(scenario.actors(_BuiltRoads(network))))
+    network = network._replace(
+        lane_changes=_frozen(scenario.lanes(_BuiltRoads(network)))
+    )
+    return network._replace(
+        traffic_changes=_frozen(scenario.actors(_BuiltRoads(network)))
+    )
 
 
 def _frozen(changes: XmlChanges) -> Changes:

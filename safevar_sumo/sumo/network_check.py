@@ -12,7 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError, about, subject
+from safevar_sumo.errors import (
+    EnvironmentFault,
+    InputError,
+    SimulationError,
+    about,
+    subject,
+)
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import ensure_cached, parse_seconds, parse_xml
 from safevar_sumo.sumo.engine import STEP_LENGTH, as_arguments, open_world, own_options
@@ -130,8 +136,15 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
     unused_attributes = dict[str, None]()
     for element in parse_xml(file).findall(f"*[@id='{VUT}']"):
         for attribute, value in element.items():
-            is_replaced = attribute in SETTING_ATTRIBUTES or DRIVER_ATTRIBUTES.fullmatch(attribute)
-            if is_replaced and attribute not in acting and value != NO_EFFECT.get(attribute):
+            is_replaced = (
+                attribute in SETTING_ATTRIBUTES
+                or DRIVER_ATTRIBUTES.fullmatch(attribute)
+            )
+            if (
+                is_replaced
+                and attribute not in acting
+                and value != NO_EFFECT.get(attribute)
+            ):
                 unused_attributes[f"{attribute} = {value}"] = None
     remarks = []
     if unused_attributes:
@@ -193,8 +206,14 @@ def _check_files(network: NetworkFiles) -> None:
         "route-files": TRAFFIC_FILE,
         **options_in(network.path(OPTIONS_FILE)),
     }
-    is_legal_step = SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP
-    if "remote-port" in options or not is_legal_step or options["route-files"] != TRAFFIC_FILE:
+    is_legal_step = (
+        SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP
+    )
+    if (
+        "remote-port" in options
+        or not is_legal_step
+        or options["route-files"] != TRAFFIC_FILE
+    ):
         stated = ", ".join(
             f"{name} = {options[name]!r}"
             for name in ("remote-port", "step-length", "route-files")
@@ -206,23 +225,36 @@ def _check_files(network: NetworkFiles) -> None:
     file = network.path(TRAFFIC_FILE)
     traffic = parse_xml(file)
     vut = next(
-        (actor for actor in traffic if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT),
+        (
+            actor
+            for actor in traffic
+            if actor.tag in ("vehicle", "trip") and actor.get("id") == VUT
+        ),
         None,
     )
     if vut is None:
         raise InputError(
-            file, f"has no vehicle {VUT!r}", f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>'
+            file,
+            f"has no vehicle {VUT!r}",
+            f'<vehicle id="{VUT}" type="{VUT}" depart="0" ...>',
         )
-    routes = (vut, *vut.findall("route"), *traffic.findall(f"route[@id='{vut.get('route')}']"))
+    routes = (
+        vut,
+        *vut.findall("route"),
+        *traffic.findall(f"route[@id='{vut.get('route')}']"),
+    )
     type_name = vut.get("type")
     depart = vut.get("depart", "")
     n_others = sum(actor is not vut and actor.get("type") == VUT for actor in traffic)
     has_stop = any(route.find("stop") is not None for route in routes)
     if type_name != VUT or n_others or parse_seconds(depart) != 0 or has_stop:
         problem = (
-            f"vehicle {VUT!r}: type = {type_name!r} (of {n_others} others), depart = {depart!r}"
+            f"vehicle {VUT!r}: type = {type_name!r} (of {n_others} others), depart ="
+            f" {depart!r}"
         )
-        raise InputError(file, f"{problem}, has {'a stop' if has_stop else 'no stop'}", LEGAL_VUT)
+        raise InputError(
+            file, f"{problem}, has {'a stop' if has_stop else 'no stop'}", LEGAL_VUT
+        )
     _check_lanes(file, routes, parse_xml(built_network(network)))
     _refuse_random_types(file, traffic)
     _warnings_file(network)
@@ -233,7 +265,9 @@ def _check_lanes(
 ) -> None:
     """Refuse a sloping or slippery road of the vehicle under test."""
     names = " ".join(
-        route.get(name, "") for route in routes for name in ("edges", "from", "via", "to")
+        route.get(name, "")
+        for route in routes
+        for name in ("edges", "from", "via", "to")
     ).split()
     edges = (edge for edge in roads.iter("edge") if edge.get("id") in names)
     for lane in (lane for edge in edges for lane in edge.iter("lane")):
@@ -266,7 +300,11 @@ def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
             f"vType {vtype.get('id')!r} drives at random: speedDev = {speed_dev}, sigma = {sigma},"
             f" {model}"
         )
-        if float(speed_dev) or float(sigma) or model not in (*SIGMA_MODELS, *DETERMINISTIC_MODELS):
+        if (
+            float(speed_dev)
+            or float(sigma)
+            or model not in (*SIGMA_MODELS, *DETERMINISTIC_MODELS)
+        ):
             raise InputError(
                 file,
                 problem,
@@ -279,7 +317,9 @@ def _warnings_file(network: NetworkFiles) -> Path:
     `check_network`.
     """
     folder = cache_folder_name(network, 0, [digest for _, digest in network.digests])
-    return ensure_cached(f"tried-{folder}", WARNINGS_FILE, partial(_try_network, network))
+    return ensure_cached(
+        f"tried-{folder}", WARNINGS_FILE, partial(_try_network, network)
+    )
 
 
 def _try_network(network: NetworkFiles, into: Path) -> None:
@@ -287,7 +327,14 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
     two copies.
     """
     legal = "options and traffic that SUMO loads without an error"
-    files = ("-c", OPTIONS_FILE, "-n", str(built_network(network).absolute()), "-r", TRAFFIC_FILE)
+    files = (
+        "-c",
+        OPTIONS_FILE,
+        "-n",
+        str(built_network(network).absolute()),
+        "-r",
+        TRAFFIC_FILE,
+    )
     fixed_options = own_options(options_in(network.path(OPTIONS_FILE)))
     exit_code, messages = load_in_sumo(
         network.folder,
@@ -299,8 +346,12 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
         *as_arguments(fixed_options),
     )
     if exit_code != 0:
-        raise InputError(network.folder, f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}:"
-            f" {messages or f'exit code {exit_code}'}", legal)
+        raise InputError(
+            network.folder,
+            f"SUMO refuses the network, {OPTIONS_FILE} or {TRAFFIC_FILE}:"
+            f" {messages or f'exit code {exit_code}'}",
+            legal,
+        )
 
     # Traffic that is random moves otherwise in each copy.
     try:

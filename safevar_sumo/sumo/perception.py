@@ -50,7 +50,9 @@ class Perception:
     """Observations, step by step, of K groups of `size` vehicles; group k is in weather k."""
 
     def __init__(self, weathers: Sequence[Weather], step: float, size: int) -> None:
-        self._visibility = per_vehicle([weather.visibility for weather in weathers], size)
+        self._visibility = per_vehicle(
+            [weather.visibility for weather in weathers], size
+        )
 
         delays = per_vehicle([weather.recognition_delay for weather in weathers], size)
         self._lines: list[tuple[IntArray | slice, DelayLine]] = []

@@ -18,7 +18,13 @@ from safevar_sumo.records import BoolArray, FloatArray, IntArray
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.scenarios.roads import Frame
-from safevar_sumo.sumo.bodies import Body, BodyPairs, VehicleStates, distance_covered, find_overlaps
+from safevar_sumo.sumo.bodies import (
+    Body,
+    BodyPairs,
+    VehicleStates,
+    distance_covered,
+    find_overlaps,
+)
 from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.vehicles import SumoType
 
@@ -54,22 +60,31 @@ class RecordedWorld:
         self._size = size
         self._scene = recording
         self._is_person = np.array([film.is_person for film in films], dtype=bool)
-        self._sizes = np.array([(film.length, film.width) for film in films]).reshape(-1, 2)
+        self._sizes = np.array([(film.length, film.width) for film in films]).reshape(
+            -1, 2
+        )
         self._motion = np.full((n_samples, n_scenes, len(films), 5), np.nan)
         for actor, film in enumerate(films):
             self._motion[: len(film.motion), :, actor] = film.motion.reshape(
                 len(film.motion), -1, 5
             )
 
-        self._middles = self._motion[..., :2] - self._motion[..., 2:4] * (self._sizes[:, :1] / 2)
+        self._middles = self._motion[..., :2] - self._motion[..., 2:4] * (
+            self._sizes[:, :1] / 2
+        )
         self._reach = (
-            np.add.outer((recording.length, recording.width), np.hypot(*self._sizes.T)) / 2
+            np.add.outer((recording.length, recording.width), np.hypot(*self._sizes.T))
+            / 2
         )
         """Largest distances of the middles of a vehicle and of each actor that touch, along the way
         and across [m].
         """
-        begins = (self._middles @ recording.along - self._reach[0]).reshape(n_samples, -1)
-        self._begins = np.fmin.reduce(begins, axis=1, initial=np.inf) + recording.length / 2
+        begins = (self._middles @ recording.along - self._reach[0]).reshape(
+            n_samples, -1
+        )
+        self._begins = (
+            np.fmin.reduce(begins, axis=1, initial=np.inf) + recording.length / 2
+        )
         """The first position along the way, at every sample, of a front that may touch somebody
         [m].
         """
@@ -84,7 +99,9 @@ class RecordedWorld:
         self._struck: dict[int, int] = {}
         """The actors that vehicles strike in this step, by vehicle."""
 
-    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> VehicleStates:
+    def enter(
+        self, types: SumoType | None, *, keeps_drivers: bool = False
+    ) -> VehicleStates:
         """All vehicles have departed, and their types do not limit the commanded speeds."""
         return self._moved(np.ones(self.n, dtype=bool))
 
@@ -121,7 +138,9 @@ class RecordedWorld:
 
     def _moment(self, speeds: FloatArray) -> _Moment:
         return _Moment(
-            self._lanes.positions(self._lane_position), speeds, self._lanes.meets_persons != 0
+            self._lanes.positions(self._lane_position),
+            speeds,
+            self._lanes.meets_persons != 0,
         )
 
     def _moved(self, is_open: BoolArray) -> VehicleStates:
@@ -192,7 +211,10 @@ class RecordedWorld:
         # Persons are struck before they move, vehicles after they have moved.
         persons = self._is_person[actors]
         early = self._overlaps(
-            self._before, vehicles, actors, persons & self._before.meets_persons[vehicles]
+            self._before,
+            vehicles,
+            actors,
+            persons & self._before.meets_persons[vehicles],
         )
         late = self._overlaps(
             self._now, vehicles, actors, ~persons | self._now.meets_persons[vehicles]
@@ -201,7 +223,9 @@ class RecordedWorld:
         pairs = np.flatnonzero(early | late)
         struck, rows = np.unique(vehicles[pairs], return_index=True)
         pairs = pairs[rows]
-        speeds = np.where(early[pairs], self._before.speeds[struck], self._now.speeds[struck])
+        speeds = np.where(
+            early[pairs], self._before.speeds[struck], self._now.speeds[struck]
+        )
         self._struck = dict(zip(struck.tolist(), actors[pairs].tolist(), strict=True))
         return dict(zip(struck.tolist(), speeds.tolist(), strict=True))
 
@@ -209,7 +233,8 @@ class RecordedWorld:
         """Which of the A actors each vehicle may have touched since the last step, shape (N, A)."""
         middles = self._now.fronts - self._scene.along * (self._scene.length / 2)
         offsets = (
-            middles.reshape(-1, self._size, 1, 2) - self._at_sample(self._middles)[:, np.newaxis]
+            middles.reshape(-1, self._size, 1, 2)
+            - self._at_sample(self._middles)[:, np.newaxis]
         )
         dx, dy = offsets.reshape(self.n, -1, 2).transpose(2, 0, 1)
         east, north = self._scene.along
@@ -217,11 +242,16 @@ class RecordedWorld:
         across = np.abs(dy * east - dx * north)
         covered = np.maximum(self._before.speeds, self._now.speeds) * self.step_length
         return np.asarray(
-            (across < self._reach[1]) & (along < self._reach[0] + covered[:, np.newaxis])
+            (across < self._reach[1])
+            & (along < self._reach[0] + covered[:, np.newaxis])
         )
 
     def _overlaps(
-        self, moment: _Moment, vehicles: IntArray, actors: IntArray, is_checked: BoolArray
+        self,
+        moment: _Moment,
+        vehicles: IntArray,
+        actors: IntArray,
+        is_checked: BoolArray,
     ) -> BoolArray:
         """Which vehicles overlap their actor among the pairs that are checked. Two parallel
         vehicles must overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
@@ -231,9 +261,12 @@ class RecordedWorld:
         if len(pairs):
             obstacles = self._actors(vehicles[pairs], actors[pairs])
             is_parallel = np.abs(obstacles.along @ self._scene.along) >= PARALLEL_COSINE
-            tolerance = np.where(is_parallel & ~self._is_person[actors[pairs]], NUMERICAL_EPS, 0.0)
+            tolerance = np.where(
+                is_parallel & ~self._is_person[actors[pairs]], NUMERICAL_EPS, 0.0
+            )
             overlaps[pairs] = (
-                find_overlaps(self._vehicle_body(moment, vehicles[pairs]), obstacles) > tolerance
+                find_overlaps(self._vehicle_body(moment, vehicles[pairs]), obstacles)
+                > tolerance
             )
         return overlaps
 
@@ -241,14 +274,18 @@ class RecordedWorld:
         numbers = np.asarray(vehicles)
         struck = np.array([self._struck[vehicle] for vehicle in vehicles])
         return BodyPairs(
-            numbers, self._vehicle_body(self._now, numbers), self._actors(numbers, struck)
+            numbers,
+            self._vehicle_body(self._now, numbers),
+            self._actors(numbers, struck),
         )
 
     def bodies_around(self, vehicles: Sequence[int]) -> BodyPairs:
         numbers = np.repeat(vehicles, len(self._sizes))
         actors = np.tile(np.arange(len(self._sizes)), len(vehicles))
         return BodyPairs(
-            numbers, self._vehicle_body(self._now, numbers), self._actors(numbers, actors)
+            numbers,
+            self._vehicle_body(self._now, numbers),
+            self._actors(numbers, actors),
         )
 
     def _at_sample(self, motion: FloatArray) -> FloatArray:
@@ -267,4 +304,6 @@ class RecordedWorld:
         along = np.tile(scene.along, (len(vehicles), 1))
         length = np.full(len(vehicles), scene.length)
         width = np.full(len(vehicles), scene.width)
-        return Body.behind(moment.fronts[vehicles], along, length, width, moment.speeds[vehicles])
+        return Body.behind(
+            moment.fronts[vehicles], along, length, width, moment.speeds[vehicles]
+        )

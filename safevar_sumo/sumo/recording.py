@@ -51,7 +51,8 @@ NEXT_LANE, INTERNAL_LANE = 0, 4
 there is none.
 """
 NOT_STRAIGHT = (
-    "the vehicle under test does not depart in the middle of a lane and drive straight on"
+    "the vehicle under test does not depart in the middle of a lane and"
+    " drive straight on"
 )
 
 
@@ -121,7 +122,9 @@ class Scenes:
 
     def step_of(self, scenario: Scenario) -> float:
         """Time step of a scenario [s]."""
-        return self.step or step_of(options_in(open_network(scenario.network).path(OPTIONS_FILE)))
+        return self.step or step_of(
+            options_in(open_network(scenario.network).path(OPTIONS_FILE))
+        )
 
     def of(self, scenario: WorldScenario) -> Recording | str:
         """A scenario's scene, or the reason why SUMO must simulate it.
@@ -146,7 +149,9 @@ class Scenes:
         if scenes suffice.
         """
         scenes = (
-            self.of(point.scenario) for point in points if isinstance(point.scenario, WorldScenario)
+            self.of(point.scenario)
+            for point in points
+            if isinstance(point.scenario, WorldScenario)
         )
         return next((scene for scene in scenes if isinstance(scene, str)), "")
 
@@ -158,7 +163,8 @@ def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
     # A shipped scenario knows only shipped networks; a user's scenario declares that nobody reacts.
     if not scenario.is_user_code and not is_shipped(scenario.network):
         return (
-            f"the traffic of the network {scenario.network!r} may react to the vehicle under test"
+            f"the traffic of the network {scenario.network!r} may react to the"
+            " vehicle under test"
         )
     network = network_for(scenario)
     if scenario.is_user_code:
@@ -177,7 +183,9 @@ def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
         )
 
     file = ensure_cached(f"scene-{digest.hexdigest()[:16]}", SCENE_FILE, build)
-    return msgpack.decode(file.read_bytes(), type=Recording | str, dec_hook=_unpacked_array)
+    return msgpack.decode(
+        file.read_bytes(), type=Recording | str, dec_hook=_unpacked_array
+    )
 
 
 @cache
@@ -185,7 +193,9 @@ def _code_bytes() -> bytes:
     """SUMO's version and the code that plays scenes: a scene depends on them and on its
     scenario.
     """
-    files = sorted([*(PACKAGE / "sumo").glob("*.*"), *(PACKAGE / "scenarios").glob("*.*")])
+    files = sorted(
+        [*(PACKAGE / "sumo").glob("*.*"), *(PACKAGE / "scenarios").glob("*.*")]
+    )
     return sumo_version().encode() + b"".join(file.read_bytes() for file in files)
 
 
@@ -198,7 +208,9 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
     return np.frombuffer(content).reshape(shape)
 
 
-def _play(scenario: WorldScenario, network: NetworkFiles, step: float | None) -> Recording | str:
+def _play(
+    scenario: WorldScenario, network: NetworkFiles, step: float | None
+) -> Recording | str:
     """The scene, or the reason why it cannot be recorded."""
     with open_world(copied_network(network, 1), 1, step) as world:
         world.enter(None)
@@ -223,7 +235,8 @@ def _play(scenario: WorldScenario, network: NetworkFiles, step: float | None) ->
             way=way,
             along=direction_of(vehicle.getAngle(vut)),
             lanes={
-                copy_and_name(id_)[1]: tuple(api.lane.getShape(id_)) for id_ in api.lane.getIDList()
+                copy_and_name(id_)[1]: tuple(api.lane.getShape(id_))
+                for id_ in api.lane.getIDList()
             },
             first_lanes=lane_of,
             tracks=_tracks(scenario, world),
@@ -269,7 +282,9 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
         lanes.append(next_lane)
 
     shapes = [api.lane.getShape(lane) for lane in lanes]
-    if api.vehicle.getLateralLanePosition(vut) or any(len(shape) != 2 for shape in shapes):
+    if api.vehicle.getLateralLanePosition(vut) or any(
+        len(shape) != 2 for shape in shapes
+    ):
         return None
     starts, ends = np.array(shapes, dtype=float).transpose(1, 0, 2)
     vector = ends - starts
@@ -281,7 +296,9 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
     if largest_turn > STRAIGHTNESS or largest_gap > STRAIGHTNESS:
         return None
 
-    is_junction = np.array([float(copy_and_name(lane)[1].startswith(":")) for lane in lanes])
+    is_junction = np.array(
+        [float(copy_and_name(lane)[1].startswith(":")) for lane in lanes]
+    )
     meets_persons = is_junction if is_junction.any() else np.ones(len(lanes))
     stretch = np.maximum(shape_length, POSITION_EPS) / lengths
     return LaneSequence(starts, vector, lengths, stretch, shape_length, meets_persons)

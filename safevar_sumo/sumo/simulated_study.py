@@ -16,7 +16,9 @@ NOISE = re.compile("noise|noisy|dropout|jitter")
 """Words of characteristics that are noise."""
 SEED = "seed"
 """The parameter of a simulator that its noise is drawn from."""
-IN_SIMULATOR = "nothing: the simulator moves and drives the vehicle, in a weather of its own"
+IN_SIMULATOR = (
+    "nothing: the simulator moves and drives the vehicle, in a weather of its own"
+)
 
 
 def check_tables(study: Study, mover: Mover) -> None:
@@ -36,9 +38,17 @@ def check_tables(study: Study, mover: Mover) -> None:
     }
     if mover.has("a driving system"):
         if study.scenario.repeats > 1:
-            raise InputError("", f"scenario.repeats = {study.scenario.repeats}: SUMO repeats itself to the bit", "no repeats, or a simulator of the user's own")
+            raise InputError(
+                "",
+                f"scenario.repeats = {study.scenario.repeats}: SUMO repeats itself to the bit",
+                "no repeats, or a simulator of the user's own",
+            )
         if study.search.failed != "stop":
-            raise InputError("", f"search.failed = {study.search.failed!r} without a simulator of one's own", "'stop': settings on which SUMO fails are skipped anyway")
+            raise InputError(
+                "",
+                f"search.failed = {study.search.failed!r} without a simulator of one's own",
+                "'stop': settings on which SUMO fails are skipped anyway",
+            )
         for key in ("vehicle.model", "ads.model", "weather"):
             if not entries[key]:
                 table = key.removesuffix(".model") if key.startswith("ads") else key
@@ -53,12 +63,18 @@ def check_tables(study: Study, mover: Mover) -> None:
         "step_length": study.step_length,
         "spread": study.spread,
         "repair": study.repair.parameters,
-        "matrix.tests.weathers": next((test.weathers for test in study.tests if test.weathers), []),
+        "matrix.tests.weathers": next(
+            (test.weathers for test in study.tests if test.weathers), []
+        ),
     }
     for key, value in entries.items():
         if value:
             text = value if isinstance(value, str | float) else str(value)
-            raise InputError("", f"{key} = {text!r} beside the simulator of scenario.model", IN_SIMULATOR)
+            raise InputError(
+                "",
+                f"{key} = {text!r} beside the simulator of scenario.model",
+                IN_SIMULATOR,
+            )
 
 
 def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
@@ -72,15 +88,23 @@ def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
     for point in matrix:
         kind, study_kind = point.scenario.mover.kind, scenario.mover.kind
         if kind != study_kind:
-            raise InputError("", f"matrix.tests: {point.name!r} is {kind}, and scenario.model is {study_kind}", "tests of the kind of scenario.model")
+            raise InputError(
+                "",
+                f"matrix.tests: {point.name!r} is {kind}, and scenario.model is {study_kind}",
+                "tests of the kind of scenario.model",
+            )
 
 
-def noise_remarks(characteristics: CharacteristicSet, points: Sequence[Point]) -> list[str]:
+def noise_remarks(
+    characteristics: CharacteristicSet, points: Sequence[Point]
+) -> list[str]:
     """A remark on characteristics that are noise, by their words, if all runs draw it from one
     seed.
     """
     noisy = [
-        item.name for item in characteristics if NOISE.search(f"{item.name} {item.meaning}".lower())
+        item.name
+        for item in characteristics
+        if NOISE.search(f"{item.name} {item.meaning}".lower())
     ]
     seeds = {getattr(point.scenario, SEED, None) for point in points}
     if not noisy or len(seeds) > 1:

@@ -41,7 +41,13 @@ from safevar_sumo.records import (
     Trace,
 )
 from safevar_sumo.scenarios import Simulator
-from safevar_sumo.scenarios.simulated import ALSO_SAMPLED, IMPACT_SPEED, OUTCOME, STRUCK_SPEED, TIME
+from safevar_sumo.scenarios.simulated import (
+    ALSO_SAMPLED,
+    IMPACT_SPEED,
+    OUTCOME,
+    STRUCK_SPEED,
+    TIME,
+)
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.kept import KEPT
@@ -67,12 +73,19 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
     """
     (point,) = system.points
     vehicles, encounters = system.split(settings)
-    names, searched = system.characteristics.vehicle.names, system.characteristics.scenario.names
+    names, searched = (
+        system.characteristics.vehicle.names,
+        system.characteristics.scenario.names,
+    )
     results = []
-    for vehicle, values, row in zip(vehicles.tolist(), encounters.tolist(), settings, strict=True):
+    for vehicle, values, row in zip(
+        vehicles.tolist(), encounters.tolist(), settings, strict=True
+    ):
         command = f"{system.command} {system.characteristics.options(row)}"
         note_work(f"{REPRODUCED_BY}{command}")
-        scenario: Any = encounter(point, dict(zip(searched, values, strict=True))).scenario
+        scenario: Any = encounter(
+            point, dict(zip(searched, values, strict=True))
+        ).scenario
         with (
             set_variables({MARK: this_process.mark}),
             user_errors(system.source),
@@ -129,7 +142,9 @@ def unread_characteristics(system: System, settings: FloatArray) -> set[str]:
     names = system.characteristics.vehicle.names
     unread = {*names}
     for vehicle, values in zip(*system.split(settings), strict=True):
-        searched = dict(zip(system.characteristics.scenario.names, values.tolist(), strict=True))
+        searched = dict(
+            zip(system.characteristics.scenario.names, values.tolist(), strict=True)
+        )
         scenario: Any = encounter(system.points[0], searched).scenario
         setting = _Setting(dict(zip(names, vehicle.tolist(), strict=True)))
         with user_errors(system.source):
@@ -178,7 +193,10 @@ def _attempt(command: str, system: System) -> Iterator[None]:
 
 def _has_died(attempt: Path) -> bool:
     """Whether the process of an attempt has died during it: nobody has locked its file."""
-    with suppress(FileNotFoundError, portalocker.LockException), attempt.open("r+") as file:
+    with (
+        suppress(FileNotFoundError, portalocker.LockException),
+        attempt.open("r+") as file,
+    ):
         portalocker.lock(file, ALONE)
         return attempt.exists()
     return False
@@ -204,11 +222,15 @@ def _check_step(simulator: Simulator, time: FloatArray, point: str) -> None:
     earlier_step = _steps.setdefault(kind, {}).setdefault(point, step)
     if step != earlier_step:
         steps = f"{min(step, earlier_step):g} and {max(step, earlier_step):g} s"
-        code = UserCode(f"scenario.model = {kind.__name__}: runs have time steps of {steps}", kind)
+        code = UserCode(
+            f"scenario.model = {kind.__name__}: runs have time steps of {steps}", kind
+        )
         raise code.wrong("simulate", f"{step:g} s", "one time step in all runs")
 
 
-def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System) -> None:
+def _check_names(
+    scenario: Simulator, result: Mapping[str, Any], system: System
+) -> None:
     """Refuse metrics that nobody knows, and objectives that are missing, in a result without a
     trace.
     """
@@ -226,7 +248,11 @@ def _check_names(scenario: Simulator, result: Mapping[str, Any], system: System)
         measure = measures.get(objective.name)
         if objective.name == UNSAFE_SHARE.name:
             continue
-        if measure is not None and measure.of == "runs" and objective.name not in result:
+        if (
+            measure is not None
+            and measure.of == "runs"
+            and objective.name not in result
+        ):
             raise code.wrong(
                 "simulate",
                 f"a result without a trace and without {objective.name}",
@@ -269,7 +295,9 @@ def _runs_of(
     outcome = np.array([result[OUTCOME] for result in results], dtype="U16")
     collided = outcome == Outcome.COLLISION
     struck = np.nan_to_num(number(STRUCK_SPEED))
-    impact = np.where(np.isnan(number(IMPACT_SPEED)), -number(SAFETY_DEGREE), number(IMPACT_SPEED))
+    impact = np.where(
+        np.isnan(number(IMPACT_SPEED)), -number(SAFETY_DEGREE), number(IMPACT_SPEED)
+    )
     closing_speed = np.maximum(impact - struck, LEAST_CLOSING_SPEED)
     stated = {name: number(name, rigs) for name in system.measuring.measures}
     stated["impact_speed"] = np.where(collided, closing_speed, np.nan)
@@ -292,7 +320,9 @@ def _runs_of(
             active=samples[:, np.newaxis] < lengths,
             **columns,
         ),
-        encounter=Encounter(separation, columns["gap"], closing, np.isfinite(separation)),
+        encounter=Encounter(
+            separation, columns["gap"], closing, np.isfinite(separation)
+        ),
         outcome=outcome,
         collision_speed=np.where(collided, impact, np.nan),
         contact=NO_CONTACT._replace(speed=struck),
@@ -302,7 +332,9 @@ def _runs_of(
     )
 
 
-def joined(evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION) -> Evaluations:
+def joined(
+    evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION
+) -> Evaluations:
     """Of N settings that were simulated in several rounds, in their order, the worst outcome, the
     safety degree and the collision speed of the worst run, the share of runs that are unsafe by the
     study's own criterion, and the mean of each other metric over the runs that define it. Metrics
@@ -319,7 +351,9 @@ def joined(evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION
 
     outcomes = evaluations.outcome.reshape(repeats, n)
     rank = {str(name): number for number, name in enumerate(SEVERITY)}
-    severity = np.reshape([rank[name] for name in evaluations.outcome.tolist()], (repeats, n))
+    severity = np.reshape(
+        [rank[name] for name in evaluations.outcome.tolist()], (repeats, n)
+    )
     degrees = evaluations.f_safe.reshape(repeats, n)
     worst = np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)
     metrics = {name: mean(values) for name, values in evaluations.metrics.items()}
@@ -333,7 +367,10 @@ def joined(evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION
     rounds = dict[str, FloatArray]()
     for name, values in evaluations.metrics.items():
         if name not in means_alone:
-            rounds |= {f"{name}_{k + 1}": row for k, row in enumerate(values.reshape(repeats, n))}
+            rounds |= {
+                f"{name}_{k + 1}": row
+                for k, row in enumerate(values.reshape(repeats, n))
+            }
     return replace(
         evaluations.take(columns),
         outcome=outcomes[np.argmin(severity, axis=0), columns],

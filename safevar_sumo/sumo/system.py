@@ -103,7 +103,11 @@ class System:
             About the study.
         """
         if reason := self.mover.lacks.get(part):
-            raise InputError(self.source, f"{question} needs {part}, and scenario.model is {self.mover.kind}: {reason}", "a study with a vehicle and a driving system")
+            raise InputError(
+                self.source,
+                f"{question} needs {part}, and scenario.model is {self.mover.kind}: {reason}",
+                "a study with a vehicle and a driving system",
+            )
 
     @property
     def meets_nobody(self) -> bool:
@@ -161,11 +165,15 @@ class System:
             return self
         values = self.characteristics.scenario.columns(encounters)
         points = tuple(encounter(point, values) for point in self.points)
-        return replace(self, points=points, characteristics=self.characteristics.vehicle)
+        return replace(
+            self, points=points, characteristics=self.characteristics.vehicle
+        )
 
     def at(self, point: Point) -> System:
         """The system reduced to one point."""
-        return replace(self, points=(point._replace(name="", parameters=(), constraints=()),))
+        return replace(
+            self, points=(point._replace(name="", parameters=(), constraints=()),)
+        )
 
 
 def simulate_command(study: Study) -> str:
@@ -269,7 +277,9 @@ def _check_sensors(study: Study, vehicle: Vehicle, ads: Ads) -> None:
     """Refuse a user's vehicle without sensors beside a controller that reads SUMO: such a
     controller would see everything.
     """
-    has_none = study.vehicle.model not in VEHICLES and type(vehicle).sensors is Vehicle.sensors
+    has_none = (
+        study.vehicle.model not in VEHICLES and type(vehicle).sensors is Vehicle.sensors
+    )
     if isinstance(ads, TraciController) and has_none:
         raise InputError(
             "",
@@ -289,4 +299,6 @@ def _check_metrics(study: Study, measuring: Measuring) -> None:
     if study.matrix is not None and study.matrix.aggregate != WORST:
         aggregate = study.matrix.aggregate
         name = aggregate.split()[0]
-        check_name("", f"matrix.aggregate = {aggregate!r}: {name} is no metric", name, metrics)
+        check_name(
+            "", f"matrix.aggregate = {aggregate!r}: {name} is no metric", name, metrics
+        )

@@ -32,7 +32,14 @@ COMMANDS: Mapping[str, tuple[str, ...]] = {
 """The commands that a controller may give, each with its numeric arguments."""
 LISTS = ("getIDList", "getIDCount")
 POSITIONS = ("getPosition", "getPosition3D")
-MOTION = (*POSITIONS, "getSpeed", "getAngle", "getRoadID", "getLaneID", "getLanePosition")
+MOTION = (
+    *POSITIONS,
+    "getSpeed",
+    "getAngle",
+    "getRoadID",
+    "getLaneID",
+    "getLanePosition",
+)
 SENSED: Mapping[str, tuple[str, ...]] = {
     "vehicle": (
         *MOTION,
@@ -164,7 +171,12 @@ class CommandedSpeed:
     Then SUMO's own driver takes over.
     """
 
-    LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE = 1, 2, 4, 31
+    LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE = (
+        1,
+        2,
+        4,
+        31,
+    )
     BEYOND_LIMIT = 64
 
     def __init__(self, step: float) -> None:
@@ -174,17 +186,26 @@ class CommandedSpeed:
         self._rate = math.inf
         self._end = -math.inf
 
-    def command(self, name: str, time: float, speed: float, values: tuple[Any, ...]) -> None:
+    def command(
+        self, name: str, time: float, speed: float, values: tuple[Any, ...]
+    ) -> None:
         """Process a command at a time [s] and speed [m/s]; raises `InputError` if an argument is no
         legal number.
         """
         for argument, number in zip(COMMANDS[name], values, strict=True):
-            returns_control = number == SUMO_CONTROL and name in ("setSpeed", "setSpeedMode")
+            returns_control = number == SUMO_CONTROL and name in (
+                "setSpeed",
+                "setSpeedMode",
+            )
             is_legal = math.isfinite(number) and (
                 number >= 0 or argument == "acceleration" or returns_control
             )
-            if not is_legal or (name == "setSpeedMode" and number not in range(-1, 128)):
-                raise InputError(f"traci.vehicle.{name}", f"{argument} = {number!r}", LEGAL_NUMBERS)
+            if not is_legal or (
+                name == "setSpeedMode" and number not in range(-1, 128)
+            ):
+                raise InputError(
+                    f"traci.vehicle.{name}", f"{argument} = {number!r}", LEGAL_NUMBERS
+                )
 
         # What would make results random, or leave the lane.
         value, *durations = map(float, values)
@@ -209,7 +230,9 @@ class CommandedSpeed:
             self._end = -math.inf if value == SUMO_CONTROL else math.inf
         elif durations:
             duration = math.floor(durations[0] * TICKS + 0.5) / TICKS
-            self._target = value if name == "slowDown" else max(speed + value * duration, 0.0)
+            self._target = (
+                value if name == "slowDown" else max(speed + value * duration, 0.0)
+            )
             self._rate = abs(self._target - speed) / max(duration, self._step)
             self._end = time + duration
 

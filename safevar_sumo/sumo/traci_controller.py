@@ -89,7 +89,9 @@ class TraciController(Ads):
         )
         return SumoType(mass, accel, decel, max_speed, lag, types.tau)
 
-    def drive(self, observation: Observation, memory: _Memory) -> tuple[Command, _Memory]:
+    def drive(
+        self, observation: Observation, memory: _Memory
+    ) -> tuple[Command, _Memory]:
         # `start` recorded the traffic of the first step.
         initial_trim = memory.initial_trim
         accelerations = np.zeros(len(memory.drivers))
@@ -103,8 +105,12 @@ class TraciController(Ads):
                 if memory.traffic.is_on_road(i):
                     view.time = observation.time
                     self._call(view, step)
-                    accelerations[i] = view.commanded_acceleration(float(observation.speed[i]))
-        command = pedals_for(memory.nominal, observation.speed, accelerations, initial_trim)
+                    accelerations[i] = view.commanded_acceleration(
+                        float(observation.speed[i])
+                    )
+        command = pedals_for(
+            memory.nominal, observation.speed, accelerations, initial_trim
+        )
         return command, memory._replace(initial_trim=initial_trim)
 
     def _call(self, view: TraciView, function: Callable[..., None]) -> None:

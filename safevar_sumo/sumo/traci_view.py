@@ -62,12 +62,19 @@ def refused(domain: str, name: str, problem: str) -> InputError:
     """The error for a controller's call of a function, of traci itself if `domain` is ""."""
     function = ".".join(filter(None, ("traci", domain, name)))
     if function == "traci.vehicle.setType":
-        return InputError(function, "makes it another vehicle, but the study's vehicle drives", ", ".join(DRIVER_COMMANDS))
+        return InputError(
+            function,
+            "makes it another vehicle, but the study's vehicle drives",
+            ", ".join(DRIVER_COMMANDS),
+        )
     body = (
-        "the body of your script's loop, without this call, as a function step(traci, vehicle_id)"
+        "the body of your script's loop, without this call, as a function"
+        " step(traci, vehicle_id)"
     )
     return InputError(
-        function, problem, f"{body}, with calls of {', '.join(CALLS.get(domain, CALLS))}"
+        function,
+        problem,
+        f"{body}, with calls of {', '.join(CALLS.get(domain, CALLS))}",
     )
 
 
@@ -96,7 +103,9 @@ class SensedTraffic:
         self._sensors = sensors
         ages = (sensors.latency / step).tolist()
         # Rounded twice, so that the last bits of a quotient do not decide about half a step:
-        self._past = [deque[Snapshot](maxlen=1 + round(round(age, STEP_DECIMALS))) for age in ages]
+        self._past = [
+            deque[Snapshot](maxlen=1 + round(round(age, STEP_DECIMALS))) for age in ages
+        ]
         self.record_step()
 
     def record_step(self) -> None:
@@ -117,7 +126,9 @@ class SensedTraffic:
         """Whether a vehicle has not left the road."""
         return bool(self._past[copy][-1].vehicle)
 
-    def _snapshot(self, copy: int, names: Mapping[tuple[int, str], list[str]]) -> Snapshot:
+    def _snapshot(
+        self, copy: int, names: Mapping[tuple[int, str], list[str]]
+    ) -> Snapshot:
         api = self._world.api
         vut = copied_id(copy, VUT)
         if vut not in self._world.driving:
@@ -125,12 +136,15 @@ class SensedTraffic:
         actors: dict[str, dict[str, ActorValues]] = {}
         for domain, functions in SENSED.items():
             getters = {
-                name: getattr(getattr(api, domain), name) for name in (*functions, "getLength")
+                name: getattr(getattr(api, domain), name)
+                for name in (*functions, "getLength")
             }
             actors[domain] = {}
             for actor in names[copy, domain]:
                 id_ = copied_id(copy, actor)
-                actors[domain][actor] = {name: get(id_) for name, get in getters.items()}
+                actors[domain][actor] = {
+                    name: get(id_) for name, get in getters.items()
+                }
 
         vehicle = actors["vehicle"].pop(VUT)
         leader = api.vehicle.getLeader(vut, LEADER_RANGE)
@@ -157,9 +171,14 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
             heading = math.radians(values["getAngle"])
             front = values["getPosition"]
             position = vehicle["getPosition"]
-            rear = front[0] - length * math.sin(heading), front[1] - length * math.cos(heading)
+            rear = (
+                front[0] - length * math.sin(heading),
+                front[1] - length * math.cos(heading),
+            )
             if min(math.dist(position, front), math.dist(position, rear)) <= reach:
-                actors[domain][name] = values | _positions_in_scale(vehicle, values, scale)
+                actors[domain][name] = values | _positions_in_scale(
+                    vehicle, values, scale
+                )
     leader = snapshot.leader
     if leader is None or leader[0] not in actors["vehicle"]:
         return Snapshot(vehicle, actors, None)
@@ -167,7 +186,9 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
     return Snapshot(vehicle, actors, (name, gap * scale))
 
 
-def _positions_in_scale(vehicle: ActorValues, values: ActorValues, scale: float) -> ActorValues:
+def _positions_in_scale(
+    vehicle: ActorValues, values: ActorValues, scale: float
+) -> ActorValues:
     """The positions of an actor, with distances from the vehicle itself multiplied by the sensors'
     scale.
     """
@@ -190,7 +211,9 @@ class TraciView:
         self._traffic = traffic
         self._step = world.step_length
         self._commands = CommandedSpeed(world.step_length)
-        self._steps_of_action = round(self._api.vehicle.getActionStepLength(self._vut) / self._step)
+        self._steps_of_action = round(
+            self._api.vehicle.getActionStepLength(self._vut) / self._step
+        )
         self._acceleration = 0.0
         self._subscriptions: dict[tuple[str, str], Variables] = {}
         self.time = 0.0
@@ -210,7 +233,9 @@ class TraciView:
         is_action = steps % self._steps_of_action == 0
         if is_action:
             sumo_speed = self._speed_of_sumo(speed, accel, decel)
-        self._acceleration = self._commands.acceleration(speed, self.time, sumo_speed, accel, decel)
+        self._acceleration = self._commands.acceleration(
+            speed, self.time, sumo_speed, accel, decel
+        )
         return self._acceleration
 
     def _speed_of_sumo(self, speed: float, accel: float, decel: float) -> float:
@@ -221,8 +246,12 @@ class TraciView:
         vut = self._vut
         _, actors, leader = self._traffic.seen[self._copy]
         ignores_limit = self._commands.mode & CommandedSpeed.BEYOND_LIMIT
-        limit = vehicle.getMaxSpeed(vut) if ignores_limit else vehicle.getAllowedSpeed(vut)
-        sumo_speed = min(speed + accel * self._step, max(limit, speed - decel * self._step))
+        limit = (
+            vehicle.getMaxSpeed(vut) if ignores_limit else vehicle.getAllowedSpeed(vut)
+        )
+        sumo_speed = min(
+            speed + accel * self._step, max(limit, speed - decel * self._step)
+        )
         if leader is not None:
             name, gap = leader
             id_ = copied_id(self._copy, name)
@@ -252,7 +281,9 @@ class TraciView:
         try:
             if name not in CALLS.get(domain, ()):
                 reason = OWN_LOOP if domain in ("", "simulation") else BYPASS
-                raise refused(domain, name, f"is not for a controller of {VUT!r}: {reason}")
+                raise refused(
+                    domain, name, f"is not for a controller of {VUT!r}: {reason}"
+                )
             bound = _signature(domain, name).bind(*arguments, **named)
             if name in COMMANDS or name in SUBSCRIPTIONS:
                 bound.apply_defaults()
@@ -274,7 +305,9 @@ class TraciView:
     def _command(self, domain: str, name: str, vehicle: str, *values: Value) -> Value:
         if vehicle != VUT:
             raise refused(
-                domain, name, f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}"
+                domain,
+                name,
+                f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}",
             )
         speed = float(self._api.vehicle.getSpeed(self._vut))
         self._commands.command(name, self.time, speed, values)
@@ -297,13 +330,17 @@ class TraciView:
             return self._commands.mode
         return self._sumo_value(domain, name, *arguments)
 
-    def _sensed_value(self, domain: str, name: str, actor: str, *arguments: Value) -> Value:
+    def _sensed_value(
+        self, domain: str, name: str, actor: str, *arguments: Value
+    ) -> Value:
         """Another actor's value as the sensors report it; of an actor that they do not see, as SUMO
         reports one that is not on the road.
         """
         if name not in SENSED[domain]:
             raise refused(
-                domain, name, f"returns a value of {actor!r} that no sensor of the vehicle measures"
+                domain,
+                name,
+                f"returns a value of {actor!r} that no sensor of the vehicle measures",
             )
 
         actors = self._traffic.seen[self._copy].actors[domain]
@@ -322,7 +359,11 @@ class TraciView:
         network's parts.
         """
         if domain not in SENSED:
-            return tuple(dict.fromkeys(map(_original_ids, getattr(self._api, domain).getIDList())))
+            return tuple(
+                dict.fromkeys(
+                    map(_original_ids, getattr(self._api, domain).getIDList())
+                )
+            )
         ids = [VUT] if domain == "vehicle" else []
         return (*ids, *self._traffic.seen[self._copy].actors[domain])
 
@@ -343,15 +384,25 @@ class TraciView:
         return _original_ids(getattr(getattr(self._api, domain), name)(*copied))
 
     def _subscribe(
-        self, domain: str, actor: str, requested: Value, begin: float, end: float, parameters: Value
+        self,
+        domain: str,
+        actor: str,
+        requested: Value,
+        begin: float,
+        end: float,
+        parameters: Value,
     ) -> Value:
         """Subscribe to variables of an actor, by their numbers, at all times."""
         functions = {_constant(name): function for name, function in VARIABLES.items()}
         variables: Variables = {}
-        for number in map(_constant, DEFAULT_VARIABLES) if requested is None else requested:
+        for number in (
+            map(_constant, DEFAULT_VARIABLES) if requested is None else requested
+        ):
             if functions.get(number) not in CALLS[domain]:
                 raise refused(
-                    domain, "subscribe", f"variable {number!r} is none of {', '.join(VARIABLES)}"
+                    domain,
+                    "subscribe",
+                    f"variable {number!r} is none of {', '.join(VARIABLES)}",
                 )
             # TraCI's tuples begin with the type of what follows.
             extras = (parameters or {}).get(number, ())

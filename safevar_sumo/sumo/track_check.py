@@ -25,7 +25,9 @@ TRACKS_KEY = "scenario.model"
 """The key that errors name; the study stands before it."""
 
 
-def check_shapes(tracks: Sequence[Track], n_samples: int, n_encounters: int, step: float) -> None:
+def check_shapes(
+    tracks: Sequence[Track], n_samples: int, n_encounters: int, step: float
+) -> None:
     """Refuse actors that share a name, and quantities that are neither numbers nor arrays of all
     samples.
 
@@ -52,10 +54,17 @@ def check_shapes(tracks: Sequence[Track], n_samples: int, n_encounters: int, ste
                 or shape[0] not in (1, n_samples)
                 or shape[-1] not in (1, n_encounters)
             ):
-                end = f" ends at {(shape[0] - 1) * step:g} s and" if np.ndim(value) == 2 else ""
-                problem = f"actor {track.name!r}: {name}{end} has the shape {np.shape(value)}"
+                end = (
+                    f" ends at {(shape[0] - 1) * step:g} s and"
+                    if np.ndim(value) == 2
+                    else ""
+                )
+                problem = (
+                    f"actor {track.name!r}: {name}{end} has the shape {np.shape(value)}"
+                )
                 samples = (
-                    f"({n_samples}, 1), a value for each time up to {(n_samples - 1) * step:g} s"
+                    f"({n_samples}, 1), a value for each time up to"
+                    f" {(n_samples - 1) * step:g} s"
                 )
                 raise InputError(
                     "",
@@ -76,7 +85,10 @@ def check_motion(track: Track, times: FloatArray, step: float) -> None:
     refuse = partial(_refuse, track, step)
     for name, column in zip(Track._fields[2:], track[2:], strict=True):
         refuse(
-            ~np.isfinite(column), column, f"has {name} = {{:g}}", "a finite number at every sample"
+            ~np.isfinite(column),
+            column,
+            f"has {name} = {{:g}}",
+            "a finite number at every sample",
         )
     for name, column in (("length", track.length), ("width", track.width)):
         refuse(column < 0, column, f"has {name} = {{:g}} m", "a size of 0 m or more")
@@ -124,14 +136,21 @@ def check_motion(track: Track, times: FloatArray, step: float) -> None:
 
 
 def _refuse(
-    track: Track, step: float, wrong: BoolArray, values: FloatArray, problem: str, expected: str
+    track: Track,
+    step: float,
+    wrong: BoolArray,
+    values: FloatArray,
+    problem: str,
+    expected: str,
 ) -> None:
     """Raise the error for the first sample at which something about a track is wrong, if any."""
     if wrong.any():
         sample, column = np.argwhere(wrong)[0].tolist()
         text = problem.format(float(values[sample, column]))
         raise UserCodeError(
-            "", f"{TRACKS_KEY}: at {sample * step:g} s actor {track.name!r} {text}", expected
+            "",
+            f"{TRACKS_KEY}: at {sample * step:g} s actor {track.name!r} {text}",
+            expected,
         )
 
 
@@ -144,7 +163,11 @@ def check_start(tracks: Sequence[Track], vehicle: Body) -> None:
     InputError
         With the actors, the time [s] and what is expected.
     """
-    bodies = {f"actor {track.name!r}": _first(track) for track in tracks if track.kind != SCREEN}
+    bodies = {
+        f"actor {track.name!r}": _first(track)
+        for track in tracks
+        if track.kind != SCREEN
+    }
     bodies["the vehicle under test"] = vehicle
     for (name, body), (obstacle_name, obstacle) in combinations(bodies.items(), 2):
         n = max(len(body.speed), len(obstacle.speed))
@@ -155,13 +178,17 @@ def check_start(tracks: Sequence[Track], vehicle: Body) -> None:
         if depth > TOUCH:
             problem = f"at 0 s {name} is {depth:.2f} m inside {obstacle_name}"
             raise InputError(
-                "", f"{TRACKS_KEY}: {problem}", "bodies that do not overlap at the start"
+                "",
+                f"{TRACKS_KEY}: {problem}",
+                "bodies that do not overlap at the start",
             )
 
 
 def _repeated(body: Body, n: int) -> Body:
     """A body of all encounters in columns of N encounters."""
-    return Body._make(np.broadcast_to(column, (n, *column.shape[1:])) for column in body)
+    return Body._make(
+        np.broadcast_to(column, (n, *column.shape[1:])) for column in body
+    )
 
 
 def _first(track: Track) -> Body:

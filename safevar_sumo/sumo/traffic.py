@@ -93,17 +93,25 @@ class Traffic:
         """Place all bodies at this number of samples."""
         times = (np.arange(n_samples) * self.step).astype(float)[:, np.newaxis]
         vehicle = self._vehicle_body(np.zeros(1), np.zeros(1))
-        self.tracks = tracks_of(self._points, times, self._n_encounters, self.step, vehicle)
+        self.tracks = tracks_of(
+            self._points, times, self._n_encounters, self.step, vehicle
+        )
         bodies = [Moving.of(track, self.step, self.width) for track in self.tracks]
-        highest_level = np.maximum.reduce(np.broadcast_arrays(*(body.level for body in bodies)))
+        highest_level = np.maximum.reduce(
+            np.broadcast_arrays(*(body.level for body in bodies))
+        )
         self._counts = [np.atleast_2d(body.level == highest_level) for body in bodies]
         # Who is met comes first; scenery hides them, and is seen only where there is nobody else.
         self._encountered = [
-            k for k, body in enumerate(bodies) if body.level.max() >= min(highest_level.max(), 1)
+            k
+            for k, body in enumerate(bodies)
+            if body.level.max() >= min(highest_level.max(), 1)
         ]
         self._bodies = bodies
         screens = [body for body in bodies if body.track.kind == SCREEN]
-        self._hides = [k for k, body in enumerate(bodies) if not body.is_covered_by(screens)]
+        self._hides = [
+            k for k, body in enumerate(bodies) if not body.is_covered_by(screens)
+        ]
         self._is_avoidable = [bool(body.is_avoidable.any()) for body in bodies]
 
     def are_closing(self, motion: VehicleStates) -> BoolArray:
@@ -124,7 +132,9 @@ class Traffic:
         n_placed = self._ended.shape[1]
         if n_samples > n_placed:
             self._place(n_samples)
-            self._ended = np.pad(self._ended, ((0, 0), (0, n_samples - n_placed), (0, 0)))
+            self._ended = np.pad(
+                self._ended, ((0, 0), (0, n_samples - n_placed), (0, 0))
+            )
 
     def _row(self, column: Sampled, sample: int | None = None) -> Sampled:
         return row(column, self._sample if sample is None else sample, self.group)
@@ -165,7 +175,12 @@ class Traffic:
         visible = self._row(self._bodies[number].is_there)
         for k in self._hides:
             if k != number:
-                line = (front - self.setback, 0.0, self._row(track.x), self._row(track.y))
+                line = (
+                    front - self.setback,
+                    0.0,
+                    self._row(track.x),
+                    self._row(track.y),
+                )
                 visible = visible & ~self._blocks(self._bodies[k], *line)
         return visible
 
@@ -188,7 +203,10 @@ class Traffic:
         # In shares of the line: 0 at the sensors, 1 at the other point.
         enter: Quantity = -np.inf
         leave: Quantity = np.inf
-        for position, change, size in ((rx, dx, body.track.length), (ry, dy, body.track.width)):
+        for position, change, size in (
+            (rx, dx, body.track.length),
+            (ry, dy, body.track.width),
+        ):
             half = self._row(size) / 2 + TIE
             # Infinite for a line along the body.
             to_rear = (-half - position) / change
@@ -226,7 +244,9 @@ class Traffic:
             time_to_arrival = np.maximum(view.gap, 0.0) / closing
             lateral = self._row(body.track.y)
             drift = self._row(body.vy)
-            lateral_at_arrival = lateral + drift * np.where(view.closing > 0, time_to_arrival, 0.0)
+            lateral_at_arrival = lateral + drift * np.where(
+                view.closing > 0, time_to_arrival, 0.0
+            )
             comes = (view.closing > 0) & (
                 np.abs(lateral_at_arrival) < self.width / 2 + self._row(body.half_width)
             )
@@ -248,7 +268,9 @@ class Traffic:
         scene = self._scene_of(views[numbers[0]], over)
         for number in numbers[1:]:
             columns = zip(scene, self._scene_of(views[number], over), strict=True)
-            scene = Scene(*(np.where(chosen == number, new, old) for old, new in columns))
+            scene = Scene(
+                *(np.where(chosen == number, new, old) for old, new in columns)
+            )
         return scene
 
     def hits(
@@ -273,14 +295,17 @@ class Traffic:
             vehicles = np.flatnonzero(is_beside & is_open & (self._struck == NOBODY))
             if vehicles.size:
                 overlaps = find_overlaps(
-                    self._vehicle_body(front[vehicles], speed[vehicles]), self._body(k, vehicles)
+                    self._vehicle_body(front[vehicles], speed[vehicles]),
+                    self._body(k, vehicles),
                 )
                 self._struck[vehicles[overlaps > TOUCH]] = k
 
         touched = np.flatnonzero(self._struck != NOBODY)
         return dict(zip(touched.tolist(), speed[touched].tolist(), strict=True))
 
-    def bodies(self, vehicles: Sequence[int], front: FloatArray, speed: FloatArray) -> BodyPairs:
+    def bodies(
+        self, vehicles: Sequence[int], front: FloatArray, speed: FloatArray
+    ) -> BodyPairs:
         """Vehicles that touch somebody and those whom they touch, in lane coordinates."""
         numbers = np.asarray(vehicles)
         bodies = [self._body(k, numbers) for k in range(len(self._bodies))]
@@ -338,7 +363,10 @@ class Traffic:
                 np.copyto(closing[samples], rate, where=is_nearer)
                 in_conflict[samples] |= counts
         return Encounter(
-            separation=distance, distance=distance, closing_speed=closing, in_conflict=in_conflict
+            separation=distance,
+            distance=distance,
+            closing_speed=closing,
+            in_conflict=in_conflict,
         )
 
     def _approach(
@@ -350,19 +378,30 @@ class Traffic:
         body = self._bodies[number]
         edge, far_end, vx, vy, y, half_width = (
             self._table(column, samples)
-            for column in (body.edge, body.far_end, body.vx, body.vy, body.track.y, body.half_width)
+            for column in (
+                body.edge,
+                body.far_end,
+                body.vx,
+                body.vy,
+                body.track.y,
+                body.half_width,
+            )
         )
         gap_ahead = edge - front
         gap_behind = front - self.length - far_end
         dx = np.maximum(np.maximum(gap_ahead, gap_behind), 0.0)
         dy = np.maximum(np.abs(y) - self.width / 2 - half_width, 0.0)
         separation = np.sqrt(dx * dx + dy * dy) if dy.any() else dx
-        approach = (speed - vx) * np.where(gap_ahead > gap_behind, dx, -dx) - np.sign(y) * vy * dy
+        approach = (speed - vx) * np.where(gap_ahead > gap_behind, dx, -dx) - np.sign(
+            y
+        ) * vy * dy
         rate = approach / np.maximum(separation, LEAST_DISTANCE)
         if body.is_rotated:
             columns = (self._table(column, samples) for column in body.track[2:])
             track = Track(*body.track[:2], *columns)
-            separation = distance_between(track, front - self.length / 2, self.length, self.width)
+            separation = distance_between(
+                track, front - self.length / 2, self.length, self.width
+            )
         counts = self._table(body.is_there & self._counts[number], samples)
         counts = counts & ~self._ended[number, samples]
         return separation, rate, counts

@@ -76,7 +76,9 @@ class Placed(NamedTuple):
     def of(cls, track: Track, ids: list[str], start: Frame) -> Placed:
         is_person = track.kind in PERSONS
         offset = 0.0 if is_person else track.length.max(axis=0) / 2
-        x, y = start.point(track.x + track.along * offset, track.y + track.left * offset)
+        x, y = start.point(
+            track.x + track.along * offset, track.y + track.left * offset
+        )
         east, north = start._replace(origin=(0.0, 0.0)).point(track.along, track.left)
         angle = np.degrees(np.arctan2(east, north)) % 360
         return cls(track, ids, is_person, np.asarray(x), np.asarray(y), angle)
@@ -121,7 +123,9 @@ class TrafficWorld(SumoWorld):
     def frame(self) -> Frame:
         return self._lane.frame
 
-    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> VehicleStates:
+    def enter(
+        self, types: SumoType | None, *, keeps_drivers: bool = False
+    ) -> VehicleStates:
         super().enter(types, keeps_drivers=keeps_drivers)
         return self._checked(self._lane.enter(types))
 
@@ -147,7 +151,9 @@ class TrafficWorld(SumoWorld):
         """Nobody is filmed without a size."""
         super().film(tracks, sample, length)
         for actor in self._actors:
-            size = self._at_copies(actor.track.length) + self._at_copies(actor.track.width)
+            size = self._at_copies(actor.track.length) + self._at_copies(
+                actor.track.width
+            )
             tracks[actor.track.name].motion[sample, size == 0] = np.nan
 
     def _add(self, actor: Placed) -> None:
@@ -155,10 +161,14 @@ class TrafficWorld(SumoWorld):
         types = self.api.vehicletype
         track = actor.track
         # Who is not there yet has the size that it will have.
-        sizes = (column.max(axis=0, keepdims=True) for column in (track.length, track.width))
+        sizes = (
+            column.max(axis=0, keepdims=True) for column in (track.length, track.width)
+        )
         lengths, widths = map(self._of_copies, sizes)
         default_type = "DEFAULT_PEDTYPE" if actor.is_person else "DEFAULT_VEHTYPE"
-        for id_, route, length, width in zip(actor.ids, self._routes, lengths, widths, strict=True):
+        for id_, route, length, width in zip(
+            actor.ids, self._routes, lengths, widths, strict=True
+        ):
             types.copy(default_type, id_)
             types.setLength(id_, length)
             types.setWidth(id_, width)
@@ -176,7 +186,9 @@ class TrafficWorld(SumoWorld):
     def _put(self) -> None:
         """Put all actors where they are at the sample that the coming step leads to."""
         for actor in self._actors:
-            places = (self._of_copies(column) for column in (actor.x, actor.y, actor.angle))
+            places = (
+                self._of_copies(column) for column in (actor.x, actor.y, actor.angle)
+            )
             placed = zip(actor.ids, self._edges, *places, strict=True)
             if actor.is_person:
                 for id_, edge, x, y, angle in placed:
@@ -184,7 +196,9 @@ class TrafficWorld(SumoWorld):
             else:
                 for id_, edge, x, y, angle in placed:
                     self._move_vehicle(id_, edge, ANY_LANE, x, y, angle, ANY_PLACE)
-                for id_, speed in zip(actor.ids, self._of_copies(actor.track.speed), strict=True):
+                for id_, speed in zip(
+                    actor.ids, self._of_copies(actor.track.speed), strict=True
+                ):
                     self._set_previous_speed(id_, speed)
 
     def _of_copies(self, column: FloatArray) -> list[float]:
@@ -206,8 +220,12 @@ class TrafficWorld(SumoWorld):
         driving = [*self.driving.values()]
         places = {"vehicle under test": (front[driving], self._fronts[driving])}
         for actor in self._actors:
-            get_position = self._get_person_position if actor.is_person else self._get_position
-            expected = np.stack([self._at_copies(actor.x), self._at_copies(actor.y)], axis=1)
+            get_position = (
+                self._get_person_position if actor.is_person else self._get_position
+            )
+            expected = np.stack(
+                [self._at_copies(actor.x), self._at_copies(actor.y)], axis=1
+            )
             places[f"actor {actor.track.name!r}"] = (
                 expected,
                 np.array([*map(get_position, actor.ids)]),

@@ -49,14 +49,18 @@ def check_units(study: Study, vehicle: Vehicle) -> None:
         check_name("", f"{key}: {model} has no such characteristic", name, units)
         if entry.original == 0 and name not in vehicle.OPTIONAL:
             raise InputError(
-                "", f"{key}: original = 0", "a value other than 0: changes are relative to it"
+                "",
+                f"{key}: original = 0",
+                "a value other than 0: changes are relative to it",
             )
         if entry.unit != units[name]:
             raise InputError("", f"{key}.unit = {entry.unit!r}", repr(units[name]))
     for name in units:
         if name not in table and name not in vehicle.OPTIONAL:
             names = ", ".join(name for name in units if name not in vehicle.OPTIONAL)
-            raise InputError("", f"vehicle.characteristics.{name} is missing", f"all of {names}")
+            raise InputError(
+                "", f"vehicle.characteristics.{name} is missing", f"all of {names}"
+            )
 
 
 def check_plausible(study: Study, vehicle: Vehicle) -> None:
@@ -67,15 +71,23 @@ def check_plausible(study: Study, vehicle: Vehicle) -> None:
         ranges = msgspec.convert(vehicle.PLAUSIBLE, dict[str, Plausible])
     except msgspec.ValidationError as error:
         raise InputError(
-            "", f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE: {error}", "(lowest, highest) or (lowest, highest, unit) by name"
+            "",
+            f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE: {error}",
+            "(lowest, highest) or (lowest, highest, unit) by name",
         ) from None
     for name, (lowest, highest, own_unit) in ranges.items():
         entry = study.vehicle.characteristics.get(name)
         if entry is None and name in vehicle.OPTIONAL:
             continue
         if entry is None and not hasattr(vehicle, name):
-            raise InputError("", f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE has {name!r}", "names of characteristics and of parameters")
-        values: list[tuple[str, Any]] = [(f"parameters.{name}", getattr(vehicle, name, None))]
+            raise InputError(
+                "",
+                f"vehicle.model = {study.vehicle.model!r}: PLAUSIBLE has {name!r}",
+                "names of characteristics and of parameters",
+            )
+        values: list[tuple[str, Any]] = [
+            (f"parameters.{name}", getattr(vehicle, name, None))
+        ]
         if entry is not None:
             values = [
                 (f"characteristics.{name}.{end}", getattr(entry, end))

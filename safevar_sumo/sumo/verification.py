@@ -14,7 +14,12 @@ import numpy as np
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import ROUNDING, FloatArray, IntArray, Outcome, SimulationRuns
-from safevar_sumo.sumo.batch import drive_all, observer_of, open_points_world, traffic_of
+from safevar_sumo.sumo.batch import (
+    drive_all,
+    observer_of,
+    open_points_world,
+    traffic_of,
+)
 from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.drive import enter
 from safevar_sumo.sumo.encounters import met_at
@@ -44,12 +49,17 @@ def drive_again(
     """
     trace = runs.trace
     n = len(runs)
-    values = {name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")}
+    values = {
+        name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")
+    }
     vehicles, encounters = system.split(settings)
     on_road = system.at_encounters(encounters)
     point = on_road.points[0]
     traffic = traffic_of(system, encounters, OVERTIME)
-    with user_errors(system.source), open_points_world(system, encounters, traffic, start) as world:
+    with (
+        user_errors(system.source),
+        open_points_world(system, encounters, traffic, start) as world,
+    ):
         motion = enter(on_road, vehicles, world).motion
         observer = observer_of(point.scenario, world, traffic)
         is_open = np.ones(n, dtype=bool)
@@ -66,7 +76,10 @@ def drive_again(
             is_open = is_open & trace.active[sample]
             is_open[[*collisions]] = False
             # A trace may be longer than the point's runs, which end before those of other points.
-            if sample + 1 == len(trace.time) or not (is_open & trace.active[sample + 1]).any():
+            if (
+                sample + 1 == len(trace.time)
+                or not (is_open & trace.active[sample + 1]).any()
+            ):
                 break
             motion = world.step(trace.speed[sample + 1], is_open)
     return values
@@ -92,7 +105,9 @@ def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str
     digest = zlib.crc32(settings.tobytes())
     candidates = [numbers[digest % len(numbers)] for numbers in of_tests.values()]
     second_points = np.resize(candidates, len(settings))
-    second_points = np.where(second_points == worst, (worst + 1) % len(points), second_points)
+    second_points = np.where(
+        second_points == worst, (worst + 1) % len(points), second_points
+    )
 
     remark = ""
     size = batch_size(system)
@@ -118,11 +133,16 @@ def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) ->
     for start in range(0, len(order), size):
         rows = order[start : start + size]
         chosen = runs.of(rows)
-        _compare(system, settings[rows], chosen, drive_again(system, settings[rows], chosen))
+        _compare(
+            system, settings[rows], chosen, drive_again(system, settings[rows], chosen)
+        )
 
 
 def _compare(
-    system: System, settings: FloatArray, runs: SimulationRuns, in_sumo: dict[str, FloatArray]
+    system: System,
+    settings: FloatArray,
+    runs: SimulationRuns,
+    in_sumo: dict[str, FloatArray],
 ) -> None:
     """Compare the quantities of N recorded runs, shape (T, N), with those in SUMO; raises the first
     difference.
@@ -130,7 +150,10 @@ def _compare(
     trace = runs.trace
     collision = np.full(trace.speed.shape, np.nan)
     collision[trace.last_active, np.arange(len(settings))] = runs.collision_speed
-    recorded = {name: np.broadcast_to(getattr(trace, name), trace.speed.shape) for name in COMPARED}
+    recorded = {
+        name: np.broadcast_to(getattr(trace, name), trace.speed.shape)
+        for name in COMPARED
+    }
     recorded["collision"] = collision
     for name, values in recorded.items():
         differs = trace.active & ~np.isclose(

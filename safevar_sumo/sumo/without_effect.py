@@ -38,14 +38,18 @@ def without_effect(system: System) -> list[str]:
     remarks += system.vehicle.remarks
     remarks += _remarks_on_driver(system)
     remarks += _remarks_on_grip(system)
-    for weather in {point.weather.name: point.weather for point in system.points}.values():
+    for weather in {
+        point.weather.name: point.weather for point in system.points
+    }.values():
         if weather.visibility != 1 and uses_traci and not _has_limited_range(system):
             remarks.append(
                 f"weather {weather.name!r}: visibility = {weather.visibility:g} has no effect:"
                 " the vehicle has no sensor range, so a controller written for TraCI sees"
                 " everything"
             )
-        if equals_clear(weather) and not (system.ads.recognition_delay or system.ads.hesitation):
+        if equals_clear(weather) and not (
+            system.ads.recognition_delay or system.ads.hesitation
+        ):
             remarks.append(
                 f"weather {weather.name!r} has no effect: its road and its visibility are those"
                 " of clear weather, and no key of [ads.parameters] delays the ADS in it"
@@ -91,7 +95,9 @@ def _remarks_on_grip(system: System) -> list[str]:
     upper = members.upper[members.names.index(DECEL)]
     friction = max(point.weather.road_friction for point in system.points)
     nearly, highest = (
-        system.vehicle.sumo_type(_prepared(system, friction, decel=np.array([value]))).decel[0]
+        system.vehicle.sumo_type(
+            _prepared(system, friction, decel=np.array([value]))
+        ).decel[0]
         for value in (NEARLY * upper, upper)
     )
     if highest > nearly:

@@ -48,7 +48,8 @@ class SumoWorld:
         self.n = n
         self.step_length: float = api.simulation.getDeltaT()
         self._set_speed, self._get_speed, self._get_position = (
-            function_of(api, "vehicle", name) for name in ("setSpeed", "getSpeed", "getPosition")
+            function_of(api, "vehicle", name)
+            for name in ("setSpeed", "getSpeed", "getPosition")
         )
         self._get_person_position = function_of(api, "person", "getPosition")
         self._copy_of = {id_: copy for copy, id_ in enumerate(self.ids(VUT))}
@@ -71,7 +72,9 @@ class SumoWorld:
         """The ids of an actor in its copies."""
         return _copied_ids(name, self.n)
 
-    def _set_decelerations(self, decel: FloatArray, emergency_decel: FloatArray) -> None:
+    def _set_decelerations(
+        self, decel: FloatArray, emergency_decel: FloatArray
+    ) -> None:
         """Set the largest decelerations of the vehicles under test, usually and in emergencies
         [m/s^2].
         """
@@ -82,7 +85,9 @@ class SumoWorld:
         for id_, value in zip(self.ids(VUT), values.tolist(), strict=True):
             set_value(id_, value)
 
-    def enter(self, types: SumoType | None, *, keeps_drivers: bool = False) -> VehicleStates:
+    def enter(
+        self, types: SumoType | None, *, keeps_drivers: bool = False
+    ) -> VehicleStates:
         """Insert all actors; see `VehicleWorld.enter`.
 
         Raises
@@ -96,7 +101,8 @@ class SumoWorld:
         decelerations = (insertion_decel if types is None else types.decel,) * 2
         if keeps_drivers:
             planned = [
-                (vehicletype.getDecel(id_), vehicletype.getEmergencyDecel(id_)) for id_ in ids
+                (vehicletype.getDecel(id_), vehicletype.getEmergencyDecel(id_))
+                for id_ in ids
             ]
             decelerations = tuple(np.array(planned).T)
         if types is None:
@@ -107,7 +113,9 @@ class SumoWorld:
             self._set(vehicletype.setMaxSpeed, types.max_speed)
             if types.tau is not None:
                 self._set(vehicletype.setTau, types.tau)
-        self._set_decelerations(*(np.maximum(values, insertion_decel) for values in decelerations))
+        self._set_decelerations(
+            *(np.maximum(values, insertion_decel) for values in decelerations)
+        )
         self._depart()
         self._set_decelerations(*decelerations)
         if keeps_drivers:
@@ -181,7 +189,9 @@ class SumoWorld:
         for collision in self.api.simulation.getCollisions():
             pairs = [(collision.collider, collision.colliderSpeed, collision.victim)]
             if collision.type == "junction":
-                pairs.append((collision.victim, collision.victimSpeed, collision.collider))
+                pairs.append(
+                    (collision.victim, collision.victimSpeed, collision.collider)
+                )
             for id_, speed, other_id in pairs:
                 if (copy := self._copy_of.get(id_)) is not None and is_open[copy]:
                     speeds[copy] = speed
@@ -212,7 +222,11 @@ class SumoWorld:
         front = np.array(domain.getPosition(id_))
         along = direction_of(domain.getAngle(id_))
         return Body.behind(
-            front, along, domain.getLength(id_), domain.getWidth(id_), domain.getSpeed(id_)
+            front,
+            along,
+            domain.getLength(id_),
+            domain.getWidth(id_),
+            domain.getSpeed(id_),
         )
 
     def _domain_of(self, id_: str) -> Api:
@@ -237,7 +251,9 @@ class SumoWorld:
         # One of them has left the road.
         except self.api.TraCIException:
             positions = self._persons.get(actor, np.zeros((self.n, 2))).copy()
-            positions[copies] = [self._get_person_position(ids[copy]) for copy in copies]
+            positions[copies] = [
+                self._get_person_position(ids[copy]) for copy in copies
+            ]
         self._persons[actor] = positions
         return positions
 
@@ -259,9 +275,16 @@ class SumoWorld:
             if name not in tracks:
                 motion = np.full((length, self.n, 5), np.nan)
                 tracks[name] = Film(
-                    motion, domain is self.api.person, domain.getLength(id_), domain.getWidth(id_)
+                    motion,
+                    domain is self.api.person,
+                    domain.getLength(id_),
+                    domain.getWidth(id_),
                 )
-            tracks[name].motion[sample, copy] = *place, *direction_of(angle), domain.getSpeed(id_)
+            tracks[name].motion[sample, copy] = (
+                *place,
+                *direction_of(angle),
+                domain.getSpeed(id_),
+            )
 
     def vehicle_length(self, actor: str) -> float:
         return float(self.api.vehicle.getLength(self.ids(actor)[0]))
@@ -278,7 +301,9 @@ class SumoWorld:
         return Frame.through_origin(self.lane_of(VUT))
 
     def lane_of(self, vehicle: str) -> Lane:
-        return self.lane(copy_and_name(self.api.vehicle.getLaneID(self.ids(vehicle)[0]))[1])
+        return self.lane(
+            copy_and_name(self.api.vehicle.getLaneID(self.ids(vehicle)[0]))[1]
+        )
 
     def person_width(self, actor: str) -> float:
         return float(self.api.person.getWidth(self.ids(actor)[0]))

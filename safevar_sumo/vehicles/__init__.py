@@ -26,7 +26,10 @@ from safevar_sumo.vehicles.characteristics import (
     CharacteristicSet as CharacteristicSet,
 )
 from safevar_sumo.vehicles.lgsvl import Lgsvl
-from safevar_sumo.vehicles.region import FeasibleRegion as FeasibleRegion, region_of as region_of
+from safevar_sumo.vehicles.region import (
+    FeasibleRegion as FeasibleRegion,
+    region_of as region_of,
+)
 from safevar_sumo.vehicles.sensing import SumoVehicle, WornVehicle
 
 VEHICLES: Mapping[str, type[Any]] = {
@@ -56,13 +59,19 @@ def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> N
     )
 
 
-def _prepared_original(vehicle: Vehicle, characteristics: CharacteristicSet) -> Prepared:
-    values = {member.name: np.full(1, float(member.original)) for member in characteristics}
+def _prepared_original(
+    vehicle: Vehicle, characteristics: CharacteristicSet
+) -> Prepared:
+    values = {
+        member.name: np.full(1, float(member.original)) for member in characteristics
+    }
     return vehicle.prepare(values, DRY_ROAD_FRICTION, STEP)
 
 
 @lru_cache(maxsize=4)
-def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> PedalTables:
+def _simulated_tables(
+    vehicle: Vehicle, characteristics: CharacteristicSet
+) -> PedalTables:
     """Accelerate at full throttle to the highest speed of the tables; from there, coast in one
     drive and brake lightly in another.
     """
@@ -79,7 +88,9 @@ def _simulated_tables(vehicle: Vehicle, characteristics: CharacteristicSet) -> P
         for _ in range(round(LONGEST_DRIVE / STEP)):
             state = vehicle.advance(prepared, state, command)
             speeds.append(float(state.speed[0]))
-            is_complete = speeds[-1] >= SPEEDS[-1] + 1 if throttle else speeds[-1] < SPEEDS[1]
+            is_complete = (
+                speeds[-1] >= SPEEDS[-1] + 1 if throttle else speeds[-1] < SPEEDS[1]
+            )
             if is_complete:
                 break
         return speeds, state
@@ -108,12 +119,18 @@ def _accelerations(speeds: list[float]) -> FloatArray:
     Outside the speeds of the drive, the nearest acceleration holds. A drive at constant speed has
     acceleration 0.
     """
-    distinct_speeds, samples = np.unique(np.maximum.accumulate(np.array(speeds)), return_index=True)
-    reached = np.flatnonzero((distinct_speeds[0] <= SPEEDS) & (distinct_speeds[-1] >= SPEEDS))
+    distinct_speeds, samples = np.unique(
+        np.maximum.accumulate(np.array(speeds)), return_index=True
+    )
+    reached = np.flatnonzero(
+        (distinct_speeds[0] <= SPEEDS) & (distinct_speeds[-1] >= SPEEDS)
+    )
     if len(reached) < 2:
         return np.zeros(len(SPEEDS))
     times = np.interp(SPEEDS[reached], distinct_speeds, samples * STEP)
     accelerations = np.diff(SPEEDS[reached]) / np.diff(times)
     return np.asarray(
-        accelerations[np.clip(np.arange(len(SPEEDS)) - reached[0], 0, len(accelerations) - 1)]
+        accelerations[
+            np.clip(np.arange(len(SPEEDS)) - reached[0], 0, len(accelerations) - 1)
+        ]
     )

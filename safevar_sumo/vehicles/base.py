@@ -12,7 +12,14 @@ from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import FINITE, POSITIVE, SHARE, Legal, Returned
-from safevar_sumo.records import GRAVITY, BoolArray, Command, FloatArray, FloatOrArray, Observation
+from safevar_sumo.records import (
+    GRAVITY,
+    BoolArray,
+    Command,
+    FloatArray,
+    FloatOrArray,
+    Observation,
+)
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 """A model's parameter above 0."""
@@ -108,7 +115,11 @@ LEGAL_STATE = {
     "brake": SHARE,
     "gear": FINITE,
 }
-LEGAL_SENSORS = {"latency": Legal(0.0), "reach": Legal(0.0, infinite=True), "scale": POSITIVE}
+LEGAL_SENSORS = {
+    "latency": Legal(0.0),
+    "reach": Legal(0.0, infinite=True),
+    "scale": POSITIVE,
+}
 LEGAL_OBSERVATION = {
     **dict.fromkeys(Observation._fields, Legal(scalar=True)),
     # While no obstacle is detected.
@@ -265,7 +276,9 @@ class SimulatedVehicle(Vehicle):
         self.UNITS = units
         self.OPTIONAL = optional  # type: ignore[misc]
 
-    def prepare(self, characteristics: Characteristics, *conditions: object) -> Characteristics:
+    def prepare(
+        self, characteristics: Characteristics, *conditions: object
+    ) -> Characteristics:
         return characteristics
 
     def sumo_type(self, prepared: Characteristics) -> SumoType:
@@ -282,7 +295,10 @@ def _select_state(is_rolling: BoolArray, steady: State, standing: State) -> Stat
     if hasattr(standing, "where"):
         return steady.where(is_rolling, standing)
     if isinstance(steady, tuple):
-        columns = [_select_state(is_rolling, *pair) for pair in zip(steady, standing, strict=True)]
+        columns = [
+            _select_state(is_rolling, *pair)
+            for pair in zip(steady, standing, strict=True)
+        ]
         if hasattr(steady, "_fields"):
             return type(steady)(*columns)
         return tuple(columns)

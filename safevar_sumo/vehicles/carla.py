@@ -167,7 +167,12 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
         c = characteristics
         radius = c["radius"] / 100
-        grip = c["tireFric"] * (self.tyre_friction * road_friction) * c["mass"] * slope.down
+        grip = (
+            c["tireFric"]
+            * (self.tyre_friction * road_friction)
+            * c["mass"]
+            * slope.down
+        )
         substeps = math.ceil(step / SUBSTEP - TIME_ROUNDING)
         substep = step / substeps
         tyre_step = substep / TYRE_STEPS
@@ -272,13 +277,20 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             # Downhill the engine brakes and the brake supplies the rest; then w_e = G w_w + m / k_c
             # with the clutch torque m = -c_e w_e.
             engine_drag = (
-                -p.damping_engaged * ratio * wheel_speed / (1 + p.damping_engaged / p.clutch)
+                -p.damping_engaged
+                * ratio
+                * wheel_speed
+                / (1 + p.damping_engaged / p.clutch)
             )
             clutch_torque = np.maximum(resistance / ratio, engine_drag)
             engine_speed = np.minimum(
                 ratio * wheel_speed + clutch_torque / p.clutch, p.engine_limit
             )
-            return clutch_torque, ratio * (engine_drag - resistance / ratio), engine_speed
+            return (
+                clutch_torque,
+                ratio * (engine_drag - resistance / ratio),
+                engine_speed,
+            )
 
         gear = np.ones_like(speed)
         for ratio in OVERALL_RATIOS[1:-1]:
@@ -300,18 +312,26 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             speed, wheel_speed, engine_speed, gear, gear, since_shift, throttle, brake
         )
 
-    def hold_gear(self, prepared: _Prepared, state: CarlaState, holds: BoolArray) -> CarlaState:
+    def hold_gear(
+        self, prepared: _Prepared, state: CarlaState, holds: BoolArray
+    ) -> CarlaState:
         """Hold the gear where `holds`, shape (N,), is true, as a selector lever does. It may change
         as soon as it is released.
         """
-        since_shift = np.where(state.since_shift < 0, self.shift_latency, state.since_shift)
+        since_shift = np.where(
+            state.since_shift < 0, self.shift_latency, state.since_shift
+        )
         return state._replace(since_shift=np.where(holds, -np.inf, since_shift))
 
-    def _rim_at(self, p: Car, pull: FloatArray, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _rim_at(
+        self, p: Car, pull: FloatArray, speed: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Rim speed at which the tyre force balances air drag and slope [m/s], and that force
         [N].
         """
-        force = np.minimum(np.maximum(p.air_drag * speed * speed + pull, -p.grip), p.grip)
+        force = np.minimum(
+            np.maximum(p.air_drag * speed * speed + pull, -p.grip), p.grip
+        )
         grip_share = np.abs(force) / p.grip
         root = np.ones_like(speed)
         # root^3 = 1 - force / grip; see `tyre_force`.
@@ -323,13 +343,17 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         return np.where(force < 0, braking_rim, driving_rim), force
 
     def sensors(self, prepared: _Prepared) -> Sensors:
-        return Sensors.perfect(len(prepared.mass))._replace(scale=prepared.assumed_height)
+        return Sensors.perfect(len(prepared.mass))._replace(
+            scale=prepared.assumed_height
+        )
 
     def sense(
         self, prepared: _Prepared, state: CarlaState, observation: Observation
     ) -> tuple[Observation, CarlaState]:
         """The gap as the camera measures it: the wheel radius sets the height of the camera."""
-        return observation._replace(gap=observation.gap * prepared.assumed_height), state
+        return observation._replace(
+            gap=observation.gap * prepared.assumed_height
+        ), state
 
     @defer_interrupts()
     def compile(self, *, only_load: bool = False) -> bool:
@@ -346,7 +370,9 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         step()
         return True
 
-    def advance(self, prepared: _Prepared, state: CarlaState, command: Command) -> CarlaState:
+    def advance(
+        self, prepared: _Prepared, state: CarlaState, command: Command
+    ) -> CarlaState:
         from safevar_sumo.vehicles.carla_step import CarlaState, advance
 
         states = np.array(state)

@@ -148,7 +148,10 @@ def shift(car: Car, law: Law, s: CarlaState, throttle: FloatOrArray) -> Gearbox:
     is_ready = s.since_shift >= law.shift_latency
     sets_off = (s.gear <= NEUTRAL) & (s.gear == s.target_gear) & (throttle > 0.0)
     up = sets_off | (
-        is_ready & (speed_share > law.shift_up) & (s.gear > NEUTRAL) & (s.gear < TOP_GEAR)
+        is_ready
+        & (speed_share > law.shift_up)
+        & (s.gear > NEUTRAL)
+        & (s.gear < TOP_GEAR)
     )
     down = is_ready & (speed_share < law.shift_down) & (s.gear > FIRST_GEAR)
     target = s.target_gear + (1.0 if up else 0.0) - (1.0 if down else 0.0)
@@ -158,7 +161,9 @@ def shift(car: Car, law: Law, s: CarlaState, throttle: FloatOrArray) -> Gearbox:
 
 
 @equation
-def tyre_force(car: Car, law: Law, speed: FloatOrArray, rim: FloatOrArray) -> FloatOrArray:
+def tyre_force(
+    car: Car, law: Law, speed: FloatOrArray, rim: FloatOrArray
+) -> FloatOrArray:
     """Longitudinal force of the tyres [N] (`PxVehicleComputeTireForceDefault` without lateral
     slip).
 
@@ -168,7 +173,10 @@ def tyre_force(car: Car, law: Law, speed: FloatOrArray, rim: FloatOrArray) -> Fl
     slip_speed = rim - speed
     denominator = np.maximum(rim, speed) + law.slip_offset
     # 1 - K / 3 in the equation: 1 without slip, 0 where the tyre slides.
-    adhesion = np.maximum(denominator - car.slip_stiffness * np.abs(slip_speed), 0.0) / denominator
+    adhesion = (
+        np.maximum(denominator - car.slip_stiffness * np.abs(slip_speed), 0.0)
+        / denominator
+    )
     return np.copysign(car.grip - car.grip * adhesion * adhesion * adhesion, slip_speed)
 
 
@@ -196,9 +204,13 @@ def roll(
     damping = car.damping_engaged if gear > NEUTRAL else car.damping_neutral
     clutch_by_ratio = ratio * clutch
     # Inertias with everything that is implicit:
-    engine = law.engine_inertia + damping + (car.damping_full - damping) * throttle + clutch
+    engine = (
+        law.engine_inertia + damping + (car.damping_full - damping) * throttle + clutch
+    )
     wheel = (
-        car.wheel_inertia + car.wheel_damping + clutch_by_ratio * ratio * (1.0 - clutch / engine)
+        car.wheel_inertia
+        + car.wheel_damping
+        + clutch_by_ratio * ratio * (1.0 - clutch / engine)
     )
     # Coefficients of a tyre step: x_by_y is the change of x for a unit of y; the rim's speed stands
     # for the wheel's.
@@ -209,7 +221,9 @@ def roll(
     rim_by_engine = clutch_by_ratio * rim_by_torque
     rim_loss = brake * car.brake_torque * rim_by_torque
     rim_by_force = car.radius * rim_by_torque
-    speed_loss = car.speed_by_force * car.air_drag * s.speed * s.speed + car.speed_by_slope
+    speed_loss = (
+        car.speed_by_force * car.air_drag * s.speed * s.speed + car.speed_by_slope
+    )
     slip_by_force = rim_by_force + car.speed_by_force
     engine_by_rim = clutch_by_ratio / (engine * car.radius)
 
@@ -222,19 +236,29 @@ def roll(
         slip_end_force = (free_rim - speed) / slip_by_force
         lower_limit = np.minimum(slip_end_force, 0.0)
         upper_limit = np.maximum(slip_end_force, 0.0)
-        force = np.minimum(np.maximum(tyre_force(car, law, speed, rim), lower_limit), upper_limit)
+        force = np.minimum(
+            np.maximum(tyre_force(car, law, speed, rim), lower_limit), upper_limit
+        )
         rim = np.maximum(free_rim - rim_by_force * force, 0.0)
-        engine_speed = np.minimum(free_engine_speed + engine_by_rim * rim, car.engine_limit)
+        engine_speed = np.minimum(
+            free_engine_speed + engine_by_rim * rim, car.engine_limit
+        )
         speed = np.maximum(speed + car.speed_by_force * force - speed_loss, 0.0)
     return Speeds(speed, rim / car.radius, engine_speed)
 
 
 @equation
 def move(
-    car: Car, law: Law, s: CarlaState, throttle_command: FloatOrArray, brake_command: FloatOrArray
+    car: Car,
+    law: Law,
+    s: CarlaState,
+    throttle_command: FloatOrArray,
+    brake_command: FloatOrArray,
 ) -> CarlaState:
     """The state of a vehicle one substep later."""
-    throttle = pedal_position(throttle_command, s.throttle, law.throttle_fall, law.throttle_rise)
+    throttle = pedal_position(
+        throttle_command, s.throttle, law.throttle_fall, law.throttle_rise
+    )
     brake = pedal_position(brake_command, s.brake, law.brake_fall, law.brake_rise)
     gearbox = shift(car, law, s, throttle)
     speeds = roll(car, law, s, gearbox.gear, throttle, brake)

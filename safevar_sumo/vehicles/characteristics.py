@@ -17,7 +17,14 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues, Quantity
-from safevar_sumo.study import PHASE, PHASE_DECIMALS, Precision, Study, plain_values, unit_text
+from safevar_sumo.study import (
+    PHASE,
+    PHASE_DECIMALS,
+    Precision,
+    Study,
+    plain_values,
+    unit_text,
+)
 
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
@@ -107,7 +114,9 @@ class Characteristic:
     def resolution(self) -> float:
         """A change that matters little: beta (u - l) (method section 2)."""
         width = self.upper - self.lower
-        shares = (share for smallest_width, share in FILTER_SHARES if width >= smallest_width)
+        shares = (
+            share for smallest_width, share in FILTER_SHARES if width >= smallest_width
+        )
         return next(shares) * width
 
     @property
@@ -137,7 +146,9 @@ class Characteristic:
         up = math.ceil(scaled - ROUNDING)
         down = math.floor(scaled + ROUNDING)
         rounded = (up if upwards else down) / 10**self.digits
-        is_beyond = rounded > original >= value if upwards else rounded < original <= value
+        is_beyond = (
+            rounded > original >= value if upwards else rounded < original <= value
+        )
         return original if is_beyond else rounded
 
     def rounded_inwards(self, interval: tuple[float, float]) -> tuple[float, float]:
@@ -218,7 +229,9 @@ class CharacteristicSet:
         return cls(
             tuple(
                 Characteristic(
-                    name=name, is_scenario=name in study.ranges, **msgspec.structs.asdict(row)
+                    name=name,
+                    is_scenario=name in study.ranges,
+                    **msgspec.structs.asdict(row),
                 )
                 for name, row in study.domains.items()
             )
@@ -248,19 +261,25 @@ class CharacteristicSet:
     @cached_property
     def vehicle(self) -> CharacteristicSet:
         """The characteristics of the vehicle alone."""
-        return CharacteristicSet(tuple(member for member in self.members if not member.is_scenario))
+        return CharacteristicSet(
+            tuple(member for member in self.members if not member.is_scenario)
+        )
 
     @cached_property
     def scenario(self) -> CharacteristicSet:
         """The searched parameters of the scenario; empty in most studies."""
-        return CharacteristicSet(tuple(member for member in self.members if member.is_scenario))
+        return CharacteristicSet(
+            tuple(member for member in self.members if member.is_scenario)
+        )
 
     @cached_property
     def of_vehicle(self) -> BoolArray:
         """Which members are the vehicle's, shape (n,)."""
         return np.array([not member.is_scenario for member in self.members], dtype=bool)
 
-    def of_others(self, characteristics: CharacteristicSet, settings: FloatArray) -> FloatArray:
+    def of_others(
+        self, characteristics: CharacteristicSet, settings: FloatArray
+    ) -> FloatArray:
         """Settings of other characteristics, shape (N, m), with those of this set alone, shape
         (N, n).
         """
@@ -303,7 +322,8 @@ class CharacteristicSet:
     def _column(self, attribute: str) -> FloatArray:
         """One attribute of all characteristics as a read-only array, shape (n,)."""
         values = np.array(
-            [getattr(characteristic, attribute) for characteristic in self.members], dtype=float
+            [getattr(characteristic, attribute) for characteristic in self.members],
+            dtype=float,
         )
         values.flags.writeable = False
         return values
@@ -320,7 +340,9 @@ class CharacteristicSet:
         """Reset each value that differs from the original by no more than the threshold (method
         section 2).
         """
-        return np.where(np.abs(self.original - settings) > self.threshold, settings, self.original)
+        return np.where(
+            np.abs(self.original - settings) > self.threshold, settings, self.original
+        )
 
     def changed(self, filtered: FloatArray) -> BoolArray:
         """Which characteristics differ from the original; bool, shape (N, n)."""
@@ -341,7 +363,9 @@ class CharacteristicSet:
         """
         vehicle = self.vehicle
         scale = np.where(
-            vehicle.original == 0, vehicle.upper - vehicle.lower, np.abs(vehicle.original)
+            vehicle.original == 0,
+            vehicle.upper - vehicle.lower,
+            np.abs(vehicle.original),
         )
         changes = np.abs(vehicle.original - filtered[:, self.of_vehicle]) / scale
         return np.asarray(np.max(changes, axis=1))
@@ -351,10 +375,13 @@ class CharacteristicSet:
         section 3).
         """
         return np.asarray(
-            np.count_nonzero(self.changed(filtered) & self.of_vehicle, axis=1), dtype=float
+            np.count_nonzero(self.changed(filtered) & self.of_vehicle, axis=1),
+            dtype=float,
         )
 
-    def setting(self, values: Mapping[str, float], *, beyond: bool = False) -> FloatArray:
+    def setting(
+        self, values: Mapping[str, float], *, beyond: bool = False
+    ) -> FloatArray:
         """The original setting with some values replaced, shape (n,); with `beyond`, plausible
         values outside the domain are legal.
 

@@ -45,7 +45,9 @@ TRACTION_RATE = 6.75 / 0.02
 AIR_DRAG, DOWNFORCE = map(np.array, (1.0, 2.0))  # N s^2/m^2; VehicleSMI
 # Unity's WheelCollider: forward friction rises to its extremum and falls to its asymptote.
 PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = map(np.array, (0.4, 0.8, 0.5))
-SLIDING_RANGE, FRICTION_LOSS = map(np.array, (SLIDING_SLIP - PEAK_SLIP, 1 - SLIDING_FRICTION))
+SLIDING_RANGE, FRICTION_LOSS = map(
+    np.array, (SLIDING_SLIP - PEAK_SLIP, 1 - SLIDING_FRICTION)
+)
 FRICTION = 1.0  # at the extremum
 # m/s, smallest denominator of a slip (assumption, as in PhysX).
 SLIP_FLOOR = np.array(4.0)
@@ -208,7 +210,10 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             mass=p.mass,
             accel=np.minimum(drive, grip) / p.mass,
             decel=np.minimum(p.brake_torque / p.radius, grip) / p.mass,
-            max_speed=p.largest_rpm / RPM_PER_RAD_S / (GEAR_RATIOS[-1] * FINAL_RATIO) * p.radius,
+            max_speed=p.largest_rpm
+            / RPM_PER_RAD_S
+            / (GEAR_RATIOS[-1] * FINAL_RATIO)
+            * p.radius,
             actuator_lag=np.full_like(p.mass, p.step + self.pedal_lag),
         )
 
@@ -240,20 +245,28 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         p = prepared
         zeros = np.zeros_like(prepared.mass)
 
-        force = (AIR_DRAG * speed + p.rolling_drag) * speed + p.body * p.slope_deceleration
+        force = (
+            AIR_DRAG * speed + p.rolling_drag
+        ) * speed + p.body * p.slope_deceleration
         wheel_speed = _rim_at(p, speed, force) / p.radius
 
         gear = zeros + 1
         for lower_ratio in GEAR_RATIOS[:-1]:
-            rpm = p.least_rpm + wheel_speed * (lower_ratio * FINAL_RATIO * RPM_PER_RAD_S)
+            rpm = p.least_rpm + wheel_speed * (
+                lower_ratio * FINAL_RATIO * RPM_PER_RAD_S
+            )
             gear += rpm > SHIFT_UP * p.largest_rpm
         ratio = GEAR_RATIOS[gear.astype(np.intp) - 1]
         gearing = ratio * FINAL_RATIO
 
         engine_rpm = p.least_rpm + wheel_speed * gearing * RPM_PER_RAD_S
-        full_torque = _torque_share(engine_rpm / p.largest_rpm) * gearing * p.motor_torque
+        full_torque = (
+            _torque_share(engine_rpm / p.largest_rpm) * gearing * p.motor_torque
+        )
         needed_torque = p.damping * wheel_speed + p.radius * force
-        throttle = np.minimum(np.maximum(needed_torque, 0.0) / np.maximum(full_torque, 1.0), 1.0)
+        throttle = np.minimum(
+            np.maximum(needed_torque, 0.0) / np.maximum(full_torque, 1.0), 1.0
+        )
         brake = np.minimum(np.maximum(-needed_torque, 0.0) / p.brake_torque, 1.0)
         return self.at_rest(p)._replace(
             speed=speed,
@@ -274,7 +287,9 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     ) -> tuple[Observation, LgsvlState]:
         return observation, state
 
-    def advance(self, prepared: _Prepared, state: LgsvlState, command: Command) -> LgsvlState:
+    def advance(
+        self, prepared: _Prepared, state: LgsvlState, command: Command
+    ) -> LgsvlState:
         p = prepared
         lateral, heading, cornering_drag = self._steer(p, state)
         # Of its error a pedal makes up this share in a step.
@@ -291,7 +306,9 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             state = _roll(p, state, gearing, cornering_drag)
         return state._replace(since_shift=state.since_shift + p.step)
 
-    def _steer(self, p: _Prepared, s: LgsvlState) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _steer(
+        self, p: _Prepared, s: LgsvlState
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Lane keeping, a kinematic bicycle at small angles: lateral position, heading, and
         cornering drag [N s/m].
 
@@ -332,7 +349,8 @@ def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
 def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
     """The gear ratio in use."""
     return np.asarray(
-        s.old_ratio + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, ONE)
+        s.old_ratio
+        + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, ONE)
     )
 
 
@@ -353,18 +371,29 @@ def _roll(
     """
     h = p.substep
     steady_rpm = p.least_rpm + s.wheel_speed * gearing * RPM_PER_RAD_S
-    engine_rpm = s.engine_rpm + (steady_rpm - s.engine_rpm) * (RPM_RATE * h / (1 + RPM_RATE * h))
-    drive = _torque_share(engine_rpm / p.largest_rpm) * gearing * s.traction_torque * s.throttle
+    engine_rpm = s.engine_rpm + (steady_rpm - s.engine_rpm) * (
+        RPM_RATE * h / (1 + RPM_RATE * h)
+    )
+    drive = (
+        _torque_share(engine_rpm / p.largest_rpm)
+        * gearing
+        * s.traction_torque
+        * s.throttle
+    )
 
     rim = p.radius * s.wheel_speed
     slip_speed = rim - s.speed
     is_spinning = slip_speed > p.slip_limit * np.maximum(rim, LEAST_RIM_SPEED)
     torque_change = TRACTION_RATE * h
-    traction_torque = s.traction_torque + np.where(is_spinning, -torque_change, torque_change)
+    traction_torque = s.traction_torque + np.where(
+        is_spinning, -torque_change, torque_change
+    )
 
     stiffness = _tyre_stiffness(p, s.speed, rim, slip_speed)
     pull = h * p.radius * stiffness
-    damped_mass = p.body + h * (stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag)
+    damped_mass = p.body + h * (
+        stiffness + AIR_DRAG * s.speed + p.rolling_drag + cornering_drag
+    )
     slope_speed = s.speed - p.slope_deceleration * h
     wheel_momentum = (
         p.inertia * s.wheel_speed

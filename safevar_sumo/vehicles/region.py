@@ -51,7 +51,8 @@ class _Bounds(NamedTuple):
         table = study.domains
         widths = characteristics.upper - characteristics.lower
         weights = tuple(
-            (characteristics.names.index(name), weight) for name, weight in constraint.sum.items()
+            (characteristics.names.index(name), weight)
+            for name, weight in constraint.sum.items()
         )
         width = float(sum(abs(weight) * widths[column] for column, weight in weights))
         return cls(
@@ -76,7 +77,8 @@ class _Bounds(NamedTuple):
         """By how much each setting violates the bounds, as a share of `width`, shape (N,)."""
         values = self.quantity(settings)
         return (
-            np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0) / self.width
+            np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0)
+            / self.width
         )
 
     def __str__(self) -> str:
@@ -122,16 +124,22 @@ class FeasibleRegion:
         for setting in settings[~self.feasible(settings)][:1]:
             row = setting[np.newaxis]
             bound = next(
-                bound for bound in self.bounds if bound.excess(row)[0] > SLACK / len(self.bounds)
+                bound
+                for bound in self.bounds
+                if bound.excess(row)[0] > SLACK / len(self.bounds)
             )
             values = ", ".join(
                 f"{characteristic.name} = {value:g}{characteristic.suffix}"
-                for characteristic, value in zip(self.characteristics, setting, strict=True)
+                for characteristic, value in zip(
+                    self.characteristics, setting, strict=True
+                )
                 if characteristic.name in bound.constraint.sum
             )
             quantity = f"{bound.constraint.quantity} = {bound.quantity(row)[0]:g}{bound.suffix}"
             raise InputError(
-                "", f"violates a constraint: {quantity} ({values})", bound.condition + otherwise
+                "",
+                f"violates a constraint: {quantity} ({values})",
+                bound.condition + otherwise,
             )
 
     def repaired(self, settings: FloatArray) -> FloatArray:
@@ -145,7 +153,9 @@ class FeasibleRegion:
             if not len(infeasible):
                 break
             repaired[infeasible] = original + share * (settings[infeasible] - original)
-            infeasible = infeasible[~self._are_accepted(repaired[infeasible], filtered=True)]
+            infeasible = infeasible[
+                ~self._are_accepted(repaired[infeasible], filtered=True)
+            ]
         return repaired
 
     def draw_feasible(
@@ -156,7 +166,9 @@ class FeasibleRegion:
         """
         batches = [np.zeros((0, len(self.characteristics)))]
         draws = 0
-        while (shortage := number - sum(map(len, batches))) and draws < REJECTIONS * number:
+        while (
+            shortage := number - sum(map(len, batches))
+        ) and draws < REJECTIONS * number:
             # As many as all draws before, where few are feasible.
             settings = draw(max(shortage, min(draws, LARGEST_DRAW)))
             draws += len(settings)
@@ -164,7 +176,9 @@ class FeasibleRegion:
         return np.concatenate(batches)
 
     def _are_accepted(self, settings: FloatArray, filtered: bool) -> BoolArray:
-        return self.feasible(self.characteristics.filter(settings) if filtered else settings)
+        return self.feasible(
+            self.characteristics.filter(settings) if filtered else settings
+        )
 
 
 def region_of(study: Study) -> FeasibleRegion:
@@ -177,7 +191,8 @@ def region_of(study: Study) -> FeasibleRegion:
     """
     characteristics = CharacteristicSet.of(study)
     bounds = tuple(
-        _Bounds.of(constraint, study, characteristics) for constraint in study.shared_constraints
+        _Bounds.of(constraint, study, characteristics)
+        for constraint in study.shared_constraints
     )
     region = FeasibleRegion(characteristics, bounds)
     if not bounds:

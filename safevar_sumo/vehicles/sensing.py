@@ -59,7 +59,9 @@ class _PreparedSumo(NamedTuple):
     slope: Slope
 
 
-class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class SumoVehicle(
+    SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
     """A SUMO vehicle type: greatest accelerations, top speed, and delays of sensors and actuators.
 
     `tau` is SUMO's: the time headway of a driver who is one of SUMO's car-following models.
@@ -138,11 +140,17 @@ class SumoVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         return SumoType(p.mass, *limits, p.max_speed, p.actuator_lag, p.tau)
 
     def _acceleration(
-        self, p: _PreparedSumo, state: SensingState, throttle: FloatArray, brake: FloatArray
+        self,
+        p: _PreparedSumo,
+        state: SensingState,
+        throttle: FloatArray,
+        brake: FloatArray,
     ) -> FloatArray:
         """The wheels follow the pedals with the actuator lag T: da/dt = (target - a) / T."""
         is_braking = brake > RELEASED_BRAKE
-        commanded = np.where(is_braking, -brake * p.brake_gain * p.decel, throttle * p.drive)
+        commanded = np.where(
+            is_braking, -brake * p.brake_gain * p.decel, throttle * p.drive
+        )
         target = np.minimum(np.maximum(commanded, -p.grip), p.grip)
         acceleration = state.acceleration + (target - state.acceleration) * (
             p.step / (p.actuator_lag + p.step)
@@ -177,7 +185,9 @@ class _PreparedWorn(NamedTuple):
     dropout: FloatArray | None
 
 
-class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class WornVehicle(
+    SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
+):
     """A car with two axles that never lock: each axle brakes up to the friction that its load
     allows.
 
@@ -295,7 +305,10 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
             brake=c["brakeTorque"] * (self.brake_force / mass),
             grip=self.tyre_friction * road_friction,
             lift=lift_of(
-                water, np.maximum(c["treadDepth"], 0.0), self.water_lift, self.road_texture
+                water,
+                np.maximum(c["treadDepth"], 0.0),
+                self.water_lift,
+                self.road_texture,
             ),
             max_speed=self.max_speed,
             front_load=1 - rear_load,
@@ -316,14 +329,19 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
 
         if prepared.tangent is not None:
             distance = np.where(np.isfinite(sensed.gap), sensed.gap, 0.0)
-            sensed = sensed._replace(lateral=sensed.lateral + distance * prepared.tangent)
+            sensed = sensed._replace(
+                lateral=sensed.lateral + distance * prepared.tangent
+            )
         if prepared.dropout is None:
             return sensed, state
 
         frame = np.stack([getattr(sensed, name) for name in DELAYED])
         if state.frame is not None:
             number = round(observation.time / prepared.step)
-            is_lost = np.random.default_rng([self.frame_seed, number]).random() < prepared.dropout
+            is_lost = (
+                np.random.default_rng([self.frame_seed, number]).random()
+                < prepared.dropout
+            )
             frame = np.where(is_lost, state.frame, frame)
         sensed = sensed._replace(**dict(zip(DELAYED, frame, strict=True)))
         return sensed, state._replace(frame=frame)
@@ -332,11 +350,20 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         p = prepared
         full_pedal = np.ones_like(prepared.mass)
         grip = lifted_friction(p.grip, p.lift, 0 * full_pedal)
-        limits = np.minimum(p.drive, grip * p.slope.down), self._deceleration(p, full_pedal, grip)
-        return SumoType(p.mass, *limits, self.max_speed * full_pedal, p.brake_delay + p.step)
+        limits = (
+            np.minimum(p.drive, grip * p.slope.down),
+            self._deceleration(p, full_pedal, grip),
+        )
+        return SumoType(
+            p.mass, *limits, self.max_speed * full_pedal, p.brake_delay + p.step
+        )
 
     def _acceleration(
-        self, p: _PreparedWorn, state: SensingState, throttle: FloatArray, brake: FloatArray
+        self,
+        p: _PreparedWorn,
+        state: SensingState,
+        throttle: FloatArray,
+        brake: FloatArray,
     ) -> FloatArray:
         # The speed in the middle of the step, as if the vehicle went on as in the last one.
         speed = state.speed + 0.5 * p.step * (state.acceleration - p.slope.back)
@@ -344,13 +371,21 @@ class WornVehicle(SensingVehicle, Struct, frozen=True, kw_only=True, forbid_unkn
         drive = np.minimum(throttle * p.drive, grip * p.slope.down)
         return np.where(brake > 0, -self._deceleration(p, brake, grip), drive)
 
-    def _deceleration(self, p: _PreparedWorn, pedal: FloatArray, grip: FloatArray) -> FloatArray:
+    def _deceleration(
+        self, p: _PreparedWorn, pedal: FloatArray, grip: FloatArray
+    ) -> FloatArray:
         """Deceleration by the brakes of both axles together [m/s^2]; `grip` is the friction
         coefficient now.
         """
         demand = pedal * p.brake
         grip_limit = grip * p.slope.down
         lever = grip * (self.centre_height / self.wheelbase)
-        rear_limit = (self.front_share * demand + grip_limit * p.rear_load) / (1 + lever)
-        front_limit = ((1 - self.front_share) * demand + grip_limit * p.front_load) / (1 - lever)
-        return np.minimum(np.minimum(demand, grip_limit), np.minimum(rear_limit, front_limit))
+        rear_limit = (self.front_share * demand + grip_limit * p.rear_load) / (
+            1 + lever
+        )
+        front_limit = ((1 - self.front_share) * demand + grip_limit * p.front_load) / (
+            1 - lever
+        )
+        return np.minimum(
+            np.minimum(demand, grip_limit), np.minimum(rear_limit, front_limit)
+        )

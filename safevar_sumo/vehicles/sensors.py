@@ -39,7 +39,11 @@ class DelayedSignal:
     __slots__ = ("_begin", "_room", "newer", "samples", "share")
 
     def __init__(
-        self, samples: FloatArray, newer: IntArray, share: FloatArray, room: _Room | None = None
+        self,
+        samples: FloatArray,
+        newer: IntArray,
+        share: FloatArray,
+        room: _Room | None = None,
     ) -> None:
         if room is None:
             room = _Room(samples)
@@ -62,7 +66,9 @@ class DelayedSignal:
         age = delay / step
         if not longest <= LONGEST_DELAY:
             raise InputError(
-                "vehicle", f"one of its delays is {longest:g} s", f"up to {LONGEST_DELAY:g} s"
+                "vehicle",
+                f"one of its delays is {longest:g} s",
+                f"up to {LONGEST_DELAY:g} s",
             )
         whole_steps = np.floor(age)
         first_sample = np.arange(sample.size).reshape(sample.shape)
@@ -76,7 +82,9 @@ class DelayedSignal:
         """
         samples = np.where(chosen, self.samples, history.samples)
         newer = np.where(chosen, self.newer, history.newer)
-        return DelayedSignal(samples, newer, np.where(chosen, self.share, history.share))
+        return DelayedSignal(
+            samples, newer, np.where(chosen, self.share, history.share)
+        )
 
     def extended(self, sample: FloatArray) -> DelayedSignal:
         """The history with a new sample at its front and the oldest one dropped."""
@@ -138,7 +146,11 @@ def sensed_observation(
     sample = np.empty((len(DELAYED), *observation.gap.shape))
     for row, name in enumerate(DELAYED):
         sample[row] = getattr(observation, name)
-    past = DelayedSignal.of(sample, latency, step) if past is None else past.extended(sample)
+    past = (
+        DelayedSignal.of(sample, latency, step)
+        if past is None
+        else past.extended(sample)
+    )
     then = dict(zip(DELAYED, past.delayed(), strict=True))
     is_detected = then["gap"] <= reach * observation.visibility
     then["gap"] = np.where(is_detected, then["gap"], np.inf)
@@ -177,7 +189,9 @@ class SensingVehicle(Vehicle):
     __slots__ = ()
 
     def sensors(self, prepared: Prepared) -> Sensors:
-        return Sensors(prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range))
+        return Sensors(
+            prepared.latency, prepared.sensor_range, np.ones_like(prepared.sensor_range)
+        )
 
     def sense(
         self, prepared: Prepared, state: SensingState, observation: Observation
@@ -186,14 +200,20 @@ class SensingVehicle(Vehicle):
         the visibility.
         """
         sensed, past = sensed_observation(
-            observation, state.observations, prepared.latency, prepared.sensor_range, prepared.step
+            observation,
+            state.observations,
+            prepared.latency,
+            prepared.sensor_range,
+            prepared.step,
         )
         return sensed, state._replace(observations=past)
 
     def at_rest(self, prepared: Prepared) -> SensingState:
         zeros = np.zeros_like(prepared.mass)
         commands = DelayedSignal.of(zeros, prepared.brake_delay, prepared.step)
-        return SensingState(zeros, zeros, zeros, np.ones_like(zeros), None, commands, zeros)
+        return SensingState(
+            zeros, zeros, zeros, np.ones_like(zeros), None, commands, zeros
+        )
 
     def at_speed(self, prepared: Prepared, speed: FloatArray) -> SensingState:
         """The steady state: the pedals balance the slope, the only resistance."""
@@ -209,7 +229,9 @@ class SensingVehicle(Vehicle):
             acceleration=standing.acceleration + back,
         )
 
-    def advance(self, prepared: Prepared, state: SensingState, command: Command) -> SensingState:
+    def advance(
+        self, prepared: Prepared, state: SensingState, command: Command
+    ) -> SensingState:
         p = prepared
 
         commands = state.brake_commands.extended(command.brake)

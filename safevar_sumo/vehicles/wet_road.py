@@ -22,13 +22,17 @@ source.
 """
 
 
-def lift_of(water: FloatOrArray, tread: FloatArray, lift: float, texture: float) -> FloatArray:
+def lift_of(
+    water: FloatOrArray, tread: FloatArray, lift: float, texture: float
+) -> FloatArray:
     """k [s^2/m^2], shape (N,), of treads at depths of water [mm]; 0 on a dry road."""
     flood = water / NEW_TREAD
     return lift * np.sqrt(water) / (texture + tread / (1 + flood * flood))
 
 
-def lifted_friction(grip: FloatOrArray, lift: FloatArray, speed: FloatArray) -> FloatArray:
+def lifted_friction(
+    grip: FloatOrArray, lift: FloatArray, speed: FloatArray
+) -> FloatArray:
     """mu at speeds [m/s], shape (N,); `grip` on a dry road or at rest."""
     lifted = lift * (speed * speed)
     return grip / np.sqrt(1 + lifted * lifted)

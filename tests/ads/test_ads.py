@@ -43,7 +43,9 @@ STUDIES = {study.ads.model: study for study in map(read_study, study_names())}
 NATIVE = read_study("native")
 UNAVAILABLE = {read_study(name).ads.model for name in MISSING}
 SYSTEMS = {
-    name: assemble(STUDIES.get(name, msgspec.structs.replace(NATIVE, ads=ModelTable(model=name))))
+    name: assemble(
+        STUDIES.get(name, msgspec.structs.replace(NATIVE, ads=ModelTable(model=name)))
+    )
     for name in ADS
     if name not in UNAVAILABLE
 }
@@ -82,7 +84,9 @@ def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def approach(ads: Ads, nominal: Nominal, speed: FloatArray, gap: FloatArray) -> FloatArray:
+def approach(
+    ads: Ads, nominal: Nominal, speed: FloatArray, gap: FloatArray
+) -> FloatArray:
     """Pedals over time, shape (T, 2, N), of vehicles whose speed stays constant whatever the pedals
     are.
     """
@@ -90,7 +94,8 @@ def approach(ads: Ads, nominal: Nominal, speed: FloatArray, gap: FloatArray) -> 
     pedals = []
     for step in range(80):
         command, memory = ads.drive(
-            seen(step * STEP, speed, gap - speed * step * STEP, lateral_speed=1.8), memory
+            seen(step * STEP, speed, gap - speed * step * STEP, lateral_speed=1.8),
+            memory,
         )
         pedals.append(np.stack(command))
     return np.stack(pedals)
@@ -166,9 +171,15 @@ def worn(scenario: Any, latency: float, ads: Any) -> SimulationRuns:
 @pytest.mark.parametrize("latency", [0.05, 0.25, 0.4])
 @pytest.mark.parametrize(
     "scenario",
-    [CarToCar(test="CCRs", speed=60), Along(test="CPLA", speed=60), Along(test="CBLA", speed=70)],
+    [
+        CarToCar(test="CCRs", speed=60),
+        Along(test="CPLA", speed=60),
+        Along(test="CBLA", speed=70),
+    ],
 )
-def test_sensors_that_are_late_warn_as_much_later(scenario: Any, latency: float) -> None:
+def test_sensors_that_are_late_warn_as_much_later(
+    scenario: Any, latency: float
+) -> None:
     """The first step in which the observed gap / closing speed is below 2.2 s: a true TTC of 2.2 s
     - latency, or one step less.
     """
@@ -201,7 +212,9 @@ def test_an_ads_of_ones_own_warns() -> None:
     original = CARLA.characteristics.original
     for_many = checked_class(UserCode("ads", NearForMany), Ads)()
     for ads in (PerVehicleAds(Near, UserCode("ads")), for_many):
-        run = driven(CarToCar(test="CCRs", speed=36), ads, np.stack([original, original]))
+        run = driven(
+            CarToCar(test="CCRs", speed=36), ads, np.stack([original, original])
+        )
         assert run.warning_ttc == pytest.approx([2.0, 2.0], abs=STEP + 1e-6)
 
 
@@ -254,7 +267,8 @@ def test_world_on_rails_throttle_is_linear_between_its_speeds_and_none_above_20_
 
 
 @pytest.mark.parametrize(
-    ("gap", "speed", "brakes"), [(0.6, 1.0, 1), (0.5, 1.0, 0), (0.4, 0.0, 0), (-0.2, 1.0, 0)]
+    ("gap", "speed", "brakes"),
+    [(0.6, 1.0, 1), (0.5, 1.0, 0), (0.4, 0.0, 0), (-0.2, 1.0, 0)],
 )
 def test_world_on_rails_sees_nothing_nearer_than_its_gap_of_release(
     gap: float, speed: float, brakes: int
@@ -271,7 +285,10 @@ def test_world_on_rails_brakes_up_to_a_gap_that_shrinks_before_and_past_its_plac
     lateral: float, speed: float, gap: float
 ) -> None:
     ads = world_on_rails(
-        brake_gap_per_speed=-0.5, brake_place=-0.4, brake_gap_before=10.0, brake_gap_past=2.0
+        brake_gap_per_speed=-0.5,
+        brake_place=-0.4,
+        brake_gap_before=10.0,
+        brake_gap_past=2.0,
     )
     short = max(-0.4 - lateral, 0.0)
     limit = 0.9 * (9.0 - 0.5 * speed - 10.0 * short - 2.0 * max(lateral + 0.4, 0.0))
@@ -293,7 +310,9 @@ def test_world_on_rails_waits_for_its_first_command_and_for_its_latency() -> Non
     for k in range(9):
         command, memory = ads.drive(seen(k * STEP, 0.0, FAR), memory)
         throttle.append(float(command.throttle[0]))
-    assert throttle == [0.0] * 6 + [0.9] * 3, "0.2 s is step 4, the command arrives two steps later"
+    assert throttle == [0.0] * 6 + [0.9] * 3, (
+        "0.2 s is step 4, the command arrives two steps later"
+    )
 
 
 @pytest.mark.parametrize(("speed", "lag"), [(4.0, 0.1), (8.0, 0.1), (8.0, 0.6)])
@@ -327,7 +346,9 @@ def test_apollo_asks_for_what_is_needed_to_stand_at_its_gap_through_the_original
 
 
 @given(speed=st.floats(0, 20), gap=st.floats(0, 100))
-def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap: float) -> None:
+def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(
+    speed: float, gap: float
+) -> None:
     """v tau + v^2 / (2 b) = gap - standing gap, reached within a step and the vehicle's lag; at the
     end 0.5 m/s^2.
     """
@@ -341,7 +362,9 @@ def test_krauss_aims_at_the_speed_from_which_it_can_still_stop(speed: float, gap
     assert command.throttle[0] == pytest.approx(
         min(max(acceleration / KNOWN.accel, 0), 1), abs=1e-6
     )
-    assert command.brake[0] == pytest.approx(min(max(-acceleration / KNOWN.decel, 0), 1), abs=1e-6)
+    assert command.brake[0] == pytest.approx(
+        min(max(-acceleration / KNOWN.decel, 0), 1), abs=1e-6
+    )
 
 
 @SLOW

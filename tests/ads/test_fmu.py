@@ -98,7 +98,10 @@ def small(in_tmp: Path) -> Make:
             edited = re.sub(old, new, contents["modelDescription.xml"].decode())
             assert edited.encode() != contents["modelDescription.xml"]
             with zipfile.ZipFile("Small.fmu", "w") as archive:
-                for name, content in {**contents, "modelDescription.xml": edited.encode()}.items():
+                for name, content in {
+                    **contents,
+                    "modelDescription.xml": edited.encode(),
+                }.items():
                     archive.writestr(name, content)
         Path("small.toml").write_text(
             f'extends = "native"\nname = "small"\n[ads]\nkind = "fmu"\nmodel = "Small.fmu"\n{table}'
@@ -115,7 +118,13 @@ def driven(system: System, gaps: list[float], step: float = 0.1) -> np.ndarray:
     one = np.ones(2)
     for sample, gap in enumerate(gaps):
         seen = Observation(
-            sample * step, 10 * one, gap + np.array([0.0, 10.0]), 10 * one, one, one, 1.0
+            sample * step,
+            10 * one,
+            gap + np.array([0.0, 10.0]),
+            10 * one,
+            one,
+            one,
+            1.0,
         )
         command, memory = system.ads.drive(seen, memory)
         commands.append([command.throttle, command.brake])
@@ -139,7 +148,9 @@ def test_instances_begin_anew_in_each_run(small: Make) -> None:
 
 def test_an_acceleration_drives_as_the_same_law_in_python(small: Make) -> None:
     table = TABLE.replace("25", "15").replace('"gap" }', '"gap", speed = "speed" }')
-    fmu = small("self.wish = -9.0", table.replace('brake = "pedal"', 'acceleration = "wish"'))
+    fmu = small(
+        "self.wish = -9.0", table.replace('brake = "pedal"', 'acceleration = "wish"')
+    )
     Path("law.py").write_text("""
 import numpy as np
 from safevar_sumo.ads.base import Ads, pedals_for, trim_at
@@ -155,10 +166,14 @@ class Law(Ads):
         wish = np.where(seen.gap < 15.0, -9.0, 8.0 - seen.speed)
         return pedals_for(nominal, seen.speed, wish, trim), (nominal, trim)
 """)
-    Path("law.toml").write_text('extends = "native"\nname = "law"\n[ads]\nmodel = "law:Law"')
+    Path("law.toml").write_text(
+        'extends = "native"\nname = "law"\n[ads]\nmodel = "law:Law"'
+    )
     law = assemble(load_study("law.toml"))
     members = law.characteristics
-    settings = np.random.default_rng(5).uniform(members.lower, members.upper, (12, len(members)))
+    settings = np.random.default_rng(5).uniform(
+        members.lower, members.upper, (12, len(members))
+    )
     expected = drive_and_score(law, settings)
     results = drive_and_score(fmu, settings)
     assert_array_equal(results.outcome, expected.outcome)
@@ -174,14 +189,18 @@ class Law(Ads):
         ("self.pedal = float('nan')", "brake = nan"),
     ],
 )
-def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, message: str) -> None:
+def test_what_it_does_wrong_is_told_and_when(
+    small: Make, then: str, message: str
+) -> None:
     system = small(then)
     with pytest.raises(UserCodeError) as error:
         driven(system, [100.0, 50.0, 20.0, 10.0])
     assert error.value.problem.startswith("ads.model = 'Small.fmu'")
     assert message in error.value.problem
     assert "\n" not in error.value.problem
-    assert_array_equal(driven(system, [100.0, 50.0]), 0, err_msg="it drives again after the fault")
+    assert_array_equal(
+        driven(system, [100.0, 50.0]), 0, err_msg="it drives again after the fault"
+    )
 
 
 @pytest.mark.parametrize(
@@ -189,7 +208,12 @@ def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, message: st
     [
         ('fmiVersion="2.0"', 'fmiVersion="1.0"', TABLE, "Small.fmu"),
         ("CoSimulation", "ModelExchange", TABLE, "is another FMU"),
-        ('(canBeInstantiatedOnlyOncePerProcess=")false', "\\1true", TABLE, "is another FMU"),
+        (
+            '(canBeInstantiatedOnlyOncePerProcess=")false',
+            "\\1true",
+            TABLE,
+            "is another FMU",
+        ),
         (
             '(name="gap"[^>]*>\\s*<Real) ',
             '\\1 unit="km" ',
@@ -215,7 +239,12 @@ def test_what_it_does_wrong_is_told_and_when(small: Make, then: str, message: st
             TABLE.replace("{ brake", '{ acceleration = "wish", brake'),
             "ads.outputs = ['acceleration', 'brake']",
         ),
-        ("", "", TABLE.replace("where", "wear"), "ads.parameters.wear = 'wear': no real parameter"),
+        (
+            "",
+            "",
+            TABLE.replace("where", "wear"),
+            "ads.parameters.wear = 'wear': no real parameter",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_refused_in_one_line(
@@ -230,14 +259,17 @@ def test_what_cannot_be_used_is_refused_in_one_line(
 def test_a_step_that_an_fmu_cannot_change_has_to_be_the_studys(small: Make) -> None:
     fixed = '\\1<DefaultExperiment stepSize="0.1"/><ModelVariables>'
     system = small(
-        old='(?s)canHandleVariableCommunicationStepSize="true"(.*?)<ModelVariables>', new=fixed
+        old='(?s)canHandleVariableCommunicationStepSize="true"(.*?)<ModelVariables>',
+        new=fixed,
     )
     assert driven(system, [20.0])[0, 1, 0] == 1
     with pytest.raises(InputError, match=r"takes steps of 0\.1 s"):
         driven(system, [20.0], 0.05)
 
 
-def test_without_fmpy_the_extra_is_named(small: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_fmpy_the_extra_is_named(
+    small: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "fmpy", None)
     with pytest.raises(InputError, match="needs FMPy"):
         small()

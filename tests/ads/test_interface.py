@@ -25,7 +25,10 @@ from safevar_sumo.sumo.system import System, assemble
 from tests.ads.test_ads import BRAKING, COASTING, FULL, KNOWN
 from tests.made_up import original_of
 
-WISHES = [(1.0, (1.0 + COASTING) / (FULL + COASTING), 0.0), (-5.0, 0.0, (5.0 - COASTING) / BRAKING)]
+WISHES = [
+    (1.0, (1.0 + COASTING) / (FULL + COASTING), 0.0),
+    (-5.0, 0.0, (5.0 - COASTING) / BRAKING),
+]
 """Accelerations, and the pedals of `KNOWN` for them."""
 STANDING = {"model": "car_to_car", "parameters": {"test": "CCRs", "speed": 40.0}}
 
@@ -67,7 +70,9 @@ def test_a_class_may_have_another_method_of_that_name(in_tmp: Path) -> None:
         "    def pedals(self, wish):\n        return 0.0, min(-wish, 1.0)\n\n"
         "    def drive(self, seen):\n        return self.pedals(-0.5)\n"
     )
-    system = assemble(load_study("wear", matrix=None, scenario=STANDING, ads={"model": "own:Own"}))
+    system = assemble(
+        load_study("wear", matrix=None, scenario=STANDING, ads={"model": "own:Own"})
+    )
     assert drive_and_score(system, original_of(system)).outcome.tolist() == ["stopped"]
 
 
@@ -101,7 +106,10 @@ CAR, ADULT = BODIES["car"], BODIES["adult"]
     ("scenario", "extent"),
     [
         (STANDING, (CAR.length, CAR.width)),
-        ({"model": "crossing", "parameters": {"test": "CPFA"}}, (ADULT.width, ADULT.length)),
+        (
+            {"model": "crossing", "parameters": {"test": "CPFA"}},
+            (ADULT.width, ADULT.length),
+        ),
     ],
 )
 def test_an_ads_knows_how_long_the_obstacle_and_its_own_vehicle_are(
@@ -159,6 +167,8 @@ def step(traci, vehicle_id):
 
 def test_a_traci_controller_reads_them_by_its_own_calls(in_tmp: Path) -> None:
     (in_tmp / "reads.py").write_text(CONTROLLER)
-    system: System = assemble(load_study("native", ads={"kind": "traci", "model": "reads:step"}))
+    system: System = assemble(
+        load_study("native", ads={"kind": "traci", "model": "reads:step"})
+    )
     with pytest.raises(UserCodeError, match=r"4\.700 m and \d\.\d+ m"):
         drive_and_score(system, original_of(system))

@@ -21,11 +21,17 @@ from tests.ads.test_ads import COASTING, FULL, KNOWN
 from tests.in_process import run
 from tests.made_up import MISSING, original_of
 
-needs_ad_rss = pytest.mark.skipif("wear_rss" in MISSING, reason="the extra ad-rss is missing")
+needs_ad_rss = pytest.mark.skipif(
+    "wear_rss" in MISSING, reason="the extra ad-rss is missing"
+)
 
 
 def seen(
-    speed: float, gap: float, leader: float = 0.0, lateral: float = 0.0, time: float = 0.0
+    speed: float,
+    gap: float,
+    leader: float = 0.0,
+    lateral: float = 0.0,
+    time: float = 0.0,
 ) -> Observation:
     return Observation(
         time, speed, gap, speed - leader, lateral, 0.0, 1.0, leader, obstacle_width=1.8
@@ -64,18 +70,25 @@ def test_ad_rss_brakes_below_the_published_safe_distance(
 
 
 @needs_ad_rss
-def test_ad_rss_holds_its_speed_before_it_brakes_and_releases_the_accelerator_after() -> None:
+def test_ad_rss_holds_its_speed_before_it_brakes_and_releases_the_accelerator_after() -> (
+    None
+):
     driver = AdRss()
     driver.start(KNOWN, 0.05)
-    assert driver.drive(seen(10.0, 200.0)) == pytest.approx(((COASTING / (FULL + COASTING)), 0.0))
-    assert driver.drive(seen(9.0, 200.0)) == pytest.approx(((1 + COASTING) / (FULL + COASTING), 0))
+    assert driver.drive(seen(10.0, 200.0)) == pytest.approx(
+        ((COASTING / (FULL + COASTING)), 0.0)
+    )
+    assert driver.drive(seen(9.0, 200.0)) == pytest.approx(
+        ((1 + COASTING) / (FULL + COASTING), 0)
+    )
     assert driver.drive(seen(10.0, 5.0, lateral=3.0))[1] == 0, "beside its corridor"
     assert driver.drive(seen(10.0, 5.0)) == (0.0, 1.0)
     assert driver.drive(seen(5.0, math.inf)) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(
-    ("speed", "gap", "leader"), [(10.0, 60.0, 0.0), (14.0, 60.0, 0.0), (14.0, 25.0, 10.0)]
+    ("speed", "gap", "leader"),
+    [(10.0, 60.0, 0.0), (14.0, 60.0, 0.0), (14.0, 25.0, 10.0)],
 )
 def test_highway_idm_accelerates_by_the_published_formula(
     speed: float, gap: float, leader: float
@@ -88,7 +101,9 @@ def test_highway_idm_accelerates_by_the_published_formula(
     expected = a * (1 - (speed / target) ** 4) - a * (wanted / (gap + 5.0)) ** 2
     driver = HighwayIdm(target_speed=target)
     driver.start(KNOWN, 0.05)
-    assert driver.drive(seen(speed, gap, leader)) == pytest.approx(driver.pedals(expected, speed))
+    assert driver.drive(seen(speed, gap, leader)) == pytest.approx(
+        driver.pedals(expected, speed)
+    )
     assert driver.drive(seen(speed, gap, leader)) != driver.drive(seen(speed, math.inf))
 
 
@@ -115,7 +130,10 @@ def test_the_original_of_their_studies_is_safe_and_a_parameter_acts(
 
 @pytest.mark.parametrize(
     ("model", "module", "extra"),
-    [("ad_rss", "ad_rss", "ad-rss"), ("highway_idm", "highway_env.road.road", "highway-env")],
+    [
+        ("ad_rss", "ad_rss", "ad-rss"),
+        ("highway_idm", "highway_env.road.road", "highway-env"),
+    ],
 )
 def test_without_its_library_the_extra_is_named(
     model: str, module: str, extra: str, monkeypatch: pytest.MonkeyPatch
@@ -142,7 +160,9 @@ def test_numbers_that_its_library_refuses_are_refused_without_its_log(
 ) -> None:
     """The library logs past Python's stderr."""
     with open("own.toml", "w", encoding="utf-8") as file:
-        file.write(f'extends = "wear_rss"\nname = "own"\n[ads.parameters]\n{name} = {value}\n')
+        file.write(
+            f'extends = "wear_rss"\nname = "own"\n[ads.parameters]\n{name} = {value}\n'
+        )
     first, second = run("simulate", "own.toml", expect=2).stderr.strip().splitlines()
     assert first.endswith(f"own.toml: ads.parameters.{name} = {float(value):g}")
     assert second == f"expected: {legal}"

@@ -62,9 +62,12 @@ def sumo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         f' depart="0" departPos="{100 + 300 * i}"/>'
         for i, name in enumerate(("IDM", "ACC", "Krauss"))
     ]
-    traffic.write_text('<routes><route id="r" edges="road"/>' + "".join(kinds) + "</routes>")
+    traffic.write_text(
+        '<routes><route id="r" edges="road"/>' + "".join(kinds) + "</routes>"
+    )
     with open_world(
-        CopiedNetwork(folder / "network.net.xml", traffic, folder / "scenario.sumocfg"), 0
+        CopiedNetwork(folder / "network.net.xml", traffic, folder / "scenario.sumocfg"),
+        0,
     ):
         import libsumo
 
@@ -93,7 +96,9 @@ def test_idm_is_sumos(sumo: Any) -> None:
 def test_acc_is_sumos(sumo: Any) -> None:
     expected = sumo_accelerations(sumo, "ACC")
     accelerations = Acc().acceleration_at(GAPS, SPEEDS, LEADERS)
-    compared = (SPEEDS + accelerations * STEP > 0) & (np.abs(expected - accelerations) < 1e-6)
+    compared = (SPEEDS + accelerations * STEP > 0) & (
+        np.abs(expected - accelerations) < 1e-6
+    )
     braked = (
         expected < accelerations - 1e-6
     )  # in danger, SUMO's emergency override brakes harder than the control law
@@ -120,9 +125,13 @@ def braking(
         if now <= 0:
             break
         across = lateral + lateral_speed * k * STEP
-        one = seen(k * STEP, speed, now, across, lateral_speed=lateral_speed, leader=leader)
+        one = seen(
+            k * STEP, speed, now, across, lateral_speed=lateral_speed, leader=leader
+        )
         command, memory = driver.drive(one, memory)
-        if command.brake[0] > 0.05 and np.isnan(first):  # more than the accelerator let go
+        if command.brake[0] > 0.05 and np.isnan(
+            first
+        ):  # more than the accelerator let go
             first = now
         if not np.isnan(first):
             decelerations.append(float(command.brake[0]) * 10)
@@ -138,7 +147,9 @@ def test_the_competent_driver_brakes_075_s_after_two_seconds_to_collision() -> N
 
 
 @pytest.mark.parametrize("driver", [CompetentDriver(), Rss(), FuzzySafety(), R157()])
-def test_who_reacts_releases_the_accelerator_and_brakes_by_what_is_missing(driver: Any) -> None:
+def test_who_reacts_releases_the_accelerator_and_brakes_by_what_is_missing(
+    driver: Any,
+) -> None:
     """The vehicle coasts with 1 m/s^2; the tables are those of a gear in which the original coasts
     with 3 m/s^2.
     """
@@ -148,17 +159,23 @@ def test_who_reacts_releases_the_accelerator_and_brakes_by_what_is_missing(drive
     gap = 40.0
     commands = []
     for k in range(80):
-        command, memory = driver.drive(seen(k * STEP, speed, gap, throttle=0.25), memory)
+        command, memory = driver.drive(
+            seen(k * STEP, speed, gap, throttle=0.25), memory
+        )
         commands.append((float(command.throttle[0]), float(command.brake[0])))
         gap = gap - speed * STEP
-        speed = max(speed - (0.0 if commands[-1][0] else 1 + 10 * commands[-1][1]) * STEP, 0.0)
+        speed = max(
+            speed - (0.0 if commands[-1][0] else 1 + 10 * commands[-1][1]) * STEP, 0.0
+        )
         if not speed or gap <= 0:
             break
     throttle, brake = np.array(commands).T
     released = np.argmax(throttle == 0)
     braking = np.argmax(brake > 0)
     assert released > 0
-    assert (braking - released) * STEP == pytest.approx(driver.reaction_time, abs=2 * STEP)
+    assert (braking - released) * STEP == pytest.approx(
+        driver.reaction_time, abs=2 * STEP
+    )
     assert not throttle[released:].any()
     greatest = {"R157": 6.0, "FuzzySafety": 1 + 10 * brake.max()}.get(
         type(driver).__name__, 0.774 * 9.81
@@ -172,12 +189,18 @@ def test_the_competent_driver_perceives_a_pedestrian_after_a_stray_of_0375_m() -
     """From 2 m aside at 1 m/s, seen at once: it strays at 0.375 s, is perceived at 0.775 s with a
     TTC below 2 s, brakes 0.75 s later.
     """
-    onset_gap, _ = braking(CompetentDriver(), 10.0, 20.0, lateral=-2.0, lateral_speed=1.0)
-    assert onset_gap == pytest.approx(20.0 - 10 * (0.375 + 0.4 + 0.75), abs=10 * 2.1 * STEP)
+    onset_gap, _ = braking(
+        CompetentDriver(), 10.0, 20.0, lateral=-2.0, lateral_speed=1.0
+    )
+    assert onset_gap == pytest.approx(
+        20.0 - 10 * (0.375 + 0.4 + 0.75), abs=10 * 2.1 * STEP
+    )
 
 
 @pytest.mark.parametrize("is_another", [False, True])
-def test_another_body_ahead_that_is_slower_is_no_braking_leader(is_another: bool) -> None:
+def test_another_body_ahead_that_is_slower_is_no_braking_leader(
+    is_another: bool,
+) -> None:
     """A leader at 15 m/s leaves; the next car, 30 m farther, drives 10 m/s."""
     driver = CompetentDriver()
     memory = driver.start(1, KNOWN, STEP)
@@ -189,18 +212,24 @@ def test_another_body_ahead_that_is_slower_is_no_braking_leader(is_another: bool
         )
         command, memory = driver.drive(one, memory)
         pedals.append(command.brake[0])
-    assert (max(pedals) > 0.05) == (not is_another), "the same body would have braked by 100 m/s^2"
+    assert (max(pedals) > 0.05) == (not is_another), (
+        "the same body would have braked by 100 m/s^2"
+    )
 
 
 def test_r157_brakes_with_6_at_once_when_the_regulation_says() -> None:
     onset_gap, decelerations = braking(R157(), 12.0, 60.0)
-    assert onset_gap == pytest.approx(12.0 * (12.0 / 12 + 0.45 - 0.35), abs=2 * 12 * STEP)
+    assert onset_gap == pytest.approx(
+        12.0 * (12.0 / 12 + 0.45 - 0.35), abs=2 * 12 * STEP
+    )
     assert decelerations == pytest.approx(np.full(len(decelerations), 6.0))
 
 
 def test_rss_brakes_a_reaction_time_after_its_safe_distance() -> None:
     safe = 12 * 0.75 + (12**2 - 5**2) / (2 * (0.774 * 9.81))
-    assert Rss().safe_distance(np.array([12.0]), np.array([5.0]))[0] == pytest.approx(safe)
+    assert Rss().safe_distance(np.array([12.0]), np.array([5.0]))[0] == pytest.approx(
+        safe
+    )
     onset_gap, _ = braking(Rss(), 12.0, 60.0, leader=5.0)
     assert onset_gap == pytest.approx(safe - 7 * 0.75, abs=2 * 7 * STEP)
 
@@ -209,7 +238,9 @@ def test_the_safe_distance_of_rss_allows_for_what_is_gained_while_reacting() -> 
     """rt = 1 s at 2 m/s^2: from 20 to 22 m/s within 21 m; then 22^2 / 8 m to a stop, less the
     leader's 10^2 / 16 m.
     """
-    driver = Rss(reaction_time=1.0, acceleration=2.0, deceleration=4.0, leader_deceleration=8.0)
+    driver = Rss(
+        reaction_time=1.0, acceleration=2.0, deceleration=4.0, leader_deceleration=8.0
+    )
     assert driver.safe_distance(np.array([20.0]), np.array([10.0]))[0] == pytest.approx(
         21 + 60.5 - 6.25
     )
@@ -222,14 +253,14 @@ def test_fuzzy_metrics_are_those_worked_out_by_hand() -> None:
     model = FuzzySafety()
     one = np.ones(1)
     for gap, pfs in ((62.0, 0.0), (43.1, 1.0), (52.523809, 0.5)):
-        assert model.proactive_metric(gap * one, 20 * one, 10 * one)[0] == pytest.approx(
-            pfs, abs=1e-3
-        )
+        assert model.proactive_metric(gap * one, 20 * one, 10 * one)[
+            0
+        ] == pytest.approx(pfs, abs=1e-3)
     # a = 0: v' = 20; closing = 7.5, d_safe = 7.5 + 12.5 = 20, d_unsafe = 7.5 + 8.333 = 15.833
     for gap, cfs in ((20.1, 0.0), (15.8, 1.0), (17.91667, 0.5)):
-        assert model.critical_metric(gap * one, 20 * one, 10 * one, 0 * one)[0] == pytest.approx(
-            cfs, abs=1e-4
-        )
+        assert model.critical_metric(gap * one, 20 * one, 10 * one, 0 * one)[
+            0
+        ] == pytest.approx(cfs, abs=1e-4)
     # a = -8, at most -4: v' = 12 - 3 = 9 < u = 10: a crash is ahead where the gap is below (12 -
     # 10)^2 / (2 * 4) = 0.5
     assert model.critical_metric(0.4 * one, 12 * one, 10 * one, -8 * one)[0] == 1
@@ -278,7 +309,8 @@ def follow(
             seen(k * STEP, v, gap, 4.0 * (k * STEP >= leaves), leader=u), memory
         )
         next_v = max(
-            v + (3 * float(command.throttle[0]) - 10 * float(command.brake[0])) * STEP, 0.0
+            v + (3 * float(command.throttle[0]) - 10 * float(command.brake[0])) * STEP,
+            0.0,
         )
         gap += (u + next_u - v - next_v) / 2 * STEP
         v = next_v
@@ -295,12 +327,16 @@ def behind_a_braking_leader(
     """As `by_the_rule`, with a driver in a vehicle without delays, and a leader that brakes after a
     second.
     """
-    leader = np.maximum(speed - leader_braking * np.maximum(np.arange(500) * STEP - 1, 0.0), 0.0)
+    leader = np.maximum(
+        speed - leader_braking * np.maximum(np.arange(500) * STEP - 1, 0.0), 0.0
+    )
     gaps, _, closing = follow(driver, leader, headway)
     return float(gaps.min() if gaps[-1] >= 0 else -closing)
 
 
-@pytest.mark.parametrize("headway", [1.0, *(pytest.param(v, marks=SLOW) for v in (1.4, 2.0))])
+@pytest.mark.parametrize(
+    "headway", [1.0, *(pytest.param(v, marks=SLOW) for v in (1.4, 2.0))]
+)
 @pytest.mark.parametrize(
     "speed", [50.0, *(pytest.param(v, marks=SLOW) for v in (30.0, 80.0, 100.0, 130.0))]
 )
@@ -351,7 +387,9 @@ def test_in_a_car_the_competent_driver_is_the_rule_and_the_cars_delays() -> None
         "wear",
         weather="clear",
         scenario={"model": "car_to_car", "parameters": {"test": "CCRb", **car}},
-        matrix={"tests": [{"name": "CCRb", "parameters": {"test": "CCRb"}, "over": over}]},
+        matrix={
+            "tests": [{"name": "CCRb", "parameters": {"test": "CCRb"}, "over": over}]
+        },
         ads={"model": "competent_driver", "parameters": {}},
     )
     system = assemble(study)
@@ -370,21 +408,31 @@ def test_in_a_car_the_competent_driver_is_the_rule_and_the_cars_delays() -> None
     [CompetentDriver(leader_braking=0.5), FullBraking(), FuzzySafety(), R157(), Rss()],
     ids=repr,
 )
-def test_nobody_accelerates_until_the_cause_of_a_danger_has_left_the_way(driver: Any) -> None:
+def test_nobody_accelerates_until_the_cause_of_a_danger_has_left_the_way(
+    driver: Any,
+) -> None:
     """The leader brakes from 22 to 10 m/s, drives on for 4 s, brakes to 6 m/s, drives on, and
     leaves the lane.
     """
-    accelerations = np.repeat([0.0, -4.0, 0.0, -4.0, 0.0], np.array([1, 3, 4, 1, 8]) * 20)
-    gaps, speeds, _ = follow(driver, 22 + np.cumsum(accelerations) * STEP, 1.9, leaves=13.0)
+    accelerations = np.repeat(
+        [0.0, -4.0, 0.0, -4.0, 0.0], np.array([1, 3, 4, 1, 8]) * 20
+    )
+    gaps, speeds, _ = follow(
+        driver, 22 + np.cumsum(accelerations) * STEP, 1.9, leaves=13.0
+    )
     slows = int(np.argmax(speeds < 21.5))
     assert gaps[:260].min() > 0
     assert np.diff(speeds[slows:260]).max() < 1e-9
     assert speeds[-1] > speeds[260] + 5
 
 
-def test_a_leader_who_drives_on_after_gentle_braking_is_a_danger_at_a_ttc_of_two_seconds() -> None:
+def test_a_leader_who_drives_on_after_gentle_braking_is_a_danger_at_a_ttc_of_two_seconds() -> (
+    None
+):
     """From 80 to 60 km/h at 2 m/s^2, then steady: closing at 20 km/h, he reacts at 11.1 m."""
-    leader = np.maximum(80 / 3.6 - 2.0 * np.maximum(np.arange(600) * STEP - 1, 0.0), 60 / 3.6)
+    leader = np.maximum(
+        80 / 3.6 - 2.0 * np.maximum(np.arange(600) * STEP - 1, 0.0), 60 / 3.6
+    )
     gaps, speeds, _ = follow(CompetentDriver(), leader, 2.0)
     released = int(np.argmax(speeds < 80 / 3.6 - 0.01))
     assert gaps[released] == pytest.approx(2 * 20 / 3.6, abs=3 * 20 / 3.6 * STEP)
@@ -398,7 +446,10 @@ def test_r157_avoids_a_braking_leader_from_its_least_time_gap_and_nearer_nothing
     for speed in (20.0, 50.0, 60.0):
         least = 1 + speed / 100
         assert behind_a_braking_leader(R157(), speed / 3.6, least, leader_braking) > 0
-        assert behind_a_braking_leader(R157(), speed / 3.6, least - 0.001, leader_braking) < 0
+        assert (
+            behind_a_braking_leader(R157(), speed / 3.6, least - 0.001, leader_braking)
+            < 0
+        )
 
 
 def test_rss_brakes_with_another_number_than_it_plans_with() -> None:
@@ -423,4 +474,6 @@ def test_drivers_see_a_danger_within_a_time_step(share: float) -> None:
     _, of_rss = braking(Rss(), speed, gap)
     hardest = 0.774 * 9.81
     braked = end - (gap - (speed * 0.75 + speed**2 / (2 * hardest))) / speed - 0.75
-    assert of_rss.sum() * STEP == pytest.approx(hardest * (braked - hardest / 12.65 / 2), abs=0.03)
+    assert of_rss.sum() * STEP == pytest.approx(
+        hardest * (braked - hardest / 12.65 / 2), abs=0.03
+    )

@@ -46,12 +46,21 @@ def test_changes_override_a_study_as_a_file_that_extends_it_would(in_tmp: Path) 
         " 2\n[ads.parameters]\ncorridor = 3.0\n"
     )
     same = sv.load_study("mine.toml")
-    assert (changed.weather, changed.search, changed.ads) == (same.weather, same.search, same.ads)
+    assert (changed.weather, changed.search, changed.ads) == (
+        same.weather,
+        same.search,
+        same.ads,
+    )
     assert sv.load_study(changed, search={"seed": 7}).search.runs == 2
 
 
 def test_values_of_numpy_and_pandas_are_those_of_python() -> None:
-    weather = {"name": "wet", "road_friction": 0.5, "visibility": 1.0, "recognition_delay": 0.0}
+    weather = {
+        "name": "wet",
+        "road_friction": 0.5,
+        "visibility": 1.0,
+        "recognition_delay": 0.0,
+    }
     search = {"runs": np.int64(2), "seed": np.array(7)}
     plain = {"runs": 2, "seed": 7}
     theirs = {**weather, "road_friction": np.float64(0.5), "visibility": np.array(1.0)}
@@ -87,7 +96,9 @@ def test_simulate_returns_the_setting_and_the_original_beside_it() -> None:
     assert result.original.metrics != result.metrics
     assert "<p>&lt;Simulation of rain" in result._repr_html_()
     assert result.to_dict()["vcs"] == result.setting
-    assert sv.simulate("rain", {"mass": 2410.0}, filtered=True).setting["mass"] == 2404.0
+    assert (
+        sv.simulate("rain", {"mass": 2410.0}, filtered=True).setting["mass"] == 2404.0
+    )
 
 
 def test_a_safety_degree_has_the_digits_by_which_both_vehicles_differ() -> None:
@@ -102,12 +113,15 @@ def test_a_safety_degree_has_the_digits_by_which_both_vehicles_differ() -> None:
 
 def test_evaluate_is_simulate_row_by_row() -> None:
     asked = pd.DataFrame(
-        {"tireFric": [1.2, 3.45, 1.2], "mass": [2500.0, 2404.0, 2500.0]}, index=list("abc")
+        {"tireFric": [1.2, 3.45, 1.2], "mass": [2500.0, 2404.0, 2500.0]},
+        index=list("abc"),
     )
     frame = sv.evaluate("sun", asked, jobs=1)
     assert list(frame.index) == list("abc")
     assert frame.loc["b", "tireFric"] == 3.45, "a setting is simulated as it is given"
-    assert frame.loc["b", ["f_diff", "f_num_diff"]].tolist() == [0, 0], "as in the paper"
+    assert frame.loc["b", ["f_diff", "f_num_diff"]].tolist() == [0, 0], (
+        "as in the paper"
+    )
     filtered = sv.evaluate("sun", asked, filtered=True, jobs=1)
     assert filtered.loc["b", ["tireFric", "mass"]].tolist() == [3.5, 2404.0]
     assert frame.loc["a"].equals(frame.loc["c"])
@@ -120,14 +134,17 @@ def test_evaluate_is_simulate_row_by_row() -> None:
 
 def test_a_value_that_is_missing_is_the_originals() -> None:
     """Mappings name only what is changed; an empty mapping is the original vehicle."""
-    frame = sv.evaluate("sun", [{"tireFric": 1.2}, {}, {"mass": 2500.0, "tireFric": None}], jobs=1)
+    frame = sv.evaluate(
+        "sun", [{"tireFric": 1.2}, {}, {"mass": 2500.0, "tireFric": None}], jobs=1
+    )
     assert frame["tireFric"].tolist() == [1.2, 3.5, 3.5]
     assert frame["mass"].tolist() == [2404.0, 2404.0, 2500.0]
 
 
 def test_a_collision_with_a_moving_car_has_its_closing_speed_and_the_cars_own() -> None:
     study = at_point(
-        sv.load_study("euro_ncap_car_to_car"), "CCRm, speed 80, impact_location 50, clear"
+        sv.load_study("euro_ncap_car_to_car"),
+        "CCRm, speed 80, impact_location 50, clear",
     )
     one = sv.simulate(study, {"tireFric": 1.0})
     closing, own = -one.metrics["safety_degree"], one.collision_speed
@@ -137,7 +154,9 @@ def test_a_collision_with_a_moving_car_has_its_closing_speed_and_the_cars_own() 
 
 
 @SLOW
-def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehicle() -> None:
+def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehicle() -> (
+    None
+):
     """A table, a trace, and a picture show the same two drives."""
     one = sv.simulate("wear", {"brakeTorque": 0.6})
     comparison = sv.comparison_of(one)
@@ -151,7 +170,10 @@ def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehic
             comparison.runs.trace.speed[: comparison.moments[row].end + 1, row], abs=0
         )
     alone = sv.simulate(at_point(sv.load_study("wear"), name), {"brakeTorque": 0.6})
-    assert (alone.original.numbers, alone.numbers) == (one.original.numbers, one.numbers)
+    assert (alone.original.numbers, alone.numbers) == (
+        one.original.numbers,
+        one.numbers,
+    )
     assert_frame_equal(alone.trace, one.trace)
 
 
@@ -159,7 +181,10 @@ def test_in_a_matrix_the_original_drives_at_the_worst_point_of_the_changed_vehic
     ("settings", "expected"),
     [
         (pd.DataFrame({"weight": [1.0]}), "weight"),
-        (pd.DataFrame({"mass": ["heavy"]}), "row 0: mass = 'heavy'\nexpected: a number"),
+        (
+            pd.DataFrame({"mass": ["heavy"]}),
+            "row 0: mass = 'heavy'\nexpected: a number",
+        ),
         (
             [{"mass": 2500.0}, {"mass": [1], "radius": 33}],
             r"row 1: mass = \[1\]\nexpected: a number",
@@ -182,8 +207,14 @@ def test_unusable_settings_are_reported_before_any_simulation(
 
 def test_what_is_wrong_with_an_argument_names_it_and_not_the_file() -> None:
     for changes, told in (
-        ({"serach": {"runs": 2}}, r"rain.toml with serach=...: serach: .* did you mean 'search'"),
-        ({"search": {"rns": 2}}, r"rain.toml with search=...: search.rns: .* did you mean 'runs'"),
+        (
+            {"serach": {"runs": 2}},
+            r"rain.toml with serach=...: serach: .* did you mean 'search'",
+        ),
+        (
+            {"search": {"rns": 2}},
+            r"rain.toml with search=...: search.rns: .* did you mean 'runs'",
+        ),
     ):
         with pytest.raises(sv.InputError, match=told):
             sv.load_study("rain", **changes)
@@ -193,7 +224,9 @@ def test_what_is_wrong_with_an_argument_names_it_and_not_the_file() -> None:
 
 def test_a_value_that_no_vehicle_can_have_is_refused_even_with_beyond() -> None:
     for value in (0.0, -5.0, 1e300):
-        with pytest.raises(sv.InputError, match=r"mass = .*\nexpected: a finite number above 0"):
+        with pytest.raises(
+            sv.InputError, match=r"mass = .*\nexpected: a finite number above 0"
+        ):
             sv.evaluate("sun", pd.DataFrame({"mass": [2500.0, value]}), beyond=True)
 
 
@@ -212,7 +245,10 @@ def test_load_reads_the_results_of_run(results: sv.Results) -> None:
     [
         ({"jobs": -1}, "jobs: -1\nexpected: a whole number from 1 to 1,024"),
         ({"jobs": 0}, "jobs: 0\nexpected: a whole number from 1 to 1,024"),
-        ({"only": [("rs", 0), ("nsga2", 9)]}, "only: ('nsga2', 9)\nexpected: (algorithm"),
+        (
+            {"only": [("rs", 0), ("nsga2", 9)]},
+            "only: ('nsga2', 9)\nexpected: (algorithm",
+        ),
         ({"only": [("sr", 0)]}, "only: ('sr', 0)"),
         ({"out": ""}, "out: ''"),
     ],
@@ -225,7 +261,11 @@ def test_a_run_refuses_what_its_command_refuses(
     assert str(refused.value).startswith(error)
     assert not [*in_tmp.iterdir()]
     if "jobs" in options:
-        for ask in (sv.risk, sv.tolerance, lambda study, jobs: sv.evaluate(study, [{}], jobs=jobs)):
+        for ask in (
+            sv.risk,
+            sv.tolerance,
+            lambda study, jobs: sv.evaluate(study, [{}], jobs=jobs),
+        ):
             with pytest.raises(sv.InputError, match="jobs"):
                 ask("smoke", jobs=options["jobs"])
 
@@ -244,7 +284,9 @@ def test_a_run_refuses_what_its_command_refuses(
 def test_a_value_of_another_type_is_refused_by_the_name_of_its_argument(
     function: Callable[..., object], argument: str, values: Any
 ) -> None:
-    with pytest.raises(sv.InputError, match=f"^{argument}: 3\nexpected: a text or a path"):
+    with pytest.raises(
+        sv.InputError, match=f"^{argument}: 3\nexpected: a text or a path"
+    ):
         function(**values) if isinstance(values, dict) else function(values)
 
 
@@ -256,7 +298,9 @@ def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
         " progress=True)\nprint(len(sv.evaluate('smoke', results.solutions[['mass']], jobs=2)) =="
         " len(results.solutions))\n"
     )
-    done = subprocess.run([sys.executable, "script.py"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "script.py"], capture_output=True, text=True, check=True
+    )
     assert done.stdout.split() == ["begun", "True"]
 
 
@@ -273,8 +317,13 @@ def test_the_title_of_an_own_algorithm_stands_in_tables(in_tmp: Path) -> None:
     )
     results = sv.run("mine.toml", jobs=1)
     assert "My own search" in sv.tables(results).render("text", "rq1")
-    for option, error in (("table", "'rq9'.*\n.*rq3.1"), ("alpha", "expected: .* between 0 and 1")):
+    for option, error in (
+        ("table", "'rq9'.*\n.*rq3.1"),
+        ("alpha", "expected: .* between 0 and 1"),
+    ):
         with pytest.raises(sv.InputError, match=f"(?s)^{option}: .*{error}"):
             sv.tables(results, **{option: "rq9"})
-    with pytest.raises(sv.InputError, match=r"^compare\(\): takes exactly source and other$"):
+    with pytest.raises(
+        sv.InputError, match=r"^compare\(\): takes exactly source and other$"
+    ):
         sv.compare("smoke")

@@ -13,7 +13,14 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign import Campaign, RunKey, all_runs, evaluation, run_campaign, user_checks
+from safevar_sumo.campaign import (
+    Campaign,
+    RunKey,
+    all_runs,
+    evaluation,
+    run_campaign,
+    user_checks,
+)
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings
 from safevar_sumo.campaign.share import carry_share
 from safevar_sumo.errors import SafevarError
@@ -35,7 +42,10 @@ def evaluated(settings: FloatArray) -> Evaluations:
     """
     share = (settings - SUN.original) / (SUN.upper - SUN.lower)
     safety = 3.0 - 4.0 * np.add.accumulate(np.abs(share), axis=1)[:, -1]
-    metrics = {name: np.where(safety <= 0, np.nan, share[:, i]) for i, name in enumerate(METRICS)}
+    metrics = {
+        name: np.where(safety <= 0, np.nan, share[:, i])
+        for i, name in enumerate(METRICS)
+    }
     return made_up_evaluations(
         safety,
         settings=settings,

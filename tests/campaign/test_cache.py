@@ -65,7 +65,9 @@ def simulated(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     return numbers
 
 
-def evaluated(study: Study, settings: FloatArray, *, fresh: bool = False) -> Evaluations:
+def evaluated(
+    study: Study, settings: FloatArray, *, fresh: bool = False
+) -> Evaluations:
     """Settings as a question evaluates them, in a process of its own."""
     with keep_simulations(fresh=fresh):
         return evaluate_all(study, settings, InlinePool(), verified=0)
@@ -228,7 +230,9 @@ def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_conti
         if continued:
             with pytest.raises(KeyboardInterrupt):
                 ask("risk own", after=40)
-            with pytest.warns(UserWarning, match=r"continues: 32 simulated at \d\d:\d\d"):
+            with pytest.warns(
+                UserWarning, match=r"continues: 32 simulated at \d\d:\d\d"
+            ):
                 assert_equal(ask(command), first)
         else:
             assert_equal(ask(command), first)
@@ -271,7 +275,8 @@ def test_nothing_is_unpickled(
 
     with sqlite3.connect(folder / "cache.db") as database:
         database.execute(
-            "UPDATE Cache SET mode = 4, filename = NULL, value = ?", [pickle.dumps(Planted())]
+            "UPDATE Cache SET mode = 4, filename = NULL, value = ?",
+            [pickle.dumps(Planted())],
         )
     evaluated(*eight)
     assert sum(simulated) == 16
@@ -304,7 +309,9 @@ def test_without_a_usable_folder_all_is_simulated_and_one_line_says_so(
     assert sum(simulated) == 9
 
 
-def test_the_oldest_simulations_make_room(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_oldest_simulations_make_room(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cache, "SIZE_LIMIT", 300_000)
     with keep_simulations():
         kept = cache.cache_of(load_study("smoke"), [])

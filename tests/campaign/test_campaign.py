@@ -28,7 +28,14 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.results import Journal, journal_file, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study
-from tests.campaign.formulas import SUN, FormulaPool, carried_out, evaluated, solutions, with_search
+from tests.campaign.formulas import (
+    SUN,
+    FormulaPool,
+    carried_out,
+    evaluated,
+    solutions,
+    with_search,
+)
 from tests.in_process import SLOW, InlinePool, searched
 
 
@@ -38,7 +45,9 @@ def study() -> Study:
 
 
 def test_runs_of_a_share_share_batches(study: Study, tmp_path: Path) -> None:
-    large = with_search(study, population=40, evaluations=400, runs=10, algorithms=["rs"])
+    large = with_search(
+        study, population=40, evaluations=400, runs=10, algorithms=["rs"]
+    )
     together = FormulaPool(workers=2)
     alone = FormulaPool(workers=2)
     carried_out(large, tmp_path / "together", together)
@@ -66,7 +75,11 @@ def test_runs_of_a_share_share_batches(study: Study, tmp_path: Path) -> None:
 def test_runs_are_dealt_in_equal_shares_with_equally_many_runs_of_each_algorithm(
     workers: int, runs_at_once: int, sizes: set[int]
 ) -> None:
-    keys = [RunKey(name, run) for name in ("nsga2", "rs", "safe_fuzzer") for run in range(30)]
+    keys = [
+        RunKey(name, run)
+        for name in ("nsga2", "rs", "safe_fuzzer")
+        for run in range(30)
+    ]
     shares = deal(keys, workers, batch_size=50 * runs_at_once, population=100)
     assert sorted(key for share in shares for key in share) == sorted(keys)
     assert {len(share) for share in shares} == sizes
@@ -77,14 +90,18 @@ def test_runs_are_dealt_in_equal_shares_with_equally_many_runs_of_each_algorithm
 
 
 @SLOW
-def test_a_run_in_other_hands_is_left_to_them_and_named(study: Study, tmp_path: Path) -> None:
+def test_a_run_in_other_hands_is_left_to_them_and_named(
+    study: Study, tmp_path: Path
+) -> None:
     study = with_search(study, algorithms=["nsga2", "rs"])
     carried_out(study, tmp_path / "whole")
     carried_out(study, tmp_path / "out", keys=[RunKey("rs", 1)])
     path = journal_file(tmp_path / "out", "rs-01")
     theirs = path.read_bytes()
     journal = Journal(path, evaluation.msgspec.json.decode(theirs.partition(b"\n")[0]))
-    with pytest.raises(SafevarError, match=r"rs-01\.jsonl: another process works on this run"):
+    with pytest.raises(
+        SafevarError, match=r"rs-01\.jsonl: another process works on this run"
+    ):
         carried_out(study, tmp_path / "out")
     journal.close()
     assert [*path.parent.iterdir()] == [path], "no other run has begun"
@@ -98,7 +115,9 @@ def test_a_run_in_other_hands_is_left_to_them_and_named(study: Study, tmp_path: 
 def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_others(
     study: Study, tmp_path: Path, budgets: tuple[int, int]
 ) -> None:
-    first, second = (with_search(study, evaluations=budget, runs=1) for budget in budgets)
+    first, second = (
+        with_search(study, evaluations=budget, runs=1) for budget in budgets
+    )
     before = FormulaPool()
     after = FormulaPool()
     carried_out(first, tmp_path / "out", before)
@@ -136,7 +155,9 @@ def test_what_a_longer_run_found_after_its_budget_is_not_counted(
     journal.append([0, 1], both)
     journal.finish([0], 1)
     journal.close()
-    run = Run(RunKey("rs", 0), iter(()), Journal(journal.path, head), 1, PUBLISHED_SCORING)  # type: ignore[arg-type]
+    run = Run(
+        RunKey("rs", 0), iter(()), Journal(journal.path, head), 1, PUBLISHED_SCORING
+    )  # type: ignore[arg-type]
     result = run.finish(default_rng(0))
     for found in (result.solutions, result.sample):
         assert np.array_equal(found.settings, both.settings[:1])
@@ -150,10 +171,12 @@ def test_a_search_that_asks_for_other_settings_than_its_journal_holds_is_refused
     path = journal_file(tmp_path, "rs-00")
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
     monkeypatch.setattr(
-        "safevar_sumo.campaign.share.random_generator_of", lambda study, key: default_rng(7)
+        "safevar_sumo.campaign.share.random_generator_of",
+        lambda study, key: default_rng(7),
     )
     with pytest.raises(
-        SafevarError, match=r"rs-00\.jsonl: holds other settings than this search requests"
+        SafevarError,
+        match=r"rs-00\.jsonl: holds other settings than this search requests",
     ):
         carried_out(study, tmp_path)
 
@@ -168,12 +191,20 @@ ENDS = {
     ),
     "vehicles/base.py": ("Vehicle.at_start",),
     "vehicles/carla.py": ("Carla.prepare", "Carla.sense", "Carla.advance"),
-    "scenarios/published.py": ("PedestrianCrossing.observe", "PedestrianCrossing.encounter"),
+    "scenarios/published.py": (
+        "PedestrianCrossing.observe",
+        "PedestrianCrossing.encounter",
+    ),
     "ads/published.py": ("WorldOnRails.drive",),
     "sumo/perception.py": ("Perception.observe",),
     "sumo/recorded_world.py": ("RecordedWorld.enter", "RecordedWorld.step"),
     "sumo/bodies.py": ("FirstContacts.count",),
-    "sumo/drive.py": ("_Log.write", "_Log.trace", "_Outcomes.note_sample", "_Outcomes.classify"),
+    "sumo/drive.py": (
+        "_Log.write",
+        "_Log.trace",
+        "_Outcomes.note_sample",
+        "_Outcomes.classify",
+    ),
     "results/journal.py": ("Journal.append", "Journal.finish"),
     "results/store.py": ("evaluations_frame",),
     "results/manifest.py": ("write_whole",),
@@ -210,12 +241,17 @@ def listed() -> list[tuple[str, str]]:
         .partition("\n## ")[0]
     )
     rows = re.findall(r"^\|.*\| `([\w/]+\.py)` \| (.+) \|$", section, re.MULTILINE)
-    return [(file, name) for file, names in rows for name in re.findall(r"`([\w.]+)`", names)]
+    return [
+        (file, name)
+        for file, names in rows
+        for name in re.findall(r"`([\w.]+)`", names)
+    ]
 
 
 def test_the_way_of_a_setting_is_the_one_in_the_manual(tmp_path: Path) -> None:
     study = load_study(
-        "rain", search={"algorithms": ["nsga2"], "population": 4, "evaluations": 8, "runs": 1}
+        "rain",
+        search={"algorithms": ["nsga2"], "population": 4, "evaluations": 8, "runs": 1},
     )
     way = dict[tuple[str, str], None]()
 
@@ -223,14 +259,18 @@ def test_the_way_of_a_setting_is_the_one_in_the_manual(tmp_path: Path) -> None:
         if event == "call":
             file = frame.f_code.co_filename
             name = frame.f_code.co_qualname
-            if file.startswith(PACKAGE) and name in ENDS.get(file.removeprefix(PACKAGE), ()):
+            if file.startswith(PACKAGE) and name in ENDS.get(
+                file.removeprefix(PACKAGE), ()
+            ):
                 functions = functions_on_the_stack(frame)
                 names = [name for _, name in functions]
                 if BESIDE not in names and (
                     "carry_share" in names or "ResultsDirectory.finish" in names
                 ):
                     start = names.index(
-                        "carry_share" if "carry_share" in names else "ResultsDirectory.finish"
+                        "carry_share"
+                        if "carry_share" in names
+                        else "ResultsDirectory.finish"
                     )
                     way.update(dict.fromkeys(functions[start::-1]))
 

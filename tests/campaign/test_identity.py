@@ -39,7 +39,9 @@ def test_a_file_that_changes_while_a_study_runs_ends_it_before_a_run_counts_as_f
     shutil.copytree(NETWORKS / "pedestrian_crossing", tmp_path / "mine")
     search = {"algorithms": ["rs"], "evaluations": 20, "runs": 1}
     study = load_study(
-        "smoke", scenario={"parameters": {"network": str(tmp_path / "mine")}}, search=search
+        "smoke",
+        scenario={"parameters": {"network": str(tmp_path / "mine")}},
+        search=search,
     )
     traffic = tmp_path / "mine" / "traffic.rou.xml"
 
@@ -50,7 +52,8 @@ def test_a_file_that_changes_while_a_study_runs_ends_it_before_a_run_counts_as_f
             return super().evaluate(task, settings)
 
     with pytest.raises(
-        InputError, match=r"traffic\.rou\.xml has changed since: it was changed meanwhile"
+        InputError,
+        match=r"traffic\.rou\.xml has changed since: it was changed meanwhile",
     ):
         formulas.carried_out(study, tmp_path / "out", Edited())
     assert not load_runs(tmp_path / "out").finished
@@ -168,7 +171,15 @@ def test_what_user_code_imports_while_it_runs_counts_and_what_it_opens_is_named(
     (there / "it.toml").write_text(
         f'extends = "smoke"\n[ads]\nmodel = "hidden:Hidden"\n[search]\n{search}'
     )
-    command = ("study", str(there / "it.toml"), "--out", "out", "--jobs", "1", "--quiet")
+    command = (
+        "study",
+        str(there / "it.toml"),
+        "--out",
+        "out",
+        "--jobs",
+        "1",
+        "--quiet",
+    )
     message = (
         "user code reads gap.txt, scale.json, which no `files` of the study names: edits go"
         " unnoticed"
@@ -179,7 +190,9 @@ def test_what_user_code_imports_while_it_runs_counts_and_what_it_opens_is_named(
     assert not {"gap.txt", "log.txt"} & set(read_manifest(Path("out"))["files"])
     run("rules", "out", "--samples", "20")
     (there / "it.toml").write_text(
-        (there / "it.toml").read_text().replace("[search]", 'files = ["gap.txt"]\n[search]')
+        (there / "it.toml")
+        .read_text()
+        .replace("[search]", 'files = ["gap.txt"]\n[search]')
     )
     assert (
         "user code reads scale.json, which"
@@ -244,7 +257,9 @@ class File:
         self._disk = disk
 
     def write(self, content: Any) -> int:
-        half = self._disk.step() and isinstance(content, memoryview) and len(content) > 1
+        half = (
+            self._disk.step() and isinstance(content, memoryview) and len(content) > 1
+        )
         return int(self._inner.write(content[: len(content) // 2] if half else content))
 
     def truncate(self, size: int) -> int:
@@ -263,7 +278,12 @@ class File:
 
 @pytest.fixture(scope="module")
 def tiny() -> Study:
-    search = {"algorithms": ["nsga2", "rs"], "population": 10, "evaluations": 20, "runs": 1}
+    search = {
+        "algorithms": ["nsga2", "rs"],
+        "population": 10,
+        "evaluations": 20,
+        "runs": 1,
+    }
     return load_study("smoke", search=search)
 
 
@@ -288,7 +308,9 @@ def broken(study: Study, path: Path, disk: Disk) -> bool:
 
 @SLOW
 @pytest.mark.parametrize("stays", [False, True])
-def test_every_step_on_the_disk_may_fail(stays: bool, tiny: Study, tmp_path: Path) -> None:
+def test_every_step_on_the_disk_may_fail(
+    stays: bool, tiny: Study, tmp_path: Path
+) -> None:
     expected = carried_out(tiny, tmp_path / "whole")
     errors = 0
     for number in range(1, MOST_STEPS):
@@ -317,8 +339,16 @@ def test_what_libraries_read_in_folders_of_the_system_is_no_file_of_the_user(
     cached = platformdirs.user_cache_path() / "fonts.txt"
     cached.parent.mkdir(parents=True, exist_ok=True)
     cached.write_text("Arial")
-    paths = [elsewhere, cached, Path(np.__file__), Path(os.__file__), Path("/etc/hosts")]
-    code = f"for path in {[str(path) for path in paths]}:\n    open(path, 'rb').close()\n"
+    paths = [
+        elsewhere,
+        cached,
+        Path(np.__file__),
+        Path(os.__file__),
+        Path("/etc/hosts"),
+    ]
+    code = (
+        f"for path in {[str(path) for path in paths]}:\n    open(path, 'rb').close()\n"
+    )
     with record_opened([]) as opened:
         exec(compile(code, str(in_tmp / "mine.py"), "exec"))
     assert opened == [elsewhere.as_posix()]

@@ -44,7 +44,9 @@ pytestmark = pytest.mark.usefixtures("worker_processes")
 
 def processes() -> list[psutil.Process]:
     return [
-        child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline())
+        child
+        for child in psutil.Process().children()
+        if "spawn_main" in " ".join(child.cmdline())
     ]
 
 
@@ -75,7 +77,9 @@ def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:
 
 
 @SLOW
-def test_the_job_of_a_dead_worker_is_carried_out_once_more_and_others_go_on(tmp_path: Path) -> None:
+def test_the_job_of_a_dead_worker_is_carried_out_once_more_and_others_go_on(
+    tmp_path: Path,
+) -> None:
     with open_pool(2) as pool:
         jobs = [(tmp_path / str(k), int(k == 1)) for k in range(4)]
         assert pool.map(die, jobs) == ["done"] * 4
@@ -87,7 +91,9 @@ def test_the_job_of_a_dead_worker_is_carried_out_once_more_and_others_go_on(tmp_
         assert lost.value.job == 1
         os.kill(processes()[0].pid, signal.SIGKILL)
         time.sleep(0.1)
-        assert pool.map(abs, [(-1,)]) == [1], "one that dies between two jobs is replaced"
+        assert pool.map(abs, [(-1,)]) == [1], (
+            "one that dies between two jobs is replaced"
+        )
 
 
 def take(task: Task, seconds: float) -> None:
@@ -121,14 +127,17 @@ def test_an_error_of_the_study_arrives_as_it_is(pool: Pool) -> None:
     with pytest.raises(InputError, match="world_on_roads") as caught:
         carry_out(evaluate_settings, [(Task(study=wrong), SUN.original_settings)], pool)
     assert "expected" in str(caught.value)
-    assert carry_out(evaluate_settings, [(Task(study=study), SUN.original_settings)], pool)[
-        0
-    ].valid.all()
+    assert carry_out(
+        evaluate_settings, [(Task(study=study), SUN.original_settings)], pool
+    )[0].valid.all()
 
 
 STUDY = load_study("sun")
 WITH_USER_CODE = replace(
-    STUDY, ads=ModelTable(model="my_ads:Mine"), spread={}, origin=Origin(called="my study.toml")
+    STUDY,
+    ads=ModelTable(model="my_ads:Mine"),
+    spread={},
+    origin=Origin(called="my study.toml"),
 )
 
 
@@ -170,7 +179,9 @@ def test_a_setting_that_sumo_refuses_is_told_from_the_others(
     assert result.outcome[2] == Outcome.SIMULATOR_ERROR
     assert result.reason(2) == "SUMO failed: no place"
     assert np.isnan(result.f_safe[2])
-    assert np.array_equal(result.f_safe[result.valid], evaluated(settings(8)).f_safe[result.valid])
+    assert np.array_equal(
+        result.f_safe[result.valid], evaluated(settings(8)).f_safe[result.valid]
+    )
     assert np.array_equal(result.f_num_diff, SUN.number_changed(settings(8)))
 
 
@@ -178,7 +189,10 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it(
     fail: Callable[..., list[int]],
 ) -> None:
     sizes = fail(
-        UserCodeError("study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError"), 4313
+        UserCodeError(
+            "study", "ads.model = 'my_ads:Mine' raised in drive: ZeroDivisionError"
+        ),
+        4313,
     )
     with pytest.raises(UserCodeError) as caught:
         evaluate_settings(Task(study=WITH_USER_CODE), settings(50))
@@ -191,9 +205,13 @@ def test_what_a_users_code_does_on_one_setting_is_an_error_that_names_it(
     assert len(sizes) <= 1 + 2 * 6, "halvings of 50"
 
 
-def test_a_full_disk_or_memory_is_no_property_of_a_setting(fail: Callable[..., list[int]]) -> None:
+def test_a_full_disk_or_memory_is_no_property_of_a_setting(
+    fail: Callable[..., list[int]],
+) -> None:
     fail(MemoryError(), 4300)
-    with pytest.raises(EnvironmentFault, match="a batch cannot be computed: no memory is left"):
+    with pytest.raises(
+        EnvironmentFault, match="a batch cannot be computed: no memory is left"
+    ):
         evaluate_settings(Task(study=STUDY), settings(2))
 
 
@@ -203,12 +221,16 @@ def reproduced(study: Study, **values: float) -> str:
     return reproduction_command(study, setting).partition(f"simulate {study.name}")[2]
 
 
-def test_the_command_that_reproduces_a_setting_keeps_small_changes_and_the_point() -> None:
+def test_the_command_that_reproduces_a_setting_keeps_small_changes_and_the_point() -> (
+    None
+):
     study = load_study("euro_ncap_car_to_car")
     original = SUN.original[SUN.names.index("mass")]
     assert reproduced(study, mass=original + 200) == f" --set mass={original + 200}"
     assert reproduced(study, mass=original + 5) == f" --set mass={original + 5}"
-    assert reproduced(study, mass=original * 9) == f" --set mass={original * 9} --beyond"
+    assert (
+        reproduced(study, mass=original * 9) == f" --set mass={original * 9} --beyond"
+    )
     point = assemble(study).matrix[3].name
     assert (
         reproduced(at_point(study, point), mass=original + 200)

@@ -114,9 +114,13 @@ class Defect(NamedTuple):
     got: str
 
 
-def planted(kind: str, check_study: str, module: str, where: str, line: str, got: str) -> Defect:
+def planted(
+    kind: str, check_study: str, module: str, where: str, line: str, got: str
+) -> Defect:
     assert where in module, where
-    return Defect(kind, check_study, module.replace(where, line, 1).replace("BODY", "pass"), got)
+    return Defect(
+        kind, check_study, module.replace(where, line, 1).replace("BODY", "pass"), got
+    )
 
 
 ALONE, ORDER, AGAIN = (
@@ -126,7 +130,9 @@ ALONE, ORDER, AGAIN = (
 )
 RUN = "in another run"
 DEFECTS = {
-    "random": planted("ads", "repetition", SCALAR, "BODY", "stopping += random.random()", AGAIN),
+    "random": planted(
+        "ads", "repetition", SCALAR, "BODY", "stopping += random.random()", AGAIN
+    ),
     "class variable": planted(
         "ads",
         "order",
@@ -144,7 +150,12 @@ DEFECTS = {
         ALONE,
     ),
     "place in the batch": planted(
-        "ads", "order", ARRAYS, "BODY", "memory = memory + np.arange(len(seen.speed))", ORDER
+        "ads",
+        "order",
+        ARRAYS,
+        "BODY",
+        "memory = memory + np.arange(len(seen.speed))",
+        ORDER,
     ),
     "out of range": planted(
         "ads",
@@ -163,10 +174,20 @@ DEFECTS = {
         AGAIN,
     ),
     "vehicle maximum": planted(
-        "vehicle", "alone", VEHICLE, "* command.throttle -", "* np.max(state.speed + 1) -", ALONE
+        "vehicle",
+        "alone",
+        VEHICLE,
+        "* command.throttle -",
+        "* np.max(state.speed + 1) -",
+        ALONE,
     ),
     "scenario with a text": planted(
-        "scenario", "contract", SCENARIO, "self.distance, 0.0", "'far', 0.0", "returned x"
+        "scenario",
+        "contract",
+        SCENARIO,
+        "self.distance, 0.0",
+        "'far', 0.0",
+        "returned x",
     ),
     "scenario beside its speed": planted(
         "scenario",
@@ -176,7 +197,9 @@ DEFECTS = {
         "self.distance + 2 * times, 0.0, -2.0,",
         "from where its speed takes it",
     ),
-    "scenario undeclared reaction": Defect("scenario", "contract", REACTS, "in SUMO, with "),
+    "scenario undeclared reaction": Defect(
+        "scenario", "contract", REACTS, "in SUMO, with "
+    ),
     "metric over runs": planted(
         "metric",
         "alone",
@@ -248,7 +271,9 @@ FAST = ("random", "mean over vehicles", "out of range", "scenario beside its spe
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in FAST else SLOW) for name in DEFECTS]
 )
-def test_a_planted_defect_is_found_with_the_input_that_shows_it(name: str, in_tmp: Path) -> None:
+def test_a_planted_defect_is_found_with_the_input_that_shows_it(
+    name: str, in_tmp: Path
+) -> None:
     defect = DEFECTS[name]
     (in_tmp / "mine.py").write_text(defect.module)
     (in_tmp / "mine.toml").write_text(STUDY_OF[defect.kind])
@@ -307,17 +332,26 @@ def test_others_who_have_left_in_time_or_never_come_are_the_scenarios_matter(
     )
     findings = check_study(study_to_check("mine.toml"))
     assert [finding.check for finding in findings] == found
-    assert all("mine.py:4" in finding.where and words in finding.finding for finding in findings)
+    assert all(
+        "mine.py:4" in finding.where and words in finding.finding
+        for finding in findings
+    )
 
 
 @SLOW
-@pytest.mark.parametrize("criterion", ["", '[unsafe]\ncriterion = "safety_degree < 99"\n'])
+@pytest.mark.parametrize(
+    "criterion", ["", '[unsafe]\ncriterion = "safety_degree < 99"\n']
+)
 def test_an_original_that_is_unsafe_does_not_pass(criterion: str, in_tmp: Path) -> None:
     """With a wrong sign a driving system hits the pedestrian; with a right one it stops nearer
     than 99 m.
     """
-    wrong = SCALAR.replace("seen.gap < stopping", "seen.gap < -stopping").replace("BODY", "pass")
-    (in_tmp / "mine.py").write_text(SCALAR.replace("BODY", "pass") if criterion else wrong)
+    wrong = SCALAR.replace("seen.gap < stopping", "seen.gap < -stopping").replace(
+        "BODY", "pass"
+    )
+    (in_tmp / "mine.py").write_text(
+        SCALAR.replace("BODY", "pass") if criterion else wrong
+    )
     (in_tmp / "mine.toml").write_text(STUDY_OF["ads"] + criterion)
     (finding,) = check_study(study_to_check("mine.toml"))
     assert finding.check == "original", finding
@@ -326,7 +360,11 @@ def test_an_original_that_is_unsafe_does_not_pass(criterion: str, in_tmp: Path) 
 
 
 @pytest.mark.parametrize(
-    "study", ["smoke", *(pytest.param(name, marks=SLOW) for name in ("lgsvl", "native", "wear"))]
+    "study",
+    [
+        "smoke",
+        *(pytest.param(name, marks=SLOW) for name in ("lgsvl", "native", "wear")),
+    ],
 )
 def test_what_is_shipped_passes(study: str) -> None:
     """What is right of users is in the tutorials, whose studies begin with these checks."""
@@ -357,7 +395,10 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
     assert "mine.py:11" in text
     (in_tmp / "mine.py").write_text(SCALAR.replace("BODY", "self.far = seen.gap"))
     passed = json_of("check", "mine.toml")
-    assert (passed["numbers"]["passed"], passed["tables"]["findings"]["rows"]) == (True, [])
+    assert (passed["numbers"]["passed"], passed["tables"]["findings"]["rows"]) == (
+        True,
+        [],
+    )
 
 
 @SLOW

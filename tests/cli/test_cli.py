@@ -37,7 +37,9 @@ def loaded(code: str) -> set[str]:
     """Which of the heavy packages a fresh interpreter has loaded after some code."""
     result = f"import sys\n{code}\nprint(*(set(sys.modules) & {HEAVY!r}))"
     return set(
-        subprocess.run([sys.executable, "-c", result], capture_output=True, text=True, check=True)
+        subprocess.run(
+            [sys.executable, "-c", result], capture_output=True, text=True, check=True
+        )
         .stdout.splitlines()[-1]
         .split()
     )
@@ -53,9 +55,13 @@ def test_the_help_lists_every_command_with_the_first_sentence_of_its_function() 
 
 
 @pytest.mark.parametrize("command", list(COMMANDS))
-def test_every_command_and_each_of_its_options_has_a_whole_sentence_of_help(command: str) -> None:
+def test_every_command_and_each_of_its_options_has_a_whole_sentence_of_help(
+    command: str,
+) -> None:
     found = commands.get_command(None, command)  # type: ignore[arg-type]
-    options = [option for option in found.params if not isinstance(option, click.Argument)]
+    options = [
+        option for option in found.params if not isinstance(option, click.Argument)
+    ]
     short, full = (
         CliRunner().invoke(commands, [command, flag], catch_exceptions=False).output
         for flag in ("--help", "--help-all")
@@ -88,9 +94,12 @@ def test_the_package_and_the_help_load_nothing_heavy() -> None:
 @SLOW
 def test_one_simulation_loads_sumo_and_no_statistics() -> None:
     code = "from click.testing import CliRunner\nfrom safevar_sumo.cli.program import commands\n"
-    assert loaded(code + "print(CliRunner().invoke(commands, ['list']).exit_code)") == {"pandas"}
+    assert loaded(code + "print(CliRunner().invoke(commands, ['list']).exit_code)") == {
+        "pandas"
+    }
     simulation = loaded(
-        code + "print(CliRunner().invoke(commands, ['simulate', 'sun', '--json']).exit_code)"
+        code
+        + "print(CliRunner().invoke(commands, ['simulate', 'sun', '--json']).exit_code)"
     )
     assert simulation <= {"libsumo", "traci", "pandas", "scipy"}, (
         "Numba looks up the version of scipy"
@@ -125,7 +134,12 @@ def test_a_gate_ends_with_code_3_and_of_a_table_it_names_the_row(
 
 @pytest.mark.parametrize(
     ("change", "value"),
-    [("mass=2500", 2500.0), ("mass=+10%", 2644.4), ("mass=-5%", 2283.8), ("mass = 2.5e3", 2500.0)],
+    [
+        ("mass=2500", 2500.0),
+        ("mass=+10%", 2644.4),
+        ("mass=-5%", 2283.8),
+        ("mass = 2.5e3", 2500.0),
+    ],
 )
 def test_a_change_is_a_value_or_a_share(change: str, value: float) -> None:
     assert read_changes((change,), SUN) == {"mass": pytest.approx(value)}
@@ -142,7 +156,9 @@ def test_a_matrix_says_of_how_many_test_cases_a_degree_is_the_least() -> None:
     assert "simulated" not in simulate("wear").stdout
 
 
-def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> None:
+def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> (
+    None
+):
     result = simulate(
         "rain",
         *("--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301"),
@@ -151,16 +167,24 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
     assert "original" in result.stdout
     assert "The original vehicle stops, with a safety degree of 2.01 m" in result.stdout
     assert "the changed vehicle is less safe" in result.stdout
-    filtered = "f_diff and f_num_diff are of the filtered setting, as in a search: they count"
+    filtered = (
+        "f_diff and f_num_diff are of the filtered setting, as in a search: they count"
+    )
     said = " ".join(result.stdout.replace("│", " ").split())
     assert f"{filtered} dragCoeff = 0.301 as unchanged" in said
     assert "changed vehicle" not in simulate("rain").stdout
     hit, stop = (sv.simulate("native", {"decel": value}) for value in (4.5, 8))
     assert (hit.outcome, hit.gap) == ("collision", 0), "the vehicle is 4.7 m long"
     gap = stop.gap
-    assert (stop.outcome, gap) == ("stopped", pytest.approx(stop.metrics["safety_degree"] - 4.7))
+    assert (stop.outcome, gap) == (
+        "stopped",
+        pytest.approx(stop.metrics["safety_degree"] - 4.7),
+    )
     lead = simulate("native", "--set", "decel=8").stdout
-    assert f"{gap + 4.7:.2f} m from centre to centre (gap {gap:.2f} m): the changed vehicle" in lead
+    assert (
+        f"{gap + 4.7:.2f} m from centre to centre (gap {gap:.2f} m): the changed vehicle"
+        in lead
+    )
 
 
 @SLOW
@@ -218,7 +242,8 @@ def shown(clock: list[float], width: int) -> list[str]:
             show("rain: 1 of 6 runs", done, 6000)
             clock[0] += 10
     return [
-        re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip() for line in out.getvalue().splitlines()
+        re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", line).rstrip()
+        for line in out.getvalue().splitlines()
     ]
 
 
@@ -233,9 +258,13 @@ def test_on_a_terminal_all_fits_in_its_line(width: int, clock: list[float]) -> N
 
 def test_before_a_total_is_known_a_terminal_says_searching() -> None:
     out = StringIO()
-    with open_progress(True, Console(file=out, force_terminal=True, width=80, _environ={})):
+    with open_progress(
+        True, Console(file=out, force_terminal=True, width=80, _environ={})
+    ):
         pass
-    last = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", out.getvalue()).splitlines()[-1].rstrip()
+    last = (
+        re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", out.getvalue()).splitlines()[-1].rstrip()
+    )
     assert re.fullmatch(r"searching [━╸╺ ]+", last)
 
 
@@ -249,7 +278,9 @@ def test_what_user_code_prints_leaves_the_json_alone(
         " Loud(ScalarAds):\n    def drive(self, seen):\n        print('drives')\n       "
         " os.write(1, b'writes')\n        return 0.3, 0.0\n"
     )
-    Path("loud.toml").write_text('extends = "smoke"\nname = "loud"\n[ads]\nmodel = "loud:Loud"\n')
+    Path("loud.toml").write_text(
+        'extends = "smoke"\nname = "loud"\n[ads]\nmodel = "loud:Loud"\n'
+    )
     for question in (
         ("simulate", "loud.toml"),
         ("risk", "loud.toml", "--samples", "4", "--jobs", "1"),
@@ -310,7 +341,10 @@ def test_a_key_that_the_study_of_a_simulation_has_not_is_refused_before_it_drive
 
 
 def test_a_metric_of_the_study_is_a_key_of_its_simulations(in_tmp: Path) -> None:
-    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\n[metrics]\nalso = ["drac"]\n')
+    Path("mine.toml").write_text(
+        'extends = "smoke"\nname = "mine"\n[metrics]\nalso = ["drac"]\n'
+    )
     assert (
-        "failed: drac = " in run("simulate", "mine.toml", "--fail-if", "drac > 0", expect=3).stderr
+        "failed: drac = "
+        in run("simulate", "mine.toml", "--fail-if", "drac > 0", expect=3).stderr
     )

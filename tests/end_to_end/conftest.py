@@ -37,7 +37,9 @@ def started(*arguments: str, batch: int | None = None, **options: object) -> Pro
     """Start a command in its own process group and with Ctrl-C as a shell does, whatever this
     process ignores; with `batch`, in batches of at most so many settings.
     """
-    program = ["-m", "safevar_sumo"] if batch is None else [str(SMALL_BATCHES), str(batch)]
+    program = (
+        ["-m", "safevar_sumo"] if batch is None else [str(SMALL_BATCHES), str(batch)]
+    )
     running.append(
         subprocess.Popen(
             [sys.executable, *program, *arguments],
@@ -84,7 +86,10 @@ def left_of_group(process: Process) -> list[str]:
     command_lines = []
     for member in psutil.process_iter() if os.name == "posix" else ():
         try:
-            if os.getpgid(member.pid) == process.pid and member.status() != psutil.STATUS_ZOMBIE:
+            if (
+                os.getpgid(member.pid) == process.pid
+                and member.status() != psutil.STATUS_ZOMBIE
+            ):
                 command_lines.append(" ".join(member.cmdline()))
         except (psutil.Error, ProcessLookupError):
             continue

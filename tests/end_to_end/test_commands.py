@@ -53,14 +53,28 @@ def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> Non
     assert frame["ttc [s]"].notna().any()
     step = np.diff(frame["time [s]"])
     assert np.allclose(step, step[0])
-    assert np.allclose(np.diff(frame["speed [m/s]"]) / step, frame["acceleration [m/s^2]"][1:])
+    assert np.allclose(
+        np.diff(frame["speed [m/s]"]) / step, frame["acceleration [m/s^2]"][1:]
+    )
 
 
 @SLOW
 def test_a_title_is_no_markup(in_tmp: Path) -> None:
-    Path("mine.toml").write_text('extends = "smoke"\nname = "mine"\ntitle = "[red]x[/blue] {$"\n')
+    Path("mine.toml").write_text(
+        'extends = "smoke"\nname = "mine"\ntitle = "[red]x[/blue] {$"\n'
+    )
     assert "[red]x[/blue]" in run("simulate", "mine.toml", "--details").stdout
-    run("study", "mine.toml", "--evaluations", "10", "--runs", "1", "--algorithms", "rs", "--quiet")
+    run(
+        "study",
+        "mine.toml",
+        "--evaluations",
+        "10",
+        "--runs",
+        "1",
+        "--algorithms",
+        "rs",
+        "--quiet",
+    )
 
 
 @SLOW
@@ -91,7 +105,9 @@ def test_parts_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     sv.run("small.toml", "alone", only=keys[1:2])
     assert [path.name for path in Path("alone/runs").glob("*-*")] == ["nsga2-01.jsonl"]
     expected = (
-        load_runs(whole).solutions.query("algorithm == 'nsga2' and run == 1").reset_index(drop=True)
+        load_runs(whole)
+        .solutions.query("algorithm == 'nsga2' and run == 1")
+        .reset_index(drop=True)
     )
     pd.testing.assert_frame_equal(load_runs("alone").solutions, expected)
 
@@ -105,7 +121,16 @@ def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> N
         " another solution" in longer
     )
     assert "left out" not in longer
-    fewer = study("--out", "out", "--evaluations", "160", "--runs", "1", "--algorithms", "nsga2,rs")
+    fewer = study(
+        "--out",
+        "out",
+        "--evaluations",
+        "160",
+        "--runs",
+        "1",
+        "--algorithms",
+        "nsga2,rs",
+    )
     assert (
         "out: earlier runs are left out of the results: nsga2-01, rs-01, safe_fuzzer-00,"
         " safe_fuzzer-01" in fewer
@@ -204,19 +229,27 @@ def test_code_and_named_files_count_and_every_command_that_simulates_results_ref
     Path("elsewhere").mkdir()
     monkeypatch.chdir("elsewhere")
     run("study", "../mine.toml", "--out", "../out", "--quiet")
-    assert {*files, "my_ads.py", "my_map.py"} <= set(read_manifest(Path("../out"))["files"])
+    assert {*files, "my_ads.py", "my_map.py"} <= set(
+        read_manifest(Path("../out"))["files"]
+    )
     run("study", "../mine.toml", "--out", "../out", "--runs", "2", "--quiet")
     listed = [
         path.relative_to("../out").as_posix()
         for path in Path("../out").rglob("*")
         if path.is_file()
     ]
-    assert {row for row in FILES if any(fnmatch(name, row[0]) for name in listed)} == {*FILES}
-    assert [name for name in listed if not any(fnmatch(name, row[0]) for row in FILES)] == [], (
-        "a file that the manual does not list"
-    )
+    assert {row for row in FILES if any(fnmatch(name, row[0]) for name in listed)} == {
+        *FILES
+    }
+    assert [
+        name for name in listed if not any(fnmatch(name, row[0]) for row in FILES)
+    ] == [], "a file that the manual does not list"
     Path("../far.txt").write_text("another")
-    for words in ("simulate ../out --solution most-severe", "explain ../out", "report ../out"):
+    for words in (
+        "simulate ../out --solution most-severe",
+        "explain ../out",
+        "report ../out",
+    ):
         result = refusal(*words.split())
         assert "far.txt has changed since" in result
         assert "--as-it-is-now" in result
@@ -224,17 +257,24 @@ def test_code_and_named_files_count_and_every_command_that_simulates_results_ref
         commands, ["rules", "../out", "--samples", "8", "--json", "--as-it-is-now"]
     )
     assert done.exit_code == 0, done.exception
-    assert "warning: ../out: far.txt has changed since; simulated as it is now" in done.stderr
+    assert (
+        "warning: ../out: far.txt has changed since; simulated as it is now"
+        in done.stderr
+    )
 
 
 @SLOW
 def test_a_search_says_how_fast_an_original_collides(in_tmp: Path) -> None:
-    weather = 'name = "fog"\nroad_friction = 1.0\nvisibility = 1.0\nrecognition_delay = 1.5'
+    weather = (
+        'name = "fog"\nroad_friction = 1.0\nvisibility = 1.0\nrecognition_delay = 1.5'
+    )
     Path("late.toml").write_text(f'extends = "smoke"\n[weather]\n{weather}\n')
     searched = run("study", "late.toml", "--runs", "1", "--evaluations", "10", "--json")
     speed = sv.simulate("late.toml").collision_speed
     assert speed > 1
-    sentence = f"he original vehicle itself collides at {speed:.2f} m/s: no change is needed"
+    sentence = (
+        f"he original vehicle itself collides at {speed:.2f} m/s: no change is needed"
+    )
     assert f"t{sentence}" in searched.stderr
     assert json.loads(searched.stdout)["verdict"].startswith(f"T{sentence}.")
     demanded = run(

@@ -43,13 +43,21 @@ def answered(typed: str, *, must: bool = False) -> str:
     text = output.stdout
     assert "Traceback" not in output.stderr, output.stderr
     if not text:
-        reason = [line for line in output.stderr.splitlines() if line.startswith("safevar-sumo: ")]
+        reason = [
+            line
+            for line in output.stderr.splitlines()
+            if line.startswith("safevar-sumo: ")
+        ]
         assert not must, output.stderr
         assert len(reason) == 1, output.stderr
         assert "\nexpected: " in output.stderr, output.stderr
         assert not NO_NUMBER.search(reason[0])
         return ""
-    lines = [part for line in text.splitlines() for part in textwrap.wrap(line, WIDTH) or [""]]
+    lines = [
+        part
+        for line in text.splitlines()
+        for part in textwrap.wrap(line, WIDTH) or [""]
+    ]
     assert len(lines) <= MAX_LINES, text
     assert max(map(len, lines)) <= WIDTH, text
     assert not NO_NUMBER.search(text), text
@@ -104,7 +112,10 @@ def test_every_shipped_study_has_answers_or_reasons(words: str) -> None:
 @pytest.mark.parametrize(
     ("typed", "told"),
     [
-        ("permit autoware_july --quick --set brakeTorque=0.55 --others new", "may not drive"),
+        (
+            "permit autoware_july --quick --set brakeTorque=0.55 --others new",
+            "may not drive",
+        ),
         ("risk autoware_july --simulations 9", None),
         *(
             pytest.param(*row, marks=SLOW)
@@ -167,19 +178,28 @@ QUESTIONS = (
 @SLOW
 @pytest.mark.usefixtures("in_tmp")
 @pytest.mark.parametrize("name", KINDS)
-def test_every_question_about_each_kind_of_study_has_an_answer_or_a_reason(name: str) -> None:
+def test_every_question_about_each_kind_of_study_has_an_answer_or_a_reason(
+    name: str,
+) -> None:
     Path("models.py").write_text(MODELS)
     Path("rig.toml").write_text(STUDY.replace("models:Wall", "models:Rig"))
     Path("any_gap.toml").write_text(ANY_GAP)
     for file, text in files_of("docs/recorded_tracks.md").items():
         Path(file).write_text(text)
-    Path("kind.toml").write_text(KIND.format(name if name in study_names() else f"{name}.toml"))
+    Path("kind.toml").write_text(
+        KIND.format(name if name in study_names() else f"{name}.toml")
+    )
     study = load_study("kind.toml")
     answered("study kind.toml --out results", must=True)
     few = FEW.format(260 * (4 if study.ranges or study.matrix else 1))
     first, row = next(iter(study.vehicle.characteristics.items()))
-    values = f"{first}={row.original!r}", WORN.get(study.vehicle.model, f"{first}={row.lower!r}")
-    assert_next_answers(*(answered(each.format("results", *values, few=few)) for each in QUESTIONS))
+    values = (
+        f"{first}={row.original!r}",
+        WORN.get(study.vehicle.model, f"{first}={row.lower!r}"),
+    )
+    assert_next_answers(
+        *(answered(each.format("results", *values, few=few)) for each in QUESTIONS)
+    )
     # The usual questions where they take little time, as none has an answer.
     ask = "" if name == "stop" else '--ask "rules --samples 16"'
     answered(f"evidence results {ask} --out it.zip", must=True)
@@ -196,11 +216,14 @@ def test_the_speed_of_a_packed_sheet_is_that_of_its_own_limits() -> None:
     )
     answered(f"study july.toml {search}", must=True)
     limits = "tolerance --quick --at-tests --characteristics brakeTorque"
-    asked = f'--ask "{limits}" --ask "permit --quick --set brakeTorque=0.55 --others new"'
+    asked = (
+        f'--ask "{limits}" --ask "permit --quick --set brakeTorque=0.55 --others new"'
+    )
     answered(f"evidence results {asked} --out it.zip", must=True)
     with ZipFile("it.zip") as pack:
         # It is about brakes at the limit, which fail between the tests, not about those of the car.
-        assert b"<dt>Greatest speed</dt><dd>With brakeTorque 1 -&gt; 0.95 (-5.0 %)" in pack.read(
-            "1-july/report.html"
+        assert (
+            b"<dt>Greatest speed</dt><dd>With brakeTorque 1 -&gt; 0.95 (-5.0 %)"
+            in pack.read("1-july/report.html")
         )
     assert json_of("verify", "it.zip")["numbers"]["passed"]

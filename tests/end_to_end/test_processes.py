@@ -21,7 +21,15 @@ from safevar_sumo.campaign import batches
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.output import SETTLING_TIME
 from safevar_sumo.results import load_runs, write_whole
-from tests.end_to_end.conftest import ended, killed, solutions, started, until, workers_of, written
+from tests.end_to_end.conftest import (
+    ended,
+    killed,
+    solutions,
+    started,
+    until,
+    workers_of,
+    written,
+)
 from tests.in_process import SLOW, refused, run
 from tests.scenarios.test_simulated import MODELS, STUDY
 
@@ -59,19 +67,23 @@ def assert_ends_with_the_results(process: Process, whole: Path) -> None:
 @SLOW
 @pytest.mark.parametrize("when", ["mid-run", "loading", "twice"])
 def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
-    process = started("study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo")
+    process = started(
+        "study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo"
+    )
     if when == "loading":
         until(
-            lambda: any("numpy" in one.path for one in psutil.Process(process.pid).memory_maps()),
+            lambda: any(
+                "numpy" in one.path for one in psutil.Process(process.pid).memory_maps()
+            ),
             process,
         )
     else:
         until_it_writes(process)
         loaded = " ".join(one.path for one in workers_of(process)[0].memory_maps())
         assert "libsumo" in loaded
-        assert not any(name in loaded for name in ("pandas", "pyarrow", "matplotlib")), (
-            "a worker loads neither frames nor figures"
-        )
+        assert not any(
+            name in loaded for name in ("pandas", "pyarrow", "matplotlib")
+        ), "a worker loads neither frames nor figures"
     os.killpg(process.pid, signal.SIGINT)
     if when == "twice":
         time.sleep(0.05)
@@ -81,11 +93,21 @@ def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
 
 
 @SLOW
-def test_sigterm_ends_everything_as_ctrl_c_does_and_leaves_nothing(in_tmp: Path) -> None:
+def test_sigterm_ends_everything_as_ctrl_c_does_and_leaves_nothing(
+    in_tmp: Path,
+) -> None:
     Path("temporary").mkdir()
     environment = {**os.environ, "TMPDIR": str(in_tmp / "temporary")}
     process = started(
-        "study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo", env=environment
+        "study",
+        "rain",
+        "--out",
+        "out",
+        "--jobs",
+        "1",
+        "--engine",
+        "sumo",
+        env=environment,
     )
     until_it_writes(process)
     process.terminate()
@@ -104,7 +126,10 @@ def test_what_a_killed_write_left_is_removed_by_the_next_and_what_is_being_writt
         " flush=True)\n    sys.stdin.read()\n"
     )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    writers = [subprocess.Popen([sys.executable, "-c", code], text=True, **pipes) for _ in range(2)]
+    writers = [
+        subprocess.Popen([sys.executable, "-c", code], text=True, **pipes)
+        for _ in range(2)
+    ]
     names = [writer.stdout.readline().strip() for writer in writers if writer.stdout]
     writers[0].kill()
     writers[0].wait()
@@ -135,8 +160,12 @@ def test_a_temporary_folder_is_removed_once_its_process_was_killed(
     command = [sys.executable, "-c", HOLDING]
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    holders = [subprocess.Popen(command, text=True, env=environment, **pipes) for _ in range(2)]
-    folders = [Path(holder.stdout.readline().strip()) for holder in holders if holder.stdout]
+    holders = [
+        subprocess.Popen(command, text=True, env=environment, **pipes) for _ in range(2)
+    ]
+    folders = [
+        Path(holder.stdout.readline().strip()) for holder in holders if holder.stdout
+    ]
     holders[0].kill()
     holders[0].wait()
     time.sleep(2 * SETTLING_TIME)
@@ -166,12 +195,17 @@ def test_a_worker_that_hangs_does_not_outlive_a_killed_study() -> None:
 @pytest.mark.parametrize(
     ("line", "why"),
     [
-        ("time.sleep(1000)", "a batch took longer than the time limit, `search.time_limit`"),
+        (
+            "time.sleep(1000)",
+            "a batch took longer than the time limit, `search.time_limit`",
+        ),
         ("os._exit(3)", "the worker process died (exit code 3)"),
         ("ctypes.string_at(0)", "the worker process died (exit code -11)"),
     ],
 )
-def test_user_code_that_its_workers_die_of_is_an_error_with_its_line(line: str, why: str) -> None:
+def test_user_code_that_its_workers_die_of_is_an_error_with_its_line(
+    line: str, why: str
+) -> None:
     Path("my_ads.py").write_text(
         "import ctypes\nimport os\nimport time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass"
         " Deadly(ScalarAds):\n    def drive(self, seen):\n        if os.path.exists('now'):\n     "
@@ -209,7 +243,10 @@ def start(small: None) -> Iterator[Start]:
             *arguments,
             "--no-dashboard",
         ]
-        environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+        environment = {
+            **os.environ,
+            "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
+        }
         with open(f"{program}-{len(running)}.log", "w") as log:
             running.append(
                 subprocess.Popen(
@@ -237,17 +274,23 @@ def scheduler(start: Start) -> tuple[Process, str]:
     log = Path("scheduler-0.log")
     until(lambda: "Scheduler at:" in log.read_text(), process)
     return process, next(
-        line.split()[-1] for line in log.read_text().splitlines() if "Scheduler at:" in line
+        line.split()[-1]
+        for line in log.read_text().splitlines()
+        if "Scheduler at:" in line
     )
 
 
 def worker(start: Start, address: str, *options: str) -> Process:
-    return start("worker", address, "--nthreads", "1", "--local-directory", "scratch", *options)
+    return start(
+        "worker", address, "--nthreads", "1", "--local-directory", "scratch", *options
+    )
 
 
 def busy(process: Process) -> bool:
     """Whether a worker has loaded a compiled vehicle, so computes."""
-    return any("llvmlite" in one.path for one in psutil.Process(process.pid).memory_maps())
+    return any(
+        "llvmlite" in one.path for one in psutil.Process(process.pid).memory_maps()
+    )
 
 
 @SLOW
@@ -257,10 +300,14 @@ def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
     _, address = scheduler
     workers = [worker(start, address, "--no-nanny") for _ in range(2)]
     until(
-        lambda: all("Registered to" in Path(f"worker-{i}.log").read_text() for i in (1, 2)),
+        lambda: all(
+            "Registered to" in Path(f"worker-{i}.log").read_text() for i in (1, 2)
+        ),
         workers[0],
     )
-    process = started("study", "small.toml", "--cluster", address, "--out", "out", batch=1)
+    process = started(
+        "study", "small.toml", "--cluster", address, "--out", "out", batch=1
+    )
     until(lambda: written(OUT) > 0 and all(busy(one) for one in workers), process)
     assert process.poll() is None, "too late: the study is over"
     killed(workers[0])
@@ -313,12 +360,28 @@ def test_questions_on_a_cluster_have_the_bytes_of_one_process(
     run("study", "wall.toml", "--out", "walls")
     for command in ("report walls --out", "evidence walls --out"):
         ending = "html" if "report" in command else "zip"
-        run(*command.split(), f"1.{ending}", "--jobs", "1", "--ask", "rules --samples 300")
-        run(*command.split(), f"2.{ending}", "--cluster", address, "--ask", "rules --samples 300")
+        run(
+            *command.split(),
+            f"1.{ending}",
+            "--jobs",
+            "1",
+            "--ask",
+            "rules --samples 300",
+        )
+        run(
+            *command.split(),
+            f"2.{ending}",
+            "--cluster",
+            address,
+            "--ask",
+            "rules --samples 300",
+        )
         assert Path(f"1.{ending}").read_bytes() == Path(f"2.{ending}").read_bytes()
 
     # A worker dies at work.
-    process = started("rules", "wall.toml", "--samples", "900", "--cluster", address, "--json")
+    process = started(
+        "rules", "wall.toml", "--samples", "900", "--cluster", address, "--json"
+    )
     time.sleep(3)
     killed(workers[0])
     process.wait(60)

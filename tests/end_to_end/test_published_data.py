@@ -16,7 +16,12 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import SLOW, json_of, refused, run
 
-COLUMNS = {"safety_degree": "SaftyDegree", "tet": "TET", "tit": "TIT", "ave_dece": "Dece"}
+COLUMNS = {
+    "safety_degree": "SaftyDegree",
+    "tet": "TET",
+    "tit": "TIT",
+    "ave_dece": "Dece",
+}
 
 
 @pytest.fixture(scope="module")
@@ -31,11 +36,13 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     settings[::2, :6] = characteristics.original[:6] + 0.001
     result = drive_and_score(system, package_filter(characteristics, settings))
-    columns = {column: np.nan_to_num(result.metrics[name]) for name, column in COLUMNS.items()}
+    columns = {
+        column: np.nan_to_num(result.metrics[name]) for name, column in COLUMNS.items()
+    }
     path = tmp_path_factory.mktemp("data") / "mine.csv"
-    pd.DataFrame(settings, columns=list(characteristics.names)).assign(**columns).to_csv(
-        path, index=False
-    )
+    pd.DataFrame(settings, columns=list(characteristics.names)).assign(
+        **columns
+    ).to_csv(path, index=False)
     return path
 
 
@@ -47,14 +54,19 @@ def test_validate_agrees_perfectly_with_itself(data: Path) -> None:
         "sun",
         40,
     )
-    collisions = [output["numbers"][f"collisions_{side}"] for side in ("here", "reference", "both")]
+    collisions = [
+        output["numbers"][f"collisions_{side}"]
+        for side in ("here", "reference", "both")
+    ]
     assert collisions == collisions[:1] * 3
     table = output["tables"]["agreement"]
     assert all(list(row) == list(table["columns"]) for row in table["rows"])
     assert {row["metric"]: row["spearman"] for row in table["rows"]} == pytest.approx(
         dict.fromkeys(COLUMNS, 1.0)
     )
-    errors = [row[name] for row in table["rows"] for name in ("mean_absolute_error", "bias")]
+    errors = [
+        row[name] for row in table["rows"] for name in ("mean_absolute_error", "bias")
+    ]
     assert errors == pytest.approx([0.0] * 8, abs=1e-12)
 
 
@@ -80,8 +92,12 @@ def test_figures_are_png_and_pdf_files(results: Path, in_tmp: Path) -> None:
 
 
 @SLOW
-def test_tables_prints_what_answers_the_questions_and_all_of_them_if_asked(results: Path) -> None:
-    short, whole = (run("tables", str(results), *more).stdout for more in ((), ("--details",)))
+def test_tables_prints_what_answers_the_questions_and_all_of_them_if_asked(
+    results: Path,
+) -> None:
+    short, whole = (
+        run("tables", str(results), *more).stdout for more in ((), ("--details",))
+    )
     for title in ("RQ2 over runs", "RQ3.1", "Medians over runs"):
         assert title not in short
         assert title in whole
@@ -91,7 +107,9 @@ def test_tables_prints_what_answers_the_questions_and_all_of_them_if_asked(resul
     assert "rq3.2" in json_of("tables", str(results))["tables"]
 
 
-def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Path) -> None:
+def test_imported_solutions_are_filtered_and_counted_anew(
+    data: Path, in_tmp: Path
+) -> None:
     run("import", "sun", "--out", "imported", "--nsga2", str(data), "--rs", str(data))
     assert sorted(path.name for path in Path("imported").iterdir()) == [
         "manifest.json",
@@ -100,9 +118,9 @@ def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Pa
     frame = pd.read_csv("imported/solutions.csv")
     assert frame["algorithm"].value_counts().to_dict() == {"nsga2": 40, "rs": 40}
     assert "run" not in frame
-    pd.read_csv(data).assign(mass=lambda rows: rows["mass"].where(rows.index > 0, 9e9)).to_csv(
-        "heavy.csv", index=False
-    )
+    pd.read_csv(data).assign(
+        mass=lambda rows: rows["mass"].where(rows.index > 0, 9e9)
+    ).to_csv("heavy.csv", index=False)
     output = run("import", "sun", "--out", "imported", "--rs", "heavy.csv")
     assert "1 rows with values outside the domains are left out" in output.stderr
     assert "39 solutions" in output.stdout
@@ -112,21 +130,33 @@ def test_imported_solutions_are_filtered_and_counted_anew(data: Path, in_tmp: Pa
         "changes below the threshold are put back"
     )
     assert frame["f_num_diff"].tolist() == changed.sum(axis=1).tolist()
-    assert np.allclose(frame["f_diff"], np.max(np.abs(frame.iloc[:, 1:13] / original - 1), axis=1))
+    assert np.allclose(
+        frame["f_diff"], np.max(np.abs(frame.iloc[:, 1:13] / original - 1), axis=1)
+    )
 
 
 @SLOW
-def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_tmp: Path) -> None:
+def test_an_unfinished_campaign_is_answered_as_far_as_it_went(
+    results: Path, in_tmp: Path
+) -> None:
     shutil.copytree(results, "part")
     Path("part/runs/rs-01.jsonl").unlink()
     Path("part/solutions.csv").unlink()
     output = json_of("tables", "part")
-    assert "incomplete: 1 of 2 runs of rs are finished" in str(output["tables"]["remarks"])
-    assert "1 of 2 runs of rs" in run("rules", "part", "--samples", "64", "--jobs", "1").stderr
+    assert "incomplete: 1 of 2 runs of rs are finished" in str(
+        output["tables"]["remarks"]
+    )
+    assert (
+        "1 of 2 runs of rs"
+        in run("rules", "part", "--samples", "64", "--jobs", "1").stderr
+    )
     records = output["tables"]["rq2"]["rows"]
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
     assert "budget" not in output["tables"]
-    assert {*json_of("tables", "part", "--table", "budget")["tables"]} == {"budget", "remarks"}
+    assert {*json_of("tables", "part", "--table", "budget")["tables"]} == {
+        "budget",
+        "remarks",
+    }
     Path("part/runs/rs-00.jsonl").unlink()
     assert "only nsga2" in run("tables", "part", "--table", "rq2").stdout
     refused("tables", "part", "--table", "budget", message=("only nsga2",))
@@ -139,4 +169,6 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(results: Path, in_
     answer = run("explain", "part", "--jobs", "1")
     assert "Of 0 different solutions of the search, none is unsafe" in answer.stdout
     assert "nan %" not in answer.stdout
-    assert answer.stderr.count("warning") == 1, "the unfinished runs, and nothing of numpy"
+    assert answer.stderr.count("warning") == 1, (
+        "the unfinished runs, and nothing of numpy"
+    )

@@ -32,9 +32,13 @@ QUESTIONS = {
 @SLOW
 @pytest.mark.usefixtures("small", "worker_processes")
 @pytest.mark.parametrize("command", QUESTIONS)
-def test_an_answer_has_the_same_bytes_for_one_worker_process_and_for_two(command: str) -> None:
+def test_an_answer_has_the_same_bytes_for_one_worker_process_and_for_two(
+    command: str,
+) -> None:
     words = f"{command} {QUESTIONS[command]}".split()
-    assert len({run(*words, "--json", "--jobs", jobs).stdout for jobs in ("1", "2")}) == 1
+    assert (
+        len({run(*words, "--json", "--jobs", jobs).stdout for jobs in ("1", "2")}) == 1
+    )
 
 
 @SLOW
@@ -54,7 +58,11 @@ MIXED = ["nsga2", "surrogate", "pymoo:NSGA3", "pymoo:CMAES", "pymoo:MOEAD"]
     [(OURS, 7, None, None), (OURS, 3, 3, None), (OURS, 2, 1, None), (MIXED, 1, 11, 9)],
 )
 def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches_nor_on_an_interruption(
-    algorithms: list[str], workers: int, batch: int | None, breaks_after: int | None, tmp_path: Path
+    algorithms: list[str],
+    workers: int,
+    batch: int | None,
+    breaks_after: int | None,
+    tmp_path: Path,
 ) -> None:
     """Those of pymoo share numpy's random state, so they run in one thread of a process."""
     parameters = {"pymoo:NSGA3": {"ref_dirs": 3}} if algorithms is MIXED else {}
@@ -63,9 +71,13 @@ def test_results_depend_neither_on_workers_nor_on_order_nor_on_batches_nor_on_an
     carried_out(searched, tmp_path / "whole")
     if breaks_after:
         with pytest.raises(SafevarError, match="broken down"):
-            carried_out(searched, tmp_path / "out", FormulaPool(limit=breaks_after), batch=7)
+            carried_out(
+                searched, tmp_path / "out", FormulaPool(limit=breaks_after), batch=7
+            )
     carried_out(searched, tmp_path / "out", FormulaPool(workers), batch=batch)
     assert solutions(tmp_path / "out") == solutions(tmp_path / "whole")
     whole, results = (load_runs(tmp_path / name) for name in ("whole", "out"))
     pd.testing.assert_frame_equal(results.evaluations, whole.evaluations)
-    assert {*results.solutions["algorithm"]} == {name.replace(":", "_") for name in algorithms}
+    assert {*results.solutions["algorithm"]} == {
+        name.replace(":", "_") for name in algorithms
+    }

@@ -54,14 +54,19 @@ def computed(name: str) -> JsonObject:
     with tempfile.TemporaryDirectory() as folder:
         results = load_runs(searched(study, Path(folder)))
     original = results.manifest["original"]
-    changed = {member: row.original for member, row in study.vehicle.characteristics.items()}
+    changed = {
+        member: row.original for member, row in study.vehicle.characteristics.items()
+    }
     solutions = {
         str(algorithm): _of_algorithm(rows, changed)
         for algorithm, rows in results.solutions.groupby("algorithm")
     }
     return {
         "why": WHY[name],
-        "original": {**_rounded(original), "digest": _digest(json.dumps(original, sort_keys=True))},
+        "original": {
+            **_rounded(original),
+            "digest": _digest(json.dumps(original, sort_keys=True)),
+        },
         "solutions": solutions,
     }
 
@@ -109,11 +114,13 @@ def test_a_shipped_studys_results_are_those_of_ever(name: str) -> None:
     here = computed(name)
     expected = GOLDEN["studies"][name]
     numbers = {
-        key: value for key, value in expected["original"].items() if isinstance(value, float)
+        key: value
+        for key, value in expected["original"].items()
+        if isinstance(value, float)
     }
-    assert {key: here["original"][key] for key in numbers} == pytest.approx(numbers, rel=1e-4), (
-        "other results, not only other bits"
-    )
+    assert {key: here["original"][key] for key in numbers} == pytest.approx(
+        numbers, rel=1e-4
+    ), "other results, not only other bits"
     if GOLDEN["platform"] == PLATFORM:
         assert here == expected, CHANGED
 

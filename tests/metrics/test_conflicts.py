@@ -25,7 +25,9 @@ WEAR = assemble(load_study("wear", matrix=None, weather="clear"))
 
 def measured(runs: SimulationRuns) -> FloatArray:
     """`ttc_min` [s] and `drac` [m/s^2] of N vehicles, shape (2, N)."""
-    return np.stack([OPTIONAL_METRICS[name].function(runs, None) for name in ("ttc_min", "drac")])
+    return np.stack(
+        [OPTIONAL_METRICS[name].function(runs, None) for name in ("ttc_min", "drac")]
+    )
 
 
 def along_the_path(runs: SimulationRuns) -> FloatArray:
@@ -44,15 +46,27 @@ def along_the_path(runs: SimulationRuns) -> FloatArray:
         & (trace.gap > 0)
         & (trace.speed > 1e-3)
     )
-    counts = meets & trace.active & runs.encounter.in_conflict & np.isnan(runs.collision_speed)
-    both = np.where(counts, ttc, np.inf).min(axis=0), np.where(counts, rate, 0).max(axis=0)
+    counts = (
+        meets
+        & trace.active
+        & runs.encounter.in_conflict
+        & np.isnan(runs.collision_speed)
+    )
+    both = (
+        np.where(counts, ttc, np.inf).min(axis=0),
+        np.where(counts, rate, 0).max(axis=0),
+    )
     return np.where(counts.any(axis=0), both, np.nan)
 
 
 @pytest.mark.parametrize("test", ["CPNA", "CPFA", "CBNA"])
 def test_towards_who_crosses_only_the_way_along_the_path_counts(test: Any) -> None:
-    kmh, place, target = np.random.default_rng(3).uniform((10, -20, 4), (60, 120, 25), (300, 3)).T
-    scenario = Crossing(test=test, speed=kmh, impact_location=place, target_speed=target)
+    kmh, place, target = (
+        np.random.default_rng(3).uniform((10, -20, 4), (60, 120, 25), (300, 3)).T
+    )
+    scenario = Crossing(
+        test=test, speed=kmh, impact_location=place, target_speed=target
+    )
     runs = met_at_once(WEAR, scenario, WEAR.ads, 300)
     expected = along_the_path(runs)
     assert np.isfinite(expected).sum() > 200
@@ -69,7 +83,12 @@ def test_a_pedestrian_who_walks_fast_is_not_approached_faster() -> None:
     """2.84 m/s^2 stops in time, and gap over speed is never below 0.577 s; TET and TIT keep the
     paper's TTC.
     """
-    values = {"test": "CPNA", "speed": 12.26, "impact_location": 4.88, "target_speed": 11.99}
+    values = {
+        "test": "CPNA",
+        "speed": 12.26,
+        "impact_location": 4.88,
+        "target_speed": 11.99,
+    }
     scenario: Any = WEAR.points[0].scenario.at(values)
     runs = met_at_once(WEAR, scenario, WEAR.ads, 1)
     assert measured(runs)[:, 0] == pytest.approx([0.577, 2.84], abs=3e-3)
@@ -79,7 +98,9 @@ def test_a_pedestrian_who_walks_fast_is_not_approached_faster() -> None:
 @pytest.mark.parametrize(
     "scenario", [CarToCar(impact_location=20), CarToCar(test="CCRb"), Along()], ids=repr
 )
-def test_behind_a_leader_both_times_to_collision_are_one_to_the_bit(scenario: Any) -> None:
+def test_behind_a_leader_both_times_to_collision_are_one_to_the_bit(
+    scenario: Any,
+) -> None:
     runs = met_at_once(WEAR, scenario, WEAR.ads, 1)
     ttc = runs.time_to_collision
     assert measured(runs)[:, 0].tolist() == [
@@ -90,4 +111,7 @@ def test_behind_a_leader_both_times_to_collision_are_one_to_the_bit(scenario: An
 
 def test_the_table_of_metrics_says_that_there_are_two_times_to_collision() -> None:
     title = list_models("metrics").tables["metrics"].attrs["title"]
-    assert "TET and TIT use TTC = L_s / v_L, ttc_min and drac TTC_p = gap / (v - u)" in title
+    assert (
+        "TET and TIT use TTC = L_s / v_L, ttc_min and drac TTC_p = gap / (v - u)"
+        in title
+    )

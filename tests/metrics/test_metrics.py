@@ -19,7 +19,13 @@ from safevar_sumo.metrics import (
     Unsafe,
     impact_in_words,
 )
-from safevar_sumo.records import NO_CONTACT, Encounter, FloatArray, Outcome, SimulationRuns
+from safevar_sumo.records import (
+    NO_CONTACT,
+    Encounter,
+    FloatArray,
+    Outcome,
+    SimulationRuns,
+)
 from safevar_sumo.study import MetricsTable
 from tests.made_up import made_up_evaluations, made_up_runs
 
@@ -35,7 +41,9 @@ def braking_run(collision_speed: float = np.nan) -> SimulationRuns:
     moving = np.minimum(time, 2.0)
     way = 10 * moving - 5 * moving**2 / 2
     v = np.where(time < 2.0, 10 - 5 * moving, 0.0)
-    return made_up_runs(STEP, v, 12 - way, collision_speed, position=way, brake=np.ones_like(v))
+    return made_up_runs(
+        STEP, v, 12 - way, collision_speed, position=way, brake=np.ones_like(v)
+    )
 
 
 RUN = braking_run()
@@ -56,18 +64,23 @@ FIRST_SECOND = RUN.trace.time[:, np.newaxis] < 1.0
 COARSE = MetricsTable(ttc_threshold=2.0, sampling_interval=0.2)
 
 
-def value(name: str, run: SimulationRuns, thresholds: MetricsTable = THRESHOLDS) -> float:
+def value(
+    name: str, run: SimulationRuns, thresholds: MetricsTable = THRESHOLDS
+) -> float:
     """A metric of a run's first vehicle."""
     return float({**METRICS, **OPTIONAL_METRICS}[name].function(run, thresholds)[0])
 
 
-def test_safety_degree_is_the_distance_at_standstill_or_minus_the_speed_of_the_collision() -> None:
+def test_safety_degree_is_the_distance_at_standstill_or_minus_the_speed_of_the_collision() -> (
+    None
+):
     assert value("safety_degree", RUN) == pytest.approx(2.0)
     assert value("safety_degree", HIT) == -3.5
 
 
 @pytest.mark.parametrize(
-    ("speed_of_the_struck", "degree"), [(2.5, -1.0), (-1.0, -4.5), (3.5, -0.001), (9.0, -0.001)]
+    ("speed_of_the_struck", "degree"),
+    [(2.5, -1.0), (-1.0, -4.5), (3.5, -0.001), (9.0, -0.001)],
 )
 def test_severity_is_the_closing_speed_and_every_collision_is_below_0(
     speed_of_the_struck: float, degree: float
@@ -93,7 +106,9 @@ def test_exposed_and_integrated_time_of_even_approach() -> None:
     """
     time = np.arange(0, 5 + STEP / 2, STEP)[:, np.newaxis]
     run = made_up_runs(STEP, np.full_like(time, 4.0), 20 - 4.0 * time)
-    run = dataclasses.replace(run, encounter=run.encounter._replace(in_conflict=run.trace.gap > -1))
+    run = dataclasses.replace(
+        run, encounter=run.encounter._replace(in_conflict=run.trace.gap > -1)
+    )
     assert run.time_to_collision[0, 0] == pytest.approx(5.0)
     assert value("tet", run) == pytest.approx(2.0, abs=2 * STEP)
     assert value("tit", run) == pytest.approx(2.0, abs=4 * STEP)
@@ -117,7 +132,12 @@ def test_least_ttc_and_largest_drac_of_even_braking() -> None:
     ("gap", "lateral", "lateral_speed", "expected"),
     [
         (6.0, 1.6, 2.0, 0.6),  # he has left, and the vehicle is 6 m before his path
-        (-7.0, -3.6, 2.0, 1.0),  # the vehicle's rear has left, and his side is 2 m beside its path
+        (
+            -7.0,
+            -3.6,
+            2.0,
+            1.0,
+        ),  # the vehicle's rear has left, and his side is 2 m beside its path
         (6.0, -3.6, 2.0, np.nan),  # he has not crossed yet
         (6.0, 1.0, 2.0, np.nan),  # he is in the path
         (-7.0, -3.6, -2.0, np.nan),  # he goes back
@@ -137,7 +157,9 @@ def test_post_encroachment_time_is_that_of_the_second_one(
     }
     active = np.array([[True], [True], [False]])
     run = made_up_runs(STEP, 10 * at, gap * at, **columns, active=active)
-    run = dataclasses.replace(run, trace=dataclasses.replace(run.trace, vehicle_width=2.0))
+    run = dataclasses.replace(
+        run, trace=dataclasses.replace(run.trace, vehicle_width=2.0)
+    )
     assert np.isnan(value("pet", run)), "it has stopped"
     run.outcome[:] = "passed"
     assert value("pet", run) == pytest.approx(expected, nan_ok=True)
@@ -153,13 +175,18 @@ def test_reaction_time_begins_with_the_first_sight() -> None:
         ({"brake": brake & (time < 0.9), "visible": visible}, np.nan),
         ({"visible": visible & False}, np.nan),
     ):
-        assert value("reaction_time", driving(**seen)) == pytest.approx(expected, nan_ok=True)
+        assert value("reaction_time", driving(**seen)) == pytest.approx(
+            expected, nan_ok=True
+        )
 
 
 def test_who_collides_is_unsafe_by_every_measure_of_a_run() -> None:
     """The third vehicle collides with a measure on the safe side, the fourth without one."""
     nan = np.nan
-    columns = {"safety_degree": [1.0, 2.0, -3.0, -1.0, 1.0], "drac": [5.0, 7.0, 1.0, nan, nan]}
+    columns = {
+        "safety_degree": [1.0, 2.0, -3.0, -1.0, 1.0],
+        "drac": [5.0, 7.0, 1.0, nan, nan],
+    }
     runs = made_up_evaluations(
         columns["safety_degree"], metrics={k: np.array(v) for k, v in columns.items()}
     )
@@ -182,7 +209,10 @@ def test_a_coarser_sampling_interval_counts_fewer_and_longer_samples() -> None:
     coarse = value("tet", RUN, COARSE)
     assert coarse == pytest.approx(fine, abs=0.2)
     assert coarse / 0.2 == pytest.approx(round(coarse / 0.2))
-    assert value("tet", RUN, MetricsTable(ttc_threshold=2.0, sampling_interval=STEP)) == fine
+    assert (
+        value("tet", RUN, MetricsTable(ttc_threshold=2.0, sampling_interval=STEP))
+        == fine
+    )
 
 
 def test_exposure_is_undefined_on_a_collision() -> None:
@@ -194,10 +224,14 @@ def test_time_to_collision_ends_with_the_first_standstill() -> None:
     assert np.all(np.isinf(ttc[RUN.trace.time > 2.0]))
 
 
-def test_a_vehicle_that_stands_at_the_start_has_a_time_to_collision_once_it_drives() -> None:
+def test_a_vehicle_that_stands_at_the_start_has_a_time_to_collision_once_it_drives() -> (
+    None
+):
     speed = np.where(FIRST_SECOND, 0.0, 2.0)
     gap = 20.0 + 0 * speed
-    later = dataclasses.replace(driving(speed=speed), encounter=Encounter(gap, gap, speed, gap > 0))
+    later = dataclasses.replace(
+        driving(speed=speed), encounter=Encounter(gap, gap, speed, gap > 0)
+    )
     ttc = later.time_to_collision[:, 0]
     assert np.isinf(ttc[RUN.trace.time < 1.0]).all()
     assert ttc[RUN.trace.time >= 1.0] == pytest.approx(10.0)
@@ -217,7 +251,10 @@ def test_samples_that_are_not_active_do_not_count(name: str) -> None:
 
 @pytest.mark.parametrize(
     "encounter",
-    [{"closing_speed": -RUN.encounter.closing_speed}, {"distance": RUN.encounter.distance - 20}],
+    [
+        {"closing_speed": -RUN.encounter.closing_speed},
+        {"distance": RUN.encounter.distance - 20},
+    ],
 )
 def test_what_opens_or_lies_behind_has_no_time_to_collision(
     encounter: dict[str, FloatArray],
@@ -236,9 +273,12 @@ def test_a_time_to_collision_at_the_threshold_is_exposed() -> None:
 
 def test_a_batch_that_failed_as_a_whole_has_no_valid_objective() -> None:
     """Without a simulation, a user's metric is undefined, and so is the safety degree."""
-    failed = made_up_evaluations([np.nan, np.nan], outcome=np.full(2, "simulator-error"))
+    failed = made_up_evaluations(
+        [np.nan, np.nan], outcome=np.full(2, "simulator-error")
+    )
     scoring = Scoring(
-        metrics=(), objectives=(F_SAFE, F_DIFF, Measure(name="jerk", title="jerk", unit="m/s^3"))
+        metrics=(),
+        objectives=(F_SAFE, F_DIFF, Measure(name="jerk", title="jerk", unit="m/s^3")),
     )
     assert scoring.valid(failed).tolist() == [False, False]
     assert np.isnan(scoring.values(failed)[:, 2]).all()
@@ -260,16 +300,24 @@ def test_a_margin_is_the_safety_degree_above_the_limit() -> None:
 SAMPLED = 0.05
 
 
-def of_speeds(name: str, speed: FloatArray, collision_speed: float = np.nan) -> FloatArray:
+def of_speeds(
+    name: str, speed: FloatArray, collision_speed: float = np.nan
+) -> FloatArray:
     v = speed.reshape(len(speed), -1)
-    runs = made_up_runs(SAMPLED, v, 0.0, collision_speed, active=np.ones(v.shape, dtype=bool))
+    runs = made_up_runs(
+        SAMPLED, v, 0.0, collision_speed, active=np.ones(v.shape, dtype=bool)
+    )
     return OPTIONAL_METRICS[name].function(runs, THRESHOLDS)
 
 
 @pytest.mark.parametrize("name", OPTIONAL_METRICS)
-def test_each_vehicle_counts_for_itself_to_the_bit_and_says_if_on_a_collision(name: str) -> None:
+def test_each_vehicle_counts_for_itself_to_the_bit_and_says_if_on_a_collision(
+    name: str,
+) -> None:
     speed = np.cumsum(default_rng(2).normal(size=(150, 7)), axis=0)
-    np.testing.assert_array_equal(of_speeds(name, speed)[4:5], of_speeds(name, speed[:, 4]))
+    np.testing.assert_array_equal(
+        of_speeds(name, speed)[4:5], of_speeds(name, speed[:, 4])
+    )
     in_collision = of_speeds(name, speed, collision_speed=3.0)
     assert OPTIONAL_METRICS[name].over_collisions or np.isnan(in_collision).all()
 
@@ -279,16 +327,31 @@ def test_each_vehicle_counts_for_itself_to_the_bit_and_says_if_on_a_collision(na
     [
         (Unsafe(), Outcome.COLLISION, -3.214, "collides at 3.21 m/s"),
         (Unsafe(keep=0.3), Outcome.COLLISION, -3.214, "collides at 3.21 m/s"),
-        (Unsafe(keep=0.3), Outcome.STOPPED, 0.041, "keeps 0.04 m of clearance, less than 0.3 m"),
+        (
+            Unsafe(keep=0.3),
+            Outcome.STOPPED,
+            0.041,
+            "keeps 0.04 m of clearance, less than 0.3 m",
+        ),
         (
             Unsafe(keep=0.3, contact=2.0),
             Outcome.PASSED,
             2.2999,
             "keeps 0.2999 m of clearance, less than 0.3 m",
         ),
-        (Unsafe(degree=1.4), Outcome.STOPPED, 0.8, "has a safety degree of 0.8 m, below 1.4 m"),
+        (
+            Unsafe(degree=1.4),
+            Outcome.STOPPED,
+            0.8,
+            "has a safety degree of 0.8 m, below 1.4 m",
+        ),
         (Unsafe(degree=1.4), Outcome.COLLISION, -2.0, "collides at 2.00 m/s"),
-        (Unsafe(below=1.4), Outcome.STOPPED, 0.8, "keeps 0.80 m of clearance, less than 1.4 m"),
+        (
+            Unsafe(below=1.4),
+            Outcome.STOPPED,
+            0.8,
+            "keeps 0.80 m of clearance, less than 1.4 m",
+        ),
         (
             Unsafe(below=0.3, contact=2.0),
             Outcome.PASSED,
@@ -323,7 +386,9 @@ def braked(speed: FloatArray, delay: float, step: float) -> SimulationRuns:
     columns = {
         "position": position[:, np.newaxis],
         "brake": np.ones((len(speed), 1)),
-        "pedal": (np.arange(len(speed)) * step >= delay - 1e-9)[:, np.newaxis].astype(float),
+        "pedal": (np.arange(len(speed)) * step >= delay - 1e-9)[:, np.newaxis].astype(
+            float
+        ),
     }
     return made_up_runs(step, speed[:, np.newaxis], **columns)
 
@@ -335,7 +400,9 @@ def test_a_stop_is_that_of_a_constant_deceleration_after_a_delay() -> None:
     speed, deceleration, delay, step = 100 / 3.6, 6.0, 0.2, 0.01
     times = np.arange(600) * step
     run = braked(
-        np.maximum(speed - deceleration * np.maximum(times - delay, 0.0), 0.0), delay, step
+        np.maximum(speed - deceleration * np.maximum(times - delay, 0.0), 0.0),
+        delay,
+        step,
     )
     metrics = {name: value(name, run) for name in STOPS}
     stop = speed**2 / (2 * deceleration)

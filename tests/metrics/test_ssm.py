@@ -33,11 +33,15 @@ DEVICE = (
 Rows = dict[str, dict[float, tuple[float, float, float]]]
 
 
-def vehicle(name: str, route: str, depart: float, place: float, speed: float, *, ego: bool) -> str:
+def vehicle(
+    name: str, route: str, depart: float, place: float, speed: float, *, ego: bool
+) -> str:
     """A vehicle that keeps its speed; that under test has the device, and brakes for who is
     ahead.
     """
-    params = "".join(f'<param key="{key}" value="{value}"/>' for key, value in DEVICE if ego)
+    params = "".join(
+        f'<param key="{key}" value="{value}"/>' for key, value in DEVICE if ego
+    )
     return (
         f'<vType id="t{name}" length="{LENGTH}" width="{WIDTH}" maxSpeed="{speed}" accel="8"'
         ' decel="9" tau="0.05" minGap="0" sigma="0" speedDev="0" jmIgnoreFoeProb="1"'
@@ -77,15 +81,23 @@ def simulate(
     )
     for name, *words in (net, run.split()):
         subprocess.run(
-            [program_of_sumo(name, "test"), *words], cwd=folder, check=True, capture_output=True
+            [program_of_sumo(name, "test"), *words],
+            cwd=folder,
+            check=True,
+            capture_output=True,
         )
     rows: Rows = defaultdict(dict)
     for step in ET.parse(folder / "fcd.xml").getroot():
         for row in step:
-            values = (float(row.attrib["x"]), float(row.attrib["y"]), float(row.attrib["speed"]))
+            values = (
+                float(row.attrib["x"]),
+                float(row.attrib["y"]),
+                float(row.attrib["speed"]),
+            )
             rows[row.attrib["id"]][float(step.attrib["time"])] = values
     return rows, {
-        row.attrib["ego"] + row.attrib["foe"]: row for row in ET.parse(folder / "ssm.xml").getroot()
+        row.attrib["ego"] + row.attrib["foe"]: row
+        for row in ET.parse(folder / "ssm.xml").getroot()
     }
 
 
@@ -102,7 +114,9 @@ def measured(name: str, run: SimulationRuns) -> float:
 
 
 @SLOW
-def test_behind_a_slower_car_ttc_and_drac_are_those_of_the_device(tmp_path: Path) -> None:
+def test_behind_a_slower_car_ttc_and_drac_are_those_of_the_device(
+    tmp_path: Path,
+) -> None:
     """Both divide the gap by the closing speed, and half its square by the gap, at the ends of
     steps.
     """
@@ -115,7 +129,9 @@ def test_behind_a_slower_car_ttc_and_drac_are_those_of_the_device(tmp_path: Path
         traffic.append(f'<route id="r{i}" edges="e{i}"/>')
         fast, slow, gap = rng.uniform(12, 30), rng.uniform(1, 10), rng.uniform(30, 80)
         traffic.append(vehicle(f"ego{i}", f"r{i}", 0, 50, fast, ego=True))
-        traffic.append(vehicle(f"foe{i}", f"r{i}", 0, 50 + LENGTH + gap, slow, ego=False))
+        traffic.append(
+            vehicle(f"foe{i}", f"r{i}", 0, 50 + LENGTH + gap, slow, ego=False)
+        )
     rows, conflicts = simulate(tmp_path, nodes, edges, traffic)
     for i in range(RUNS):
         ego, foe = shared(rows, f"ego{i}", f"foe{i}")

@@ -34,7 +34,9 @@ def throttle(study: Path) -> float:
     return float(system.ads.start(1, system.nominal, 0.05)[0].drive(None)[0])
 
 
-def test_beside_the_study_comes_before_the_working_directory(mine: Mine, folder: Path) -> None:
+def test_beside_the_study_comes_before_the_working_directory(
+    mine: Mine, folder: Path
+) -> None:
     Path("mine.py").write_text(CONSTANT.format(0.1))
     mine(CONSTANT.format(0.9))
     assert throttle(folder / "mine.toml") == 0.9
@@ -68,7 +70,8 @@ def test_an_error_of_an_installed_driving_system_has_its_line(
     study.write_text(f'extends = "smoke"\nname = "it"\n[ads]\n{ads}\n')
     line = len(code.splitlines())
     with pytest.raises(
-        UserCodeError, match=rf"raised in {where}: ZeroDivisionError.*bought\.py:{line}\)"
+        UserCodeError,
+        match=rf"raised in {where}: ZeroDivisionError.*bought\.py:{line}\)",
     ):
         throttle(study)
     del sys.modules["bought"]
@@ -79,7 +82,9 @@ def test_two_studies_with_modules_of_one_name_get_their_own_whatever_the_order(
 ) -> None:
     for place, value in (("a", 0.2), ("b", 0.4)):
         (tmp_path / place).mkdir()
-        (tmp_path / place / "mine.toml").write_text(f'extends = "smoke"\nname = "mine"\n{ADS}')
+        (tmp_path / place / "mine.toml").write_text(
+            f'extends = "smoke"\nname = "mine"\n{ADS}'
+        )
         (tmp_path / place / "mine.py").write_text(
             "from sibling import VALUE\n" + CONSTANT.format("VALUE")
         )
@@ -94,7 +99,9 @@ def test_a_module_that_was_edited_is_read_anew_and_so_is_what_it_imports(
     (folder / "sibling.py").write_text("VALUE = 0.2\n")
     mine("from sibling import VALUE\n" + CONSTANT.format("VALUE"))
     assert throttle(folder / "mine.toml") == 0.2
-    (folder / "sibling.py").write_text("VALUE = 0.6\n")  # as long as before, within the same second
+    (folder / "sibling.py").write_text(
+        "VALUE = 0.6\n"
+    )  # as long as before, within the same second
     assert throttle(folder / "mine.toml") == 0.6
 
 
@@ -107,8 +114,13 @@ def test_a_module_that_fails_can_be_corrected_and_does_not_see_a_file_named_like
     mine("import scipy\n" + CONSTANT.format(0.3))
 
 
-def test_a_lone_surrogate_in_an_error_of_the_user_can_be_printed(mine: Mine, folder: Path) -> None:
-    mine(SCALAR + "    def drive(self, seen):\n        raise ValueError('bad \\ud800 text')\n")
+def test_a_lone_surrogate_in_an_error_of_the_user_can_be_printed(
+    mine: Mine, folder: Path
+) -> None:
+    mine(
+        SCALAR
+        + "    def drive(self, seen):\n        raise ValueError('bad \\ud800 text')\n"
+    )
     assert run("check", str(folder / "mine.toml"), expect=1).stdout.encode()
 
 
@@ -142,7 +154,8 @@ def test_ctrl_c_passes(name: str, mine: Mine) -> None:
 def test_what_user_code_does_on_ctrl_c_stays(mine: Mine) -> None:
     handler = signal.getsignal(signal.SIGINT)
     own = (
-        "        import signal\n        signal.signal(signal.SIGINT, print)\n        return 0, 0\n"
+        "        import signal\n        signal.signal(signal.SIGINT, print)\n   "
+        "     return 0, 0\n"
     )
     system = mine(f"{SCALAR}    def drive(self, seen):\n{own}")
     try:
@@ -153,10 +166,15 @@ def test_what_user_code_does_on_ctrl_c_stays(mine: Mine) -> None:
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_a_command_is_interrupted_by_ctrl_c(name: str, mine: Mine, folder: Path) -> None:
+def test_a_command_is_interrupted_by_ctrl_c(
+    name: str, mine: Mine, folder: Path
+) -> None:
     mine(SCALAR + PRESSED.format(name))
     with handled_by_default(name):
-        assert "interrupted" in run("simulate", str(folder / "mine.toml"), expect=130).stderr
+        assert (
+            "interrupted"
+            in run("simulate", str(folder / "mine.toml"), expect=130).stderr
+        )
 
 
 def test_ctrl_c_waits_for_a_compiler() -> None:
@@ -172,7 +190,9 @@ def test_ctrl_c_waits_for_a_compiler() -> None:
     assert done == ["compiled"]
 
 
-def test_a_handler_that_was_not_set_from_python_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_handler_that_was_not_set_from_python_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(signal, "getsignal", lambda _: None)
     monkeypatch.setattr(signal, "signal", lambda *_: pytest.fail("set"))
     with defer_interrupts():
@@ -187,7 +207,10 @@ def take_streams() -> None:
     ("damage", "told"),
     [
         (take_streams, r"sys\.stdout or sys\.stderr to None"),
-        (lambda: os.close(this_process.descriptor), "closed descriptors of its process"),
+        (
+            lambda: os.close(this_process.descriptor),
+            "closed descriptors of its process",
+        ),
     ],
 )
 def test_a_process_without_streams_or_descriptors_is_an_error(
@@ -204,10 +227,13 @@ def test_what_user_code_tells_numpy_ends_with_its_call(mine: Mine) -> None:
     """The package divides by closing speeds of 0."""
     strict = "import numpy as np\n\nnp.seterr(all='raise')\n" + CONSTANT.format(0.2)
     strict = strict.replace(
-        "def drive(self, seen):\n", "def drive(self, seen):\n        np.seterr(all='raise')\n"
+        "def drive(self, seen):\n",
+        "def drive(self, seen):\n        np.seterr(all='raise')\n",
     )
     before = np.geterr()
-    expected = drive_and_score(system := mine(CONSTANT.format(0.2)), original_of(system))
+    expected = drive_and_score(
+        system := mine(CONSTANT.format(0.2)), original_of(system)
+    )
     found = drive_and_score(mine(strict), original_of(system))
     assert not [*differences(expected.results, found.results)]
     assert np.geterr() == before

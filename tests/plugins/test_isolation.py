@@ -86,7 +86,17 @@ def test_members_of_user_code_are_simulated_and_scored(six: None) -> None:
 
 @SLOW
 def test_members_of_user_code_are_searched_and_tabulated(six: None) -> None:
-    run("study", "six.toml", "--out", "out", "--runs", "1", "--evaluations", "20", "--quiet")
+    run(
+        "study",
+        "six.toml",
+        "--out",
+        "out",
+        "--runs",
+        "1",
+        "--evaluations",
+        "20",
+        "--quiet",
+    )
     solutions = load_runs("out").solutions
     assert set(solutions["algorithm"]) == {"nsga2", "Halving"}
     assert np.isfinite(solutions[["jerk", "mean_change"]].to_numpy()).all()
@@ -117,14 +127,17 @@ class Late(ScalarAds):
 @pytest.mark.parametrize(
     "command", ["rules late.toml --samples 1500", "study late.toml --out out --quiet"]
 )
-def test_a_state_that_shows_late_is_an_error_at_the_end(command: str, in_tmp: Path) -> None:
+def test_a_state_that_shows_late_is_an_error_at_the_end(
+    command: str, in_tmp: Path
+) -> None:
     Path("late.py").write_text(LATE)
     Path("late.toml").write_text(
         'extends = "smoke"\nname = "late"\n[ads]\nmodel = "late:Late"\n'
         '[search]\nalgorithms = ["rs"]\nruns = 1\nevaluations = 1500\n'
     )
     refused(
-        *command.split(), message=("when a worker simulated its first batch again", "late:Late")
+        *command.split(),
+        message=("when a worker simulated its first batch again", "late:Late"),
     )
     assert not [*Path().rglob("*.jsonl")], "nothing is continued"
 
@@ -136,7 +149,10 @@ HEAVY = np.where(np.arange(len(ORIGINAL)) == MASS, 1700.0, ORIGINAL)
 
 
 BRAKES = Pedals(
-    lambda seen: (np.where((np.arange(len(seen.speed)) > 0) & (seen.time > 1), 0.05, 1), 0)
+    lambda seen: (
+        np.where((np.arange(len(seen.speed)) > 0) & (seen.time > 1), 0.05, 1),
+        0,
+    )
 )
 """Full throttle, and hardly any for the light one of two."""
 
@@ -168,7 +184,9 @@ class Diverges(Vehicle):
         self._calls += 1
         result = self._inner.advance(prepared, state, command)
         return result._replace(
-            speed=np.where(self._is_heavy & (self._calls >= self.steps), self.speed, result.speed)
+            speed=np.where(
+                self._is_heavy & (self._calls >= self.steps), self.speed, result.speed
+            )
         )
 
 
@@ -178,19 +196,25 @@ USERS = checked_class(UserCode("vehicle.model = 'mine:Mine'", Diverges), Vehicle
 BOTH = np.stack([HEAVY, ORIGINAL])
 
 
-@pytest.mark.parametrize("vehicle", [Diverges(np.nan), *map(USERS, (np.nan, -3.0, 900.0))])
+@pytest.mark.parametrize(
+    "vehicle", [Diverges(np.nan), *map(USERS, (np.nan, -3.0, 900.0))]
+)
 def test_a_vehicle_that_diverges_after_its_own_collision_has_the_result_that_it_has_alone(
     vehicle: Vehicle,
 ) -> None:
     system = replace(NATIVE, ads=BRAKES, vehicle=vehicle)
     alone = drive_and_score(system, BOTH[:1])
     together = drive_and_score(system, BOTH)
-    assert len(drive_worst(system, BOTH).trace.time) > LENGTH, "the other vehicle drives longer"
+    assert len(drive_worst(system, BOTH).trace.time) > LENGTH, (
+        "the other vehicle drives longer"
+    )
     assert not [*differences(together.take([0]).results, alone.results)]
     assert alone.collided.all()
 
 
-@pytest.mark.parametrize("vehicle", [Diverges(np.nan, LENGTH - 1), USERS(-3.0, LENGTH - 1)])
+@pytest.mark.parametrize(
+    "vehicle", [Diverges(np.nan, LENGTH - 1), USERS(-3.0, LENGTH - 1)]
+)
 def test_a_vehicle_that_diverges_before_its_end_is_an_error_in_every_batch(
     vehicle: Vehicle,
 ) -> None:
@@ -199,7 +223,9 @@ def test_a_vehicle_that_diverges_before_its_end_is_an_error_in_every_batch(
             drive_and_score(replace(NATIVE, ads=BRAKES, vehicle=vehicle), settings)
 
 
-def test_a_module_beside_the_study_may_have_the_name_of_one_that_is_loaded(in_tmp: Path) -> None:
+def test_a_module_beside_the_study_may_have_the_name_of_one_that_is_loaded(
+    in_tmp: Path,
+) -> None:
     Path("random.py").write_text(
         "import random\n"
         "from safevar_sumo.ads.aeb import Aeb\n"
@@ -209,4 +235,6 @@ def test_a_module_beside_the_study_may_have_the_name_of_one_that_is_loaded(in_tm
     Path("mine.toml").write_text(
         'extends = "wear"\nname = "mine"\n[ads]\nmodel = "random:Mine"\nparameters = {}\n'
     )
-    assert json_of("simulate", "mine.toml")["numbers"]["f_safe"] == pytest.approx(1.16, abs=0.01)
+    assert json_of("simulate", "mine.toml")["numbers"]["f_safe"] == pytest.approx(
+        1.16, abs=0.01
+    )

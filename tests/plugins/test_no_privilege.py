@@ -40,7 +40,10 @@ FAST = ("crossing", "stop", "carla", "aeb", "fuzzy", "nsga2")
 
 
 def each(names: Iterable[str], *others: str) -> list[Any]:
-    return [pytest.param(name, *others, marks=() if name in FAST else SLOW) for name in names]
+    return [
+        pytest.param(name, *others, marks=() if name in FAST else SLOW)
+        for name in names
+    ]
 
 
 def copied(model: Any, folder: Path) -> str:
@@ -52,7 +55,9 @@ def copied(model: Any, folder: Path) -> str:
 
 def results_of(study: Study) -> Mapping[str, np.ndarray]:
     system = assemble(study)
-    found: Mapping[str, np.ndarray] = drive_and_score(system, drawn(system, 8, 2)).results
+    found: Mapping[str, np.ndarray] = drive_and_score(
+        system, drawn(system, 8, 2)
+    ).results
     return found
 
 
@@ -84,8 +89,18 @@ def test_a_scenario_in_a_users_file_is_the_same_alone_in_a_matrix_and_searched(
     key, one = next(iter(free.items()))
     middle = (one.lower + one.upper) / 2
     matrix = {"tests": [{"name": "it", "over": {key: [one.lower, middle]}}]}
-    assert_equal(with_scenario(name, name, matrix=matrix), with_scenario(name, own, matrix=matrix))
-    over = {key: {"lower": middle, "upper": one.upper, "original": one.upper, "unit": one.unit}}
+    assert_equal(
+        with_scenario(name, name, matrix=matrix),
+        with_scenario(name, own, matrix=matrix),
+    )
+    over = {
+        key: {
+            "lower": middle,
+            "upper": one.upper,
+            "original": one.upper,
+            "unit": one.unit,
+        }
+    }
     base = load_study(
         BASES.get(name, "wear"),
         matrix=None,
@@ -118,22 +133,32 @@ def test_what_a_search_leaves_out_is_what_a_class_declares_a_shipped_one_as_a_us
         over = {"speed": {}, "visibility": {"lower": 0.5}}
         for tables in (
             {"scenario": {"model": model, "over": over}, "matrix": None},
-            {"scenario": {"over": over}, "matrix": {"tests": [{"name": "it", "model": model}]}},
+            {
+                "scenario": {"over": over},
+                "matrix": {"tests": [{"name": "it", "model": model}]},
+            },
         ):
             found = load_study("wear", **tables, encounters="ranges").ranges
             speed = found["speed"]
-            assert (speed.unit, speed.original, speed.lower, speed.upper) == domain, model
+            assert (speed.unit, speed.original, speed.lower, speed.upper) == domain, (
+                model
+            )
             assert (found["visibility"].lower, found["visibility"].upper) == (0.5, 1.5)
     with pytest.raises(
-        InputError, match=r"scenario\.over\.pace: no scenario or weather declares a range of pace"
+        InputError,
+        match=r"scenario\.over\.pace: no scenario or weather declares a range of pace",
     ):
-        load_study("wear", matrix=None, scenario={"model": "deer:Deer", "over": {"pace": {}}})
+        load_study(
+            "wear", matrix=None, scenario={"model": "deer:Deer", "over": {"pace": {}}}
+        )
 
 
 @pytest.mark.parametrize(
     "name", sorted(SCENARIOS.keys() - {"recorded_tracks", "stop"})
 )  # which have no such scenes
-def test_benign_scenes_of_a_scenario_in_a_users_file_are_the_same(name: str, in_tmp: Path) -> None:
+def test_benign_scenes_of_a_scenario_in_a_users_file_are_the_same(
+    name: str, in_tmp: Path
+) -> None:
     names = []
     for model in (name, copied(SCENARIOS[name], in_tmp)):
         study = with_scenario(name, model)
@@ -141,7 +166,9 @@ def test_benign_scenes_of_a_scenario_in_a_users_file_are_the_same(name: str, in_
     assert names[0] == names[1] != []
 
 
-@pytest.mark.parametrize(("name", "table"), [*each(VEHICLES, "vehicle"), *each(ADS, "ads")])
+@pytest.mark.parametrize(
+    ("name", "table"), [*each(VEHICLES, "vehicle"), *each(ADS, "ads")]
+)
 def test_a_vehicle_and_a_driving_system_in_a_users_file_are_the_same(
     name: str, table: str, in_tmp: Path
 ) -> None:
@@ -153,7 +180,9 @@ def test_a_vehicle_and_a_driving_system_in_a_users_file_are_the_same(
         ),
         None,
     )
-    ours = load_study(base or "wear", matrix=None, **{} if base else {table: {"model": name}})
+    ours = load_study(
+        base or "wear", matrix=None, **{} if base else {table: {"model": name}}
+    )
     own = replace(getattr(ours, table), model=copied({**VEHICLES, **ADS}[name], in_tmp))
     assert_equal(ours, replace(ours, **{table: own}))
 
@@ -182,7 +211,9 @@ def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(
 ) -> None:
     """Random numbers go with an algorithm's name, so the copy has it, too."""
     module, _, class_ = copied(ALGORITHMS[name], in_tmp).partition(":")
-    (in_tmp / "named.py").write_text(f"from {module} import {class_}\n\n{name} = {class_}\n")
+    (in_tmp / "named.py").write_text(
+        f"from {module} import {class_}\n\n{name} = {class_}\n"
+    )
     assert_same_solutions(short("smoke", name), short("smoke", f"named:{name}"), in_tmp)
 
 
@@ -191,13 +222,17 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
     shipped = {**METRICS, **OPTIONAL_METRICS}
     own_functions = [inspect.unwrap(one.function) for one in shipped.values()]
     functions = {inspect.getfile(one): one for one in own_functions}
-    modules = [copied(function, in_tmp).partition(":")[0] for function in functions.values()]
+    modules = [
+        copied(function, in_tmp).partition(":")[0] for function in functions.values()
+    ]
     lines = [
         "from msgspec.structs import replace",
         *(f"from {module} import *" for module in modules),
         "from safevar_sumo.metrics import Measure",
     ]
-    lines.append("known = [one for one in list(globals().values()) if isinstance(one, Measure)]")
+    lines.append(
+        "known = [one for one in list(globals().values()) if isinstance(one, Measure)]"
+    )
     lines.append(
         "globals().update({one.name: replace(one, name='own_' + one.name) for one in known})"
     )
@@ -213,15 +248,21 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
     objectives = ["named:tit", "f_safe", "named:own_f_diff"]
     system = assemble(
         load_study(
-            "smoke", metrics={"also": [*OPTIONAL_METRICS, *own]}, search={"objectives": objectives}
+            "smoke",
+            metrics={"also": [*OPTIONAL_METRICS, *own]},
+            search={"objectives": objectives},
         )
     )
     found = drive_and_score(system, drawn(system, 8, 2))
     for name in shipped:
-        assert_array_equal(found.column(f"own_{name}"), found.column(name), err_msg=name)
+        assert_array_equal(
+            found.column(f"own_{name}"), found.column(name), err_msg=name
+        )
     assert_array_equal(found.column("own_f_diff"), found.f_diff)
     values = system.measuring.scoring.values(found)
-    assert_array_equal(values, np.stack([-found.column("tit"), found.f_safe, found.f_diff], axis=1))
+    assert_array_equal(
+        values, np.stack([-found.column("tit"), found.f_safe, found.f_diff], axis=1)
+    )
     assert not [*trials.try_original(system, drive_all(system, drawn(system, 8, 2)))]
 
 
@@ -231,10 +272,15 @@ def test_no_module_asks_whether_something_is_a_shipped_class_of_another_one() ->
         for family in (SCENARIOS, VEHICLES, ADS, ALGORITHMS)
         for model in family.values()
     }
-    questions = re.compile(rf"is(?:instance|subclass)\([^:]*?, [^:]*?\b({'|'.join(shipped)})\b")
-    assert questions.findall("isinstance(scenario, Crossing | Stop)"), "what is looked for"
+    questions = re.compile(
+        rf"is(?:instance|subclass)\([^:]*?, [^:]*?\b({'|'.join(shipped)})\b"
+    )
+    assert questions.findall("isinstance(scenario, Crossing | Stop)"), (
+        "what is looked for"
+    )
     files = {
-        file: questions.findall(file.read_text()) for file in (ROOT / "safevar_sumo").rglob("*.py")
+        file: questions.findall(file.read_text())
+        for file in (ROOT / "safevar_sumo").rglob("*.py")
     }
     asked = [(file, name) for file, names in files.items() for name in names]
     assert [(file, name) for file, name in asked if shipped[name] != file] == []

@@ -34,7 +34,11 @@ def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
     choose = batches.choose_batches
 
     def choose_batches(study: Study, selection: Selection) -> Batches:
-        return Batches(100, True, False) if study.name == "made-up" else choose(study, selection)
+        return (
+            Batches(100, True, False)
+            if study.name == "made-up"
+            else choose(study, selection)
+        )
 
     monkeypatch.setattr(batches, "choose_batches", choose_batches)
 
@@ -45,7 +49,9 @@ def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) ->
     smoke = assemble(load_study("smoke"))
     for module in (evaluator, by_criterion, between, scope):
         monkeypatch.setattr(
-            module, "assemble", lambda study: smoke if study.name == "made-up" else assemble(study)
+            module,
+            "assemble",
+            lambda study: smoke if study.name == "made-up" else assemble(study),
         )
     system_of = batches.system_of
     for module in (evaluator, batches):
@@ -63,11 +69,16 @@ Region = Callable[[FloatArray], BoolArray]
 def made_up_study(n: int) -> Study:
     smoke = load_study("smoke", scenario={"over": False, "margin": 0.3})
     rows = {
-        name: CharacteristicTable(unit="N m", original=ORIGINAL, lower=LOWER, upper=UPPER)
+        name: CharacteristicTable(
+            unit="N m", original=ORIGINAL, lower=LOWER, upper=UPPER
+        )
         for name in "abcdefghijkl"[:n]
     }
     return replace(
-        smoke, name="made-up", spread={}, vehicle=replace(smoke.vehicle, characteristics=rows)
+        smoke,
+        name="made-up",
+        spread={},
+        vehicle=replace(smoke.vehicle, characteristics=rows),
     )
 
 
@@ -96,7 +107,9 @@ class Plant(InlinePool):
         collides = np.asarray(self._region(settings), dtype=bool)
         fails = self._failing(settings)
         collides &= ~fails
-        degree = np.where(fails, np.nan, np.where(collides, -1.0, self._degree(settings)))
+        degree = np.where(
+            fails, np.nan, np.where(collides, -1.0, self._degree(settings))
+        )
         self.seen |= {row.tobytes() for row in settings}
         return made_up_evaluations(
             degree,
@@ -143,7 +156,9 @@ def two_islands(settings: FloatArray) -> BoolArray:
 
 def diagonal_band(settings: FloatArray) -> BoolArray:
     """Where a - b is from 6 to 8: (16 - 4) / 2 = 6 of 100, none on an axis through the original."""
-    return (settings[:, 0] - settings[:, 1] >= 6) & (settings[:, 0] - settings[:, 1] <= 8)
+    return (settings[:, 0] - settings[:, 1] >= 6) & (
+        settings[:, 0] - settings[:, 1] <= 8
+    )
 
 
 @pytest.fixture
@@ -154,7 +169,9 @@ def ahead(request: pytest.FixtureRequest, in_tmp: Path) -> Study:
 
 
 @pytest.fixture(scope="module")
-def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """Where the module's `STUDY` and its results are."""
     folder = tmp_path_factory.mktemp("tiny")
     (folder / "tiny.toml").write_text(request.module.STUDY)

@@ -20,7 +20,14 @@ from click.testing import CliRunner
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.cli.program import commands
-from safevar_sumo.questions.answer import Answer, Column, Wide, contents, tabulate, with_interval
+from safevar_sumo.questions.answer import (
+    Answer,
+    Column,
+    Wide,
+    contents,
+    tabulate,
+    with_interval,
+)
 from safevar_sumo.questions.ask import QUESTIONS, Question, find_question
 from safevar_sumo.questions.permit.answer import SHOWN_WHOLE
 from safevar_sumo.questions.render import MAX_LINES, MAX_ROWS
@@ -43,7 +50,11 @@ ANSWER = Answer(
     question="parts",
     study=load_study("smoke"),
     verdict="Two parts <are> old.",
-    numbers={"probability": np.float64(0.25), "interval": (0.1, np.nan), "driven": True},
+    numbers={
+        "probability": np.float64(0.25),
+        "interval": (0.1, np.nan),
+        "driven": True,
+    },
     tables={"parts": tabulate("Parts & ages", COLUMNS, ROWS)},
 )
 
@@ -51,9 +62,16 @@ ANSWER = Answer(
 def test_json_names_units_and_meanings_and_has_no_value_where_none_is_defined() -> None:
     answer = json.loads(ANSWER.render("json"))
     assert list(answer) == ["question", "study", "verdict", "numbers", "tables"]
-    assert answer["numbers"] == {"probability": 0.25, "interval": [0.1, None], "driven": True}
+    assert answer["numbers"] == {
+        "probability": 0.25,
+        "interval": [0.1, None],
+        "driven": True,
+    }
     table = answer["tables"]["parts"]
-    assert table["columns"]["length_low"] == {"unit": "m", "meaning": "lower end of length"}
+    assert table["columns"]["length_low"] == {
+        "unit": "m",
+        "meaning": "lower end of length",
+    }
     assert table["rows"][0] == {
         "part": "a < b & 1 %",
         "length": 1.234,
@@ -75,7 +93,9 @@ def test_readers_see_units_and_intervals_and_no_column_without_values() -> None:
 
 def test_readers_are_told_of_a_table_that_is_too_long_for_them() -> None:
     frame = tabulate(
-        "Many", {"number": Column("", "it")}, [(number,) for number in range(MAX_ROWS + 1)]
+        "Many",
+        {"number": Column("", "it")},
+        [(number,) for number in range(MAX_ROWS + 1)],
     )
     long = replace(ANSWER, tables={**ANSWER.tables, "many": frame})
     for form in ("text", "html"):
@@ -99,7 +119,11 @@ def test_one_screen_has_as_many_rows_as_there_are_lines_for() -> None:
     assert f"│ {last + 1} " not in text
     assert "same" in answer.render("text", details=True)
     alone = answer.render("text", "long").splitlines()
-    assert len(alone) <= MAX_LINES < len(answer.render("text", "long", details=True).splitlines())
+    assert (
+        len(alone)
+        <= MAX_LINES
+        < len(answer.render("text", "long", details=True).splitlines())
+    )
     assert alone[-1].endswith("more rows: --details.")
 
 
@@ -108,14 +132,20 @@ def test_a_list_of_up_to_50_cars_is_whole(number: int, shown: int) -> None:
     table = tabulate("Cars", {"car": ""}, [[f"<{row}>"] for row in range(number)])
     table.attrs["shown_whole"] = SHOWN_WHOLE
     answer = Answer(
-        question="", study=load_study("smoke"), verdict="", numbers={}, tables={"cars": table}
+        question="",
+        study=load_study("smoke"),
+        verdict="",
+        numbers={},
+        tables={"cars": table},
     )
     text = answer.render("text")
     assert len(re.findall("<[0-9]+>", text)) == shown
     assert ("39 more rows: --details" in text) == (number == 51)
 
 
-def test_one_screen_says_how_many_sentences_it_leaves_out_and_none_of_what_is_valid() -> None:
+def test_one_screen_says_how_many_sentences_it_leaves_out_and_none_of_what_is_valid() -> (
+    None
+):
     sentences = [f"Sentence {number} is here." for number in range(5)]
     valid = "Only vehicles that satisfy the study's constraints count: a below b."
     tested = f"All corners. How they were chosen. {valid}"
@@ -153,11 +183,31 @@ def test_a_long_table_has_a_column_for_each_value_and_its_intervals() -> None:
     frame = tabulate(
         "Lengths", columns, rows, wide=Wide(["part"], "by", ["length"], "to {:g} km/h")
     )
-    page = replace(ANSWER, tables={"lengths": frame}).render("html").partition("<details>")[0]
-    assert re.findall("<th.*?>([^<]*)</th>", page) == ["part", "to 20 km/h", "to 30 km/h"]
-    assert re.findall("<td.*?>([^<]*)</td>", page) == ["a", "1 to 2", "1.5", "b", "up to 2", "-"]
+    page = (
+        replace(ANSWER, tables={"lengths": frame})
+        .render("html")
+        .partition("<details>")[0]
+    )
+    assert re.findall("<th.*?>([^<]*)</th>", page) == [
+        "part",
+        "to 20 km/h",
+        "to 30 km/h",
+    ]
+    assert re.findall("<td.*?>([^<]*)</td>", page) == [
+        "a",
+        "1 to 2",
+        "1.5",
+        "b",
+        "up to 2",
+        "-",
+    ]
     assert (
-        len(replace(ANSWER, tables={"lengths": frame}).to_dict()["tables"]["lengths"]["rows"]) == 4
+        len(
+            replace(ANSWER, tables={"lengths": frame}).to_dict()["tables"]["lengths"][
+                "rows"
+            ]
+        )
+        == 4
     )
 
 
@@ -165,7 +215,9 @@ def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
     page, latex = ANSWER.render("html"), ANSWER.render("latex")
     assert "<p>Two parts &lt;are&gt; old.</p>" in page
     assert ">a &lt; b &amp; 1 %</td>" in page
-    assert '<td data-head="length [m]">' in page, "on a phone a cell carries its heading"
+    assert '<td data-head="length [m]">' in page, (
+        "on a phone a cell carries its heading"
+    )
     assert page == ANSWER._repr_html_()
     assert r"a < b \& 1 \%" in latex
     assert r"c\_d" in latex
@@ -187,11 +239,30 @@ def test_no_control_character_of_a_name_reaches_a_reader(form: str) -> None:
 
 
 def test_a_spreadsheet_calculates_no_cell_of_a_csv() -> None:
-    cells = ["=1+1", "@SUM(A1)", "+cmd", "-2+3", "\t=1", "\r=1", "-2.5e3", "+4", "-inf", "a=1"]
+    cells = [
+        "=1+1",
+        "@SUM(A1)",
+        "+cmd",
+        "-2+3",
+        "\t=1",
+        "\r=1",
+        "-2.5e3",
+        "+4",
+        "-inf",
+        "a=1",
+    ]
     names = tabulate("Names", {"name": Column("", "it")}, [(cell,) for cell in cells])
     printed = replace(ANSWER, tables={"names": names}).render("csv")
     cells_there = pd.read_csv(io.StringIO(printed), dtype=str)["name"].tolist()
-    assert cells_there == ["'=1+1", "'@SUM(A1)", "'+cmd", "'-2+3", "'\t=1", "'?=1", *cells[6:]]
+    assert cells_there == [
+        "'=1+1",
+        "'@SUM(A1)",
+        "'+cmd",
+        "'-2+3",
+        "'\t=1",
+        "'?=1",
+        *cells[6:],
+    ]
 
 
 def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
@@ -200,18 +271,23 @@ def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
     remarks = tabulate(
         "Remarks", {"table": Column("", "table"), "remark": Column("", "remark")}, rows
     )
-    answer = replace(ANSWER, tables={**ANSWER.tables, "others": other, "remarks": remarks}).only(
-        "parts"
-    )
+    answer = replace(
+        ANSWER, tables={**ANSWER.tables, "others": other, "remarks": remarks}
+    ).only("parts")
     assert list(answer.tables) == ["parts", "remarks"]
     assert [*answer.tables["remarks"]["remark"]] == ["one is old", "they are made up"]
     long = tabulate(
-        "Remarks", {"remark": Column("", "remark")}, [("All of them are made up. " * 5,)]
+        "Remarks",
+        {"remark": Column("", "remark")},
+        [("All of them are made up. " * 5,)],
     )
-    assert "made up. \n" in replace(ANSWER, tables={"remarks": long}).render("text", details=True)
+    assert "made up. \n" in replace(ANSWER, tables={"remarks": long}).render(
+        "text", details=True
+    )
     assert "Others" not in ANSWER.render("latex", "parts")
     others = replace(
-        answer, tables={**answer.tables, "remarks": remarks[remarks["table"] == "others"]}
+        answer,
+        tables={**answer.tables, "remarks": remarks[remarks["table"] == "others"]},
     )
     assert r"\noindent{\footnotesize one is old\par}" in answer.render("latex"), (
         "no table, whose label would repeat"
@@ -227,7 +303,9 @@ def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
 
 def test_readers_see_folded_tables_only_if_they_ask() -> None:
     other = tabulate("Others", {"name": Column("", "it")}, [("none",)])
-    answer = replace(ANSWER, tables={**ANSWER.tables, "others": other}, folded=("others",))
+    answer = replace(
+        ANSWER, tables={**ANSWER.tables, "others": other}, folded=("others",)
+    )
     for form in ("text", "latex", "html"):
         assert "Others" not in answer.render(form, details=True)
         assert "Others" in answer.render(form, "others")
@@ -237,7 +315,9 @@ def test_readers_see_folded_tables_only_if_they_ask() -> None:
 
 def test_a_label_is_that_of_one_study_question_table_and_command() -> None:
     def label(**changes: Any) -> str:
-        (found,) = re.findall(r"\\label\{(.*)\}", replace(ANSWER, **changes).render("latex"))
+        (found,) = re.findall(
+            r"\\label\{(.*)\}", replace(ANSWER, **changes).render("latex")
+        )
         return found
 
     other = sv.load_study("rain")
@@ -273,7 +353,9 @@ def test_an_unknown_key_is_refused_with_the_nearest() -> None:
 
 
 def test_every_question_is_called_by_its_name() -> None:
-    assert [find_question(name) for name in QUESTIONS] == [getattr(sv, name) for name in QUESTIONS]
+    assert [find_question(name) for name in QUESTIONS] == [
+        getattr(sv, name) for name in QUESTIONS
+    ]
 
 
 def test_the_question_that_the_manual_adds_from_outside(
@@ -298,11 +380,15 @@ def test_the_question_that_the_manual_adds_from_outside(
         "0",
         message=("--samples: 0", "a whole number from 1 to 100,000,000"),
     )
-    answer = json.loads(CliRunner().invoke(commands, [*command, "--format", "json"]).stdout)
+    answer = json.loads(
+        CliRunner().invoke(commands, [*command, "--format", "json"]).stdout
+    )
     assert answer["question"] == name
     rows = answer["tables"]["ends"]["rows"]
     assert len(rows) == 2 * len(load_study("smoke").vehicle.characteristics)
-    assert answer["numbers"]["unsafe_ends"] == sum(row["safety_degree"] < 2.2 for row in rows)
+    assert answer["numbers"]["unsafe_ends"] == sum(
+        row["safety_degree"] < 2.2 for row in rows
+    )
 
 
 def test_a_printed_command_asks_the_same() -> None:
@@ -317,7 +403,9 @@ def test_a_printed_command_asks_the_same() -> None:
         "margin": 0.5,
         "fits": fits,
     }
-    typed = shlex.split(ask.command_line(["its results"], {"point": "CPNA, night"}, values))
+    typed = shlex.split(
+        ask.command_line(["its results"], {"point": "CPNA, night"}, values)
+    )
     assert typed[:5] == ["python", "-m", "safevar_sumo", "tolerance", "its results"]
     assert "--fits" not in typed
     command = commands.get_command(None, "tolerance")  # type: ignore[arg-type]
@@ -328,15 +416,23 @@ def test_a_printed_command_asks_the_same() -> None:
 
 def test_a_change_has_no_share_of_an_original_that_is_0() -> None:
     changes = {"recognition_delay": 0.1, "mass": 2644.4}
-    texts = change_texts(CharacteristicSet.of(load_study("sun", encounters="ranges")), changes)
+    texts = change_texts(
+        CharacteristicSet.of(load_study("sun", encounters="ranges")), changes
+    )
     assert texts == ["mass 2404 -> 2644 kg (+10.0 %)", "recognition_delay 0 -> 0.100 s"]
 
 
 def test_a_change_over_decades_or_next_to_the_original_is_no_other_value() -> None:
     items = CharacteristicSet.of(load_study("sun"))
-    mass = replace(items.members[items.names.index("mass")], original=1e-9, lower=0, upper=0.1)
+    mass = replace(
+        items.members[items.names.index("mass")], original=1e-9, lower=0, upper=0.1
+    )
     texts = (change_texts([mass], {"mass": value}) for value in (3.2e-6, 0.051, 1.1e-9))
-    assert [text.split(" -> ")[1].split()[0] for [text] in texts] == ["3.2e-06", "0.051", "1.1e-09"]
+    assert [text.split(" -> ")[1].split()[0] for [text] in texts] == [
+        "3.2e-06",
+        "0.051",
+        "1.1e-09",
+    ]
 
 
 def test_limits_are_rounded_to_the_safe_side() -> None:

@@ -35,8 +35,13 @@ def test_a_bar_shows_where_its_ranges_are_in_the_domain() -> None:
     inside = WIDTH - HEIGHT
     found = {
         name: (float(x), float(w))
-        for name, x, w in re.findall(r'class="(\w+)" x="(.*?)" .*?width="(.*?)"', worn.svg)
+        for name, x, w in re.findall(
+            r'class="(\w+)" x="(.*?)" .*?width="(.*?)"', worn.svg
+        )
     }
     assert found["together"] == (HEIGHT / 2 + inside / 2, inside / 2)
-    assert found["alone"] == (round(HEIGHT / 2 + inside / 4, 1), round(inside * 0.75, 1))
+    assert found["alone"] == (
+        round(HEIGHT / 2 + inside / 4, 1),
+        round(inside * 0.75, 1),
+    )
     assert "together" not in undefined.svg

@@ -60,7 +60,9 @@ def test_a_search_between_the_tests_finds_what_no_test_shows(ahead: Study) -> No
     assert speed == round(speed, 2)
 
 
-def test_an_encounter_between_counts_only_where_the_original_is_safe(ahead: Study) -> None:
+def test_an_encounter_between_counts_only_where_the_original_is_safe(
+    ahead: Study,
+) -> None:
     own = model_of(ahead, keep=0.3)
     worn = own.characteristics.setting({"sensorLatency": 0.4})
     for new_car, counts in ((own.unsafe, True), (Unsafe(keep=99.0), False)):
@@ -83,7 +85,9 @@ def test_a_scope_names_a_range_only_where_it_was_driven(
     text = f'[[matrix.tests]]\nname = "A"\nparameters = {{ test = "CPNA" }}\nover = {{ {over} }}\n'
     if "target" in over:
         text = text.replace("CPNA", "CPFA")
-    Path("own.toml").write_text(f'extends = "wear"\nname = "own"\ntitle = "Own"\n{text}')
+    Path("own.toml").write_text(
+        f'extends = "wear"\nname = "own"\ntitle = "Own"\n{text}'
+    )
     assert said in scope_of(load_study("own.toml"), between=between)
 
 
@@ -93,7 +97,11 @@ def test_a_scope_names_a_range_only_where_it_was_driven(
 def test_more_parameter_sets_never_widen_limits_which_hold_between_the_tests(
     ahead: Study, name: str
 ) -> None:
-    names = "treadDepth,sensorLatency" if name == "ahead.toml" else "tireFric,maxBrakeTorque"
+    names = (
+        "treadDepth,sensorLatency"
+        if name == "ahead.toml"
+        else "tireFric,maxBrakeTorque"
+    )
     options = ("--characteristics", names)
     rows = [
         json_of("tolerance", name, *options, "--fits", fits)["tables"]["limits"]["rows"]
@@ -134,13 +142,20 @@ def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]], fits: int) -
 
 @SLOW
 @pytest.mark.usefixtures("few_simulations")
-def test_a_set_in_which_the_original_is_unsafe_is_named_with_its_test(ahead: Study) -> None:
+def test_a_set_in_which_the_original_is_unsafe_is_named_with_its_test(
+    ahead: Study,
+) -> None:
     text = Path("ahead.toml").read_text()
     spread = '[spread]\n"vehicle.parameters.tyre_friction" = [1.079, 0.2]\n'
     Path("slippery.toml").write_text(f"{text}{spread}".replace('"ahead"', '"slippery"'))
     study = load_study("slippery.toml")
     answer = tolerance.compute(
-        study, Evaluator(study, InlinePool(), verified=0), characteristics=("treadDepth",)
+        study,
+        Evaluator(study, InlinePool(), verified=0),
+        characteristics=("treadDepth",),
     )
-    assert "With the original vehicle itself the car hits a pedestrian ahead" in answer.verdict
+    assert (
+        "With the original vehicle itself the car hits a pedestrian ahead"
+        in answer.verdict
+    )
     assert "(parameter set 1): there no limit is claimed." in answer.verdict

@@ -45,7 +45,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, coarse: None) -> Pat
 
 @pytest.mark.parametrize(
     "text",
-    ["collision", "below=0.3", "safety_degree < 4.75", "safety_degree < -1.5", "hardest >= 9"],
+    [
+        "collision",
+        "below=0.3",
+        "safety_degree < 4.75",
+        "safety_degree < -1.5",
+        "hardest >= 9",
+    ],
 )
 def test_the_text_of_a_criterion_is_the_criterion(text: str) -> None:
     assert str(Unsafe.parse(text)) == text
@@ -101,7 +107,9 @@ def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
         < int(counts[2])
         == ((solutions["hardest"] > 6.8) | (solutions["outcome"] == "collision")).sum()
     )
-    assert re.search(r"fewest that were found, the vehicle has hardest [\d.]+", studied["verdict"])
+    assert re.search(
+        r"fewest that were found, the vehicle has hardest [\d.]+", studied["verdict"]
+    )
     ask = ("--ask", "risk --samples 64", *criterion)
     run("report", "results", "--out", "page.html", *ask)
     assert "--unsafe &#39;hardest &gt; 6.8&#39;" in (folder / "page.html").read_text()
@@ -118,7 +126,11 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
     one question asks.
     """
     search = {"algorithms": ["rs"], "population": 10, "evaluations": 40, "runs": 1}
-    test = {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [10, 20, 40]}}
+    test = {
+        "name": "CPFA",
+        "parameters": {"test": "CPFA"},
+        "over": {"speed": [10, 20, 40]},
+    }
     matrix = {"aggregate": "worst", "tests": [test]}
     searched(load_study("wear", search=search, matrix=matrix), in_tmp / "results")
     stages = []
@@ -134,11 +146,16 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
     own = "rules --samples 64 --unsafe below=0.9"
     asked = ("--ask", "rules --samples 64", "--ask", "rules --samples 32", "--ask", own)
     run("evidence", "results", "--out", "pack.zip", *asked, "--unsafe", "drac > 5")
-    assert stages.count(STAGE) == 2, "to choose questions, and for all answers and the page"
+    assert stages.count(STAGE) == 2, (
+        "to choose questions, and for all answers and the page"
+    )
     with zipfile.ZipFile("pack.zip") as pack:
         (name,) = (name for name in pack.namelist() if name.endswith("answers.json"))
         packed = json.loads(pack.read(name))[-1]
-    assert packed["numbers"] == json_of(*own.replace("rules", "rules results").split())["numbers"]
+    assert (
+        packed["numbers"]
+        == json_of(*own.replace("rules", "rules results").split())["numbers"]
+    )
     assert json_of("verify", "pack.zip")["numbers"]["passed"]
 
 
@@ -148,11 +165,12 @@ def test_an_undefined_measure_is_counted(folder: Path) -> None:
         HARDEST_BRAKING.replace("return np.where", "return np.nan * np.where")
     )
     (folder / "mine.toml").write_text(STUDY.replace("hardest_braking", "nowhere"))
-    verdict = json_of("risk", "mine.toml", "--samples", "64", "--unsafe", "hardest > 6.8")[
-        "verdict"
-    ]
+    verdict = json_of(
+        "risk", "mine.toml", "--samples", "64", "--unsafe", "hardest > 6.8"
+    )["verdict"]
     (counts,) = re.findall(
-        r"hardest is undefined, without a collision, in ([\d,]+) of ([\d,]+) simulated", verdict
+        r"hardest is undefined, without a collision, in ([\d,]+) of ([\d,]+) simulated",
+        verdict,
     )
     undefined, simulated = (int(text.replace(",", "")) for text in counts)
     assert 0 < undefined < simulated, "some of all collide"
@@ -171,7 +189,9 @@ def test_a_clearance_is_between_bumpers_where_the_degree_is_between_middles() ->
     assert below.of(runs)[0]
     assert below.robustness(runs)[0] == pytest.approx(clearance - 0.5)
     assert below.value(below.robustness(runs)[0]) == pytest.approx(clearance)
-    assert evaluator.checked(Unsafe.parse("safety_degree < 0.5")).of(runs).tolist() == [False]
+    assert evaluator.checked(Unsafe.parse("safety_degree < 0.5")).of(runs).tolist() == [
+        False
+    ]
 
 
 @SLOW
@@ -179,5 +199,7 @@ def test_a_stated_clearance_breaks_a_limit_as_the_margin_does() -> None:
     asked = {"limits": ("decel >= 4.7",), "characteristics": ("decel",), "quick": True}
     for criterion in ({"unsafe": "below=0.3"}, {"margin": 0.3}):
         answer = sv.tolerance("native", **asked, **criterion)
-        assert answer.verdict.partition("Do not release: ")[2].startswith("decel 4.7 m/s^2: ")
+        assert answer.verdict.partition("Do not release: ")[2].startswith(
+            "decel 4.7 m/s^2: "
+        )
         assert "less than 0.3 m from a standing vehicle" in answer.verdict

@@ -22,7 +22,9 @@ tau = { meaning = "", measurement = "" }
 
 
 def rows_of(study: str) -> dict[str, Any]:
-    rows = json_of("list", "characteristics", study)["tables"]["characteristics"]["rows"]
+    rows = json_of("list", "characteristics", study)["tables"]["characteristics"][
+        "rows"
+    ]
     return {row["name"]: row for row in rows}
 
 
@@ -30,11 +32,20 @@ def test_texts_of_a_study_are_listed_and_affect_no_evaluation(tmp_path: Path) ->
     file = tmp_path / "own.toml"
     file.write_text(OWN)
     rows = rows_of(str(file))
-    own = {"short_name": "towed load", "measurement": "weighbridge", "remedy": "leave the trailer"}
-    assert rows["mass"].items() >= {**own, "unit": "kg", "lower": 1300, "upper": 2100}.items()
+    own = {
+        "short_name": "towed load",
+        "measurement": "weighbridge",
+        "remedy": "leave the trailer",
+    }
+    assert (
+        rows["mass"].items()
+        >= {**own, "unit": "kg", "lower": 1300, "upper": 2100}.items()
+    )
     assert rows["tau"]["short_name"] == "tau", "without any text, its key is its name"
     printed = run("list", "characteristics", str(file)).stdout
     assert "weighbridge" in printed
     assert "trailer" in printed
-    keys = [evaluation_keys(tables_of(read_study(name))) for name in ("native", str(file))]
+    keys = [
+        evaluation_keys(tables_of(read_study(name))) for name in ("native", str(file))
+    ]
     assert keys[0] == keys[1]

@@ -55,7 +55,9 @@ def car(coarse: None, in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return STUDY.replace("models:Wall", "cars:Car")
 
 
-def rest(decel: object, delay: object, speed: object = 15.0, gap: float = 25.0) -> pd.Series:
+def rest(
+    decel: object, delay: object, speed: object = 15.0, gap: float = 25.0
+) -> pd.Series:
     """What is left in front of the wall [m]."""
     return gap - speed * (0.5 + delay) - np.square(speed) / 2 / decel
 
@@ -80,9 +82,14 @@ def test_cars_may_drive_at_the_speeds_of_the_formula(car: str) -> None:
         {"old": np.nan, "worn": up_to, "new": new}, nan_ok=True
     )
     assert rows["verdict"].to_dict() == {"old": "stop", "worn": "up to", "new": "drive"}
-    after = {"decel": permitted(8.0, 0.25 + LATENESS), "delay": permitted(5.0 - ERROR, 0.0)}
+    after = {
+        "decel": permitted(8.0, 0.25 + LATENESS),
+        "delay": permitted(5.0 - ERROR, 0.0),
+    }
     row = rows.loc["worn"]
-    assert after[row["repair_first"]] == row["up_to_after_repair"] == max(after.values())
+    assert (
+        after[row["repair_first"]] == row["up_to_after_repair"] == max(after.values())
+    )
     assert row["simulate"].endswith(f"--set speed={up_to + 0.5}")
     typed = [f"{name}={value}" for name, value in worn.items()]
     for need in (up_to, up_to + 0.5):
@@ -100,19 +107,30 @@ def test_all_cars_within_limits_drive_as_fast_as_the_worst_of_them(car: str) -> 
 
 
 @pytest.mark.parametrize(("is_worse", "least"), [(True, 3), (False, 4)])
-def test_two_versions_are_counted_as_the_formula_says(car: str, is_worse: bool, least: int) -> None:
+def test_two_versions_are_counted_as_the_formula_says(
+    car: str, is_worse: bool, least: int
+) -> None:
     """One brakes with 8 m/s^2, the other with 6.5: the same changes of each are compared."""
     study = car.replace("[vehicle.", "parameters.gap = 40.0\n[vehicle.")
     Path("hard.toml").write_text(study)
     Path("soft.toml").write_text(study.replace("original = 8", "original = 6.5"))
     names = ["hard.toml", "soft.toml"][:: 1 if is_worse else -1]
-    answer = sv.compare(*names, samples=64, limits=[f"decel >= {least}"], pool=InlinePool())
+    answer = sv.compare(
+        *names, samples=64, limits=[f"decel >= {least}"], pool=InlinePool()
+    )
     hard, soft = "ab" if is_worse else "ba"
     frame, numbers = answer.tables["settings"], answer.numbers
-    assert frame["b_decel"].to_numpy() == pytest.approx(frame["decel"] + (1.5, -1.5)[is_worse])
+    assert frame["b_decel"].to_numpy() == pytest.approx(
+        frame["decel"] + (1.5, -1.5)[is_worse]
+    )
     assert frame[["decel", "b_decel"]].min(axis=None) >= least
-    changes = frame.sort_index()[["decel", "delay"]].to_numpy() - [(6.5, 8.0)[is_worse], 0.0]
-    ratio = changes[16:32] / changes[:16]  # of the second setting of each line to its first
+    changes = frame.sort_index()[["decel", "delay"]].to_numpy() - [
+        (6.5, 8.0)[is_worse],
+        0.0,
+    ]
+    ratio = (
+        changes[16:32] / changes[:16]
+    )  # of the second setting of each line to its first
     assert ratio[:, 0] == pytest.approx(ratio[:, 1])
     assert set(ratio.ravel().round(9)) <= {0.5, 1.5}
     fails = {}
@@ -125,11 +143,22 @@ def test_two_versions_are_counted_as_the_formula_says(car: str, is_worse: bool, 
     both = fails[soft] & fails[hard]
     assert counts == [(fails[soft] & ~both).sum(), both.sum(), (~fails[soft]).sum()]
     assert numbers["decision"] == ("do not release" if is_worse else "decide")
-    assert f"within decel >= {least}. The original vehicles differ (decel" in answer.verdict
-    assert is_worse or "but may brake more often without need, which was not" in answer.verdict
+    assert (
+        f"within decel >= {least}. The original vehicles differ (decel"
+        in answer.verdict
+    )
+    assert (
+        is_worse
+        or "but may brake more often without need, which was not" in answer.verdict
+    )
     assert answer.figure().axes
-    assert (numbers["limits_shrunk"], numbers["limits_grown"]) == (is_worse, not is_worse)
-    assert numbers["p"] == pytest.approx(2 * 0.5**16), "each of 16 lines is safer in one of both"
+    assert (numbers["limits_shrunk"], numbers["limits_grown"]) == (
+        is_worse,
+        not is_worse,
+    )
+    assert numbers["p"] == pytest.approx(2 * 0.5**16), (
+        "each of 16 lines is safer in one of both"
+    )
     limits = answer.tables["limits"].set_index("characteristic")
     assert limits["change"].tolist() == ["the same", "shrunk" if is_worse else "grown"]
     for side, original in (hard, 8.0), (soft, 6.5):

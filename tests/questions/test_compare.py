@@ -25,7 +25,9 @@ from tests.in_process import SLOW, InlinePool, json_of, refused, run, searched
 ONE_TEST = {
     "title": "one test",
     "matrix": {
-        "tests": [{"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [40]}}]
+        "tests": [
+            {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [40]}}
+        ]
     },
 }
 POOL = InlinePool()
@@ -34,9 +36,14 @@ POOL = InlinePool()
 @pytest.fixture(autouse=True)
 def _coarse_scans_and_no_benign_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(asked, "USUAL", asked.USUAL._replace(values=10, alone=256))
-    nothing = {"a_needless_braking": None, "b_needless_braking": None, "benign_scenes": 0}
+    nothing = {
+        "a_needless_braking": None,
+        "b_needless_braking": None,
+        "benign_scenes": 0,
+    }
     monkeypatch.setattr(
-        "safevar_sumo.questions.compare.differences._needless_braking", lambda a, b: nothing
+        "safevar_sumo.questions.compare.differences._needless_braking",
+        lambda a, b: nothing,
     )
 
 
@@ -51,7 +58,13 @@ OTHERS = {
     ),
     "another name of the same test": (
         "autoware_july",
-        {"matrix": {"tests": [{**LISTED, "name": "rear", "over": {"speed": [30, 40, 50, 60]}}]}},
+        {
+            "matrix": {
+                "tests": [
+                    {**LISTED, "name": "rear", "over": {"speed": [30, 40, 50, 60]}}
+                ]
+            }
+        },
         [],
     ),
     "another scenario under the same name": (
@@ -70,7 +83,11 @@ OTHERS = {
     "another weather": ("sun", {"weather": "carla_hard_rain"}, ["the weather clear"]),
     "fewer parameter sets": (
         "wear",
-        {"spread": {name: values[:3] for name, values in load_study("wear").spread.items()}},
+        {
+            "spread": {
+                name: values[:3] for name, values in load_study("wear").spread.items()
+            }
+        },
         ["9 parameter sets"],
     ),
     "a narrower range": (
@@ -123,15 +140,25 @@ def test_a_sentence_names_four_missing_parts() -> None:
 
 
 @SLOW
-def test_a_version_whose_failing_tests_were_deleted_is_not_released(in_tmp: Path) -> None:
+def test_a_version_whose_failing_tests_were_deleted_is_not_released(
+    in_tmp: Path,
+) -> None:
     """A version that is driven at 30 km/h alone looks better everywhere."""
     table = {"name": "CCRs", "parameters": {"test": "CCRs"}, "over": {"speed": [30]}}
-    version = {"extends": "autoware_july", "name": "version", "matrix": {"tests": [table]}}
+    version = {
+        "extends": "autoware_july",
+        "name": "version",
+        "matrix": {"tests": [table]},
+    }
     Path("version.toml").write_text(tomli_w.dumps(version))
-    answer = json_of("compare", "autoware_july", "version.toml", "--samples", "8", expect=4)
+    answer = json_of(
+        "compare", "autoware_july", "version.toml", "--samples", "8", expect=4
+    )
     assert answer["numbers"]["decision"] == "decide"
     assert "version lacks the test case (CCRs, speed 40, clear)" in answer["verdict"]
-    reverse = json_of("compare", "version.toml", "autoware_july", "--samples", "8", expect=4)
+    reverse = json_of(
+        "compare", "version.toml", "autoware_july", "--samples", "8", expect=4
+    )
     assert "version lacks the test case" in reverse["verdict"]
 
 
@@ -192,7 +219,9 @@ def test_none_of_four_worse_versions_is_released(
     Path("late.py").write_text(LATE)
     study = {"extends": "wear", "name": version, **ONE_TEST, **changes}
     Path("version.toml").write_text(tomli_w.dumps(study))
-    answer = sv.compare(sv.load_study("wear", **ONE_TEST), "version.toml", samples=40, pool=POOL)
+    answer = sv.compare(
+        sv.load_study("wear", **ONE_TEST), "version.toml", samples=40, pool=POOL
+    )
     assert answer.numbers["decision"] == decision
     assert answer.verdict.startswith(f"{decision.upper()}: {version} ")
     assert bool(answer.failures) == (decision == "do not release")
@@ -215,21 +244,32 @@ def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
 @SLOW
 def test_the_gap_stands_beside_a_degree_from_centre_to_centre() -> None:
     """The vehicle is 4.7 m long."""
-    later = sv.load_study("native", name="later", ads={"parameters": {"braking_share": 0.5}})
+    later = sv.load_study(
+        "native", name="later", ads={"parameters": {"braking_share": 0.5}}
+    )
     numbers = sv.compare("native", later, samples=8, pool=POOL).numbers
     assert numbers["metres_earlier"] > 0 == numbers["metres_later"]
-    assert [numbers[f"{side}_degree"] - numbers[f"{side}_gap"] for side in "ab"] == pytest.approx(
-        [4.7, 4.7]
-    )
+    assert [
+        numbers[f"{side}_degree"] - numbers[f"{side}_gap"] for side in "ab"
+    ] == pytest.approx([4.7, 4.7])
 
 
 @pytest.fixture(scope="module")
 def weathers(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Results in two weathers, with enough runs for the test."""
     folder = tmp_path_factory.mktemp("weathers")
-    search = {"algorithms": ["nsga2"], "population": 10, "evaluations": 40, "runs": 5, "seed": 1}
+    search = {
+        "algorithms": ["nsga2"],
+        "population": 10,
+        "evaluations": 40,
+        "runs": 5,
+        "seed": 1,
+    }
     return [
-        searched(load_study("smoke", weather=weather, name=name, search=search), folder / name)
+        searched(
+            load_study("smoke", weather=weather, name=name, search=search),
+            folder / name,
+        )
         for name, weather in (("dry", "clear"), ("wet", "wet"))
     ]
 
@@ -260,7 +300,9 @@ def test_solutions_of_both_run_by_run(weathers: list[Path]) -> None:
 
 
 @SLOW
-def test_a_report_of_two_results_compares_them(weathers: list[Path], in_tmp: Path) -> None:
+def test_a_report_of_two_results_compares_them(
+    weathers: list[Path], in_tmp: Path
+) -> None:
     dry, wet = map(str, weathers)
     page = (
         run("report", dry, wet, "--ask", "compare", "--out", "it.html")
@@ -285,7 +327,10 @@ def test_a_report_of_two_results_compares_them(weathers: list[Path], in_tmp: Pat
 def test_what_a_person_has_to_decide_passes_no_gate_and_counts_have_no_exponent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    decided = {"decision": "decide", "better_in": 1, "worse_in": 1}, "DECIDE: B is both."
+    decided = (
+        {"decision": "decide", "better_in": 1, "worse_in": 1},
+        "DECIDE: B is both.",
+    )
     monkeypatch.setattr("safevar_sumo.questions.compare._decide", lambda *_: decided)
     run("compare", "smoke", "smoke", "--samples", "8", "--jobs", "1", expect=4)
     assert cell_text(1259.0, ".3g") == "1,259"

@@ -15,7 +15,9 @@ from tests.in_process import SLOW, InlinePool, json_of, numbers_of, refused
 from tests.questions.conftest import made_up_model, made_up_study
 
 
-def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_out() -> None:
+def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_out() -> (
+    None
+):
     """Unsafe are values of the first from 7.13 to 7.1302 without the former: with up to three
     digits none is.
     """
@@ -63,13 +65,30 @@ def test_an_axis_of_the_matrix_is_set_where_tests_have_it() -> None:
     point = ("--point", "CPFA, speed 40, wet")
     at_test = json_of("simulate", "wear", "--set", "speed=40", *point)
     assert at_test["numbers"] == json_of("simulate", "wear", *point)["numbers"]
-    both = json_of("simulate", "wear", "--set", "speed=33", "--set", "impact_location=40")
+    both = json_of(
+        "simulate", "wear", "--set", "speed=33", "--set", "impact_location=40"
+    )
     assert [row["point"] for row in both["tables"]["points"]["rows"]] == ["CPNA, wet"]
-    refused("simulate", "wear", "--set", "speed=70", message=("speed = 70.0", "[10, 60] km/h"))
-    within = json_of("simulate", "fmvss127", "--set", "speed=65")["tables"]["points"]["rows"]
+    refused(
+        "simulate",
+        "wear",
+        "--set",
+        "speed=70",
+        message=("speed = 70.0", "[10, 60] km/h"),
+    )
+    within = json_of("simulate", "fmvss127", "--set", "speed=65")["tables"]["points"][
+        "rows"
+    ]
     tests = {row["point"].partition(",")[0] for row in within}
     assert {"stopped lead vehicle", "slower lead vehicle"} < tests
     assert "adult crosses from the right" not in tests, "its range ends at 60 km/h"
     both = ("--set", "speed=50", "--set", "headway=1")
-    refused("simulate", "fmvss127", *both, message=("no test has headway and speed together",))
-    refused("simulate", "wear", "--fit", "12", message=("--fit: 12", "a number up to 11"))
+    refused(
+        "simulate",
+        "fmvss127",
+        *both,
+        message=("no test has headway and speed together",),
+    )
+    refused(
+        "simulate", "wear", "--fit", "12", message=("--fit: 12", "a number up to 11")
+    )

@@ -31,7 +31,11 @@ from safevar_sumo.questions.causes import (
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain, failures
 from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE
-from safevar_sumo.questions.explain.tables import CAUSE_COLUMNS, MAX_DISTINCT, printed_limits
+from safevar_sumo.questions.explain.tables import (
+    CAUSE_COLUMNS,
+    MAX_DISTINCT,
+    printed_limits,
+)
 from safevar_sumo.questions.tables import cell_text, columns_of
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
@@ -69,7 +73,9 @@ def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> N
             solution["safety_degree"],
         )
         causes = [
-            one for one in answer["tables"]["causes"]["rows"] if one["solution"] == row["solution"]
+            one
+            for one in answer["tables"]["causes"]["rows"]
+            if one["solution"] == row["solution"]
         ]
         assert causes
         for cause in causes:
@@ -108,9 +114,9 @@ def test_the_failures_that_matter_come_first(case: Case, explained: Answer) -> N
     }
     assert by_reason["fewest changes"]["changed"] == crashes["f_num_diff"].min()
     assert by_reason["most severe"]["safety_degree"] == crashes["safety_degree"].min()
-    assert [explained.numbers[name] for name in ("failures", "analysed", "collisions")] == [
-        len(crashes[list(case.characteristics.names)].drop_duplicates())
-    ] * 3
+    assert [
+        explained.numbers[name] for name in ("failures", "analysed", "collisions")
+    ] == [len(crashes[list(case.characteristics.names)].drop_duplicates())] * 3
     assert explained.numbers["explained"] == len(explained.tables["solutions"]) == 3
 
 
@@ -121,30 +127,49 @@ def test_a_named_solution_is_explained_whatever_it_is(case: Case) -> None:
     )  # few changes have few subsets
     handle = str(handles_of(case.solutions)[safe])
     evaluator = Evaluator(case.study, InlinePool())
-    answer = explain.compute(case, evaluator, solution=(handle,), unsafe=Unsafe(), fits=0)
+    answer = explain.compute(
+        case, evaluator, solution=(handle,), unsafe=Unsafe(), fits=0
+    )
     (row,) = answer.tables["solutions"].to_dict("records")
-    assert (row["solution"], row["reason"], row["avoided_by"]) == (handle, "requested", None)
+    assert (row["solution"], row["reason"], row["avoided_by"]) == (
+        handle,
+        "requested",
+        None,
+    )
     assert answer.tables["causes"].empty
     with pytest.raises(InputError, match="nsga2:7:0"):
         explain.compute(case, evaluator, solution=("nsga2:7:0",))
 
 
-def test_every_boundary_is_unsafe_as_it_is_printed(case: Case, explained: Answer) -> None:
+def test_every_boundary_is_unsafe_as_it_is_printed(
+    case: Case, explained: Answer
+) -> None:
     """Also each change alone at its boundary."""
     table = explained.tables["causes"]
     columns = columns_of(table)
     typed = []
     for row in table.to_dict("records"):
         boundary, alone = (
-            dict(re.findall(r"(\w+) ([\d.]+)", cell_text(row[name], columns[name].number_format)))
+            dict(
+                re.findall(
+                    r"(\w+) ([\d.]+)", cell_text(row[name], columns[name].number_format)
+                )
+            )
             for name in ("boundary", "single_boundary")
         )
-        typed += [boundary, *({**row["changes"], name: value} for name, value in alone.items())]
+        typed += [
+            boundary,
+            *({**row["changes"], name: value} for name, value in alone.items()),
+        ]
     settings = [
-        case.characteristics.setting({name: float(value) for name, value in one.items()})
+        case.characteristics.setting(
+            {name: float(value) for name, value in one.items()}
+        )
         for one in typed
     ]
-    assert case.unsafe.of(drive_and_score(assemble(case.study), np.array(settings))).all()
+    assert case.unsafe.of(
+        drive_and_score(assemble(case.study), np.array(settings))
+    ).all()
 
 
 @SLOW
@@ -152,14 +177,19 @@ def test_the_fewest_changes_collide_as_they_are_printed_and_no_fewer_of_them_do(
     slippery: Path, case: Case
 ) -> None:
     """In the verdict of `study`, as `simulate` chooses them, and typed as the verdict says."""
-    verdict = json_of("study", str(slippery.parent / "slippery.toml"), "--out", str(slippery))[
-        "verdict"
-    ]
-    command = verdict.partition("It is simulated by python -m safevar_sumo ")[2].partition(". ")[0]
+    verdict = json_of(
+        "study", str(slippery.parent / "slippery.toml"), "--out", str(slippery)
+    )["verdict"]
+    command = verdict.partition("It is simulated by python -m safevar_sumo ")[
+        2
+    ].partition(". ")[0]
     command = command.rstrip(".")
     typed, chosen = (
         json_of(*one)["numbers"]
-        for one in (command.split(), ("simulate", str(slippery), "--solution", "fewest"))
+        for one in (
+            command.split(),
+            ("simulate", str(slippery), "--solution", "fewest"),
+        )
     )
     assert f"the vehicle collides at {-typed['safety_degree']:.2f} m/s" in verdict
     assert chosen["safety_degree"] == typed["safety_degree"]
@@ -168,8 +198,14 @@ def test_the_fewest_changes_collide_as_they_are_printed_and_no_fewer_of_them_do(
     crashes = case.solutions[case.solutions["outcome"] == "collision"]
     assert len(values) <= crashes["f_num_diff"].min()
     for left_out in values:
-        rest = [f"--set={name}={value}" for name, value in values.items() if name != left_out]
-        assert json_of("simulate", str(slippery), *rest)["numbers"]["outcome"] == "stopped"
+        rest = [
+            f"--set={name}={value}"
+            for name, value in values.items()
+            if name != left_out
+        ]
+        assert (
+            json_of("simulate", str(slippery), *rest)["numbers"]["outcome"] == "stopped"
+        )
 
 
 def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
@@ -180,7 +216,9 @@ def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
     for item in case.characteristics:
         if item.name in leading["boundary"]:
             value = leading["boundary"][item.name]
-            assert float(re.search(rf"{item.short_name} at ([\d.]+)", verdict)[1]) == value  # type: ignore[index]
+            assert (
+                float(re.search(rf"{item.short_name} at ([\d.]+)", verdict)[1]) == value
+            )  # type: ignore[index]
     share = f"{100 * leading['robust_share']:.0f} % of vehicles with slightly different values"
     assert re.search(
         r"^With .* the vehicle collides\. Of 256 vehicles .*\. The cause d.* exact values: "
@@ -222,25 +260,40 @@ def test_all_minimal_unsafe_subsets_and_no_other_whatever_the_outcomes(
         if table[sum(1 << column for column in subset)]
     ]
     minimal = [each for each in unsafe if not any(other < each for other in unsafe)]
-    (result,) = find_minimal_causes(made_up_evaluator(5, outcome), setting[np.newaxis], COLLISION)
+    (result,) = find_minimal_causes(
+        made_up_evaluator(5, outcome), setting[np.newaxis], COLLISION
+    )
     assert [set(map("abcde".index, cause.changes)) for cause in result] == minimal
 
 
-def test_the_minimal_causes_of_a_run_are_those_of_its_unsafe_solutions_each_once() -> None:
+def test_the_minimal_causes_of_a_run_are_those_of_its_unsafe_solutions_each_once() -> (
+    None
+):
     """`a` above 9 or `b` below 2 collides; the failures with the fewest changes come first, equal
     ones count once.
     """
-    evaluator = made_up_evaluator(3, lambda settings: (settings[:, 0] > 9) | (settings[:, 1] < 2))
+    evaluator = made_up_evaluator(
+        3, lambda settings: (settings[:, 0] > 9) | (settings[:, 1] < 2)
+    )
     settings = np.array(
-        [(9.5, 5.0, 5.0), (9.5, 5.0, 5.0), (9.9, 1.0, 5.0), (9.6, 5.0, 9.0), (8.0, 4.0, 9.0)]
+        [
+            (9.5, 5.0, 5.0),
+            (9.5, 5.0, 5.0),
+            (9.9, 1.0, 5.0),
+            (9.6, 5.0, 9.0),
+            (8.0, 4.0, 9.0),
+        ]
     )
     found = evaluator.evaluate(settings, "solutions")
     frame = solutions_frame(
-        evaluator.characteristics.names, [(("rs", 0), found), (("nsga2", 1), found.take([0, 4]))]
+        evaluator.characteristics.names,
+        [(("rs", 0), found), (("nsga2", 1), found.take([0, 4]))],
     )
     finished = [("rs", 0), ("nsga2", 1), ("nsga2", 0)]
     case = build_case(evaluator.study, {"safety_degree": 2.0}, frame, frame, finished)
-    counts = [causes_of_runs(case, evaluator, limit).to_numpy().tolist() for limit in (1, 9)]
+    counts = [
+        causes_of_runs(case, evaluator, limit).to_numpy().tolist() for limit in (1, 9)
+    ]
     assert counts[0] == [["rs", 0, 3, 1, 1], ["nsga2", 1, 1, 1, 1], ["nsga2", *[0] * 4]]
     assert counts[1][0] == ["rs", 0, 3, 3, 2], "a up, b down"
 
@@ -281,7 +334,9 @@ def test_a_boundary_is_rounded_to_the_unsafe_side_with_as_many_digits_as_it_need
     low: float, high: float, value: float, printed: str
 ) -> None:
     """Between `low` and `high` it is unsafe."""
-    rounded = printed_of(1, lambda rows: (rows[:, 0] > low) & (rows[:, 0] < high), value)
+    rounded = printed_of(
+        1, lambda rows: (rows[:, 0] > low) & (rows[:, 0] < high), value
+    )
     number_format = CAUSE_COLUMNS["boundary"].number_format  # type: ignore[union-attr]
     for values in (rounded["boundary"], rounded["single_boundary"]):
         assert cell_text(values["a"], number_format) == printed
@@ -301,7 +356,9 @@ def test_a_boundary_of_a_single_change_is_unsafe_when_typed_with_the_others() ->
 
 def test_a_boundary_just_below_a_change_is_found_as_accurately() -> None:
     evaluator = made_up_evaluator(1, lambda settings: settings[:, 0] > 8.996)
-    assert limits(evaluator, 9.0).boundary["a"] == pytest.approx(8.996, abs=4 * RESOLUTION)
+    assert limits(evaluator, 9.0).boundary["a"] == pytest.approx(
+        8.996, abs=4 * RESOLUTION
+    )
 
 
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
@@ -332,27 +389,38 @@ def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
 
 
 def test_needed_and_changed_over_failures() -> None:
-    evaluator = made_up_evaluator(3, lambda settings: box(settings) | (settings[:, 2] > 9))
+    evaluator = made_up_evaluator(
+        3, lambda settings: box(settings) | (settings[:, 2] > 9)
+    )
     settings, members = (
         np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]]),
         evaluator.characteristics,
     )
     causes = find_minimal_causes(evaluator, settings, COLLISION)
     frame, of_four = (
-        count_needed(members, members.changed(settings), causes, number).set_index("characteristic")
+        count_needed(members, members.changed(settings), causes, number).set_index(
+            "characteristic"
+        )
         for number in (3, 4)
     )
     assert frame["changed"].to_dict() == pytest.approx({"a": 1, "b": 1, "c": 2 / 3})
-    assert frame["needed"].to_dict() == pytest.approx({"a": 2 / 3, "b": 2 / 3, "c": 0}), (
-        "the third failure has two minimal causes"
+    assert frame["needed"].to_dict() == pytest.approx(
+        {"a": 2 / 3, "b": 2 / 3, "c": 0}
+    ), "the third failure has two minimal causes"
+    assert frame["needed_low"].equals(frame["needed"]), (
+        "of all failures the shares are exact"
     )
-    assert frame["needed_low"].equals(frame["needed"]), "of all failures the shares are exact"
     sampled = of_four.loc["a"]
-    ends = [scipy.stats.beta.ppf(q, *shape) for q, shape in ((0.025, (2, 2)), (0.975, (3, 1)))]
+    ends = [
+        scipy.stats.beta.ppf(q, *shape)
+        for q, shape in ((0.025, (2, 2)), (0.975, (3, 1)))
+    ]
     assert sampled[["needed_low", "needed_high"]].tolist() == pytest.approx(ends), (
         "2 of a sample of 3"
     )
-    assert count_distinct_causes(members, causes)[["cause", "failures"]].to_numpy().tolist() == [
+    assert count_distinct_causes(members, causes)[
+        ["cause", "failures"]
+    ].to_numpy().tolist() == [
         [("a up", "b down"), 3],
         [("c up",), 1],
     ]
@@ -364,10 +432,15 @@ def test_a_cause_is_one_with_some_fitted_models() -> None:
     """
     wider = made_up_evaluator(3, lambda one: (one[:, 0] > 7) & (one[:, 1] < 5))
     models = [
-        *(made_up_evaluator(3, region) for region in (box, lambda one: one[:, 0] > 8, nowhere)),
+        *(
+            made_up_evaluator(3, region)
+            for region in (box, lambda one: one[:, 0] > 8, nowhere)
+        ),
         wider,
     ]
-    settings = np.array([[9.0, 1.0, 5.0], [7.5, 1.0, 8.0], [9.0, 8.0, 5.0], [5.0, 5.0, 5.0]])
+    settings = np.array(
+        [[9.0, 1.0, 5.0], [7.5, 1.0, 8.0], [9.0, 8.0, 5.0], [5.0, 5.0, 5.0]]
+    )
     rows = COLLISION.of(models[0].evaluate(settings, "settings"))
     causes = [
         cause
@@ -386,7 +459,9 @@ def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() ->
     assert 0 < len(few) < 50
     assert select_affordable_rows(settings, evaluator, 10**6) == list(range(50))
     settings[:, 3:] = ORIGINAL
-    assert len(select_affordable_rows(settings, evaluator, 80)) == 10, "2 ** 3 subsets of each"
+    assert len(select_affordable_rows(settings, evaluator, 80)) == 10, (
+        "2 ** 3 subsets of each"
+    )
 
 
 def test_progress_of_a_stage_counts_all_calls() -> None:
@@ -395,7 +470,9 @@ def test_progress_of_a_stage_counts_all_calls() -> None:
     """
     shown = list[tuple[str, int, int]]()
     study = made_up_study(1)
-    evaluator = Evaluator(study, Plant(study, nowhere), lambda *values: shown.append(values))
+    evaluator = Evaluator(
+        study, Plant(study, nowhere), lambda *values: shown.append(values)
+    )
     evaluator.begin({"first": 1, "all calls": 1})
     another = evaluator.for_study(evaluator.study)
     with evaluator.phases.stage("all calls", 4):
@@ -409,11 +486,17 @@ def test_progress_of_a_stage_counts_all_calls() -> None:
     assert counts == [(0, 4), (3, 4), (3, 5), (5, 5), (5, 6), (6, 6)]
 
 
-def test_of_an_unsafe_original_no_change_is_a_cause(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_an_unsafe_original_no_change_is_a_cause(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(failures, "SAMPLED_SETTINGS", 4)
     study = load_study("smoke")
     answer = explain.compute(
-        study, Evaluator(study, InlinePool(), verified=0), unsafe=Unsafe(degree=99), fits=0, top=1
+        study,
+        Evaluator(study, InlinePool(), verified=0),
+        unsafe=Unsafe(degree=99),
+        fits=0,
+        top=1,
     )
     degree = f"{answer.numbers['original_degree']:.3g}"
     said = (
@@ -422,6 +505,7 @@ def test_of_an_unsafe_original_no_change_is_a_cause(monkeypatch: pytest.MonkeyPa
     )
     assert answer.verdict.startswith(f"{said} (--unsafe). Of 4 vehicles")
     assert [
-        len(answer.tables[name]) for name in ("causes", "characteristics", "distinct_causes")
+        len(answer.tables[name])
+        for name in ("causes", "characteristics", "distinct_causes")
     ] == [0, 0, 0]
     assert "Minimal causes" not in answer.render("text")

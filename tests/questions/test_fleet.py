@@ -14,7 +14,11 @@ from hypothesis import given, strategies as st
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.permit.assumed import assumed_cells, assumed_in_words, cars_of
+from safevar_sumo.questions.permit.assumed import (
+    assumed_cells,
+    assumed_in_words,
+    cars_of,
+)
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study
@@ -77,7 +81,12 @@ def test_a_frame_that_is_written_in_any_dialect_is_read_alike(
     path = tmp_path_factory.mktemp("fleet") / "fleet.csv"
     for separator, decimal, encoding, end in DIALECTS:
         frame.to_csv(
-            path, index=False, sep=separator, decimal=decimal, encoding=encoding, lineterminator=end
+            path,
+            index=False,
+            sep=separator,
+            decimal=decimal,
+            encoding=encoding,
+            lineterminator=end,
         )
         again = read(str(path))
         assert again.names == fleet.names
@@ -93,7 +102,13 @@ def test_cars_are_read_from_files_of_excel_frames_mappings_and_the_command_line(
     )
     fleet = read(written(tmp_path, excel), ignore=("note",))
     assert fleet.names == ["007", "8"]
-    assert list(fleet.table) == ["plate", "payload [kg]", "brakeTorque", "note", "treadDepth [mm]"]
+    assert list(fleet.table) == [
+        "plate",
+        "payload [kg]",
+        "brakeTorque",
+        "note",
+        "treadDepth [mm]",
+    ]
     assert fleet.table["note"].tolist() == ["a;b", ""]
     assert fleet.table["brakeTorque"].tolist() == ["0,9", "1"], "as it was given"
     values = {"treadDepth": 3.5, "brakeTorque": 0.9, "payload": 75}
@@ -109,8 +124,12 @@ def test_cars_are_read_from_files_of_excel_frames_mappings_and_the_command_line(
     assert other.names == ["This car"]
 
 
-def test_what_is_not_measured_is_as_the_study_states_and_as_new_only_if_the_user_says_so() -> None:
-    frame = pd.DataFrame({"car": ["a", "b"], "treadDepth": [3, None], "sensorRange": ["20", ""]})
+def test_what_is_not_measured_is_as_the_study_states_and_as_new_only_if_the_user_says_so() -> (
+    None
+):
+    frame = pd.DataFrame(
+        {"car": ["a", "b"], "treadDepth": [3, None], "sensorRange": ["20", ""]}
+    )
     told = r"row 0: no value of treadDepth, brakeTorque, payload, .* \(2 of 2 cars lack one\)"
     with pytest.raises(InputError, match=told):
         read(frame)
@@ -124,12 +143,17 @@ def test_what_is_not_measured_is_as_the_study_states_and_as_new_only_if_the_user
 
 
 def test_what_is_assumed_is_named_with_its_value_and_where_that_is_from() -> None:
-    frame = pd.DataFrame({"car": ["a", "b"], "treadDepth": [3, None], "sensorRange": [20, 30]})
+    frame = pd.DataFrame(
+        {"car": ["a", "b"], "treadDepth": [3, None], "sensorRange": [20, 30]}
+    )
     fleet = read(frame, others="new")
     vehicle = CharacteristicSet.of(JOINT).vehicle
     cells = assumed_cells(vehicle, fleet)
     own = "brakeTorque 1, brakeResponse 0.2 s, payload 75 kg, payloadCentre 2.6 m"
-    assert cells == [f"{own}, sensorLatency 0.1 s", f"treadDepth 8 mm, {own}, sensorLatency 0.1 s"]
+    assert cells == [
+        f"{own}, sensorLatency 0.1 s",
+        f"treadDepth 8 mm, {own}, sensorLatency 0.1 s",
+    ]
     assert assumed_in_words(JOINT, vehicle, fleet) == (
         "Assumed, because not measured: brakeTorque 1 (relative brake torque, as in a new car),"
         " brakeResponse 0.2 s (brake actuator delay, by [unmeasured]), payload 75 kg (payload, as"
@@ -138,7 +162,10 @@ def test_what_is_assumed_is_named_with_its_value_and_where_that_is_from() -> Non
         " of 2 cars that others state (column assumed, --details)."
     )
     whole = read({"a": vehicle.named(vehicle.original)})
-    assert (assumed_cells(vehicle, whole), assumed_in_words(JOINT, vehicle, whole)) == ([None], "")
+    assert (assumed_cells(vehicle, whole), assumed_in_words(JOINT, vehicle, whole)) == (
+        [None],
+        "",
+    )
 
 
 def test_a_written_answer_is_read_as_the_list_that_it_is_about() -> None:
@@ -157,7 +184,11 @@ def test_a_measured_value_may_be_any_within_its_precision_and_the_domain() -> No
     fleet = read(frame.assign(treadDepth=3, payload=75), others="new")
     members = CharacteristicSet.of(JOINT).vehicle
     column = members.names.index("brakeTorque")
-    ends = [(0.85, 0.95), (0.5, 0.6), (1.0, 1.0)]  # an assumed value is none that was measured
+    ends = [
+        (0.85, 0.95),
+        (0.5, 0.6),
+        (1.0, 1.0),
+    ]  # an assumed value is none that was measured
     for cars, setting, (low, high) in zip(
         cars_of(members, fleet), fleet.settings, ends, strict=True
     ):
@@ -177,22 +208,37 @@ REFUSED = [
     (HEAD + 'a,"3,1,75\n', "line 2: unexpected end"),
     (HEAD + "a,3,1\n", "line 2: 3 fields"),
     ("car;id,x\na,3\n", "1 field\nexpected: 2 fields with a semicolon between them"),
-    (HEAD.replace(",", ";") + "a;3;1;1.250\n", "or with a point that cannot be one of thousands"),
+    (
+        HEAD.replace(",", ";") + "a;3;1;1.250\n",
+        "or with a point that cannot be one of thousands",
+    ),
     (HEAD + "a,8.2,1,75\n", "8.2 is outside 1.6 to 8 mm: is this of another unit?"),
-    (HEAD + "a,3,1.05,75\n", "1.05 is outside 0.5 to 1\nexpected: a number in [0.5, 1]; at most 1"),
+    (
+        HEAD + "a,3,1.05,75\n",
+        "1.05 is outside 0.5 to 1\nexpected: a number in [0.5, 1]; at most 1",
+    ),
     (HEAD + "a,3,1.06,75\n", "1.06 is outside 0.5 to 1: is this of another unit?"),
-    (HEAD + "a,3,0.54,75\n", "0.54, measured to within 0.05, may be outside the domain\n"),
+    (
+        HEAD + "a,3,0.54,75\n",
+        "0.54, measured to within 0.05, may be outside the domain\n",
+    ),
     (HEAD + "a,3,0.48,75\n", "0.48 is outside 0.5 to 1: is this of another unit?"),
     (HEAD + "a,3,55,75\n", "55 is outside 0.5 to 1: is this percent?"),
     (HEAD + "a,3,1,75\n\nb,3,1,75\n", "line 3: 0 fields"),
     (HEAD + "a,3,5,1,75\n", "5 fields\nexpected: 4 fields with a comma"),
     (HEAD + 'a,"3,5",1,75\n', "line 2, column 'treadDepth': '3,5' is no number"),
     (HEAD.replace(",", "\t") + "a\t3,5\t1\t75\n", "'3,5' is no number"),
-    (HEAD.replace(",", ";") + "a;3,5;0.9;75\n", "'0.9' is no number with a decimal comma"),
+    (
+        HEAD.replace(",", ";") + "a;3,5;0.9;75\n",
+        "'0.9' is no number with a decimal comma",
+    ),
     (HEAD.replace(",", ";") + "a;3;1;1.234,5\n", "'1.234,5' is no number"),
     (HEAD.replace(",", ";") + "a;3;1;1,234.5\n", "'1,234.5' is no number"),
     (HEAD + 'a,"1,234.5",1,75\n', "'1,234.5' is no number"),
-    *((f"{HEAD}a,{text},1,75\n", f"'{text}' is no number") for text in ("nan", "0x3", "1_0", "3m")),
+    *(
+        (f"{HEAD}a,{text},1,75\n", f"'{text}' is no number")
+        for text in ("nan", "0x3", "1_0", "3m")
+    ),
     (HEAD + "a,1e999,1,75\n", "inf is outside 1.6 to 8 mm"),
     (HEAD + "a,9,1,75\n", "line 2, column 'treadDepth': 9 is outside 1.6 to 8 mm"),
     (HEAD + "a,3,1,75\na,3,1,75\n", "line 3, column 'car': the car 'a' is there twice"),
@@ -201,16 +247,28 @@ REFUSED = [
     (HEAD + "M\u00fc,3,1,75\nMu\u0308,3,1,75\n", "the car 'Mu\u0308' is there twice"),
     (HEAD + "=1+1,3,1,75\n", "does not begin with =, +, - or @"),
     (HEAD + " ,3,1,75\n", "'' is no name"),
-    (HEAD.replace("payload", "treadDepth [mm]") + "a,3,1,3\n", "'treadDepth' is there twice"),
+    (
+        HEAD.replace("payload", "treadDepth [mm]") + "a,3,1,3\n",
+        "'treadDepth' is there twice",
+    ),
     (HEAD.replace("treadDepth", "treadDepth [in]") + "a,3,1,75\n", "treadDepth [mm]"),
-    (HEAD.replace("treadDepth", "treadDept") + "a,3,1,75\n", "did you mean 'treadDepth'?"),
+    (
+        HEAD.replace("treadDepth", "treadDept") + "a,3,1,75\n",
+        "did you mean 'treadDepth'?",
+    ),
     (HEAD.replace("payload", "speed") + "a,3,1,40\n", "'speed' is a parameter"),
     (HEAD.replace("payload", "up_to") + "a,3,1,40\n", "a column of the answer"),
     ("plate,car,treadDepth\na,b,3\n", "a column of the answer"),
     ("treadDepth,payload\n3,75\n", "the first column is 'treadDepth'"),
     ("treadDept,payload\n3,75\n", "did you mean 'treadDepth'?"),
-    (pd.DataFrame({"treadDepth": [3]}, index=["a"]), "cars: the first column is 'treadDepth'"),
-    (pd.DataFrame({"car": ["a"], "treadDepth": [np.inf]}), "cars, row 0, column 'treadDepth'"),
+    (
+        pd.DataFrame({"treadDepth": [3]}, index=["a"]),
+        "cars: the first column is 'treadDepth'",
+    ),
+    (
+        pd.DataFrame({"car": ["a"], "treadDepth": [np.inf]}),
+        "cars, row 0, column 'treadDepth'",
+    ),
     ({"a": {"treadDepth": np.nan}}, "cars, 'a', column 'treadDepth': 'nan'"),
     ({"a": {"treadDepth": True}}, "'True' is no number"),
     ({7: {"treadDepth": 3}, "7": {"treadDepth": 3}}, "the car '7' is there twice"),
@@ -239,10 +297,14 @@ def test_all_bad_cells_are_in_one_message_and_none_has_the_end_of_a_domain_as_ad
     assert first.endswith(
         "line 2, column 'treadDepth': 35 is outside 1.6 to 8 mm: is this of another unit?"
     )
-    assert second.endswith("line 2, column 'brakeTorque': 55 is outside 0.5 to 1: is this percent?")
+    assert second.endswith(
+        "line 2, column 'brakeTorque': 55 is outside 0.5 to 1: is this percent?"
+    )
     assert "line 4, column 'treadDepth': 'x' is no number" in third
     assert expected == "expected: a number in [1.6, 8] mm; a number in [0.5, 1]"
-    with pytest.raises(InputError, match=r"--set, column 'brakeTorque': 55 is outside .*percent"):
+    with pytest.raises(
+        InputError, match=r"--set, column 'brakeTorque': 55 is outside .*percent"
+    ):
         read(None, "brakeTorque=55")
 
 

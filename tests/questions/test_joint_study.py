@@ -49,7 +49,9 @@ DEMANDED = (
     r" \(scenario\.margin\)\."
 )
 COUNTED = LEFT_OUT.format(r"[\d,]+")
-CAUSE = "collides in an encounter in which the original vehicle is safe. The encounter has"
+CAUSE = (
+    "collides in an encounter in which the original vehicle is safe. The encounter has"
+)
 QUESTIONS = {
     "risk tiny.toml --samples 300": f"{DEMANDED}.*left out",
     "risk results --samples 300": COUNTED,
@@ -101,19 +103,26 @@ def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_s
     drawn = case.evaluations
     limit = case.scoring.safe_original
     row = drawn[drawn["original_safety_degree"] < limit].iloc[0]
-    values = [f"--set={name}={float(row[name])!r}" for name in case.characteristics.names]
+    values = [
+        f"--set={name}={float(row[name])!r}" for name in case.characteristics.names
+    ]
     answer = json_of("simulate", "results", *values)
     degrees = next(
-        one for one in answer["tables"]["results"]["rows"] if one["result"] == "safety_degree"
+        one
+        for one in answer["tables"]["results"]["rows"]
+        if one["result"] == "safety_degree"
     )
     assert (degrees["original"], degrees["simulated"]) == (
         row["original_safety_degree"],
         row["safety_degree"],
     )
-    assert "Here the original vehicle keeps less than a search demands" in answer["verdict"]
-    rows = json_of("study", "tiny.toml", "--status", "--out", "results")["tables"]["algorithms"][
-        "rows"
-    ]
+    assert (
+        "Here the original vehicle keeps less than a search demands"
+        in answer["verdict"]
+    )
+    rows = json_of("study", "tiny.toml", "--status", "--out", "results")["tables"][
+        "algorithms"
+    ]["rows"]
     safe = drawn[drawn["original_safety_degree"] >= limit]
     expected = [
         ((safe["outcome"] == "collision") & (safe["algorithm"] == name)).sum()
@@ -137,7 +146,9 @@ def test_the_margin_of_the_original_is_a_key_and_says_which_evaluations_are_feas
     assert "feasible" not in sv.evaluate("smoke", [{}], jobs=1)
     strict = load_study(case.study, scenario={"margin": 2.0})
     assert assemble(strict).measuring.scoring.safe_original == 2
-    assert identity_digest(manifest_of(strict, {})) != identity_digest(manifest_of(case.study, {}))
+    assert identity_digest(manifest_of(strict, {})) != identity_digest(
+        manifest_of(case.study, {})
+    )
 
 
 TAKES_ALL = """
@@ -148,9 +159,13 @@ class TakesAll:
 
 
 @SLOW
-def test_a_study_counts_what_an_own_algorithm_returns_and_is_no_solution(folder: Path) -> None:
+def test_a_study_counts_what_an_own_algorithm_returns_and_is_no_solution(
+    folder: Path,
+) -> None:
     (folder / "takes.py").write_text(TAKES_ALL)
-    own = 'extends = "tiny.toml"\nname = "own"\nsearch.algorithms = ["takes:TakesAll"]\n'
+    own = (
+        'extends = "tiny.toml"\nname = "own"\nsearch.algorithms = ["takes:TakesAll"]\n'
+    )
     (folder / "own.toml").write_text(own)
     study = load_study("own.toml")
     warnings: list[str] = []
@@ -169,7 +184,10 @@ def test_a_search_without_a_solution_says_why_and_suggests_nothing_that_is_refus
         'extends = "tiny.toml"\nname = "far"\nscenario.margin = 40\nsearch.evaluations = 10\n'
     )
     text = run("study", "far.toml", "--out", "far").stdout
-    assert "The search found no solution: in none of 20 encounters the original vehicle" in text
+    assert (
+        "The search found no solution: in none of 20 encounters the original vehicle"
+        in text
+    )
     assert "Next: a smaller scenario.margin" in text
     assert "explain" not in text
     assert "Remarks" not in text, "a table without a remark"
@@ -177,7 +195,12 @@ def test_a_search_without_a_solution_says_why_and_suggests_nothing_that_is_refus
 
 WORN = {
     "wear": {
-        **{"treadDepth": 5.58, "brakeTorque": 0.88, "brakeResponse": 0.112, "payload": 242},
+        **{
+            "treadDepth": 5.58,
+            "brakeTorque": 0.88,
+            "brakeResponse": 0.112,
+            "payload": 242,
+        },
         **{"payloadCentre": 2.2, "sensorRange": 23.8},
     },
     "sun": {
@@ -208,12 +231,19 @@ def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
     with open_evaluator(load_study(name, encounters="ranges"), jobs=2) as judging:
         members, model = judging.characteristics, Model(0, judging, Unsafe())
         vehicle = np.array(
-            [{**members.named(members.original), **WORN[name]}[one] for one in members.names]
+            [
+                {**members.named(members.original), **WORN[name]}[one]
+                for one in members.names
+            ]
         )
         box = Box(
             judging.region,
-            np.where(members.of_vehicle, np.minimum(members.original, vehicle), members.lower),
-            np.where(members.of_vehicle, np.maximum(members.original, vehicle), members.upper),
+            np.where(
+                members.of_vehicle, np.minimum(members.original, vehicle), members.lower
+            ),
+            np.where(
+                members.of_vehicle, np.maximum(members.original, vehicle), members.upper
+            ),
         )
         found = falsify(
             box,
@@ -229,14 +259,20 @@ def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
 def test_changes_are_those_of_the_vehicle(case: Case) -> None:
     tables = json_of("tables", "results")["tables"]
     solutions = case.solutions[case.solutions["algorithm"] == "nsga2"]
-    critical = solutions[solutions["safety_degree"] < solutions["original_safety_degree"]]
-    counts = {int(one["j"]): one["count"] for one in tables["rq3.1"]["rows"] if one["count"]}
+    critical = solutions[
+        solutions["safety_degree"] < solutions["original_safety_degree"]
+    ]
+    counts = {
+        int(one["j"]): one["count"] for one in tables["rq3.1"]["rows"] if one["count"]
+    }
     assert counts == critical["f_num_diff"].astype(int).value_counts().to_dict()
     assert "distance" not in {one["characteristic"] for one in tables["rq3.2"]["rows"]}
 
 
 @SLOW
-def test_two_studies_are_compared_in_the_encounters_that_both_search(folder: Path) -> None:
+def test_two_studies_are_compared_in_the_encounters_that_both_search(
+    folder: Path,
+) -> None:
     (folder / "wider.toml").write_text(
         STUDY.replace("lower = 8, upper = 18", "lower = 10, upper = 20")
     )
@@ -246,7 +282,9 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(folder: Pat
     assert answer["numbers"]["only_a_unsafe"] == answer["numbers"]["only_b_unsafe"] == 0
     frame = answer["tables"]["settings"]["rows"]
     assert all(10 <= one["distance"] <= 18 for one in frame)
-    assert "distance" not in {one["characteristic"] for one in answer["tables"]["limits"]["rows"]}
+    assert "distance" not in {
+        one["characteristic"] for one in answer["tables"]["limits"]["rows"]
+    }
 
 
 @SLOW

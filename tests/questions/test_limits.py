@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from safevar_sumo.questions.tolerance.alone import MOST_SEARCHES, Alone, scan_alone, search_alone
+from safevar_sumo.questions.tolerance.alone import (
+    MOST_SEARCHES,
+    Alone,
+    scan_alone,
+    search_alone,
+)
 from safevar_sumo.questions.tolerance.boxes import (
     Boxes,
     Known,
@@ -46,14 +51,18 @@ def star_of(n: int) -> Space:
     return space_of(n, center=np.full(n, 5.0))
 
 
-def boxes_of(n: int, judge: CaseJudge, given: dict[tuple[int, int], float] | None = None) -> Boxes:
+def boxes_of(
+    n: int, judge: CaseJudge, given: dict[tuple[int, int], float] | None = None
+) -> Boxes:
     """Boxes around 5 of which some sides are given."""
     longest = np.full((2, n), 5.0)
     is_free = np.ones((2, n), dtype=bool)
     for side, length in (given or {}).items():
         longest[side] = length
         is_free[side] = False
-    return Boxes(judge, space_of(n), np.full(n, 5.0), longest, is_free, lambda sides: sides)
+    return Boxes(
+        judge, space_of(n), np.full(n, 5.0), longest, is_free, lambda sides: sides
+    )
 
 
 def nothing(n: int) -> FloatArray:
@@ -66,7 +75,9 @@ def cases_of(*vehicles: list[float]) -> FloatArray:
 
 def search_of(judge: CaseJudge, budget: int, seed: int = 0) -> CaseSearch:
     rng = default_rng(seed)
-    return lambda space, known: search_cases(judge, space, known, SearchPlan(budget), rng)
+    return lambda space, known: search_cases(
+        judge, space, known, SearchPlan(budget), rng
+    )
 
 
 def unsafe_where(region: CaseJudge) -> CaseJudge:
@@ -121,7 +132,10 @@ def largest(boxes: Boxes, known: FloatArray | None = None, seed: int = 0) -> Sid
     n = boxes.space.size
     rng = default_rng(seed)
     start = Known(nothing(n) if known is None else known, nothing(n))
-    quick, thorough = (search_of(boxes.judge, 1024, seed), search_of(boxes.judge, 5000, seed + 1))
+    quick, thorough = (
+        search_of(boxes.judge, 1024, seed),
+        search_of(boxes.judge, 5000, seed + 1),
+    )
     settled = find_largest_box(boxes, start, quick, thorough, rng)
     assert settled.sides is not None
     assert settled.attacked >= 5000
@@ -157,7 +171,10 @@ def test_the_box_with_a_given_limit_is_nearly_the_largest() -> None:
 def test_no_box_where_what_is_given_fails() -> None:
     boxes = boxes_of(2, unsafe_where(lambda cases: cases[:, 0] > 7), {(1, 0): 4.0})
     settled = settle(
-        boxes, Known(nothing(2), nothing(2)), boxes.longest, [search_of(boxes.judge, 2000)]
+        boxes,
+        Known(nothing(2), nothing(2)),
+        boxes.longest,
+        [search_of(boxes.judge, 2000)],
     )
     assert settled.sides is None
     assert settled.known.boxes == 1, "nothing can cut this off"
@@ -233,7 +250,11 @@ def test_a_search_ends_soon_after_a_failure_or_with_its_budget() -> None:
     assert met.simulated < 5000
     assert (tooth(met.unsafe) < 0).all()
     met = search_cases(
-        lambda cases: 1 + cases[:, 0], space, cases_of([0.25, 5, 5]), SearchPlan(1000), rng
+        lambda cases: 1 + cases[:, 0],
+        space,
+        cases_of([0.25, 5, 5]),
+        SearchPlan(1000),
+        rng,
     )
     assert met.simulated == 1000
     assert met.least == 1
@@ -244,9 +265,15 @@ def test_a_search_ends_soon_after_a_failure_or_with_its_budget() -> None:
         "known ones come first"
     )
     met = search_cases(
-        lambda cases: np.full(len(cases), np.inf), space, known, SearchPlan(600, 100), rng
+        lambda cases: np.full(len(cases), np.inf),
+        space,
+        known,
+        SearchPlan(600, 100),
+        rng,
     )
-    assert (len(met.cases), met.least, met.simulated) == (0, np.inf, 600), "none of them counts"
+    assert (len(met.cases), met.least, met.simulated) == (0, np.inf, 600), (
+        "none of them counts"
+    )
 
 
 def test_children_lie_between_beside_and_around_their_parents() -> None:
@@ -254,8 +281,12 @@ def test_children_lie_between_beside_and_around_their_parents() -> None:
     rng = default_rng(0)
     parents = np.repeat(cases_of([4.0] * 4, [5.0] * 4), 16, axis=0)
     children = space_of(4).children(parents, 4000, rng)
-    between = {pulled + shift for pulled in (4.0, 4.5, 5.0) for shift in (-0.7, 0.0, 0.7)}
-    assert {*np.round(children[1::2, 0], 9).tolist()} == {round(value, 9) for value in between}
+    between = {
+        pulled + shift for pulled in (4.0, 4.5, 5.0) for shift in (-0.7, 0.0, 0.7)
+    }
+    assert {*np.round(children[1::2, 0], 9).tolist()} == {
+        round(value, 9) for value in between
+    }
     values = children[::2, :4]
     assert ~np.isin(values, (4.0, 5.0)).mean() == pytest.approx(1.2 / 7, abs=0.01)
     assert np.isin(values, (0.0, 10.0)).mean() == pytest.approx(0.6 / 7, abs=0.01)
@@ -268,7 +299,9 @@ def test_children_come_nearer_to_what_is_unsafe_than_random_cases() -> None:
         return np.abs(cases[:, :6] - 8).sum(axis=1) - 1.2
 
     for seed in range(5):
-        met = search_cases(judge, space_of(6), nothing(6), SearchPlan(5000), default_rng(seed))
+        met = search_cases(
+            judge, space_of(6), nothing(6), SearchPlan(5000), default_rng(seed)
+        )
         assert len(met.unsafe), seed
 
 
@@ -296,10 +329,15 @@ def test_a_cut_keeps_off_failures_by_its_clearance_and_cuts_no_given_side() -> N
     assert near[1].tolist() == [pytest.approx(3.9), 5.0], "one limit cuts both off"
     assert far[1].tolist() == [pytest.approx(3.0), 5.0]
     given = boxes_of(2, linear, {(1, 0): 5.0})
-    assert without(given, given.longest, known, 0.5)[1].tolist() == [5.0, pytest.approx(2.9)]
+    assert without(given, given.longest, known, 0.5)[1].tolist() == [
+        5.0,
+        pytest.approx(2.9),
+    ]
 
 
-def test_causes_are_as_few_changes_as_possible_and_places_where_the_box_was_unsafe() -> None:
+def test_causes_are_as_few_changes_as_possible_and_places_where_the_box_was_unsafe() -> (
+    None
+):
     judge = unsafe_where(lambda cases: (cases[:, 0] > 7) & (cases[:, 1] < 3))
     boxes = boxes_of(3, judge)
     unsafe = cases_of([9, 1, 8], [8, 2, 5])
@@ -308,7 +346,9 @@ def test_causes_are_as_few_changes_as_possible_and_places_where_the_box_was_unsa
     known = learn(boxes, Known(nothing(3), nothing(3)), unsafe, boxes.longest)
     assert known.boxes == 1
     assert (judge(known.cases) < 0).all()
-    assert known.cases[:, 0].min() == pytest.approx(7, abs=0.02), "nearly the first on its way"
+    assert known.cases[:, 0].min() == pytest.approx(7, abs=0.02), (
+        "nearly the first on its way"
+    )
     assert known.places[:, :3].tolist() == [[0.8, -0.8, 0]]
     assert known.at_places(boxes, np.full((2, 3), 2.5))[:, :3].tolist() == [[7, 3, 5]]
 
@@ -323,7 +363,9 @@ def test_a_box_grows_up_to_a_wall_and_shrinks_from_what_is_beyond() -> None:
     assert sides[1, 0] == pytest.approx(2, abs=0.1)
     assert sides[1, 0] <= 2
     assert sides[:, 1].tolist() == [5, 5]
-    assert shrunk(boxes, Known(nothing(2), nothing(2)), inner).tolist() == inner.tolist()
+    assert (
+        shrunk(boxes, Known(nothing(2), nothing(2)), inner).tolist() == inner.tolist()
+    )
 
 
 def test_a_box_avoids_what_it_must_not_hold() -> None:

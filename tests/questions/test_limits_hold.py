@@ -76,7 +76,13 @@ CLAIMS: dict[str, tuple[str, dict[str, Any], dict[str, Any], int, str]] = {
         1500,
         "every vehicle that was tested within them keeps at least 0.3 m",
     ),
-    "several parameter sets": ("smoke", {}, {"fits": 4}, 1500, "in 4 of 4 parameter sets"),
+    "several parameter sets": (
+        "smoke",
+        {},
+        {"fits": 4},
+        1500,
+        "in 4 of 4 parameter sets",
+    ),
     "encounters": (
         "sun",
         {"encounters": "ranges"},
@@ -114,7 +120,11 @@ def judge_of(study: Study, unsafe: Unsafe, margin: float) -> Judge:
 
 
 def worst_within(
-    lower: FloatArray, upper: FloatArray, judges: list[Judge], simulations: int, seed: int
+    lower: FloatArray,
+    upper: FloatArray,
+    judges: list[Judge],
+    simulations: int,
+    seed: int,
 ) -> float:
     """The least that settings between two ends leave, shape (n,), by any of some judges: SciPy's
     differential evolution, from random settings, half of whose values are at ends.
@@ -171,9 +181,14 @@ def test_another_optimiser_finds_nothing_unsafe_within_joint_limits(
         ends = row["together_low"], row["together_high"]
         assert (lower[column], upper[column]) == ends, "as printed"
         assert row["alone_low"] <= ends[0] <= ends[1] <= row["alone_high"]
-    assert said in f"{answer.verdict} {answer.tested} {answer.values('limits.sentence')}"
+    assert (
+        said in f"{answer.verdict} {answer.tested} {answer.values('limits.sentence')}"
+    )
     judges = [
         judge_of(each, unsafe, 0.0 if number else numbers["margin"])
         for number, each in enumerate(sets)
     ]
-    assert min(worst_within(lower, upper, judges, simulations, seed) for seed in range(2)) >= 0
+    assert (
+        min(worst_within(lower, upper, judges, simulations, seed) for seed in range(2))
+        >= 0
+    )

@@ -21,7 +21,8 @@ from tests.questions.conftest import model_of
 
 @SLOW
 @pytest.mark.parametrize(
-    ("name", "options"), [("rules", {"samples": 32}), ("tolerance", {"simulations": 240})]
+    ("name", "options"),
+    [("rules", {"samples": 32}), ("tolerance", {"simulations": 240})],
 )
 def test_a_question_about_a_part_prints_commands_about_it(
     name: str, options: dict[str, Any]
@@ -35,24 +36,33 @@ def test_a_question_about_a_part_prints_commands_about_it(
 
 
 @SLOW
-def test_limits_are_attacked_in_the_ranges_of_their_study_by_a_car_that_can_be_simulated() -> None:
+def test_limits_are_attacked_in_the_ranges_of_their_study_by_a_car_that_can_be_simulated() -> (
+    None
+):
     part = {"characteristics": ("brakeTorque",), "point": "CPNCO"}
     answer = sv.tolerance("wear", fits=0, pool=InlinePool(), **part)
     (row,) = answer.tables["ranges"].to_dict("records")
     assert not row["kept"]
     command = row["simulate"]
-    assert {"--ranges", "CPNCO", f"speed={row['fails_at']['speed']}"} <= {*command.split()}
+    assert {"--ranges", "CPNCO", f"speed={row['fails_at']['speed']}"} <= {
+        *command.split()
+    }
     assert numbers_of(command)["f_safe"] < 0.1
 
 
 @pytest.mark.parametrize(
     ("point", "scope"),
     [
-        ("CPNA, speed 40, impact_location 25, wet", "crossing (CPNA) at 40 km/h, impact location"),
+        (
+            "CPNA, speed 40, impact_location 25, wet",
+            "crossing (CPNA) at 40 km/h, impact location",
+        ),
         ("CPLA, speed 60, wet", "along (CPLA) at 60 km/h; weather wet"),
     ],
 )
-def test_limits_at_one_point_of_a_matrix_claim_nothing_beyond_it(point: str, scope: str) -> None:
+def test_limits_at_one_point_of_a_matrix_claim_nothing_beyond_it(
+    point: str, scope: str
+) -> None:
     study = at_point(sv.load_study("wear"), point)
     assert scope_of(study).startswith(scope)
     assert moving_tests(model_of(study), Unsafe()) == []

@@ -20,7 +20,11 @@ from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit import permit
-from safevar_sumo.questions.permit.encounters import EncounterRange, encounters_of, span_of
+from safevar_sumo.questions.permit.encounters import (
+    EncounterRange,
+    encounters_of,
+    span_of,
+)
 from safevar_sumo.questions.permit.rows import verdict_of
 from safevar_sumo.questions.permit.search import PermitSearch, Reached
 from safevar_sumo.questions.permit.speeds import Cars
@@ -62,7 +66,12 @@ def short(in_tmp: Path) -> Study:
 
 
 def are_unsafe(
-    study: Study, fit: int, cars: FloatArray, values: FloatArray, places: FloatArray, keep: float
+    study: Study,
+    fit: int,
+    cars: FloatArray,
+    values: FloatArray,
+    places: FloatArray,
+    keep: float,
 ) -> BoolArray:
     """Second computation: which cars are unsafe at each speed, shape (cars, speeds), at any of the
     impact locations `places` in any test alone, whether or not the original is safe there.
@@ -85,7 +94,9 @@ def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None
     members = assemble(study).characteristics.vehicle
     rng = default_rng(5)
     lower = members.lower + [item.error for item in members]
-    settings = np.vstack([members.original, lower + rng.random((3, 7)) * (members.upper - lower)])
+    settings = np.vstack(
+        [members.original, lower + rng.random((3, 7)) * (members.upper - lower)]
+    )
     frame = pd.DataFrame(settings, columns=[*members.names])
     frame.insert(0, "car", ["new", "a", "b", "c"])
     answer = permit("wear", cars=frame, fits=6)
@@ -98,10 +109,16 @@ def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None
         fails = are_unsafe(study, fit, settings, speeds, PLACES, keep=0.1)
         for car, name in enumerate(frame["car"]):
             reached = up_to.loc[name, fit]
-            assert np.isnan(reached) or not fails[car, speeds <= reached].any(), (name, fit)
+            assert np.isnan(reached) or not fails[car, speeds <= reached].any(), (
+                name,
+                fit,
+            )
             # The encounter that is named for what lies above fails as printed.
             (speed,) = re.findall(r"speed (\S+) km/h", sets.encounter[name, fit])
-            assert float(speed) <= (10.0 if np.isnan(reached) else reached + 1), (name, fit)
+            assert float(speed) <= (10.0 if np.isnan(reached) else reached + 1), (
+                name,
+                fit,
+            )
             command = sets.simulate[name, fit]
             assert numbers_of(command)["f_safe"] < (0.1 if fit == 0 else 0), command
     rows = answer.table().set_index("car")
@@ -112,8 +129,12 @@ def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None
 
 
 @SLOW
-def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(short: Study) -> None:
-    row = json_of("permit", "short.toml", "--cars", "fleet.csv", "--ignore", "note", "--fits", "0")
+def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(
+    short: Study,
+) -> None:
+    row = json_of(
+        "permit", "short.toml", "--cars", "fleet.csv", "--ignore", "note", "--fits", "0"
+    )
     cars = row["tables"]["cars"]["rows"]
     numbers = row["numbers"]
     assert cars[0]["car"] == "slow"
@@ -123,13 +144,29 @@ def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(sh
     assert by_name["slow"]["up_to"] is None
     assert by_name["slow"]["because"].startswith("Not even at 34 km/h: ")
     assert by_name["new"]["verdict"] == "drive", "as fast as the new car"
-    assert by_name["new"]["up_to"] == by_name["new"]["new_car_up_to"] > by_name["007"]["up_to"]
+    assert (
+        by_name["new"]["up_to"]
+        == by_name["new"]["new_car_up_to"]
+        > by_name["007"]["up_to"]
+    )
     assert by_name["007"]["repair_first"] == "brakeTorque"
     assert by_name["007"]["up_to_after_repair"] == by_name["new"]["up_to"]
     assert {car["assumed"] for car in cars} == {"payloadCentre 1.4 m, sensorRange 80 m"}
-    assert "Assumed, because not measured: payloadCentre 1.4 m (longitudinal pos" in row["verdict"]
+    assert (
+        "Assumed, because not measured: payloadCentre 1.4 m (longitudinal pos"
+        in row["verdict"]
+    )
 
-    typed = ["permit", "short.toml", "--cars", "fleet.csv", "--ignore", "note", "--fits", "0"]
+    typed = [
+        "permit",
+        "short.toml",
+        "--cars",
+        "fleet.csv",
+        "--ignore",
+        "note",
+        "--fits",
+        "0",
+    ]
     printed = run(*typed, "--format", "csv", "--out", "out.csv").stdout
     listing = pd.read_csv("out.csv", dtype=str)
     assert printed == Path("out.csv").read_text()
@@ -141,7 +178,9 @@ def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(sh
     assert Path("fleet.csv").read_text() == FLEET
     refused(*typed, "--out", "fleet.csv", message=("fleet.csv is the list itself",))
     typed[3] = "out.csv"
-    assert run(*typed, "--format", "csv").stdout == printed, "the written list has the same answer"
+    assert run(*typed, "--format", "csv").stdout == printed, (
+        "the written list has the same answer"
+    )
 
 
 @SLOW
@@ -171,14 +210,20 @@ def test_all_cars_within_limits(short: Study) -> None:
     members = assemble(short).characteristics.vehicle
     names = ("treadDepth", "payload", "brakeTorque")
     corners = product([3, 8], [75, 525], [0.7, 1])
-    cars = [members.setting(dict(zip(names, corner, strict=True))) for corner in corners]
+    cars = [
+        members.setting(dict(zip(names, corner, strict=True))) for corner in corners
+    ]
     speeds = np.arange(34.0, row["up_to"] + 0.1, 0.5)
     for fit in range(2):
-        assert not are_unsafe(short, fit, np.array(cars), speeds, PLACES, keep=0.1).any()
+        assert not are_unsafe(
+            short, fit, np.array(cars), speeds, PLACES, keep=0.1
+        ).any()
 
 
 @SLOW
-def test_the_rough_answer_lets_no_car_drive_and_says_so_in_each_form(short: Study) -> None:
+def test_the_rough_answer_lets_no_car_drive_and_says_so_in_each_form(
+    short: Study,
+) -> None:
     cars = {"new": {}, "worn": {"treadDepth": 3}}
     answer = permit(short, cars=cars, others="new", quick=True)
     assert answer.numbers["rough"]
@@ -188,7 +233,9 @@ def test_the_rough_answer_lets_no_car_drive_and_says_so_in_each_form(short: Stud
     assert set(table["verdict"]) == {"up to"}
     assert set(table["rough"]) == {True}
     assert set(table["parameter_sets"]) == {1}
-    assert set(zip(table["margin"], table["unsafe"], strict=True)) == {(0.1, "collision")}
+    assert set(zip(table["margin"], table["unsafe"], strict=True)) == {
+        (0.1, "collision")
+    }
     assert "rough" in answer.only("cars").render("text")
     Path("rough.csv").write_text(answer.render("csv"))
     assert [*pd.read_csv("rough.csv")["rough"]] == ["yes", "yes"]
@@ -207,7 +254,10 @@ def test_a_needed_speed_is_no_less_where_the_new_car_is_unsafe_too() -> None:
         (49, None, "up to"),
         (None, None, "stop"),
     ):
-        assert verdict_of(up_to, 50, 60, need, is_proven=True) == expected, (up_to, need)
+        assert verdict_of(up_to, 50, 60, need, is_proven=True) == expected, (
+            up_to,
+            need,
+        )
 
 
 @SLOW
@@ -223,7 +273,9 @@ def test_a_speed_that_no_scenario_can_move_is_one_that_was_driven() -> None:
 @SLOW
 def test_a_car_passes_a_test_of_a_regulation() -> None:
     """It is no promise for the road."""
-    told = permit("r152", cars={"a": {"brakeTorque": 0.9}}, others="new", quick=True).verdict
+    told = permit(
+        "r152", cars={"a": {"brakeTorque": 0.9}}, others="new", quick=True
+    ).verdict
     assert "a passes the test up to 40 km/h" in told
     assert "the new car passes the test up to 40 km/h" in told
     assert "may drive" not in told
@@ -240,7 +292,9 @@ def test_a_car_is_safe_with_all_values_that_its_measured_one_may_have(
         EncounterRange,
         "robustness",
         lambda one, settings, stage: np.where(
-            one.values_in(settings) > 20, abs(settings[:, column] - unsafe_at) - 0.01, 1.0
+            one.values_in(settings) > 20,
+            abs(settings[:, column] - unsafe_at) - 0.01,
+            1.0,
         ),
     )
     ends = np.tile(members.original, (2, 1))
@@ -252,7 +306,9 @@ def test_a_car_is_safe_with_all_values_that_its_measured_one_may_have(
 
 
 @SLOW
-def test_one_car_is_told_which_assumed_value_lowers_its_speed_most(short: Study) -> None:
+def test_one_car_is_told_which_assumed_value_lowers_its_speed_most(
+    short: Study,
+) -> None:
     stated = {"brakeTorque": 0.7, "brakeResponse": 0.1, "sensorLatency": 0.05}
     options: dict[str, Any] = {"others": "new", "fits": 0, "quick": True}
     told = permit(short, cars={"a": stated}, **options).verdict
@@ -314,7 +370,9 @@ over = { speed = [20, 60] }
 """
 
 
-def reached(study: Study, cars: Cars | None = None, budget: int = LEAST_SIMULATIONS) -> Reached:
+def reached(
+    study: Study, cars: Cars | None = None, budget: int = LEAST_SIMULATIONS
+) -> Reached:
     """How far cars, by default the original, are safe with the study's own parameter set."""
     span = span_of(study, None)
     own = model_of(study)
@@ -325,7 +383,9 @@ def reached(study: Study, cars: Cars | None = None, budget: int = LEAST_SIMULATI
 
 
 @SLOW
-def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(in_tmp: Path) -> None:
+def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(
+    in_tmp: Path,
+) -> None:
     Path("three.toml").write_text(MATRIX)
     study = load_study("three.toml")
     span = span_of(study, None)
@@ -354,11 +414,17 @@ def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
 ) -> None:
     study = load_study("wear", encounters="ranges")
 
-    def robustness(self: EncounterRange, settings: FloatArray, stage: str) -> FloatArray:
+    def robustness(
+        self: EncounterRange, settings: FloatArray, stage: str
+    ) -> FloatArray:
         members = self.model.characteristics
         columns = members.columns(members.with_printed_encounters(settings))
         speed, location = columns["speed"], columns["impact_location"]
-        fails = (speed >= begin) & (speed <= begin + width) & (abs(location - place) <= share)
+        fails = (
+            (speed >= begin)
+            & (speed <= begin + width)
+            & (abs(location - place) <= share)
+        )
         return np.where(fails & (self.test == "CPLA"), -1.0, 1.0)
 
     with pytest.MonkeyPatch.context() as patch:

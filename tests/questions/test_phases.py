@@ -64,7 +64,9 @@ def test_an_encounter_that_begins_a_whole_step_later_is_the_same(name: str) -> N
 
 
 def test_the_phase_of_a_pedestrian_is_a_later_impact() -> None:
-    study = load_study("wear", matrix={"tests": [{"name": "CPFA", "parameters": {"test": "CPFA"}}]})
+    study = load_study(
+        "wear", matrix={"tests": [{"name": "CPFA", "parameters": {"test": "CPFA"}}]}
+    )
     system = assemble(study)
     settings = drawn(system, 6, 2)
     for phase in (0.25, 0.8, 1.0):
@@ -82,7 +84,9 @@ def test_vehicles_at_several_points_each_have_their_own_phase() -> None:
     phases = np.array([0.0, 0.4, 0.4, 0.9131, 0.2])
     found = degrees(phased, np.column_stack([settings, phases]))
     for row, phase in enumerate(phases.tolist()):
-        assert_array_equal(found[:, row], degrees(at_phase(system, phase), settings[[row]])[:, 0])
+        assert_array_equal(
+            found[:, row], degrees(at_phase(system, phase), settings[[row]])[:, 0]
+        )
 
 
 def test_sumo_repeats_a_phase_to_the_bit() -> None:
@@ -104,7 +108,13 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(phases, "NEAR", np.inf)  # also where the car stops long before
-    speed = {"unit": "km/h", "original": 45, "lower": 40, "upper": 50, "meaning": "speed"}
+    speed = {
+        "unit": "km/h",
+        "original": 45,
+        "lower": 40,
+        "upper": 50,
+        "meaning": "speed",
+    }
     evaluator = Evaluator(ahead(speed=speed), InlinePool())
     model = Model(0, evaluator, Unsafe(below=0.0))
     original = evaluator.characteristics.original
@@ -122,7 +132,9 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     assert claim is not None
     judge = partial(claim.robustness, stage="phases")
     rows, worst = at_worst_phases(claim, judge, settings[some])
-    assert_allclose(worst, np.interp(speeds[some], speeds[lower], left[lower]), atol=0.01)
+    assert_allclose(
+        worst, np.interp(speeds[some], speeds[lower], left[lower]), atol=0.01
+    )
     assert (worst <= left[some]).all()
 
     # What is printed is what was simulated.
@@ -139,7 +151,9 @@ def test_no_phase_is_unsafe_where_the_worst_is_not() -> None:
     settings[:, members.names.index("brakeTorque")] = np.linspace(0.92, 0.96, 40)
     claim = model.in_phases
     assert claim is not None
-    _, worst = at_worst_phases(claim, partial(claim.robustness, stage="phases"), settings)
+    _, worst = at_worst_phases(
+        claim, partial(claim.robustness, stage="phases"), settings
+    )
     many = np.repeat(np.linspace(0, 1, 200, endpoint=False), len(settings))
     rows = np.column_stack([np.tile(settings, (200, 1)), many])
     scanned = claim.robustness(rows, "scan").reshape(200, -1)
@@ -209,11 +223,18 @@ def test_an_answer_says_that_a_driving_system_counts_steps(
         "        self.calls += 1\n"
         "        return 0.0, self.brake\n"
     )
-    near = {"lower": 10.0, "upper": 50.0, "unit": "m", "meaning": "gap at which it brakes"}
+    near = {
+        "lower": 10.0,
+        "upper": 50.0,
+        "unit": "m",
+        "meaning": "gap at which it brakes",
+    }
     parts = {
         "ads": {"model": "slow_ads:Slow", "parameters": {"near": 25.0}},
         "repair": {"near": near},
     }
     study = {"extends": "autoware_july", "name": "slow", **parts}
-    answer = question(study, quick=True, fits=0, unsafe="safety_degree < -30", jobs=1, **options)
+    answer = question(
+        study, quick=True, fits=0, unsafe="safety_degree < -30", jobs=1, **options
+    )
     assert COUNTS_STEPS in f"{answer.verdict} {answer.tested}"

@@ -44,7 +44,9 @@ def test_robust_is_what_its_neighbours_are_too() -> None:
     deep, edge = robust_shares(evaluator, np.array([[9.0, 1.0], [7.0, 1.0]]), COLLISION)
     assert deep.tolist() == [1.0, 1.0, 1.0]
     assert edge.mean() == pytest.approx(0.5, abs=0.2)
-    (beyond,) = robust_shares(evaluator, np.array([[7.0 + 1.01 * threshold, 1.0]]), COLLISION)
+    (beyond,) = robust_shares(
+        evaluator, np.array([[7.0 + 1.01 * threshold, 1.0]]), COLLISION
+    )
     assert beyond.mean() == 1.0
 
 
@@ -57,7 +59,9 @@ ORIGINAL = np.array([one.original for one in STUDY.vehicle.characteristics.value
 def evaluator(**parameters: object) -> Evaluator:
     """A short-sighted driving system in one scenario."""
     scenario = ScenarioTable(model="crossing", parameters=parameters)
-    return Evaluator(replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), InlinePool())
+    return Evaluator(
+        replace(STUDY, matrix=None, ads=BLIND, scenario=scenario), InlinePool()
+    )
 
 
 def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
@@ -80,13 +84,20 @@ def collisions(here: Evaluator, *settings: FloatArray) -> Evaluations:
 def avoiders(here: Evaluator, *settings: FloatArray) -> list[str]:
     """The weakest driver who avoids each collision."""
     return list(
-        map(avoided_by, assess_collisions(here, collisions(here, *settings)).to_dict("records"))
+        map(
+            avoided_by,
+            assess_collisions(here, collisions(here, *settings)).to_dict("records"),
+        )
     )
 
 
-def verdicts(*drivers: Sequence[float], points: Sequence[str] | None = None) -> pd.DataFrame:
+def verdicts(
+    *drivers: Sequence[float], points: Sequence[str] | None = None
+) -> pd.DataFrame:
     """Made-up verdicts of all drivers, in their order."""
-    return pd.DataFrame(dict(zip(TITLES, drivers, strict=True))).assign(point=points or "")
+    return pd.DataFrame(dict(zip(TITLES, drivers, strict=True))).assign(
+        point=points or ""
+    )
 
 
 def test_what_drivers_avoid_is_counted_among_the_collisions_with_a_verdict() -> None:
@@ -104,14 +115,20 @@ def test_who_has_no_verdict_is_counted_with_the_points() -> None:
     nan = np.nan
     two = verdicts([1.0, nan], [1.0, 1.0], points=["a", "b"])
     rows = drivers_frame(two, 2).to_dict("records")
-    assert [(row["avoided"], row["no_verdict"], row["no_verdict_points"]) for row in rows] == [
+    assert [
+        (row["avoided"], row["no_verdict"], row["no_verdict_points"]) for row in rows
+    ] == [
         (1, 1, ["b"]),
         (2, 0, []),
     ]
     only_full, nobody = verdicts([nan], [1.0]), verdicts([nan], [nan])
     assert avoided_by(only_full.iloc[0].to_dict()) == "full braking"
     assert avoided_by(nobody.iloc[0].to_dict()) == "no verdict"
-    assert drivers_frame(nobody, 1)[["share", "share_low", "share_high"]].isna().all(axis=None)
+    assert (
+        drivers_frame(nobody, 1)[["share", "share_low", "share_high"]]
+        .isna()
+        .all(axis=None)
+    )
 
 
 @SLOW
@@ -123,16 +140,22 @@ def test_a_competent_driver_avoids_what_a_short_sighted_system_does_not() -> Non
 @SLOW
 def test_a_child_that_comes_out_late_tells_nothing_of_a_competent_driver() -> None:
     """He hits it in the original vehicle."""
-    assert avoiders(evaluator(test="CPNCO", speed=40), vehicle(brakes=0.99)) == ["full braking"]
+    assert avoiders(evaluator(test="CPNCO", speed=40), vehicle(brakes=0.99)) == [
+        "full braking"
+    ]
 
 
 @SLOW
 def test_behind_a_leader_that_brakes_with_4_a_competent_driver_has_no_verdict() -> None:
-    tests = [{"name": "CCRb", "parameters": {"test": "CCRb"}, "over": {"speed": [40, 50]}}]
+    tests = [
+        {"name": "CCRb", "parameters": {"test": "CCRb"}, "over": {"speed": [40, 50]}}
+    ]
     study = load_study("euro_ncap_car_to_car", matrix={"tests": tests})
     here = Evaluator(replace(study, ads=BLIND), InlinePool())
     found = drivers_frame(
-        *assess_sample(here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9)))
+        *assess_sample(
+            here, collisions(here, vehicle(brakes=0.95), vehicle(brakes=0.9))
+        )
     )
     letter = found.to_dict("records")[0]
     assert letter["no_verdict"] == 2
@@ -148,7 +171,9 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     """
     here = evaluator(test="CPFA", speed=30)
     brakeless = (vehicle(0.1, 1 - (30 - k) / 1e6) for k in range(20))
-    every = collisions(here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(10)))
+    every = collisions(
+        here, *brakeless, *(vehicle(1.0, 1 - k / 1e6) for k in range(10))
+    )
     whole, number = assess_sample(here, Evaluations.concatenate([every, every]))
     assert (len(whole), number) == (30, 30)
     letter = drivers_frame(whole, number).iloc[0]
@@ -159,7 +184,9 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
     sample, number = assess_sample(here, every, max_sample=15)
     assert (len(sample), number) == (15, 30)
     reverse = every.take(np.arange(30)[::-1])
-    pd.testing.assert_frame_equal(sample, assess_sample(here, reverse, max_sample=15)[0])
+    pd.testing.assert_frame_equal(
+        sample, assess_sample(here, reverse, max_sample=15)[0]
+    )
     letter = drivers_frame(sample, number).iloc[0]
     hits = letter["avoided"]
     expected = (
@@ -171,7 +198,12 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
 
 
 TESTS = [
-    {"name": "CPLA", "model": "along", "over": {"speed": [20, 40]}, "weathers": ["clear", "night"]},
+    {
+        "name": "CPLA",
+        "model": "along",
+        "over": {"speed": [20, 40]},
+        "weathers": ["clear", "night"],
+    },
     {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [30]}},
 ]
 
@@ -199,7 +231,9 @@ def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
     system: System, weak: FloatArray, failure: PointComparison
 ) -> None:
     endings, unsafe_points = failure
-    at = next(point for point in system.points if endings.startswith(f"At {point.name}: "))
+    at = next(
+        point for point in system.points if endings.startswith(f"At {point.name}: ")
+    )
     assert at.name in unsafe_points
     original = drive_and_score(system.at(at), original_of(system)).f_safe[0]
     assert (
@@ -226,9 +260,16 @@ def drive_of(*vehicles: Vehicle) -> SimulationRuns:
         braking = np.clip(time, slows, stands) - slows
         place = v * np.minimum(time, stands) - deceleration * braking**2 / 2
         drives.append(
-            (v - deceleration * braking, place, 1.0 * (time >= begins), 1.0 * (time >= slows))
+            (
+                v - deceleration * braking,
+                place,
+                1.0 * (time >= begins),
+                1.0 * (time >= slows),
+            )
         )
-    speed, place, brake, pedal = (np.stack(part, axis=1) for part in zip(*drives, strict=True))
+    speed, place, brake, pedal = (
+        np.stack(part, axis=1) for part in zip(*drives, strict=True)
+    )
     hit = place >= OBSTACLE
     collision_speed = np.where(
         hit.any(axis=0), speed[np.argmax(hit, axis=0), np.arange(len(vehicles))], np.nan
@@ -256,7 +297,9 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
     runs.trace.brake[50:150, 1:3] = 0.5
     runs.trace.throttle[150:200, 1] = 0.1
     runs.trace.brake[150:250, 2:] = 0.01
-    plain, overshot, settling, unbraked = (brake_onset(runs, column) for column in range(4))
+    plain, overshot, settling, unbraked = (
+        brake_onset(runs, column) for column in range(4)
+    )
     assert overshot == settling == plain
     assert plain is not None
     assert runs.trace.gap[plain, 0] == pytest.approx(15.0)
@@ -272,5 +315,7 @@ def test_the_drivers_of_lanes_are_judged_where_a_car_cuts_in() -> None:
     verdicts = assess_collisions(evaluator, collisions)
     rows = drivers_frame(verdicts, len(collisions)).set_index("driver")
     assert {"competent_driver", "rss", "fuzzy_safety", "r157"} < {*rows.index}
-    assert ((rows["avoided"] + rows["no_longer"] + rows["no_verdict"]) == len(collisions)).all()
+    assert (
+        (rows["avoided"] + rows["no_longer"] + rows["no_verdict"]) == len(collisions)
+    ).all()
     assert rows["no_verdict"]["full_braking"] == rows["no_verdict"].min()

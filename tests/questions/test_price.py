@@ -35,14 +35,18 @@ def keeps(decel: float, delay: float, clearance: float = 0.0) -> bool:
 
 
 @SLOW
-@pytest.mark.parametrize("question", ["risk", "rules", "explain", "tolerance", "compare"])
+@pytest.mark.parametrize(
+    "question", ["risk", "rules", "explain", "tolerance", "compare"]
+)
 @pytest.mark.parametrize("number", [150, 700])
 def test_a_question_keeps_to_the_number_of_simulations(
     rig: str, question: str, number: int
 ) -> None:
     others = [rig] if question == "compare" else []
     pool = InlinePool()
-    answer = getattr(sv, question)(rig, *others, simulations=number, pool=pool, fresh=True)
+    answer = getattr(sv, question)(
+        rig, *others, simulations=number, pool=pool, fresh=True
+    )
     assert answer.numbers["rough"]
     assert answer.numbers["simulations"] <= number
     assert f"--simulations {number}" in answer.verdict
@@ -56,12 +60,18 @@ def test_joint_limits_of_few_simulations_are_safe_by_the_formula(rig: str) -> No
     delay = limits.loc["delay", "together_high"]
     assert keeps(decel, delay, 0.3)
     assert not keeps(decel - 1.5, delay, 0.3)
-    assert limits[["alone_low", "alone_high"]].isna().all(axis=None), "no line was scanned"
+    assert limits[["alone_low", "alone_high"]].isna().all(axis=None), (
+        "no line was scanned"
+    )
     assert answer.numbers["kept"] is None
 
 
-def test_few_simulations_say_nothing_of_parts_that_were_not_asked_about(rig: str) -> None:
-    answer = sv.tolerance(rig, characteristics=["decel"], simulations=100, pool=InlinePool())
+def test_few_simulations_say_nothing_of_parts_that_were_not_asked_about(
+    rig: str,
+) -> None:
+    answer = sv.tolerance(
+        rig, characteristics=["decel"], simulations=100, pool=InlinePool()
+    )
     assert "decel can make the vehicle unsafe on its own." in answer.verdict
     assert "delay" not in answer.verdict
 
@@ -70,18 +80,26 @@ def test_few_simulations_state_no_limits_that_leave_a_part_no_room(rig: str) -> 
     """The new vehicle keeps just this clearance, so that no delay is safe beside its braking."""
     unsafe = f"below={CLEARANCE - 15**2 / 2 / 8}"
     answer = sv.tolerance(rig, unsafe=unsafe, simulations=400, pool=InlinePool())
-    assert "no joint limits of use, because no safe change of delay was found" in answer.verdict
-    assert answer.tables["limits"][["together_low", "together_high"]].isna().all(axis=None)
+    assert (
+        "no joint limits of use, because no safe change of delay was found"
+        in answer.verdict
+    )
+    assert (
+        answer.tables["limits"][["together_low", "together_high"]].isna().all(axis=None)
+    )
 
 
 def test_no_joint_limits_are_stated_that_nothing_was_tried_in(rig: str) -> None:
     answer = sv.tolerance(rig, simulations=35, pool=InlinePool())
     assert "did not suffice" in answer.verdict
-    assert answer.tables["limits"][["together_low", "together_high"]].isna().all(axis=None)
+    assert (
+        answer.tables["limits"][["together_low", "together_high"]].isna().all(axis=None)
+    )
 
 
 @pytest.mark.parametrize(
-    ("question", "least"), [("risk", 5), ("rules", 5), ("explain", 5), ("tolerance", 35)]
+    ("question", "least"),
+    [("risk", 5), ("rules", 5), ("explain", 5), ("tolerance", 35)],
 )
 def test_the_least_number_is_told_before_anything_is_simulated(
     rig: str, question: str, least: int, monkeypatch: pytest.MonkeyPatch
@@ -126,7 +144,9 @@ def test_shares_of_few_simulations_are_of_the_first_order(
     assert said in answer.verdict
     table = answer.tables["sensitivity"].set_index("characteristic")
     assert table["degree_total"].isna().all()
-    assert table["degree_first"].loc[["decel", "delay"]].tolist() == pytest.approx(shares, abs=0.1)
+    assert table["degree_first"].loc[["decel", "delay"]].tolist() == pytest.approx(
+        shares, abs=0.1
+    )
 
 
 @pytest.mark.usefixtures("coarse")
@@ -140,7 +160,9 @@ def test_few_simulations_are_for_a_design_that_takes_half_of_them(
     assert answer.numbers["samples"] > 250
 
 
-def test_no_limit_alone_is_stated_that_was_tried_in_one_encounter_only(rig: str) -> None:
+def test_no_limit_alone_is_stated_that_was_tried_in_one_encounter_only(
+    rig: str,
+) -> None:
     searched = "[scenario.over]\ngap = { lower = 38.0 }\n\n[vehicle.ch"
     Path("searched.toml").write_text(
         'encounters = "ranges"' + STUDY.replace("[vehicle.ch", searched)
@@ -205,7 +227,9 @@ class Counted(Rig):
 
 @pytest.mark.parametrize("number", [10, 40, pytest.param(300, marks=SLOW)])
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=SLOW)])
-@pytest.mark.parametrize("question", ["risk", "rules", "tolerance --limits decel>=5", "explain"])
+@pytest.mark.parametrize(
+    "question", ["risk", "rules", "tolerance --limits decel>=5", "explain"]
+)
 def test_a_number_is_that_of_all_simulations_of_an_edited_class(
     rig: str, question: str, number: int, jobs: int, request: pytest.FixtureRequest
 ) -> None:
@@ -215,7 +239,16 @@ def test_a_number_is_that_of_all_simulations_of_an_edited_class(
     Path("counted.py").write_text(f"{COUNTED}# {question} {number} {jobs}")
     Path(rig).write_text(STUDY.replace("models:Wall", "counted:Counted"))
     name, *options = question.split()
-    command = (name, rig, *options, "--simulations", f"{number}", "--jobs", f"{jobs}", "--fresh")
+    command = (
+        name,
+        rig,
+        *options,
+        "--simulations",
+        f"{number}",
+        "--jobs",
+        f"{jobs}",
+        "--fresh",
+    )
     output = run(*command, expect=None)
     if "do not suffice: an answer takes at least" in output.stderr:
         assert number < 100
@@ -224,7 +257,9 @@ def test_a_number_is_that_of_all_simulations_of_an_edited_class(
     assert number / 3 <= Path("count").stat().st_size <= number, output.stderr
     if number == 300:
         assert "30 for a check of the class, which is shorter" in output.stderr or (
-            re.search(r"with 2\d for a check of the class, which is shorter", output.stderr)
+            re.search(
+                r"with 2\d for a check of the class, which is shorter", output.stderr
+            )
         )
         assert run(*command, expect=None).stdout == output.stdout
 
@@ -248,7 +283,10 @@ def test_what_takes_long_by_default_is_limited_and_said_first(
     account = Account(Phases(show_no_progress), is_question=True)
     account.open(10_000, 0.4)
     assert account.most == 2200
-    assert "at most 2,200 simulations, about 0:14:40, of about 10,000" in capsys.readouterr().err
+    assert (
+        "at most 2,200 simulations, about 0:14:40, of about 10,000"
+        in capsys.readouterr().err
+    )
     other = Account(Phases(show_no_progress), is_question=True)
     other.open(1000, 0.4)
     assert other.most is None
@@ -256,9 +294,13 @@ def test_what_takes_long_by_default_is_limited_and_said_first(
     assert round_down(0.2) == 1
 
 
-def test_a_slow_simulator_gets_a_rough_answer(rig: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_simulator_gets_a_rough_answer(
+    rig: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(price, "LONGEST", 0.5)
-    monkeypatch.setattr("safevar_sumo.questions.evaluator.seconds_of_simulation", lambda *_: 0.001)
+    monkeypatch.setattr(
+        "safevar_sumo.questions.evaluator.seconds_of_simulation", lambda *_: 0.001
+    )
     output = run("rules", rig)
     assert "at most 500 simulations" in output.stderr
     assert output.stdout.startswith("Rough answer (--simulations 500)")
@@ -285,5 +327,11 @@ def test_a_page_and_a_pack_share_one_number(
     assert {3 * int(part) > 0.7 * number for _, part in stated} == {True}
     assert json_of("verify", "pack.zip", "--run-code")["numbers"]["passed"]
     refused(
-        "evidence", "evidence", "--simulations", "3", "--out", "3.zip", message=("not suffice",)
+        "evidence",
+        "evidence",
+        "--simulations",
+        "3",
+        "--out",
+        "3.zip",
+        message=("not suffice",),
     )

@@ -30,7 +30,9 @@ QUESTIONS: list[Any] = [
     (sv.rules, {"samples": 200}),
     pytest.param(sv.tolerance, {"quick": True}, marks=SLOW),
     pytest.param(
-        sv.repair, {"promise": ("mass <= 2450",), "change": ("brake_gap",), "fits": 1}, marks=SLOW
+        sv.repair,
+        {"promise": ("mass <= 2450",), "change": ("brake_gap",), "fits": 1},
+        marks=SLOW,
     ),
 ]
 
@@ -56,10 +58,13 @@ def test_phases_come_in_order_and_all_that_is_done_is_in_the_total(
 
 @given(
     st.lists(
-        st.tuples(st.sampled_from(["first", "second", "other"]), st.integers(1, 50)), min_size=1
+        st.tuples(st.sampled_from(["first", "second", "other"]), st.integers(1, 50)),
+        min_size=1,
     )
 )
-def test_any_order_of_parts_is_counted_without_a_way_back(parts: list[tuple[str, int]]) -> None:
+def test_any_order_of_parts_is_counted_without_a_way_back(
+    parts: list[tuple[str, int]],
+) -> None:
     shown = Shown()
     phases = Phases(lambda *one: shown.append(one))
     phases.plan({"first": 10, "second": 30})
@@ -101,12 +106,19 @@ def test_parts_weigh_at_least_what_is_expected_of_them() -> None:
     first("a", 5, 10)
     first("b", 100, 200)
     parts.begin()("c", 1, 2)
-    assert shown == [("question 1: a", 50, 150), ("question 1: b", 100, 250), ("c", 225, 250)]
+    assert shown == [
+        ("question 1: a", 50, 150),
+        ("question 1: b", 100, 250),
+        ("c", 225, 250),
+    ]
 
 
 def recorded() -> dict[str, list[tuple[float, int, int]]]:
     with RECORDED.open(encoding="utf-8", newline="") as file:
-        rows = [(row[0], float(row[1]), int(row[2]), int(row[3])) for row in csv.reader(file)]
+        rows = [
+            (row[0], float(row[1]), int(row[2]), int(row[3]))
+            for row in csv.reader(file)
+        ]
     return {
         command: [row[1:] for row in of_command]
         for command, of_command in groupby(rows, key=lambda row: row[0])

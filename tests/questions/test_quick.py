@@ -20,18 +20,32 @@ from tests.in_process import SLOW, InlinePool, run
 @SLOW
 def test_a_rough_tolerance_calls_no_limit_kept() -> None:
     """It says what was tested, and ends with code 3: a gate must not pass by it."""
-    asked = ("tolerance", "smoke", "--quick", "--limits", "mass <= 2500", "--unsafe", "collision")
+    asked = (
+        "tolerance",
+        "smoke",
+        "--quick",
+        "--limits",
+        "mass <= 2500",
+        "--unsafe",
+        "collision",
+    )
     done = run(*asked, "--json", expect=3)
     answer = json.loads(done.stdout)
     assert answer["verdict"].startswith("Rough answer (--quick")
-    assert [answer["numbers"][name] for name in ("rough", "kept", "fits_tried")] == [True, None, 1]
+    assert [answer["numbers"][name] for name in ("rough", "kept", "fits_tried")] == [
+        True,
+        None,
+        1,
+    ]
     assert {row["kept"] for row in answer["tables"]["limits"]["rows"]} == {None}
     assert "calls no limit kept" in done.stderr
 
 
 @SLOW
 def test_a_rough_tolerance_says_which_limit_fails() -> None:
-    answer = sv.tolerance("smoke", limits=("mass <= 2700",), unsafe="below=2.7", quick=True)
+    answer = sv.tolerance(
+        "smoke", limits=("mass <= 2700",), unsafe="below=2.7", quick=True
+    )
     assert answer.numbers["kept"] is False
     assert "Do not release" in answer.verdict
 
@@ -65,21 +79,31 @@ def test_a_rough_list_says_its_price_and_drives_the_own_parameter_set_alone(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """No study with another parameter set is even made."""
-    monkeypatch.setattr(model_spread, "with_values", lambda *_: pytest.fail("another set"))
+    monkeypatch.setattr(
+        model_spread, "with_values", lambda *_: pytest.fail("another set")
+    )
     sv.permit("wear", cars=WORN, others="new", quick=True, pool=InlinePool())
-    price = r"about [\d,]+ simulations, about 0:\d\d:\d\d; cars that fail early take fewer"
+    price = (
+        r"about [\d,]+ simulations, about 0:\d\d:\d\d; cars that fail early take fewer"
+    )
     assert re.fullmatch(price, capfd.readouterr().err.strip())
 
 
 @SLOW
 @pytest.mark.parametrize(
     ("ask", "options"),
-    [(sv.explain, {}), (sv.tolerance, {"characteristics": ("brakeTorque",)}), (sv.repair, PROMISE)],
+    [
+        (sv.explain, {}),
+        (sv.tolerance, {"characteristics": ("brakeTorque",)}),
+        (sv.repair, PROMISE),
+    ],
 )
 def test_rough_answers_simulate_the_own_parameter_set_alone(
     ask: Callable[..., Any], options: Mapping[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(model_spread, "with_values", lambda *_: pytest.fail("another set"))
+    monkeypatch.setattr(
+        model_spread, "with_values", lambda *_: pytest.fail("another set")
+    )
     answer = ask("wear", quick=True, pool=InlinePool(), **options)
     assert answer.verdict.startswith("Rough answer (--quick")
     assert answer.numbers["rough"]
@@ -90,7 +114,9 @@ def test_a_rough_page_has_no_line_to_sign_and_no_other_parameter_set(
     slippery: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not even in its part about trust, and in questions that have no `--quick`."""
-    monkeypatch.setattr(model_spread, "with_values", lambda *_: pytest.fail("another set"))
+    monkeypatch.setattr(
+        model_spread, "with_values", lambda *_: pytest.fail("another set")
+    )
     page = report(slippery, out=tmp_path / "page.html", quick=True, jobs=1).read_text()
     assert "Do not use this sheet: its limits are rough" in page
     assert "Rough answer (--quick" in page
@@ -103,7 +129,9 @@ def test_on_a_terminal_the_rough_answer_comes_first(
 ) -> None:
     """Elsewhere nothing is computed twice."""
     for is_terminal in (False, True):
-        monkeypatch.setattr(sys.stderr, "isatty", lambda answer=is_terminal: answer, raising=False)
+        monkeypatch.setattr(
+            sys.stderr, "isatty", lambda answer=is_terminal: answer, raising=False
+        )
         answer = sv.explain("smoke", fits=0, progress=True)
         assert answer.numbers["rough"] is False
         assert ("Rough answer (--quick" in capsys.readouterr().err) == is_terminal

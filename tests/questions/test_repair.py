@@ -162,7 +162,9 @@ def gap_for(grip: float) -> float:
 
 
 @SLOW
-def test_repair_and_price_of_a_planted_system_equal_the_closed_form(planted: Path) -> None:
+def test_repair_and_price_of_a_planted_system_equal_the_closed_form(
+    planted: Path,
+) -> None:
     found = sv.repair(planted, change=["gap", "colour"], jobs=2)
     (repair,) = found.to_dict()["tables"]["repairs"]["rows"]
     needed = max(
@@ -200,9 +202,14 @@ def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
     found = sv.repair(planted, change=["gap"], fits=0, pool=InlinePool())
     (repair,) = found.to_dict()["tables"]["repairs"]["rows"]
     fastest = 2 * 8 * (GAP_TODAY - MARGIN)  # squared, with grip 8
-    assert repair["parameters"]["gap"] == pytest.approx(MARGIN + fastest / (2 * 5), rel=0.02)
+    assert repair["parameters"]["gap"] == pytest.approx(
+        MARGIN + fastest / (2 * 5), rel=0.02
+    )
     assert repair["proof_failures"] == 0
-    assert "in the encounters with speed 30 to 72 km/h that a new vehicle survives" in found.verdict
+    assert (
+        "in the encounters with speed 30 to 72 km/h that a new vehicle survives"
+        in found.verdict
+    )
 
 
 @SLOW
@@ -256,7 +263,10 @@ def test_the_smallest_changes_are_those_of_the_closed_form(
         0, np.linspace(1, 0.5, 20)[:, np.newaxis]
     )  # what was found before becomes a lower bound
     changes = [change - problem.today for change in search.smallest_changes()]
-    found = {int(np.count_nonzero(change)): float(np.max(np.abs(change))) for change in changes}
+    found = {
+        int(np.count_nonzero(change)): float(np.max(np.abs(change)))
+        for change in changes
+    }
     assert found == pytest.approx(changed, abs=0.005)
 
 
@@ -270,7 +280,9 @@ def test_an_impossible_promise_has_no_repair(planted: Path) -> None:
 
 
 @SLOW
-def test_a_promise_that_is_kept_already_writes_no_file(planted: Path, tmp_path: Path) -> None:
+def test_a_promise_that_is_kept_already_writes_no_file(
+    planted: Path, tmp_path: Path
+) -> None:
     planted.write_text(STUDY.replace("gap = 12.0, always", "gap = 30.0, always"))
     out = tmp_path / "kept.toml"
     done = run(
@@ -299,7 +311,10 @@ def test_full_braking_takes_the_place_of_a_driving_system_whose_fitted_sets_it_d
         problem: Any = RepairProblem(
             evaluator=evaluator, promise=None, parameters=[], unsafe=Unsafe(keep=0.3)
         )  # type: ignore[arg-type]
-        assert problem.best_driver.evaluator.evaluate(original_of(evaluator), "").f_safe[0] > 0.3
+        assert (
+            problem.best_driver.evaluator.evaluate(original_of(evaluator), "").f_safe[0]
+            > 0.3
+        )
 
 
 def test_full_braking_saves_the_same_vehicles_if_the_hardest_points_are_asked_first(
@@ -316,7 +331,10 @@ def test_full_braking_saves_the_same_vehicles_if_the_hardest_points_are_asked_fi
         settings = problem.promise.draw(20, default_rng(1))
         driver = problem.best_driver
         is_safe = (
-            full_braking.robustness_of(driver.evaluator.evaluate(settings, ""), problem.unsafe) >= 0
+            full_braking.robustness_of(
+                driver.evaluator.evaluate(settings, ""), problem.unsafe
+            )
+            >= 0
         )
         assert 0 < np.count_nonzero(is_safe) < len(settings)
         for rows in (
@@ -339,29 +357,47 @@ def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(
     """
     monkeypatch.setattr(question, "SOBOL_VEHICLES", 3)
     monkeypatch.setattr(survivors, "find_failures", lambda *_: {})
-    monkeypatch.setattr(survivors, "prove_change", lambda *_: (validation.Proof(5, 0, 0.45, 0), {}))
+    monkeypatch.setattr(
+        survivors, "prove_change", lambda *_: (validation.Proof(5, 0, 0.45, 0), {})
+    )
     kept = sv.repair("native", promise=["decel>=7"], pool=InlinePool())
     worst = kept.numbers["worst_today"]
     assert worst == sv.simulate("native", {"decel": 7.0}).objectives["f_safe"] > 6
     words = f"{worst:.2f} m from centre to centre (gap {worst - 4.7:.2f} m)"
     assert f"The worst vehicle has a safety degree of {words}." in kept.verdict
-    assert "Of 5 worn vehicles that were sampled afterwards none is unsafe" in kept.tested
+    assert (
+        "Of 5 worn vehicles that were sampled afterwards none is unsafe" in kept.tested
+    )
     table = pd.DataFrame({"parameters": [{"standing_gap": 3.25}]})
     # A study that results alone hold has no file to extend.
     for study in (kept.study, replace_in(kept.study, name="lost")):
-        write_repair(tmp_path / "it.toml", replace(kept, study=study, tables={"repairs": table}))
-        assert sv.load_study(tmp_path / "it.toml").ads.parameters["standing_gap"] == 3.25
+        write_repair(
+            tmp_path / "it.toml", replace(kept, study=study, tables={"repairs": table})
+        )
+        assert (
+            sv.load_study(tmp_path / "it.toml").ads.parameters["standing_gap"] == 3.25
+        )
 
 
 @pytest.mark.parametrize(
     ("old", "new", "change", "message"),
     [
         ("lower = 4.0", "lower = 14.0", "gap", "bounds that hold the value of today"),
-        ("lower = 4.0", "log = true, lower = 0.0", "gap", "expected: 0 < lower < upper"),
+        (
+            "lower = 4.0",
+            "log = true, lower = 0.0",
+            "gap",
+            "expected: 0 < lower < upper",
+        ),
         ("always = {", "alway = {", "alway", "ads.parameters.alway = None"),
         ("", "", "gape", "did you mean 'gap'?"),
         ("at_least = 5", "at_least = 3", "gap", "outside its domain"),
-        ("gap = 12.0, always", "gap = 'x', always", "gap", "bounds that hold the value of today"),
+        (
+            "gap = 12.0, always",
+            "gap = 'x', always",
+            "gap",
+            "bounds that hold the value of today",
+        ),
     ],
 )
 def test_what_cannot_be_repaired_is_refused(
@@ -373,11 +409,16 @@ def test_what_cannot_be_repaired_is_refused(
 
 
 @pytest.mark.parametrize(
-    "model", [pytest.param(name, marks=SLOW if name[0] in "aik" else ()) for name in CHANGEABLE]
+    "model",
+    [pytest.param(name, marks=SLOW if name[0] in "aik" else ()) for name in CHANGEABLE],
 )
-def test_one_driving_system_drives_vehicles_with_different_parameters(model: str) -> None:
+def test_one_driving_system_drives_vehicles_with_different_parameters(
+    model: str,
+) -> None:
     shipped = {"world_on_rails": "sun", "apollo": "lgsvl"}
-    parameters = sv.load_study(shipped[model]).ads.parameters if model in shipped else {}
+    parameters = (
+        sv.load_study(shipped[model]).ads.parameters if model in shipped else {}
+    )
     study = sv.load_study("wear", ads={"model": model, "parameters": parameters})
     names, system = (
         tuple(CHANGEABLE[model]),
@@ -387,9 +428,13 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
     low, high = (0.98 * ends + 0.02 * ends[:, ::-1]).T
     values = default_rng(1).uniform(low, high, (3, len(names)))
     settings = np.tile(system.characteristics.original, (3, 1))
-    together = drive_and_score(replace(system, ads=VariedAds(system.ads, names, values)), settings)
+    together = drive_and_score(
+        replace(system, ads=VariedAds(system.ads, names, values)), settings
+    )
     for row, one in enumerate(values):
-        ads = ADS[model](**{**parameters, **dict(zip(names, one.tolist(), strict=True))})
+        ads = ADS[model](
+            **{**parameters, **dict(zip(names, one.tolist(), strict=True))}
+        )
         alone = drive_and_score(replace(system, ads=ads), settings[:1])
         assert not list(differences(together.take([row]).results, alone.results)), dict(
             zip(names, one, strict=True)
@@ -399,7 +444,9 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(model: str
 @SLOW
 @pytest.mark.parametrize("name", ["wear", "rain", "native", "euro_ncap_car_to_car"])
 def test_nobody_needs_to_brake_in_any_of_forty_benign_scenes(name: str) -> None:
-    system = assemble(sv.load_study(name, ads={"model": "aeb", "parameters": {"reach": 0.001}}))
+    system = assemble(
+        sv.load_study(name, ads={"model": "aeb", "parameters": {"reach": 0.001}})
+    )
     benign = replace(system, points=tuple(benign_scenes(sv.load_study(name), system)))
     assert len({scene.name for scene in benign.matrix}) == len(benign.matrix) >= 40
     for result in simulate_all_points(benign, system.characteristics.original[None]):

@@ -48,7 +48,13 @@ def of(region: Region, **options: Any) -> Answer:
 
 @pytest.mark.parametrize(
     ("region", "volume"),
-    [(box, 0.09), (two_islands, 0.15), (diagonal_band, 0.06), (nowhere, 0.0), (everywhere, 1.0)],
+    [
+        (box, 0.09),
+        (two_islands, 0.15),
+        (diagonal_band, 0.06),
+        (nowhere, 0.0),
+        (everywhere, 1.0),
+    ],
 )
 def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -> None:
     numbers = of(region, samples=8000, confidence=0.999).numbers
@@ -59,13 +65,19 @@ def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -
 
 
 @pytest.mark.parametrize("confidence", [0.9, 0.99])
-def test_no_failure_says_how_many_vehicles_would_show_a_rare_one(confidence: float) -> None:
+def test_no_failure_says_how_many_vehicles_would_show_a_rare_one(
+    confidence: float,
+) -> None:
     """And that nothing decides: all vehicles of the plant have one safety degree."""
     answer = of(nowhere, samples=200, confidence=confidence)
     verdict = answer.verdict
-    (told,) = re.findall(r"at most 0\.01 %, ([\d,]+) vehicles are needed of which", verdict)
+    (told,) = re.findall(
+        r"at most 0\.01 %, ([\d,]+) vehicles are needed of which", verdict
+    )
     needed = int(told.replace(",", ""))
-    highest = [clopper_pearson(0, number, confidence)[1] for number in (needed - 1, needed)]
+    highest = [
+        clopper_pearson(0, number, confidence)[1] for number in (needed - 1, needed)
+    ]
     assert highest[1] <= 1e-4 < highest[0]
     assert "No vehicle was found that changes the safety degree" in verdict
     assert "What decides" not in answer.render("text"), "a table without a share"
@@ -74,7 +86,11 @@ def test_no_failure_says_how_many_vehicles_would_show_a_rare_one(confidence: flo
 
 def ishigami(settings: FloatArray) -> FloatArray:
     x = (settings - 5) / 5 * math.pi
-    return np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
+    return (
+        np.sin(x[:, 0])
+        + 7 * np.sin(x[:, 1]) ** 2
+        + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
+    )
 
 
 class MeasuredPlant(Plant):
@@ -84,7 +100,9 @@ class MeasuredPlant(Plant):
         evaluations = super().evaluate(settings)
         values = ishigami(settings)
         measured = {"tit": values, "tet": np.where(settings[:, 0] > 5, np.nan, values)}
-        return dataclasses.replace(evaluations, metrics={**evaluations.metrics, **measured})
+        return dataclasses.replace(
+            evaluations, metrics={**evaluations.metrics, **measured}
+        )
 
 
 @pytest.mark.parametrize(
@@ -102,7 +120,9 @@ def test_sobol_indices_of_ishigamis_function(
     0.1. The criterion's measure varies, or the safety degree where the measure is undefined.
     """
     study = made_up_study(3)
-    answer = risk(study, unsafe=unsafe, samples=100, pool=MeasuredPlant(study, nowhere, degree))
+    answer = risk(
+        study, unsafe=unsafe, samples=100, pool=MeasuredPlant(study, nowhere, degree)
+    )
     assert f"of the variance of {measure} (" in answer.verdict
     assert ("tit: total" in answer.render("text")) is (measure == "tit")
     table = answer.tables["sensitivity"]
@@ -132,8 +152,12 @@ def test_first_order_indices_of_constrained_characteristics() -> None:
         {"a": 1.0, "b": 0.25, "c": 0.0}, abs=0.06
     )
     assert frame["degree_total"].isna().all()
-    first, again = (risk(study, unsafe="collision", samples=250, pool=plant) for _ in range(2))
-    pd.testing.assert_frame_equal(first.tables["sensitivity"], again.tables["sensitivity"])
+    first, again = (
+        risk(study, unsafe="collision", samples=250, pool=plant) for _ in range(2)
+    )
+    pd.testing.assert_frame_equal(
+        first.tables["sensitivity"], again.tables["sensitivity"]
+    )
 
 
 def drawn(**variation: dict[str, Any]) -> FloatArray:
@@ -147,9 +171,12 @@ def test_every_distribution_has_its_moments() -> None:
         b={"distribution": "triangular", "upper": 8.0},
     ).T
     assert (normal.mean(), normal.std()) == pytest.approx((6.0, 0.5), abs=0.02)
-    assert (triangular.mean(), triangular.max()) == pytest.approx((13 / 3, 8.0), abs=0.1)
+    assert (triangular.mean(), triangular.max()) == pytest.approx(
+        (13 / 3, 8.0), abs=0.1
+    )
     fixed, uniform = drawn(
-        a={"distribution": "fixed", "value": 7.0}, b={"distribution": "uniform", "lower": 2.0}
+        a={"distribution": "fixed", "value": 7.0},
+        b={"distribution": "uniform", "lower": 2.0},
     ).T
     assert set(fixed) == {7.0}
     assert (uniform.min(), uniform.mean()) == pytest.approx((2.0, 6.0), abs=0.05)
@@ -169,7 +196,9 @@ def test_a_box_is_one_rule_of_its_two_conditions() -> None:
     assert row.rule == "a above 7 N m and b below 3 N m"
     assert (row.density, row.coverage) == pytest.approx((1, 1), abs=0.02)
     assert row.density_low <= row.density <= row.density_high
-    assert answer.numbers["failures"] / answer.numbers["samples"] == pytest.approx(0.09, abs=0.005)
+    assert answer.numbers["failures"] / answer.numbers["samples"] == pytest.approx(
+        0.09, abs=0.005
+    )
     assert (
         "of the unsafe vehicles have a above 7 N m and b below 3 N m. Of all vehicles in this"
         " region" in answer.verdict
@@ -180,7 +209,9 @@ def test_rules_draw_as_the_variation_says() -> None:
     """A characteristic that is always 8 of 0 to 10 decides nothing, and the share is that of
     `risk`.
     """
-    study = load_study(made_up_study(3), variation={"a": {"distribution": "fixed", "value": 8.0}})
+    study = load_study(
+        made_up_study(3), variation={"a": {"distribution": "fixed", "value": 8.0}}
+    )
     by_rules, by_risk = (
         ask(study, unsafe="collision", samples=1000, pool=Plant(study, box))
         for ask in (rules, risk)
@@ -194,8 +225,14 @@ def test_rules_draw_as_the_variation_says() -> None:
 @pytest.mark.parametrize(
     ("of_b", "said"),
     [
-        (0.49, "a decides most: it causes 60 % of the variance of the safety degree (50 to 70 %)."),
-        (0.51, "uncertain: a causes 60 % of the variance of the safety degree (50 to 70 %), and"),
+        (
+            0.49,
+            "a decides most: it causes 60 % of the variance of the safety degree (50 to 70 %).",
+        ),
+        (
+            0.51,
+            "uncertain: a causes 60 % of the variance of the safety degree (50 to 70 %), and",
+        ),
     ],
 )
 def test_only_an_interval_above_all_others_decides(of_b: float, said: str) -> None:
@@ -212,7 +249,9 @@ def test_only_an_interval_above_all_others_decides(of_b: float, said: str) -> No
     frame.attrs = {"of_what": OUTPUTS}
     assert said in deciding_in_words(frame, 120)
     frame["unsafe_total"] = np.nan
-    assert "that needs 100 unsafe and as many safe vehicles" in deciding_in_words(frame, 1)
+    assert "that needs 100 unsafe and as many safe vehicles" in deciding_in_words(
+        frame, 1
+    )
     assert "unknown" not in deciding_in_words(frame, 0)
     assert deciding_in_words(frame.iloc[:0], 0) == ""
 
@@ -229,15 +268,21 @@ def test_nothing_everything_and_too_little() -> None:
 
 
 def test_a_rule_that_may_be_due_to_chance_is_in_no_verdict() -> None:
-    answer = rules_of(lambda settings: np.sin(1e6 * settings[:, 0]) > 0.7, n=2, samples=400)
+    answer = rules_of(
+        lambda settings: np.sin(1e6 * settings[:, 0]) > 0.7, n=2, samples=400
+    )
     table = answer.tables["rules"]
     assert (" of the unsafe vehicles have " in answer.verdict) == (
         table["density_low"] > (answer.numbers["failures"] / answer.numbers["samples"])
     ).any()
 
 
-@pytest.mark.parametrize("constraint", [None, {"sum": {"a": 1.0, "b": 1.0}, "at_most": 12.0}])
-def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any] | None) -> None:
+@pytest.mark.parametrize(
+    "constraint", [None, {"sum": {"a": 1.0, "b": 1.0}, "at_most": 12.0}]
+)
+def test_the_share_of_unsafe_vehicles_is_that_of_risk(
+    constraint: dict[str, Any] | None,
+) -> None:
     """The same vehicles in both, the first ones of a longer sequence in a shorter one: each
     estimate lies in the other's interval.
     """
@@ -260,32 +305,60 @@ def test_the_share_of_unsafe_vehicles_is_that_of_risk(constraint: dict[str, Any]
 
 
 @SLOW
-def test_risk_rules_and_explain_simulate_the_same_vehicles_with_each_parameter_set() -> None:
+def test_risk_rules_and_explain_simulate_the_same_vehicles_with_each_parameter_set() -> (
+    None
+):
     study = load_study("wear")
     vehicles = VariationModel(study).draw(VEHICLES, default_rng(study.search.seed))
     studies = studies_of_sets(study)[:3]
     unsafe = np.array(
-        [drive_and_score(assemble(one), vehicles, with_originals=False).collided for one in studies]
+        [
+            drive_and_score(assemble(one), vehicles, with_originals=False).collided
+            for one in studies
+        ]
     )
     options = {"unsafe": "collision", "pool": InlinePool()}
-    answers = [risk(study, samples=500, **options), rules(study, samples=600, **options)]
+    answers = [
+        risk(study, samples=500, **options),
+        rules(study, samples=600, **options),
+    ]
     for answer in (*answers, explain(study, fits=3, **options)):
         assert answer.numbers["by_set"][:3] == unsafe.mean(axis=1).tolist()
         ends = answer.numbers["by_set_intervals"][:3]
-        assert ends == [list(clopper_pearson(count, VEHICLES)) for count in unsafe.sum(axis=1)]
+        assert ends == [
+            list(clopper_pearson(count, VEHICLES)) for count in unsafe.sum(axis=1)
+        ]
     table = answers[1].tables["rules"]
-    for least, greatest in (("density_least", "density"), ("density", "density_greatest")):
+    for least, greatest in (
+        ("density_least", "density"),
+        ("density", "density_greatest"),
+    ):
         assert (table[least] <= table[greatest]).all()
     few = risk(study, simulations=400, unsafe="collision", pool=InlinePool())
-    assert "Other parameter sets (alternative calibrations) were not simulated" in few.verdict
+    assert (
+        "Other parameter sets (alternative calibrations) were not simulated"
+        in few.verdict
+    )
 
 
 @pytest.mark.parametrize(
     ("failing", "least", "greatest"),
     [
-        ((10, 40, 60), "2.5 % (set 0, 95", "15 % (95 % confidence interval 12 to 19 %)"),
-        ((10, 20, 60), "2.5 % (95", "15 % (set 2, 95 % confidence interval 12 to 19 %)"),
-        ((9, 9, 9), "is 2.2 % (95 % confidence interval 1 to 4.2 %) in each of", "the 3"),
+        (
+            (10, 40, 60),
+            "2.5 % (set 0, 95",
+            "15 % (95 % confidence interval 12 to 19 %)",
+        ),
+        (
+            (10, 20, 60),
+            "2.5 % (95",
+            "15 % (set 2, 95 % confidence interval 12 to 19 %)",
+        ),
+        (
+            (9, 9, 9),
+            "is 2.2 % (95 % confidence interval 1 to 4.2 %) in each of",
+            "the 3",
+        ),
     ],
 )
 def test_a_parameter_set_is_named_where_its_interval_leaves_the_others_out(
@@ -304,7 +377,13 @@ def test_the_other_parameter_sets_are_planned() -> None:
     these is a bound, within which the own set answers alone.
     """
     shown = list[tuple[str, int, int]]()
-    rules("wear", samples=100, unsafe="collision", jobs=1, progress=lambda *one: shown.append(one))
+    rules(
+        "wear",
+        samples=100,
+        unsafe="collision",
+        jobs=1,
+        progress=lambda *one: shown.append(one),
+    )
     expected = 26 * (100 + 12 * 100)  # at 26 points
     assert {total for phase, _, total in shown if phase == SAMPLED_STAGE} == {expected}
     assert shown[-1][0] == STAGE

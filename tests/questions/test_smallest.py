@@ -25,7 +25,13 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, json_of
-from tests.questions.conftest import ORIGINAL, Plant, Region, made_up_evaluator, made_up_study
+from tests.questions.conftest import (
+    ORIGINAL,
+    Plant,
+    Region,
+    made_up_evaluator,
+    made_up_study,
+)
 
 COLLISION = Unsafe()
 SIDES = (0.0, ORIGINAL, 10.0)
@@ -40,10 +46,16 @@ def test_all_minimal_combinations_of_ends_and_no_other_are_found_whatever_the_ou
 
     def region(settings: FloatArray) -> BoolArray:
         """Any function of which characteristics are at which end, monotone or not."""
-        return np.array(table)[(np.sign(settings - ORIGINAL) + 1).astype(int) @ [1, 3, 9]]
+        return np.array(table)[
+            (np.sign(settings - ORIGINAL) + 1).astype(int) @ [1, 3, 9]
+        ]
 
     unsafe = [
-        {(name, side) for name, side in zip("abc", sides, strict=True) if side != ORIGINAL}
+        {
+            (name, side)
+            for name, side in zip("abc", sides, strict=True)
+            if side != ORIGINAL
+        }
         for sides in product(SIDES, repeat=3)
         if region(np.array([sides]))[0]
     ]
@@ -56,7 +68,9 @@ def test_all_minimal_combinations_of_ends_and_no_other_are_found_whatever_the_ou
     assert found.complete_up_to == 3
 
 
-def test_likely_combinations_come_first_and_an_unfinished_size_is_not_called_complete() -> None:
+def test_likely_combinations_come_first_and_an_unfinished_size_is_not_called_complete() -> (
+    None
+):
     evaluator = made_up_evaluator(6, lambda one: (one[:, 4] > 9) & (one[:, 5] > 9))
     found = enumerate_causes(evaluator, COLLISION, 12 + 30)
     assert found.simulated == {1: 12, 2: 30}
@@ -73,7 +87,9 @@ def test_the_staircase_goes_on_below_the_first_share_without_any() -> None:
         return (share.max(axis=1) > 0.79) | (share.min(axis=1) > 0.49)
 
     evaluator = made_up_evaluator(3, region)
-    steps = staircase(evaluator, COLLISION, enumerate_causes(evaluator, COLLISION, 1000), 1000)
+    steps = staircase(
+        evaluator, COLLISION, enumerate_causes(evaluator, COLLISION, 1000), 1000
+    )
     assert [(step.share, step.size) for step in steps] == [
         *((share, 1) for share in (1.0, 0.9, 0.8)),
         *((share, 2) for share in (0.7, 0.6, 0.5)),
@@ -101,7 +117,9 @@ def test_with_few_settings_single_changes_are_simulated_at_every_share() -> None
     ]
 
 
-def smallest_of(n: int, region: Region, most: int | None = None) -> tuple[Smallest, str]:
+def smallest_of(
+    n: int, region: Region, most: int | None = None
+) -> tuple[Smallest, str]:
     """The answer about a region, with at most so many simulations, and its sentences."""
     evaluator = made_up_evaluator(n, region)
     evaluator.account.most = most
@@ -115,14 +133,27 @@ def way(settings: FloatArray) -> FloatArray:
 
 
 def test_one_change_at_half_its_way_leads_where_all_ends_are_safe() -> None:
-    smallest, verdict = smallest_of(2, lambda rows: np.abs(way(rows)[:, 0] - 0.5) < 0.049)
+    smallest, verdict = smallest_of(
+        2, lambda rows: np.abs(way(rows)[:, 0] - 0.5) < 0.049
+    )
     (row,) = smallest.table.to_dict("records")
-    assert (row["causes"], row["begins_at"], row["boundary"]) == ({"a": 7.5}, 0.46, {"a": 7.3})
+    assert (row["causes"], row["begins_at"], row["boundary"]) == (
+        {"a": 7.5},
+        0.46,
+        {"a": 7.3},
+    )
     assert row["safe_again"] == 0.55
-    assert verdict.startswith("One change is enough for a collision: a at 7.3 N m, 46 % of the way")
-    assert "The unsafe range has a gap: at 55 % of the way the vehicle is safe again." in verdict
+    assert verdict.startswith(
+        "One change is enough for a collision: a at 7.3 N m, 46 % of the way"
+    )
+    assert (
+        "The unsafe range has a gap: at 55 % of the way the vehicle is safe again."
+        in verdict
+    )
     assert "None of the 4 changes of a single characteristic to an end" in verdict
-    assert "If all changes go 50 % of the way to the ends, 1 change is enough" in verdict
+    assert (
+        "If all changes go 50 % of the way to the ends, 1 change is enough" in verdict
+    )
 
 
 def test_a_beginning_is_rounded_to_the_unsafe_side() -> None:
@@ -142,19 +173,27 @@ def test_a_cause_begins_where_none_of_its_parts_is_unsafe() -> None:
         return (np.abs(share[:, 0] - 0.438) < 0.004) | (share.min(axis=1) > 0.843)
 
     smallest, verdict = smallest_of(5, region)
-    found = {row.size: (row.begins_at, row.safe_again) for row in smallest.table.itertuples()}
+    found = {
+        row.size: (row.begins_at, row.safe_again) for row in smallest.table.itertuples()
+    }
     assert found[5][0] == 0.85
     assert np.isnan(found[5][1])
     assert found[1] == (0.44, 0.45)
-    assert verdict.startswith("One change is enough for a collision: a at 7.2 N m, 44 % of the way")
+    assert verdict.startswith(
+        "One change is enough for a collision: a at 7.2 N m, 44 % of the way"
+    )
 
 
-def test_a_cause_before_the_ends_is_not_at_the_end_where_few_simulations_are_allowed() -> None:
+def test_a_cause_before_the_ends_is_not_at_the_end_where_few_simulations_are_allowed() -> (
+    None
+):
     """Two changes at 70 % of the way; one of them alone near 35 % of it."""
 
     def region(settings: FloatArray) -> BoolArray:
         first, second = way(settings).T
-        return (np.abs(first - 0.35) < 0.045) | ((np.minimum(first, second) > 0.3) & (first < 0.95))
+        return (np.abs(first - 0.35) < 0.045) | (
+            (np.minimum(first, second) > 0.3) & (first < 0.95)
+        )
 
     assert smallest_of(2, region, 200)[0].table["begins_at"].tolist() == [0.35, 0.7]
 
@@ -177,7 +216,10 @@ def test_combinations_that_contain_a_cause_and_cures_are_counted() -> None:
     names = ("containing", "tried", "causes", "cures")
     assert [smallest.numbers[name] for name in names] == counts
     assert smallest.numbers["containing_tried"] == counts[0]
-    assert "26 further combinations of two to four changes contain a smaller cause" in verdict
+    assert (
+        "26 further combinations of two to four changes contain a smaller cause"
+        in verdict
+    )
     assert "9 of the 26 simulated ones are safe" in verdict
 
 
@@ -206,7 +248,9 @@ def test_the_answer_leads_with_the_smallest_changes() -> None:
     numbers = answer["numbers"]
     assert numbers["complete_up_to"] == 4
     assert numbers["causes"] == len(rows)
-    assert answer["verdict"].startswith("Two changes together are enough for a collision:")
+    assert answer["verdict"].startswith(
+        "Two changes together are enough for a collision:"
+    )
     counted = "1 of the 264 combinations of two changes causes a collision"
     assert counted in answer["verdict"]
     assert "All causes" not in answer["verdict"]
@@ -215,9 +259,12 @@ def test_the_answer_leads_with_the_smallest_changes() -> None:
 
     # The vehicles of `risk` with both parameter sets.
     study = load_study("rain")
-    drawn = VariationModel(study).draw(VEHICLES, np.random.default_rng(study.search.seed))
+    drawn = VariationModel(study).draw(
+        VEHICLES, np.random.default_rng(study.search.seed)
+    )
     shares = [
-        drive_and_score(assemble(one), drawn).collided.mean() for one in studies_of_sets(study)[:2]
+        drive_and_score(assemble(one), drawn).collided.mean()
+        for one in studies_of_sets(study)[:2]
     ]
     assert numbers["by_set"] == shares
     assert "over the 2 parameter sets" in answer["verdict"].replace("each of", "over")
@@ -232,7 +279,9 @@ def test_the_study_of_results_is_explained_as_without_results(slippery: Path) ->
 @SLOW
 def test_of_a_searched_scenario_each_combination_meets_critical_encounters() -> None:
     answer = sv.explain("sun", ranges=True, fits=0, quick=True, pool=InlinePool())
-    assert "Scope: the original encounter and the 16 encounters in which" in answer.verdict
+    assert (
+        "Scope: the original encounter and the 16 encounters in which" in answer.verdict
+    )
 
 
 def test_the_verdict_claims_no_more_than_was_simulated() -> None:
@@ -240,12 +289,23 @@ def test_the_verdict_claims_no_more_than_was_simulated() -> None:
 
     def region(settings: FloatArray) -> BoolArray:
         moved = settings - ORIGINAL
-        return ((moved[:, 0] > 3) & (moved[:, 1] > 3)) | ((moved[:, 1:] < -3).all(axis=1))
+        return ((moved[:, 0] > 3) & (moved[:, 1] > 3)) | (
+            (moved[:, 1:] < -3).all(axis=1)
+        )
 
     _, sentences = smallest_of(4, region)
-    assert "1 of the 24 combinations of two changes causes a collision: a and b." in sentences
-    assert "1 of the 28 combinations of three changes causes a collision: b, c and d." in sentences
-    assert "none of 480 simulated combinations (up to four changes) causes a collision" in sentences
+    assert (
+        "1 of the 24 combinations of two changes causes a collision: a and b."
+        in sentences
+    )
+    assert (
+        "1 of the 28 combinations of three changes causes a collision: b, c and d."
+        in sentences
+    )
+    assert (
+        "none of 480 simulated combinations (up to four changes) causes a collision"
+        in sentences
+    )
 
 
 class Repeated(Plant):
@@ -254,7 +314,10 @@ class Repeated(Plant):
     def evaluate(self, settings: FloatArray) -> Evaluations:
         evaluations = super().evaluate(settings)
         degree = evaluations.metrics["safety_degree"]
-        runs = {f"safety_degree_{run}": degree if run == 1 else degree + 3 for run in range(1, 5)}
+        runs = {
+            f"safety_degree_{run}": degree if run == 1 else degree + 3
+            for run in range(1, 5)
+        }
         return replace(evaluations, metrics={**evaluations.metrics, **runs})
 
 
@@ -270,8 +333,13 @@ def test_with_repeats_a_cause_has_the_share_of_its_unsafe_runs() -> None:
 @SLOW
 def test_what_is_left_of_few_simulations_explains_a_sampled_failure() -> None:
     """Of one failure there are causes, but no shares."""
-    answer = sv.explain("native", simulations=300, unsafe="collision", pool=InlinePool())
+    answer = sv.explain(
+        "native", simulations=300, unsafe="collision", pool=InlinePool()
+    )
     assert answer.numbers["failures"] > answer.numbers["analysed"] == 1
     assert answer.tables["characteristics"].empty
     assert len(answer.tables["distinct_causes"])
-    assert "simulated combinations of two changes cause a collision (145 such" in answer.verdict
+    assert (
+        "simulated combinations of two changes cause a collision (145 such"
+        in answer.verdict
+    )

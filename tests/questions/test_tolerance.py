@@ -49,7 +49,9 @@ def degrees(rows: FloatArray) -> FloatArray:
     return 8 - np.abs(rows[:, 0] - 5)
 
 
-def answer_of(n: int, region: Region, failing: Region = nowhere, **options: Any) -> Answer:
+def answer_of(
+    n: int, region: Region, failing: Region = nowhere, **options: Any
+) -> Answer:
     study = made_up_study(n)
     return tolerance(study, pool=Plant(study, region, degrees, failing), **options)
 
@@ -57,7 +59,9 @@ def answer_of(n: int, region: Region, failing: Region = nowhere, **options: Any)
 @SLOW
 @settings(max_examples=20)
 @given(ends=st.lists(st.floats(0, 10), min_size=2, max_size=2).map(sorted))
-def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(ends: list[float]) -> None:
+def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(
+    ends: list[float],
+) -> None:
     low, high = ends
     assume(high - low > 0.05 and not low <= 5 <= high)
     answer = answer_of(
@@ -80,7 +84,10 @@ def test_limits_end_before_what_cannot_be_simulated_which_counts_in_the_bound() 
 
     answer = answer_of(2, two_islands, fails, unsafe="collision")
     first = answer.tables["limits"].set_index("characteristic").loc["a"]
-    assert (first["alone_low"], first["alone_high"]) == (0, pytest.approx(5.75, abs=0.06))
+    assert (first["alone_low"], first["alone_high"]) == (
+        0,
+        pytest.approx(5.75, abs=0.06),
+    )
     assert first["together_high"] <= 5.75
     samples, failed = answer.numbers["samples"], answer.numbers["not_simulated"]
     assert failed / samples == pytest.approx(0.2 * 2 / 5.75, abs=0.03)
@@ -91,7 +98,9 @@ def test_limits_end_before_what_cannot_be_simulated_which_counts_in_the_bound() 
     assert "a can make" not in answer.verdict, "nobody knows"
 
 
-def test_a_search_that_gives_up_says_that_it_found_no_box(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_that_gives_up_says_that_it_found_no_box(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(boxes, "MOST_CUTS", 0)
     answer = answer_of(2, pair, unsafe="collision", limits=("b <= 8",))
     assert answer.verdict.startswith(
@@ -129,14 +138,18 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
     found = pool.evaluate(np.array([[8.5, 8.13, 2.0, 2.2], [5.0, 5.0, 5.0, 5.0]]))
     case = case_of(study, found.take([1]), found)
     bare, known, two = (
-        tolerance.compute(subject, Evaluator(study, pool), unsafe=unsafe, characteristics=names)
+        tolerance.compute(
+            subject, Evaluator(study, pool), unsafe=unsafe, characteristics=names
+        )
         for subject, unsafe, names in (
             (study, Unsafe(), ()),
             (case, None, ()),
             (case, None, ("a,b",)),
         )
     )
-    assert known.numbers["unsafe"] == "collision", "as the solutions do, and as `explain` takes it"
+    assert known.numbers["unsafe"] == "collision", (
+        "as the solutions do, and as `explain` takes it"
+    )
     assert share_of_domain(bare) == pytest.approx(1, abs=0.02)
     assert 0.8 < share_of_domain(known) < 0.9, "the largest box ends before 8.5"
     assert share_of_domain(two) == 1, "the solution changes others as well"
@@ -160,7 +173,10 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe() -> None:
             box = Box(region, np.full(2, attempt / 3), np.full(2, 10 - attempt / 3))
             rng = np.random.default_rng((seed, attempt))
             proof, found = prove(
-                lambda number, box=box, rng=rng: box.draw(number, rng), judge, 0.03, attempt
+                lambda number, box=box, rng=rng: box.draw(number, rng),
+                judge,
+                0.03,
+                attempt,
             )
             if not len(found):
                 wrong += proof.at_most < q
@@ -171,7 +187,10 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe() -> None:
 def test_the_bound_of_a_first_test_without_failure_is_one_sided() -> None:
     none = np.zeros(1228, dtype=bool)
     proof, _ = prove(
-        lambda number: np.zeros((number, 2)), lambda _: Judgement(none, none, ~none), 0.003, 1
+        lambda number: np.zeros((number, 2)),
+        lambda _: Judgement(none, none, ~none),
+        0.003,
+        1,
     )
     assert (1 - proof.at_most) ** 1228 == pytest.approx(0.05)
     assert bound_in_words(proof.at_most) == "with 95 % confidence at most 0.244 %"
@@ -183,7 +202,9 @@ def share_of_domain(answer: Answer) -> float:
     return float(((limits["together_high"] - limits["together_low"]) / 10).prod())
 
 
-def test_a_specified_limit_is_shown_and_every_limit_has_its_line_in_the_figure() -> None:
+def test_a_specified_limit_is_shown_and_every_limit_has_its_line_in_the_figure() -> (
+    None
+):
     answer = answer_of(2, two_islands, unsafe="collision", limits=("b <= 8",))
     assert "up to 8" in answer.render("text")
     (axis,) = answer.figure().get_axes()
@@ -200,7 +221,9 @@ def test_sets_that_break_or_cut_limits_are_told() -> None:
     ]
     limits = {"a": Limit(at_most=9.0)}
     own, two, all_sets = (
-        find_limits(asked_of(Models(tuple(some), ()), Unsafe(), [0, 1], limits, at_tests=True))
+        find_limits(
+            asked_of(Models(tuple(some), ()), Unsafe(), [0, 1], limits, at_tests=True)
+        )
         for some in (fits[:1], fits[:2], fits)
     )
     assert [*all_sets.broken] == [1]
@@ -220,7 +243,13 @@ def test_a_box_stays_within_that_of_a_smaller_unsafe_region() -> None:
         return pair(rows) | (rows[:, 1] > 7) & (rows[:, 2] > 5.5)
 
     asked, wider = (
-        asked_of(Models((made_up_model(3, region),), ()), Unsafe(), range(3), {}, at_tests=True)
+        asked_of(
+            Models((made_up_model(3, region),), ()),
+            Unsafe(),
+            range(3),
+            {},
+            at_tests=True,
+        )
         for region in (both, pair)
     )
     outer = find_limits(wider)
@@ -245,7 +274,9 @@ def test_a_box_stays_within_that_of_a_smaller_unsafe_region() -> None:
         ("a <= 8", "Do not release: a 6.6 N m: the car hits"),
         (
             "a <= 6",
-            ("All limits hold: no vehicle that was tested within them is unsafe (collision)."),
+            (
+                "All limits hold: no vehicle that was tested within them is unsafe (collision)."
+            ),
         ),
     ],
 )
@@ -255,11 +286,17 @@ def test_the_verdict_decides_on_the_limits(limit: str, said: str) -> None:
     """
     answer = answer_of(2, two_islands, unsafe="collision", limits=(limit,))
     assert answer.verdict.startswith(said)
-    assert bool(answer.failures) == (not answer.numbers["kept"]) == said.startswith("Do not")
+    assert (
+        bool(answer.failures)
+        == (not answer.numbers["kept"])
+        == said.startswith("Do not")
+    )
 
 
 @SLOW
-def test_the_car_beyond_a_joint_limit_is_near_to_it_and_within_those_of_the_other_parts() -> None:
+def test_the_car_beyond_a_joint_limit_is_near_to_it_and_within_those_of_the_other_parts() -> (
+    None
+):
     """Of the response no such car is found; that of its limit alone is 0.1 s further."""
     names = ("brakeTorque", "brakeResponse")
     answer = tolerance("autoware_july", characteristics=names, pool=InlinePool())
@@ -269,7 +306,11 @@ def test_the_car_beyond_a_joint_limit_is_near_to_it_and_within_those_of_the_othe
     assert len(cars)
     for name, car in cars.items():
         (other,) = {*names} - {name}
-        assert table.loc[other, "together_low"] <= car[other] <= table.loc[other, "together_high"]
+        assert (
+            table.loc[other, "together_low"]
+            <= car[other]
+            <= table.loc[other, "together_high"]
+        )
         low, high = table.loc[name, ["together_low", "together_high"]]
         beyond = max(low - car[name], car[name] - high) / (
             members[name].upper - members[name].lower
@@ -299,17 +340,31 @@ def test_a_refusal_says_which_limits_would_hold() -> None:
 
 @SLOW
 @pytest.mark.parametrize(("limit", "code"), [("5", 0), ("4.6", 3)])
-def test_a_limit_that_is_not_kept_ends_with_code_3(tmp_path: Path, limit: str, code: int) -> None:
+def test_a_limit_that_is_not_kept_ends_with_code_3(
+    tmp_path: Path, limit: str, code: int
+) -> None:
     study = tmp_path / "mine.toml"
     study.write_text(
         f'extends = "native"\n[limits]\ndecel = {{ at_least = {limit}, source = "workshop" }}\n'
     )
-    flags = ("--characteristics", "decel,brakeGain", "--margin", "0", "--jobs", "1", "--json")
+    flags = (
+        "--characteristics",
+        "decel,brakeGain",
+        "--margin",
+        "0",
+        "--jobs",
+        "1",
+        "--json",
+    )
     done = run("tolerance", str(study), *flags, expect=code)
     answer = json.loads(done.stdout)
     decel, gain = answer["tables"]["limits"]["rows"]
     assert (decel["specified_low"], decel["specified_high"]) == (float(limit), None)
-    assert [decel["kept"], answer["numbers"]["kept"], gain["kept"]] == [code == 0, code == 0, None]
+    assert [decel["kept"], answer["numbers"]["kept"], gain["kept"]] == [
+        code == 0,
+        code == 0,
+        None,
+    ]
     fails = "Do not release: decel 4.6 m/s^2: the car hits a standing vehicle"
     assert (fails in answer["verdict"]) == (code == 3)
     assert "failed:" not in done.stderr, "what the verdict says"
@@ -322,7 +377,9 @@ def test_the_margin_is_added_to_a_collision_alone() -> None:
 
     def ends(**options: Any) -> tuple[str, float, Any]:
         study = made_up_study(1)
-        pool = Plant(study, lambda rows: rows[:, 0] > 9, lambda rows: 8 - np.abs(rows[:, 0] - 5))
+        pool = Plant(
+            study, lambda rows: rows[:, 0] > 9, lambda rows: 8 - np.abs(rows[:, 0] - 5)
+        )
         answer = tolerance(study, pool=pool, **options)
         return (
             answer.numbers["unsafe"],

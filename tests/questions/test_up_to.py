@@ -55,12 +55,16 @@ walking_speed = false
 ROUGH: dict[str, Any] = {"quick": True, "jobs": 1}
 
 
-def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(ahead: Study) -> None:
+def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(
+    ahead: Study,
+) -> None:
     def over(study: Study) -> list[Any]:
         return [study.lists_of(test)["speed"] for test in study.matrix.tests]
 
     wear, stop = load_study("wear"), load_study("stop")
-    assert over(study_up_to(wear, "speed=45")) == [[10, 20, 30, 40]] * 3 + [[10, 20, 30, 40, 45]]
+    assert over(study_up_to(wear, "speed=45")) == [[10, 20, 30, 40]] * 3 + [
+        [10, 20, 30, 40, 45]
+    ]
     assert over(study_up_to(stop, "speed=75")) == [[30, 50]], (
         "a fixed way to stop has its own speeds"
     )
@@ -74,14 +78,18 @@ def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(ahead: 
 
 def test_a_searched_original_above_the_value_becomes_it() -> None:
     joint = load_study("wear", encounters="ranges")
-    low, high = (study_up_to(joint, text).ranges["speed"] for text in ("speed=25", "speed=50"))
+    low, high = (
+        study_up_to(joint, text).ranges["speed"] for text in ("speed=25", "speed=50")
+    )
     assert (low.original, low.upper) == (25, 25)
     assert (high.original, high.upper) == (40, 50)
     assert study_up_to(joint, "speed=60") == joint
 
 
 def limits_up_to(study: Study, value: float, **options: Any) -> Answer:
-    return tolerance(study, up_to=f"speed={value:g}", characteristics=("brakeTorque",), **options)
+    return tolerance(
+        study, up_to=f"speed={value:g}", characteristics=("brakeTorque",), **options
+    )
 
 
 @SLOW
@@ -118,7 +126,11 @@ def test_solutions_of_results_in_encounters_above_the_value_do_not_limit() -> No
     frame = frame.assign(outcome="collision", safety_degree=-1.0)
     subject: Any = SimpleNamespace(solutions=frame)
     columns = [*range(len(members.vehicle))]
-    options: dict[str, Any] = {"subject": subject, "unsafe": Unsafe(), "columns": columns}
+    options: dict[str, Any] = {
+        "subject": subject,
+        "unsafe": Unsafe(),
+        "columns": columns,
+    }
     known = _unsafe_solutions(SimpleNamespace(**options, whole=None), evaluator)  # type: ignore[arg-type]
     assert known.tolist() == [settings[0, : len(columns)].tolist()]
     whole = _unsafe_solutions(SimpleNamespace(**options, whole=evaluator), evaluator)  # type: ignore[arg-type]
@@ -131,12 +143,17 @@ def test_limits_up_to_a_larger_value_are_never_wider(ahead: Study) -> None:
     to 40.
     """
     options = {**ROUGH, "characteristics": ("brakeTorque,sensorLatency",)}
-    answers = [tolerance(ahead, up_to=f"speed={value}", **options) for value in (30, 40, 50)]
+    answers = [
+        tolerance(ahead, up_to=f"speed={value}", **options) for value in (30, 40, 50)
+    ]
     for slower, faster in pairwise(answers):
         for name, sign in (("low", 1), ("high", -1)):
             for kind in ("alone", "together"):
                 ends = [one.values(f"limits.{kind}_{name}") for one in (slower, faster)]
-                assert (sign * np.array(ends[0]) <= sign * np.array(ends[1])).all(), (kind, name)
+                assert (sign * np.array(ends[0]) <= sign * np.array(ends[1])).all(), (
+                    kind,
+                    name,
+                )
 
 
 @SLOW

@@ -34,7 +34,9 @@ def test_half_of_the_originals_is_said_by_every_question(
     """Also by one that asks another question first: nothing collides among the solutions of a short
     search.
     """
-    (tmp_path / "tiny.toml").write_text(STUDY.replace("evaluations = 100", "evaluations = 60"))
+    (tmp_path / "tiny.toml").write_text(
+        STUDY.replace("evaluations = 100", "evaluations = 60")
+    )
     searched(load_study(str(tmp_path / "tiny.toml")), tmp_path / "results")
     monkeypatch.chdir(tmp_path)
     assert load_cases(["results"])[0].unsafe.is_half
@@ -57,7 +59,11 @@ def test_half_of_the_originals_is_said_by_every_question(
 def test_a_limit_nearer_to_the_original_than_its_measurement_is_not_decidable(
     low: float, high: float, *, is_decidable: bool
 ) -> None:
-    brakes = next(item for item in CharacteristicSet.of(load_study("wear")) if item.precision)
+    brakes = next(
+        item for item in CharacteristicSet.of(load_study("wear")) if item.precision
+    )
     assert (brakes.original, brakes.lower, brakes.upper) == (1, 0.5, 1)
     assert brakes.is_decidable(low, high) is is_decidable
-    assert "relative brake torque (measured to within 0.05)" in undecidable_in_words([brakes])
+    assert "relative brake torque (measured to within 0.05)" in undecidable_in_words(
+        [brakes]
+    )

@@ -44,9 +44,9 @@ def here(safety: list[float], tet: list[float]) -> Evaluations:
 
 def test_every_number_is_what_it_says() -> None:
     there = reference([1.0, 2.0, 3.0, -1.0], [1.0, 1.2, 1.4, 0])
-    table = measure_agreement(there, here([1.5, 2.0, 2.0, 1.0], [1.1, 1.2, 1.2, 9.0])).set_index(
-        "metric"
-    )
+    table = measure_agreement(
+        there, here([1.5, 2.0, 2.0, 1.0], [1.1, 1.2, 1.2, 9.0])
+    ).set_index("metric")
     degrees = table.loc["safety_degree"]
     assert degrees["mean_absolute_error"] == pytest.approx((0.5 + 0 + 1 + 2) / 4)
     assert degrees["bias"] == pytest.approx((0.5 + 0 - 1 + 2) / 4)
@@ -58,7 +58,9 @@ def test_every_number_is_what_it_says() -> None:
 
 def test_collisions_are_counted_on_each_side_and_on_both() -> None:
     there = reference([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0], [1.0] * 6)
-    assert agreement_counts(there, here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6)) == {
+    assert agreement_counts(
+        there, here([-2.0, -2.0, -2.0, 0.05, -1.5, 2.0], [1.0] * 6)
+    ) == {
         "rows": 6,
         "collisions_here": 4,
         "collisions_reference": 4,
@@ -70,12 +72,16 @@ def test_a_study_that_simulates_alike_shares_the_shipped_agreement() -> None:
     sun = load_study("sun")
     assert shipped_agreement(sun)["rows"].tolist() == [1486, 1035, 1500]
     assert len(shipped_agreement(load_study(sun, name="mine", search={"runs": 2}))) == 3
-    assert shipped_agreement(load_study(sun, ads={"parameters": {"brake_gap": 7.0}})).empty
+    assert shipped_agreement(
+        load_study(sun, ads={"parameters": {"brake_gap": 7.0}})
+    ).empty
 
 
 def test_equal_values_and_too_few_have_no_rank_correlation() -> None:
     for undefined in ([1.0, 1, 1], [1.0], []):
-        assert np.isnan(rank_correlation(np.arange(len(undefined)), np.array(undefined)))
+        assert np.isnan(
+            rank_correlation(np.arange(len(undefined)), np.array(undefined))
+        )
 
 
 SUN = CharacteristicSet.of(load_study("sun"))
@@ -120,7 +126,9 @@ METRICS = {
 
 def table(characteristics: CharacteristicSet, columns: list[str]) -> pd.DataFrame:
     return (
-        pd.DataFrame(np.repeat(characteristics.original_settings, 3, axis=0), columns=columns)
+        pd.DataFrame(
+            np.repeat(characteristics.original_settings, 3, axis=0), columns=columns
+        )
         .assign(**METRICS)
         .astype(object)
     )
@@ -141,13 +149,21 @@ def test_both_published_formats_are_read(
     frame.loc[3, "mass"] = 1e6
     frame.to_csv(tmp_path / "data.csv", index=False)
     with pytest.warns(
-        UserWarning, match="data.csv: 1 rows with values outside the domains are left out"
+        UserWarning,
+        match="data.csv: 1 rows with values outside the domains are left out",
     ):
         data = read_reference(tmp_path / "data.csv", characteristics)
-    assert data.settings[0].tolist() == [characteristics.lower[0], *characteristics.original[1:]]
+    assert data.settings[0].tolist() == [
+        characteristics.lower[0],
+        *characteristics.original[1:],
+    ]
     assert data.metrics["safety_degree"].tolist() == [2.5, -1.5, 3.0]
     assert data.metrics["ave_dece"].tolist() == [5.0, 3.0, 6.0]
-    for undefined in (data.collided, np.isnan(data.metrics["tet"]), np.isnan(data.metrics["tit"])):
+    for undefined in (
+        data.collided,
+        np.isnan(data.metrics["tet"]),
+        np.isnan(data.metrics["tit"]),
+    ):
         assert undefined.tolist() == [False, True, False]
 
 
@@ -169,7 +185,10 @@ PUBLISHED_EFFECTS = {
     [
         ("sun", {"safety_degree": 0.05, "tet": 0.05, "tit": 0.05, "ave_dece": 0.055}),
         ("lgsvl", {"safety_degree": 0.05, "tet": 0.05, "tit": 0.05, "ave_dece": 0.05}),
-        ("rain", {"safety_degree": 0.40 / 2.2, "tet": 0.05, "tit": 0.15, "ave_dece": 0.05}),
+        (
+            "rain",
+            {"safety_degree": 0.40 / 2.2, "tet": 0.05, "tit": 0.15, "ave_dece": 0.05},
+        ),
     ],
 )
 def test_the_original_vehicle_is_as_near_to_the_published_one_as_is_said(
@@ -195,6 +214,13 @@ def test_vehicles_come_in_the_order_of_the_published_effects(study: str) -> None
     settings = np.random.default_rng(14).uniform(
         characteristics.lower, characteristics.upper, (150, len(width))
     )
-    effects = np.array([PUBLISHED_EFFECTS.get(name, 0.0) for name in characteristics.names])
+    effects = np.array(
+        [PUBLISHED_EFFECTS.get(name, 0.0) for name in characteristics.names]
+    )
     here = score(system, settings, drive_worst(system, settings)).f_safe
-    assert rank_correlation(((settings - characteristics.original) / width) @ effects, here) > 0.55
+    assert (
+        rank_correlation(
+            ((settings - characteristics.original) / width) @ effects, here
+        )
+        > 0.55
+    )

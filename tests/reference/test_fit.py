@@ -38,7 +38,9 @@ PLANS = sorted((Path(fit.__file__).parent).glob("*.toml"))
 def data() -> ReferenceData:
     system = assemble(load_study("sun"))
     characteristics = system.characteristics
-    settings = default_rng(3).uniform(characteristics.lower, characteristics.upper, (24, 12))
+    settings = default_rng(3).uniform(
+        characteristics.lower, characteristics.upper, (24, 12)
+    )
     return ReferenceData(settings, dict(drive_and_score(system, settings).metrics))
 
 
@@ -58,7 +60,9 @@ def test_a_search_brings_a_planted_parameter_nearer_to_the_truth(
         "weights = { safety_degree = 1.0 }\n"
     )
     names = load_study("sun").vehicle.characteristics
-    columns = {column: np.nan_to_num(data.metrics[name]) for name, column in COLUMNS.items()}
+    columns = {
+        column: np.nan_to_num(data.metrics[name]) for name, column in COLUMNS.items()
+    }
     pd.DataFrame(data.settings, columns=list(names)).assign(**columns).to_csv(
         "rows.csv", index=False
     )
@@ -79,7 +83,9 @@ def test_a_search_brings_a_planted_parameter_nearer_to_the_truth(
         )
     trials = pd.read_csv("log.csv")
     assert list(trials) == ["loss", GAP]
-    assert len(trials) == (1 + 12) + (1 + 4), "the study's own values, and whole generations"
+    assert len(trials) == (1 + 12) + (1 + 4), (
+        "the study's own values, and whole generations"
+    )
     assert trials[GAP][0] == 8.0
     best = trials.loc[trials["loss"].idxmin()]
     assert best["loss"] < trials["loss"][0]
@@ -92,9 +98,12 @@ def test_a_search_brings_a_planted_parameter_nearer_to_the_truth(
 @pytest.mark.parametrize("path", PLANS, ids=[path.stem for path in PLANS])
 def test_a_plan_has_the_values_of_its_studies_within_its_bounds(path: Path) -> None:
     plan = msgspec.toml.decode(path.read_bytes(), type=fit.Plan)
-    values = fit.Fit(plan, {name: load_study(name) for name in plan.studies}, {}).own_values()
+    values = fit.Fit(
+        plan, {name: load_study(name) for name in plan.studies}, {}
+    ).own_values()
     assert all(
-        row.lower <= value <= row.upper for row, value in zip(plan.parameters, values, strict=True)
+        row.lower <= value <= row.upper
+        for row, value in zip(plan.parameters, values, strict=True)
     )
 
 
@@ -107,43 +116,66 @@ def test_errors_count_in_repeats_and_each_collision_on_one_side_alone_its_share(
     nearer = with_values(load_study("sun"), {GAP: 0.8 * OWN})
     here = drive_and_score(assemble(nearer), data.settings)
     error = np.abs(here.f_safe - data.metrics["safety_degree"]).mean()
-    only = fit.Target([], {"safety_degree": 1.0}, original=0.0, rank=0.0, collisions=0.0)
+    only = fit.Target(
+        [], {"safety_degree": 1.0}, original=0.0, rank=0.0, collisions=0.0
+    )
     for unit in (1.0, 2.0):
         study = replace(nearer, repeatability={"safety_degree": unit})
         assert fit.loss_of_file(data, here, study, only) == pytest.approx(error / unit)
     published = {"safety_degree": np.array([-1.0, -2.0, -3.0, -1.0, 0.5, 2.0])}
     there = data.take(np.arange(24) < 6)._replace(metrics=published)
-    here = made_up_evaluations([-2.0, -2.0, -2.0, 0.5, -1.5, 2.0], settings=np.ones((6, 12)))
-    collisions = fit.Target([], {}, original=0.0, rank=0.0, collisions=6.0)
-    assert fit.loss_of_file(there, here, nearer, collisions) == pytest.approx(6 * 2 / 6), (
-        "four there and four here, three of them the same: two rows of six differ"
+    here = made_up_evaluations(
+        [-2.0, -2.0, -2.0, 0.5, -1.5, 2.0], settings=np.ones((6, 12))
     )
+    collisions = fit.Target([], {}, original=0.0, rank=0.0, collisions=6.0)
+    assert fit.loss_of_file(there, here, nearer, collisions) == pytest.approx(
+        6 * 2 / 6
+    ), "four there and four here, three of them the same: two rows of six differ"
 
 
 def test_a_linear_response_has_the_effects_that_it_was_made_with() -> None:
     study = load_study("sun")
     characteristics = assemble(study).characteristics
     width = characteristics.upper - characteristics.lower
-    settings = default_rng(1).uniform(characteristics.lower, characteristics.upper, (200, 12))
+    settings = default_rng(1).uniform(
+        characteristics.lower, characteristics.upper, (200, 12)
+    )
     settings[:, 3] = characteristics.original[3]
-    slopes = np.where(np.arange(12) == 3, np.nan, np.arange(12) - 5.0)  # one does not vary
-    response = 1.0 + ((settings - characteristics.original) / width) @ np.nan_to_num(slopes)
-    assert fit.linear_effects(study, settings, response) == pytest.approx(slopes, nan_ok=True)
-    assert np.isnan(fit.linear_effects(study, settings[:20], np.ones(20))).all(), "too few rows"
+    slopes = np.where(
+        np.arange(12) == 3, np.nan, np.arange(12) - 5.0
+    )  # one does not vary
+    response = 1.0 + ((settings - characteristics.original) / width) @ np.nan_to_num(
+        slopes
+    )
+    assert fit.linear_effects(study, settings, response) == pytest.approx(
+        slopes, nan_ok=True
+    )
+    assert np.isnan(fit.linear_effects(study, settings[:20], np.ones(20))).all(), (
+        "too few rows"
+    )
 
 
-def test_the_models_error_covers_nine_tenths_of_the_rows_of_each_file(data: ReferenceData) -> None:
+def test_the_models_error_covers_nine_tenths_of_the_rows_of_each_file(
+    data: ReferenceData,
+) -> None:
     """Rows of one file lie in the middle of the band, those of the other beyond it: 1 to 24
     distances from the original, at least 0.3.
     """
     sets = {GAP: [value_of(load_study("sun"), GAP)] * 2}
-    study = replace(load_study("sun"), spread=sets, repeatability={"safety_degree": 1e-9})
+    study = replace(
+        load_study("sun"), spread=sets, repeatability={"safety_degree": 1e-9}
+    )
     ch = assemble(study).characteristics
     away = np.maximum(
-        np.sqrt((((data.settings - ch.original) / (ch.upper - ch.lower)) ** 2).sum(axis=1)), 0.3
+        np.sqrt(
+            (((data.settings - ch.original) / (ch.upper - ch.lower)) ** 2).sum(axis=1)
+        ),
+        0.3,
     )
     far = data._replace(
-        metrics={"safety_degree": data.metrics["safety_degree"] + away * np.arange(1, 25)}
+        metrics={
+            "safety_degree": data.metrics["safety_degree"] + away * np.arange(1, 25)
+        }
     )
     # Of 24 rows the 23rd: ceil(0.9 * 25); another file without a miss changes nothing.
     assert fit.model_error(study, [far]) == pytest.approx(23, abs=1e-6)
@@ -167,7 +199,8 @@ def test_the_models_error_makes_the_band_wider_with_the_distance_from_the_origin
     """
     sets = {"spread": {GAP: [OWN, OWN]}, "repeatability": {"safety_degree": 1e-9}}
     bare, study = (
-        load_study("sun", **sets, model_error=error) for error in ({}, {"safety_degree": 0.4})
+        load_study("sun", **sets, model_error=error)
+        for error in ({}, {"safety_degree": 0.4})
     )
     ch = assemble(study).characteristics
     settings = np.stack([ch.original, ch.original])
@@ -201,13 +234,19 @@ def test_the_sets_are_simulated_one_by_one() -> None:
     ]
     (band,) = compute_model_spreads(study, setting)
     assert (band.lower, band.upper) == pytest.approx(
-        np.quantile([float(one.f_safe[0]) for one in alone], [0.05, 0.95]).tolist(), abs=1e-6
+        np.quantile([float(one.f_safe[0]) for one in alone], [0.05, 0.95]).tolist(),
+        abs=1e-6,
     )
-    assert (band.sets, band.collisions) == (3, sum(int(one.collided[0]) for one in alone))
+    assert (band.sets, band.collisions) == (
+        3,
+        sum(int(one.collided[0]) for one in alone),
+    )
 
 
 def test_another_vehicle_or_driver_has_no_spread() -> None:
-    other = load_study(load_study("sun", spread={GAP: [OWN, 5.0]}), ads={"model": "full_braking"})
+    other = load_study(
+        load_study("sun", spread={GAP: [OWN, 5.0]}), ads={"model": "full_braking"}
+    )
     assert not other.spread
     assert not other.model_error
 
@@ -217,9 +256,15 @@ def test_another_vehicle_or_driver_has_no_spread() -> None:
 def test_the_ends_over_fits_are_those_of_each_fitted_study() -> None:
     gap = "ads.parameters.brake_gap"
     gaps = [6.8978, 6.4, 7.4]
-    study = load_study("sun", spread={gap: gaps}, ads={"parameters": {"brake_gap": gaps[0]}})
+    study = load_study(
+        "sun", spread={gap: gaps}, ads={"parameters": {"brake_gap": gaps[0]}}
+    )
 
-    asked = {"characteristics": ["tireFric"], "unsafe": "below=1.5", "pool": InlinePool()}
+    asked = {
+        "characteristics": ["tireFric"],
+        "unsafe": "below=1.5",
+        "pool": InlinePool(),
+    }
 
     def low_end(one: Study) -> float:
         (end,) = tolerance(one, fits=0, **asked).values("limits.alone_low")

@@ -28,7 +28,9 @@ from safevar_sumo.shipped import NETWORKS
 from tests.in_process import SLOW, refused
 
 FOLDERS: dict[str, Callable[[Path], object]] = {
-    "network": lambda folder: shutil.copytree(NETWORKS / "pedestrian_crossing", folder / "mine")
+    "network": lambda folder: shutil.copytree(
+        NETWORKS / "pedestrian_crossing", folder / "mine"
+    )
 }
 
 
@@ -39,8 +41,12 @@ def rows(table: str = "*") -> Iterator[Any]:
             base = tables["base"][row["base"]] if "base" in row else {}
             whole = {**tables.get("default", {}), **base, **row}
             slow = [SLOW] if whole.get("slow") else []
-            first = whole["told"] if isinstance(whole["told"], str) else whole["told"][0]
-            yield pytest.param(whole, id=f"{path.stem}: {first.strip()[:60]}", marks=slow)
+            first = (
+                whole["told"] if isinstance(whole["told"], str) else whole["told"][0]
+            )
+            yield pytest.param(
+                whole, id=f"{path.stem}: {first.strip()[:60]}", marks=slow
+            )
 
 
 def prepare(folder: Path, row: dict[str, Any]) -> None:
@@ -57,7 +63,9 @@ def prepare(folder: Path, row: dict[str, Any]) -> None:
     if "old" in row or "adds" in row:
         text = (folder / row["in"]).read_text()
         assert row.get("old", "") in text
-        changed = text.replace(row.get("old", ""), row.get("new", ""), 1) + row.get("adds", "")
+        changed = text.replace(row.get("old", ""), row.get("new", ""), 1) + row.get(
+            "adds", ""
+        )
         (folder / row["in"]).write_text(changed)
 
 
@@ -80,5 +88,8 @@ def test_what_is_wrong_is_refused(
     if "{results}" in typed:
         typed = typed.replace("{results}", str(request.getfixturevalue("slippery")))
     named = [row["in"]] if "in" in row and row["in"] in typed else []
-    refused(*shlex.split(typed), message=(*named, *([told] if isinstance(told, str) else told)))
+    refused(
+        *shlex.split(typed),
+        message=(*named, *([told] if isinstance(told, str) else told)),
+    )
     assert files_in(in_tmp) == before

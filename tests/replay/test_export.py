@@ -44,15 +44,21 @@ def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]
     system = assemble(study)
     characteristics = system.characteristics
     middle = (characteristics.lower + characteristics.upper) / 2
-    setting = characteristics.original + np.sign(middle - characteristics.original) * 0.1 * (
-        characteristics.upper - characteristics.lower
-    )
+    setting = characteristics.original + np.sign(
+        middle - characteristics.original
+    ) * 0.1 * (characteristics.upper - characteristics.lower)
     undefined = dict.fromkeys(("tet", "tit", "ave_dece"), np.array([np.nan]))
     solutions = made_up_evaluations(
-        [1.0], settings=setting[np.newaxis], metrics={"safety_degree": np.array([1.0]), **undefined}
+        [1.0],
+        settings=setting[np.newaxis],
+        metrics={"safety_degree": np.array([1.0]), **undefined},
     )
     write_imported(
-        folder / "results", study, {"made": solutions}, {"safety_degree": 1.0}, {"made": "made.csv"}
+        folder / "results",
+        study,
+        {"made": solutions},
+        {"safety_degree": 1.0},
+        {"made": "made.csv"},
     )
     return folder / "results", system, setting
 
@@ -60,7 +66,8 @@ def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]
 @pytest.fixture(
     scope="module",
     params=[
-        pytest.param(name, marks=() if name == "lead_vehicle_stopped" else SLOW) for name in SCENES
+        pytest.param(name, marks=() if name == "lead_vehicle_stopped" else SLOW)
+        for name in SCENES
     ],
 )
 def exported(
@@ -70,7 +77,16 @@ def exported(
     results, system, setting = results_of(study, tmp_path_factory.mktemp(request.param))
     out = results.with_name("out")
     chosen = ("--point", point) if point else ()
-    done = run("export", str(results), *HANDLE, *chosen, "--to", "openscenario", "--out", str(out))
+    done = run(
+        "export",
+        str(results),
+        *HANDLE,
+        *chosen,
+        "--to",
+        "openscenario",
+        "--out",
+        str(out),
+    )
     (results / "printed.txt").write_text(done.stdout)
     there = assemble(at_point(load_study(study), point)) if point else system
     return out, comparison_of(
@@ -79,19 +95,23 @@ def exported(
 
 
 @SLOW
-def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Comparison]) -> None:
+def test_a_second_library_reads_the_places_of_the_trace(
+    exported: tuple[Path, Comparison],
+) -> None:
     xosc = pytest.importorskip("scenariogeneration.xosc")
     out, comparison = exported
     scenario = xosc.ParseOpenScenario(str(out / "scenario.xosc"))
     row = comparison.rows[-1]
     samples = slice(0, comparison.moments[row].end + 1)
     boxes = {
-        item.name: item.entityobject.boundingbox for item in scenario.entities.scenario_objects
+        item.name: item.entityobject.boundingbox
+        for item in scenario.entities.scenario_objects
     }
     groups = scenario.storyboard.stories[0].acts[0].maneuvergroup
-    assert {group.actors.actors[0].entity for group in groups} == {"Ego", *comparison.tracks} - {
-        "vut"
-    }
+    assert {group.actors.actors[0].entity for group in groups} == {
+        "Ego",
+        *comparison.tracks,
+    } - {"vut"}
     for group in groups:
         name = group.actors.actors[0].entity
         track = comparison.tracks["vut" if name == "Ego" else name]
@@ -105,7 +125,9 @@ def test_a_second_library_reads_the_places_of_the_trace(exported: tuple[Path, Co
             for axis in "xyh"
         )
         times = trajectory.shapes.time[samples]
-        assert np.allclose(times, comparison.runs.trace.time[samples], rtol=0, atol=1e-9)
+        assert np.allclose(
+            times, comparison.runs.trace.time[samples], rtol=0, atol=1e-9
+        )
         front = 0.0 if track.is_person else box.center.x + box.boundingbox.length / 2
         assert np.abs(x + front * np.cos(heading) - track.x[samples, row]).max() < 0.01
         assert np.abs(y + front * np.sin(heading) - track.y[samples, row]).max() < 0.01
@@ -121,10 +143,14 @@ def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(
     track = comparison.tracks["vut"]
     lanes = [lane for lane in comparison.road if lane.kind == "road"]
     for sample in range(comparison.moments[row].end + 1):
-        x, y, heading = (float(values[sample, row]) for values in (track.x, track.y, track.heading))
+        x, y, heading = (
+            float(values[sample, row]) for values in (track.x, track.y, track.heading)
+        )
         waypoint = road.get_waypoint(carla.Location(x, -y, 0.0), project_to_road=False)
         assert waypoint.lane_type == carla.LaneType.Driving
-        assert any(np.isclose(waypoint.lane_width, lane.width, atol=0.01) for lane in lanes)
+        assert any(
+            np.isclose(waypoint.lane_width, lane.width, atol=0.01) for lane in lanes
+        )
         assert np.isclose(
             np.cos(np.deg2rad(waypoint.transform.rotation.yaw) + heading), 1, atol=1e-3
         )
@@ -147,7 +173,9 @@ def test_asam_finds_no_fault(exported: tuple[Path, Comparison]) -> None:
             f' value="{report}"/></CheckerBundle></Config>'
         )
         subprocess.run([ASAM / program, "-c", config], check=True, capture_output=True)
-        states = re.findall(r'<Checker status="(\w+)" checkerId="(\w+)"', report.read_text())
+        states = re.findall(
+            r'<Checker status="(\w+)" checkerId="(\w+)"', report.read_text()
+        )
         assert ("completed", f"check_asam_{kind}_xml_valid_schema") in states
         assert not any(state == "error" for state, _ in states)
         assert "<Issue " not in report.read_text()
@@ -163,7 +191,9 @@ def for_carla(tmp_path: Path) -> ForCarla:
         "carla", reason="CARLA's client has wheels for Linux and Python 3.10 to 3.12"
     )
     results, _, setting = results_of("rain", tmp_path)
-    run("export", str(results), *HANDLE, "--to", "carla", "--out", str(tmp_path / "out"))
+    run(
+        "export", str(results), *HANDLE, "--to", "carla", "--out", str(tmp_path / "out")
+    )
     script = SimpleNamespace(**runpy.run_path(str(tmp_path / "out/run_in_carla.py")))
     return script, json.loads((tmp_path / "out/vehicle.json").read_text()), setting
 
@@ -172,7 +202,9 @@ def test_carla_gets_all_twelve_values_in_its_units(for_carla: ForCarla) -> None:
     import carla
 
     script, scene, setting = for_carla
-    empty = carla.VehiclePhysicsControl(wheels=[carla.WheelPhysicsControl() for _ in range(4)])
+    empty = carla.VehiclePhysicsControl(
+        wheels=[carla.WheelPhysicsControl() for _ in range(4)]
+    )
     physics = script.apply_values(empty, scene)
     assert len(physics.wheels) == 4
     wheel_values = [
@@ -247,7 +279,20 @@ def test_the_script_drives_the_whole_record(for_carla: ForCarla) -> None:
 
 def test_what_carla_has_no_counterpart_of_is_refused(tmp_path: Path) -> None:
     worn, _, _ = results_of("wear", tmp_path)
-    message = ("treadDepth, brakeTorque", "no counterpart in CARLA", "--to openscenario")
+    message = (
+        "treadDepth, brakeTorque",
+        "no counterpart in CARLA",
+        "--to openscenario",
+    )
     out = tmp_path / "out"
-    refused("export", str(worn), *HANDLE, "--to", "carla", "--out", str(out), message=message)
+    refused(
+        "export",
+        str(worn),
+        *HANDLE,
+        "--to",
+        "carla",
+        "--out",
+        str(out),
+        message=message,
+    )
     assert not out.exists()

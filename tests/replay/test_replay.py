@@ -33,7 +33,12 @@ from safevar_sumo.replay.animation import (
     lay_out,
     player_of,
 )
-from safevar_sumo.replay.comparison import COLOURS, Comparison, comparison_of, list_differences
+from safevar_sumo.replay.comparison import (
+    COLOURS,
+    Comparison,
+    comparison_of,
+    list_differences,
+)
 from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.sumo.system import assemble
@@ -43,13 +48,21 @@ from tests.in_process import SLOW
 def test_a_replay_that_differs_from_its_row_is_reported(case: Case) -> None:
     comparison = comparison_of(
         simulate_with_original(
-            case.study, assemble(case.study), case.characteristics.original, filtered=False
+            case.study,
+            assemble(case.study),
+            case.characteristics.original,
+            filtered=False,
         )
     )
     result = list_differences(
-        comparison.evaluations, {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"}
+        comparison.evaluations,
+        {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"},
     )
-    assert [one.split(" was ")[0] for one in result] == ["the outcome", "safety_degree", "tet"]
+    assert [one.split(" was ")[0] for one in result] == [
+        "the outcome",
+        "safety_degree",
+        "tet",
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +85,14 @@ def test_moments_of_a_drive(comparison: Comparison) -> None:
     assert not trace.brake[trace.time < trace.time[original.braking_start], 0].any()
     assert trace.gap[original.nearest, 0] == comparison.evaluations.f_safe[0]
     assert hit.nearest == hit.end
-    assert comparison.verdict(0) == f"stops with {comparison.evaluations.f_safe[0]:.2f} m to spare"
-    assert comparison.verdict(1) == f"collides at {-comparison.evaluations.f_safe[1]:.1f} m/s"
+    assert (
+        comparison.verdict(0)
+        == f"stops with {comparison.evaluations.f_safe[0]:.2f} m to spare"
+    )
+    assert (
+        comparison.verdict(1)
+        == f"collides at {-comparison.evaluations.f_safe[1]:.1f} m/s"
+    )
     apart = find_divergence(runs)
     assert apart is not None
     assert abs(trace.speed[apart, 0] - trace.speed[apart, 1]) > 0.1
@@ -84,12 +103,20 @@ def test_the_figure_draws_both_drives_until_their_ends(comparison: Comparison) -
     figure = draw_comparison(comparison)
     trace = comparison.runs.trace
     for axis, values in zip(
-        figure.axes, (trace.speed, trace.gap, trace.throttle - trace.brake), strict=False
+        figure.axes,
+        (trace.speed, trace.gap, trace.throttle - trace.brake),
+        strict=False,
     ):
-        drives = [line.get_xydata().tolist() for line in axis.lines if len(line.get_xdata()) > 9]
+        drives = [
+            line.get_xydata().tolist()
+            for line in axis.lines
+            if len(line.get_xdata()) > 9
+        ]
         for row in comparison.rows:
             end = comparison.moments[row].end + 1
-            assert np.column_stack([trace.time, values[:, row]])[:end].tolist() in drives
+            assert (
+                np.column_stack([trace.time, values[:, row]])[:end].tolist() in drives
+            )
     words = [text.get_text() for text in figure.legends[0].get_texts()]
     assert all(any(comparison.verdict(row) in text for text in words) for row in (0, 1))
     assert all(change in figure.get_suptitle() for change in comparison.changes)
@@ -102,7 +129,16 @@ def screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         pytest.skip("Xvfb is not installed")
     reading, writing = os.pipe()
     server = subprocess.Popen(
-        ["Xvfb", "-displayfd", str(writing), "-screen", "0", "1280x800x24", "-nolisten", "tcp"],
+        [
+            "Xvfb",
+            "-displayfd",
+            str(writing),
+            "-screen",
+            "0",
+            "1280x800x24",
+            "-nolisten",
+            "tcp",
+        ],
         pass_fds=[writing],
         stderr=subprocess.DEVNULL,
     )
@@ -136,7 +172,9 @@ def test_both_vehicles_are_in_the_window_at_the_nearest_moment(
     assert min(original.shape[1], changed.shape[1]) > 100
     assert np.ptp([original[0].min(), changed[0].min()]) <= 2, "one upon the other"
     assert original[1].max() < changed[1].max(), "the original keeps its distance"
-    assert of_colour(picture, "#ff3300").shape[1] > 20, "the changed vehicle's brake lights"
+    assert of_colour(picture, "#ff3300").shape[1] > 20, (
+        "the changed vehicle's brake lights"
+    )
 
 
 def test_the_window_plays_from_the_moment_that_it_is_there(
@@ -152,7 +190,11 @@ def test_the_window_plays_from_the_moment_that_it_is_there(
         now += seconds
 
     def drive_again(
-        system: object, settings: object, runs: object, watch: Callable[[Any], None], start: object
+        system: object,
+        settings: object,
+        runs: object,
+        watch: Callable[[Any], None],
+        start: object,
     ) -> None:
         nonlocal now
         now += 5.0
@@ -160,7 +202,9 @@ def test_the_window_plays_from_the_moment_that_it_is_there(
             watch(MagicMock(vehicle_positions=lambda name: np.zeros((2, 2))))
 
     monkeypatch.setattr(gui, "drive_again", drive_again)
-    monkeypatch.setattr(gui, "time", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
+    monkeypatch.setattr(
+        gui, "time", SimpleNamespace(monotonic=lambda: now, sleep=sleep)
+    )
     show_in_gui(comparison)
     assert waits == pytest.approx([comparison.runs.trace.step] * 3)
 
@@ -179,7 +223,9 @@ def frame(comparison: Comparison, sample: int) -> tuple[np.ndarray, float, float
     return picture, left, picture.shape[1] / (right - left)
 
 
-def test_both_vehicles_are_drawn_at_their_positions_to_scale(comparison: Comparison) -> None:
+def test_both_vehicles_are_drawn_at_their_positions_to_scale(
+    comparison: Comparison,
+) -> None:
     # The changed vehicle stands on the original's place.
     picture, left, scale = frame(comparison, 0)
     vuts = [body for body in lay_out(comparison)[0] if body.is_vut]
@@ -226,7 +272,9 @@ def test_a_gif_lasts_as_long_as_the_drive_and_has_the_same_bytes_twice(
     assert sum(durations) == pytest.approx(1000 * (seconds + 2), abs=500)
 
 
-def test_a_player_needs_nothing_else_and_has_its_own_names(comparison: Comparison) -> None:
+def test_a_player_needs_nothing_else_and_has_its_own_names(
+    comparison: Comparison,
+) -> None:
     first, again, other = (player_of(comparison, number, 3, 20) for number in (1, 1, 2))
     assert first == again
     assert "http" not in first

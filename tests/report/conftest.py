@@ -42,7 +42,9 @@ def page(slippery: Path, case: Case) -> str:
             lambda _: Plant(case.study, lambda rows: rows[:, friction] < 1.5),
         )
         shows: list[tuple[str, int, int]] = []
-        page = page_of(slippery, ask=ASK, jobs=1, progress=lambda *values: shows.append(values))
+        page = page_of(
+            slippery, ask=ASK, jobs=1, progress=lambda *values: shows.append(values)
+        )
         assert shows[0][1] == 0
         assert shows[-1][0] == "replays"
         assert all(done <= total or not total for _, done, total in shows)

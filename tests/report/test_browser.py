@@ -49,7 +49,9 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
     options.binary_location = program("chromium", "chromium-browser", "google-chrome")
     for one in (*OPTIONS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
         options.add_argument(one)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    options.set_capability(
+        "goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"}
+    )
     result = Chrome(options=options, service=Service(program("chromedriver")))
     yield result
     result.quit()
@@ -73,7 +75,10 @@ def opened(browser: Chrome, page: Path) -> None:
 
 
 def requests_of(browser: Chrome) -> list[str]:
-    messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
+    messages = [
+        json.loads(entry["message"])["message"]
+        for entry in browser.get_log("performance")
+    ]
     return [
         one["params"]["request"]["url"]
         for one in messages
@@ -109,7 +114,9 @@ def test_an_animation_plays_and_scrubs_as_a_file(
     setting = case.solutions[list(case.characteristics.names)].to_numpy()[0]
     animate(
         comparison_of(
-            simulate_with_original(case.study, assemble(case.study), setting, filtered=False)
+            simulate_with_original(
+                case.study, assemble(case.study), setting, filtered=False
+            )
         ),
         tmp_path / "it.html",
     )
@@ -164,11 +171,17 @@ def test_it_fits_the_screen_and_everybody_can_read_it(
     resized(browser, width, scheme)
     try:
         opened(browser, report)
-        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        assert (
+            browser.execute_script("return document.documentElement.scrollWidth")
+            <= width
+        )
         browser.execute_script(
             "document.querySelectorAll('details').forEach((one) => { one.open = true; })"
         )
-        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        assert (
+            browser.execute_script("return document.documentElement.scrollWidth")
+            <= width
+        )
         assert violations(browser, axe) == []
     finally:
         resized(browser, 1400)
@@ -205,20 +218,27 @@ def test_it_prints_on_few_pages_what_is_unfolded_and_nothing_to_press(
     assert 3 <= printed.count(b"/Type /Page\n") <= 8
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
     browser.execute_cdp_cmd(
-        "Emulation.setDeviceMetricsOverride", A4 | {"deviceScaleFactor": 1, "mobile": False}
+        "Emulation.setDeviceMetricsOverride",
+        A4 | {"deviceScaleFactor": 1, "mobile": False},
     )
     try:
         assert browser.execute_script(TOO_WIDE) == []
         assert browser.execute_script(BROKEN_NAMES) == []
-        height = "return document.querySelector(arguments[0]).getBoundingClientRect().height"
+        height = (
+            "return document.querySelector(arguments[0]).getBoundingClientRect().height"
+        )
         for part in (".front", ".sheet"):
-            assert browser.execute_script(height, part) <= A4["height"], f"{part} is one page"
+            assert browser.execute_script(height, part) <= A4["height"], (
+                f"{part} is one page"
+            )
         seen = (
             "return [...document.querySelectorAll(arguments[0])].filter((one) =>"
             " one.checkVisibility()).length"
         )
         assert browser.execute_script(seen, ".anim-controls") == 0
-        assert browser.execute_script(seen, ".animation") == 1, "a still of the first replay"
+        assert browser.execute_script(seen, ".animation") == 1, (
+            "a still of the first replay"
+        )
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
@@ -255,7 +275,9 @@ def test_without_javascript_it_stands_still_and_tells_the_same(
         assert "collides at" in still.get_attribute("alt")
         assert still.get_property("naturalWidth") > 100
     finally:
-        browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+        browser.execute_cdp_cmd(
+            "Emulation.setScriptExecutionDisabled", {"value": False}
+        )
 
 
 REQUIRED = "SAFEVAR_BROWSER"

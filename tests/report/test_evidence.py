@@ -98,7 +98,13 @@ def mine(in_tmp: Path) -> Path:
     for name, text in {**FILES, "mine.py": MINE, "mine.toml": STUDY}.items():
         (there / name).write_text(text)
     run(
-        "study", str(there / "mine.toml"), "--out", str(there / "results"), "--quiet", "--jobs", "1"
+        "study",
+        str(there / "mine.toml"),
+        "--out",
+        str(there / "results"),
+        "--quiet",
+        "--jobs",
+        "1",
     )
     return there / "results"
 
@@ -115,7 +121,9 @@ def changed(source: Path, target: Path, name: str, change: Callable[[str], str])
     (path,) = [path for path in texts if path.endswith(name)]
     before = texts[path].decode()
     assert change(before) != before
-    return written(target, {**texts, path: change(before).encode()}, named=path != DESCRIPTION)
+    return written(
+        target, {**texts, path: change(before).encode()}, named=path != DESCRIPTION
+    )
 
 
 def written(target: Path, files: dict[str, bytes], *, named: bool = True) -> str:
@@ -124,11 +132,15 @@ def written(target: Path, files: dict[str, bytes], *, named: bool = True) -> str
     """
     with suppress(KeyError, ValueError, RecursionError):
         described = json.loads(files[DESCRIPTION])
-        others = {name: content for name, content in files.items() if name != DESCRIPTION}
+        others = {
+            name: content for name, content in files.items() if name != DESCRIPTION
+        }
         if named:
             files = {
                 **files,
-                DESCRIPTION: json.dumps({**described, "files": digests_of(others)}).encode(),
+                DESCRIPTION: json.dumps(
+                    {**described, "files": digests_of(others)}
+                ).encode(),
             }
     with zipfile.ZipFile(target, "w") as archive:
         for name, content in files.items():
@@ -152,7 +164,9 @@ def not_same(*arguments: str) -> list[dict[str, str]]:
     """The claims that `verify` does not find the same; it must end with exit code 1."""
     result = json.loads(run("verify", *arguments, "--json", expect=1).stdout)
     numbers, claims = result["numbers"], result["tables"]["claims"]["rows"]
-    counts = [numbers[verdict] for verdict in ("same", "differs", "cannot", "unchecked")]
+    counts = [
+        numbers[verdict] for verdict in ("same", "differs", "cannot", "unchecked")
+    ]
     assert sum(counts) == numbers["claims"] == len(claims)
     assert numbers["unchecked"] == ("--search" not in arguments)
     return [claim for claim in claims if claim["verdict"] not in ("same", "unchecked")]
@@ -169,7 +183,9 @@ def verified(*arguments: str) -> list[str]:
 
 @SLOW
 @pytest.mark.usefixtures("coarse")
-def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_path: Path) -> None:
+def test_a_pack_holds_the_page_and_the_answers_and_verifies(
+    slippery: Path, tmp_path: Path
+) -> None:
     pack = tmp_path / "pack.zip"
     ask = ("--ask", "explain --quick", "--ask", "risk --samples 300")
     run("evidence", str(slippery), "--out", str(pack), *ask)
@@ -186,11 +202,14 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_
         command = answer.pop("command")
         assert html.escape(command) in page
         words = [
-            str(slippery) if word == "results/slippery" else word for word in command.split()[3:]
+            str(slippery) if word == "results/slippery" else word
+            for word in command.split()[3:]
         ]
         assert answer == json_of(*words), "the page's answer is the command's"
     shares = re.search(r"(\d+) different vehicles\.", page)
-    assert int(shares[1]) == len(load(slippery).evaluations), "the page is about the whole search"
+    assert int(shares[1]) == len(load(slippery).evaluations), (
+        "the page is about the whole search"
+    )
 
     claims = [
         "files",
@@ -203,7 +222,12 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(slippery: Path, tmp_
     ]
     assert verified(str(pack)) == claims
     (claim,) = not_same(
-        changed(pack, tmp_path / "it.zip", "answers.json", digit_of(r'"probability": 0\.(\d+)'))
+        changed(
+            pack,
+            tmp_path / "it.zip",
+            "answers.json",
+            digit_of(r'"probability": 0\.(\d+)'),
+        )
     )
     assert claim["claim"] == "answer risk --samples 300"
     assert claim["packed"].startswith('"probability": 0.')
@@ -218,12 +242,20 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     Path("my_questions.py").write_text(files_of("CONTRIBUTING.md")["my_questions.py"])
     monkeypatch.syspath_prepend(str(in_tmp))
     run(
-        "report", str(slippery), "--ask", "my_questions:ends --unsafe below=0.5", "--out", "it.html"
+        "report",
+        str(slippery),
+        "--ask",
+        "my_questions:ends --unsafe below=0.5",
+        "--out",
+        "it.html",
     )
     page = Path("it.html").read_text()
     assert "Unsafe at an end of the domain: " in page
     assert "<caption>Ends of the domains</caption>" in page
-    assert f"python -m safevar_sumo my_questions:ends {slippery} --unsafe below=0.5" in page
+    assert (
+        f"python -m safevar_sumo my_questions:ends {slippery} --unsafe below=0.5"
+        in page
+    )
     run("evidence", str(slippery), "--ask", "my_questions:ends", "--out", "it.zip")
     Path("my_questions.py").unlink()
     refused(
@@ -243,7 +275,9 @@ def test_a_pack_holds_a_list_of_cars_without_their_names(
     slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path("of_cars.py").write_text(OF_CARS)
-    Path("fleet.csv").write_text("plate;mass;driver\nM-XY 1;2100,5;Ada L.\nM-XY 2;2200;Bob\n")
+    Path("fleet.csv").write_text(
+        "plate;mass;driver\nM-XY 1;2100,5;Ada L.\nM-XY 2;2200;Bob\n"
+    )
     monkeypatch.syspath_prepend(str(in_tmp))
     ask = "of_cars:named --cars fleet.csv --ignore driver"
     run("evidence", str(slippery), "--ask", ask, "--out", "it.zip")
@@ -253,16 +287,23 @@ def test_a_pack_holds_a_list_of_cars_without_their_names(
     assert "--cars lists/1.csv --ignore driver" in answer["command"]
     packed = texts["1-slippery/lists/1.csv"].decode().replace('"', "").splitlines()
     assert packed == ["plate;mass;driver", "car 1;2100,5;", "car 2;2200;"]
-    assert not [name for name, text in texts.items() if b"M-XY" in text or b"Ada L." in text]
+    assert not [
+        name for name, text in texts.items() if b"M-XY" in text or b"Ada L." in text
+    ]
     assert len(verified("it.zip", "--run-code")) == 7
     named_elsewhere = changed(
-        Path("it.zip"), Path("bad.zip"), DESCRIPTION, lambda text: text.replace("lists/1", "fleet")
+        Path("it.zip"),
+        Path("bad.zip"),
+        DESCRIPTION,
+        lambda text: text.replace("lists/1", "fleet"),
     )
     refused("verify", named_elsewhere, "--run-code", message="1.csv")
 
 
 @SLOW
-def test_equal_contents_give_equal_bytes(bare: Path, slippery: Path, tmp_path: Path) -> None:
+def test_equal_contents_give_equal_bytes(
+    bare: Path, slippery: Path, tmp_path: Path
+) -> None:
     run(
         "evidence",
         str(slippery),
@@ -281,7 +322,8 @@ def damaged(content: bytes, damage: dict[str, Any]) -> bytes:
         text = digit_of(damage["digit"])(text)
     elif "old" in damage:
         olds, news = (
-            [one] if isinstance(one, str) else one for one in (damage["old"], damage["new"])
+            [one] if isinstance(one, str) else one
+            for one in (damage["old"], damage["new"])
         )
         for old, new in zip(olds, news, strict=True):
             new_text = new * damage.get("times", 1)
@@ -291,17 +333,25 @@ def damaged(content: bytes, damage: dict[str, Any]) -> bytes:
 
 @SLOW
 @pytest.mark.parametrize(
-    "damage", DAMAGES, ids=[f"{row['in']}, {row.get('told', 'different')}" for row in DAMAGES]
+    "damage",
+    DAMAGES,
+    ids=[f"{row['in']}, {row.get('told', 'different')}" for row in DAMAGES],
 )
-def test_a_damage_is_refused_or_named(damage: dict[str, Any], bare: Path, tmp_path: Path) -> None:
+def test_a_damage_is_refused_or_named(
+    damage: dict[str, Any], bare: Path, tmp_path: Path
+) -> None:
     texts = texts_of(bare)
-    default = damage["in"] if "/manifest" in damage["in"] else f"1-slippery/{damage['in']}"
+    default = (
+        damage["in"] if "/manifest" in damage["in"] else f"1-slippery/{damage['in']}"
+    )
     path = next((path for path in texts if path.endswith(damage["in"])), default)
     before = texts.pop(path, None)
     if "removed" not in damage:
         texts[path] = damaged(before or b"", damage)
         assert texts[path] != before
-    pack = written(tmp_path / "it.zip", texts, named=damage.get("named", path != DESCRIPTION))
+    pack = written(
+        tmp_path / "it.zip", texts, named=damage.get("named", path != DESCRIPTION)
+    )
     if "told" in damage:
         refused("verify", pack, message=("it.zip", damage["told"]))
     else:
@@ -312,10 +362,18 @@ def test_a_damage_is_refused_or_named(damage: dict[str, Any], bare: Path, tmp_pa
 def test_what_differs_is_shown_from_both_sides(bare: Path, tmp_path: Path) -> None:
     texts = texts_of(bare)
     page = texts["1-slippery/report.html"] + b"\n"
-    (claim,) = not_same(written(tmp_path / "it.zip", {**texts, "1-slippery/report.html": page}))
-    assert (claim["claim"], claim["packed"], claim["here"]) == ("report", "'\\n'", "nothing")
+    (claim,) = not_same(
+        written(tmp_path / "it.zip", {**texts, "1-slippery/report.html": page})
+    )
+    assert (claim["claim"], claim["packed"], claim["here"]) == (
+        "report",
+        "'\\n'",
+        "nothing",
+    )
     answers = {"1-slippery/answers.json": texts["1-slippery/answers.json"] + b" "}
-    (claim, *_) = not_same(written(tmp_path / "it.zip", {**texts, **answers}, named=False))
+    (claim, *_) = not_same(
+        written(tmp_path / "it.zip", {**texts, **answers}, named=False)
+    )
     assert '"1-slippery/answers.json": "' in claim["packed"]
 
 
@@ -332,7 +390,11 @@ def test_an_archive_is_its_files_and_nothing_else(
     change: Callable[[bytes], bytes], bare: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "it.zip").write_bytes(change(bare.read_bytes()))
-    refused("verify", str(tmp_path / "it.zip"), message=("it.zip", "bytes that belong to no file"))
+    refused(
+        "verify",
+        str(tmp_path / "it.zip"),
+        message=("it.zip", "bytes that belong to no file"),
+    )
 
 
 @SLOW
@@ -340,17 +402,31 @@ def test_versions_and_machines_that_differ_are_named_and_so_is_what_needs_a_sear
     bare: Path, tmp_path: Path
 ) -> None:
     path = str(bare)
-    altered = {"numpy": "manifest.json", "machine": "manifest.json", "deap": DESCRIPTION}
+    altered = {
+        "numpy": "manifest.json",
+        "machine": "manifest.json",
+        "deap": DESCRIPTION,
+    }
     for key, name in altered.items():
         path = changed(
-            Path(path), tmp_path / key, name, partial(re.sub, f'("{key}": )"', r'\1"9', count=1)
+            Path(path),
+            tmp_path / key,
+            name,
+            partial(re.sub, f'("{key}": )"', r'\1"9', count=1),
         )
-    said = "deap of pack.json: 91.*platform.machine of .*: 9x86.*numpy of .*: 92.*--search"
-    found = run("verify", path, "--json", expect=1).stdout  # the page names the version of numpy
+    said = (
+        "deap of pack.json: 91.*platform.machine of .*: 9x86.*numpy of .*: 92.*--search"
+    )
+    found = run(
+        "verify", path, "--json", expect=1
+    ).stdout  # the page names the version of numpy
     assert re.search(said, found)
     scoring = '"scoring": {"metrics": [], "objectives": []}, "results"'
     path = changed(
-        bare, tmp_path / "it.zip", "manifest.json", lambda text: text.replace('"results"', scoring)
+        bare,
+        tmp_path / "it.zip",
+        "manifest.json",
+        lambda text: text.replace('"results"', scoring),
     )
     assert [claim["verdict"] for claim in not_same(path)] == ["cannot be run"] * 2
     assert "Not compared" not in run("verify", str(bare), "--search").stdout
@@ -385,10 +461,16 @@ def test_links_bombs_and_other_files_are_refused(in_tmp: Path) -> None:
     with zipfile.ZipFile("bomb.zip", "w") as archive:
         archive.writestr("zeros", "")
         archive.filelist[0].file_size = 10_000_000_000
-    refused("verify", "bomb.zip", message=("unpacked it has 10.0 GB, at most 1 are allowed",))
+    refused(
+        "verify",
+        "bomb.zip",
+        message=("unpacked it has 10.0 GB, at most 1 are allowed",),
+    )
     many = [zipfile.ZipInfo(str(number)) for number in range(10_001)]
     _check_entries(Path("many.zip"), many[1:])
-    with pytest.raises(InputError, match="holds 10001 files, at most 10000 are allowed"):
+    with pytest.raises(
+        InputError, match="holds 10001 files, at most 10000 are allowed"
+    ):
         _check_entries(Path("many.zip"), many)
 
 
@@ -406,7 +488,9 @@ def test_user_code_and_an_own_network_travel_along_and_run_only_when_told(
     )  # SUMO's options may name outputs
     refused("verify", "it.zip", message=("would run code", *code, "--run-code"))
     assert len(verified("it.zip", "--run-code")) == 7
-    path = changed(Path("it.zip"), in_tmp / "other.zip", "code/limits.txt", digit_of(r"(\d)\."))
+    path = changed(
+        Path("it.zip"), in_tmp / "other.zip", "code/limits.txt", digit_of(r"(\d)\.")
+    )
     claims = {claim["claim"]: claim["here"] for claim in not_same(path, "--run-code")}
     assert "limits.txt has changed since" in claims["inputs"]
     assert sorted(os.listdir()) == ["it.zip", "other.zip"]
@@ -450,7 +534,11 @@ class Careless(NamedTuple):
 @pytest.mark.parametrize(
     "careless",
     [
-        Careless(MINE.replace("Path(limits)", 'Path("secret.txt")'), "secret.txt", "No such file"),
+        Careless(
+            MINE.replace("Path(limits)", 'Path("secret.txt")'),
+            "secret.txt",
+            "No such file",
+        ),
         Careless(
             MINE.replace("Path(limits).read_text()", '__import__("helper").GAP'),
             "helper.py",
@@ -465,7 +553,9 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
     there = mine.parent
     monkeypatch.chdir(there)
     monkeypatch.syspath_prepend(str(there))
-    Path(careless.file).write_text("6.0" if careless.file == "secret.txt" else "GAP = 6.0")
+    Path(careless.file).write_text(
+        "6.0" if careless.file == "secret.txt" else "GAP = 6.0"
+    )
     Path("mine.py").write_text(careless.code)
     run("study", "mine.toml", "--out", "own", "--quiet", "--jobs", "1")
     run("evidence", "own", "--ask", "rules --samples 20", "--out", "it.zip")
@@ -478,9 +568,14 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
     manifest["files"].pop(careless.file, None)
     written(
         Path("it.zip"),
-        {**texts, "1-mine/manifest.json": json.dumps(manifest, indent=2).encode() + b"\n"},
+        {
+            **texts,
+            "1-mine/manifest.json": json.dumps(manifest, indent=2).encode() + b"\n",
+        },
     )
-    claims = {claim["claim"]: claim["here"] for claim in not_same("it.zip", "--run-code")}
+    claims = {
+        claim["claim"]: claim["here"] for claim in not_same("it.zip", "--run-code")
+    }
     assert careless.error in claims["solutions"]
     command = [sys.executable, "-m", "safevar_sumo", "verify", "it.zip", "--run-code"]
     done = subprocess.run(
@@ -494,7 +589,11 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
 @SLOW
 @pytest.mark.usefixtures("planted")
 def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
-    study = Path("planted.toml").read_text().replace("gap = 12.0, always", "gap = 30.0, always")
+    study = (
+        Path("planted.toml")
+        .read_text()
+        .replace("gap = 12.0, always", "gap = 30.0, always")
+    )
     study = study.replace("at_least = 5", "at_least = 7.9").replace(
         "step_length = 0.005", "step_length = 0.02"
     )
@@ -508,8 +607,13 @@ def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
 
 @SLOW
 def test_the_whole_search_again(bare: Path, tmp_path: Path) -> None:
-    assert verified(str(bare), "--search")[-2:] == ["search: outcomes", "search: solutions"]
-    path = changed(bare, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"collision": (\d)'))
+    assert verified(str(bare), "--search")[-2:] == [
+        "search: outcomes",
+        "search: solutions",
+    ]
+    path = changed(
+        bare, tmp_path / "it.zip", DESCRIPTION, digit_of(r'"collision": (\d)')
+    )
     assert {claim["claim"] for claim in not_same(path, "--search")} == {
         "report",
         "search: outcomes",
@@ -518,14 +622,25 @@ def test_the_whole_search_again(bare: Path, tmp_path: Path) -> None:
 
 @SLOW
 def test_a_solution_that_a_run_returns_twice_is_no_damage(tmp_path: Path) -> None:
-    results = searched(load_study("smoke", search={"algorithms": ["nsga2"]}), tmp_path / "results")
+    results = searched(
+        load_study("smoke", search={"algorithms": ["nsga2"]}), tmp_path / "results"
+    )
     assert load_runs(results).solutions.duplicated().any()
-    run("evidence", str(results), "--ask", "rules --samples 20", "--out", str(tmp_path / "it.zip"))
+    run(
+        "evidence",
+        str(results),
+        "--ask",
+        "rules --samples 20",
+        "--out",
+        str(tmp_path / "it.zip"),
+    )
     assert "solutions" in verified(str(tmp_path / "it.zip"))
 
 
 @SLOW
-@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+@pytest.mark.parametrize(
+    "method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]
+)
 def test_a_flipped_bit_is_damage_however_the_archive_is_compressed(
     method: int, bare: Path, tmp_path: Path
 ) -> None:
@@ -536,7 +651,9 @@ def test_a_flipped_bit_is_damage_however_the_archive_is_compressed(
     whole = path.read_bytes()
     assert read_pack(path)[1]
     for place in random.Random(method).choices(range(len(whole)), k=60):
-        path.write_bytes(whole[:place] + bytes([whole[place] ^ 16]) + whole[place + 1 :])
+        path.write_bytes(
+            whole[:place] + bytes([whole[place] ^ 16]) + whole[place + 1 :]
+        )
         with suppress(InputError):  # any other error fails the test
             read_pack(path)
 
@@ -546,4 +663,8 @@ def test_what_cannot_be_run_has_its_reason() -> None:
         raise InputError("model", "is not installed", "an extra")
 
     row = claims.compare_claim("mine", claims.Claim("answer", b"", fail))
-    assert row[2:] == ("cannot be run", "", "model: is not installed expected: an extra")
+    assert row[2:] == (
+        "cannot be run",
+        "",
+        "model: is not installed expected: an extra",
+    )

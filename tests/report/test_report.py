@@ -46,7 +46,9 @@ def words_of(page: str) -> str:
     """The text of a page, between single blanks."""
     return " ".join(
         html.unescape(
-            re.sub("<(style|script).*?</(style|script)>|<[^>]*>", "", page, flags=re.DOTALL)
+            re.sub(
+                "<(style|script).*?</(style|script)>|<[^>]*>", "", page, flags=re.DOTALL
+            )
         ).split()
     )
 
@@ -106,18 +108,33 @@ def test_what_decides_leads_with_a_replay_and_the_rest_is_folded(page: str) -> N
     assert front.count('class="replay" open') == 1
     assert 'class="replay" open' not in details
     assert "^2" not in words_of(page)
-    order = ["Explain", "Risk", "Rules", "What was tested", "Limits and trust", "How to reproduce"]
+    order = [
+        "Explain",
+        "Risk",
+        "Rules",
+        "What was tested",
+        "Limits and trust",
+        "How to reproduce",
+    ]
     places = [details.index(f">{name}") for name in order]
     assert places == sorted(places)
-    low, high = re.findall(r"95 % confidence interval ([\d.]+) to ([\d.]+) %", details)[0]
+    low, high = re.findall(r"95 % confidence interval ([\d.]+) to ([\d.]+) %", details)[
+        0
+    ]
     assert float(low) < 100 * 0.5 / 2.9 < float(high)
 
     # What nobody has unfolded has few numbers.
     shown = re.sub(r"<(script|style)\b.*?</\1>", "", page, flags=re.DOTALL)
-    folded = re.compile(r"<details(?![^>]* open)[^>]*>(?:(?!<details).)*?</details>", re.DOTALL)
+    folded = re.compile(
+        r"<details(?![^>]* open)[^>]*>(?:(?!<details).)*?</details>", re.DOTALL
+    )
     while folded.search(shown):
         shown = folded.sub("", shown)
-    assert 20 < len(re.findall(r"(?<![\w.])-?\d[\d,.]*", re.sub("<[^>]*>", " ", shown))) <= 400
+    assert (
+        20
+        < len(re.findall(r"(?<![\w.])-?\d[\d,.]*", re.sub("<[^>]*>", " ", shown)))
+        <= 400
+    )
 
 
 @SLOW
@@ -127,9 +144,15 @@ def test_chosen_solutions_and_causes_have_replays_that_end_as_recorded(
     shown = r'<details class="replay".*?<summary>(.*?)</summary>.*?<img alt="(.*?)"'
     players = re.findall(shown, page, re.DOTALL)
     rows = dict(
-        zip(map(str, handles_of(case.solutions)), case.solutions.to_dict("records"), strict=True)
+        zip(
+            map(str, handles_of(case.solutions)),
+            case.solutions.to_dict("records"),
+            strict=True,
+        )
     )
-    solutions = {title.partition(" (")[0]: words for title, words in players if " (" in title}
+    solutions = {
+        title.partition(" (")[0]: words for title, words in players if " (" in title
+    }
     assert 1 <= len(solutions) <= 3
     for handle, words in solutions.items():
         row = rows[handle]
@@ -146,20 +169,27 @@ def test_chosen_solutions_and_causes_have_replays_that_end_as_recorded(
 def test_settings_that_answers_name_are_replayed_once_for_each_set_of_changes(
     case: Case, slippery: Path
 ) -> None:
-    changes = [{"tireFric": 1.2}, {"tireFric": 1.3}, {"mass": 2600.0, "tireFric": 1.4}, {}]
+    changes = [
+        {"tireFric": 1.2},
+        {"tireFric": 1.3},
+        {"mass": 2600.0, "tireFric": 1.4},
+        {},
+    ]
     answer = SimpleNamespace(
         tables={"causes": pd.DataFrame({"changes": changes}), "others": pd.DataFrame()}
     )
     study = ReportedStudy(directory=slippery, case=case, versions={}, answers=[answer])  # type: ignore[list-item]
     played = list(replays.replays(study, show_no_progress))
     names = [
-        entry["title"].partition(":")[0] for entry in played if entry["title"].startswith("Only ")
+        entry["title"].partition(":")[0]
+        for entry in played
+        if entry["title"].startswith("Only ")
     ]
     assert names == ["Only tireFric", "Only mass, tireFric"]
     assert played[0]["title"].startswith("Fewest changes: ")
-    assert played[1 + len(study.choices)]["changes"][0].startswith("tireFric 3.5 -> 1.20 "), (
-        "the first of them"
-    )
+    assert played[1 + len(study.choices)]["changes"][0].startswith(
+        "tireFric 3.5 -> 1.20 "
+    ), "the first of them"
 
 
 @SLOW
@@ -169,7 +199,9 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
     """Somebody's driving system was edited since: here another one drives."""
     assert "differs from the results" not in page
     monkeypatch.setattr(
-        sections, "assemble", lambda *study: replace(assemble(*study), ads=FullBraking())
+        sections,
+        "assemble",
+        lambda *study: replace(assemble(*study), ads=FullBraking()),
     )
     with pytest.warns(UserWarning, match="simulated again with different results: "):
         other = page_of(slippery, ask=["rules --samples 20"], jobs=1)
@@ -178,7 +210,8 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
 
 
 @pytest.mark.parametrize(
-    "text", ["repair --margin 0.5", "explain --solution nsga2:0:1 --solution rs:0:0", "rules"]
+    "text",
+    ["repair --margin 0.5", "explain --solution nsga2:0:1 --solution rs:0:0", "rules"],
 )
 def test_a_question_is_read_as_its_command_is_printed(text: str) -> None:
     question, values = parse_question(text)
@@ -186,7 +219,9 @@ def test_a_question_is_read_as_its_command_is_printed(text: str) -> None:
 
 
 @SLOW
-def test_the_staircase_is_on_the_page_as_a_table_and_as_steps_with_names(slippery: Path) -> None:
+def test_the_staircase_is_on_the_page_as_a_table_and_as_steps_with_names(
+    slippery: Path,
+) -> None:
     asked = "explain --of-study --simulations 600"
     page = page_of(slippery, ask=("rules --samples 20", asked), jobs=1)
     section = page.partition(">Smallest changes<")[2].partition("</section>")[0]
@@ -195,7 +230,9 @@ def test_the_staircase_is_on_the_page_as_a_table_and_as_steps_with_names(slipper
     assert f">{part}</text>" in unquote(section.partition("data:image/svg+xml,")[2])
 
 
-def test_a_question_without_an_answer_has_the_reason(case: Case, slippery: Path) -> None:
+def test_a_question_without_an_answer_has_the_reason(
+    case: Case, slippery: Path
+) -> None:
     arguments = *parse_question("repair"), [case], [slippery], None, 1, show_no_progress
     assert answer_about(*arguments, is_asked=False).verdict.startswith("No answer: ")
     with pytest.raises(InputError):
@@ -208,19 +245,27 @@ def test_the_sentence_about_a_model_is_whole() -> None:
             text = sections.name_and_sentence(models, name)
             assert text.count("(") == text.count(")"), text
             assert not text.endswith((" its)", " the)", ",)")), text
-    assert sections.name_and_sentence(ADS, "aeb").endswith("falls below its braking distances)")
+    assert sections.name_and_sentence(ADS, "aeb").endswith(
+        "falls below its braking distances)"
+    )
 
 
 def test_the_usual_questions_are_those_that_a_study_can_answer(case: Case) -> None:
     usual = usual_questions(case)
     assert usual.pop(1) == "explain --of-study"
-    assert [text.partition(" ")[0] for text in usual] == [one.partition(" ")[0] for one in ASK]
-    limited = replace(case, study=load_study("wear", limits={"treadDepth": {"at_least": 3.0}}))
+    assert [text.partition(" ")[0] for text in usual] == [
+        one.partition(" ")[0] for one in ASK
+    ]
+    limited = replace(
+        case, study=load_study("wear", limits={"treadDepth": {"at_least": 3.0}})
+    )
     assert usual_questions(limited)[-1] == "repair"
 
 
 @SLOW
-@pytest.mark.parametrize("bad", ["<script>alert(1)</script>", "</script><b>\"'&{{ 7 * 7 }}"])
+@pytest.mark.parametrize(
+    "bad", ["<script>alert(1)</script>", "</script><b>\"'&{{ 7 * 7 }}"]
+)
 def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) -> None:
     shutil.copytree(slippery, tmp_path / "copy")
     manifest = read_manifest(slippery)
@@ -233,7 +278,9 @@ def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) ->
 
 
 @SLOW
-def test_results_without_a_solution_have_a_report(slippery: Path, tmp_path: Path) -> None:
+def test_results_without_a_solution_have_a_report(
+    slippery: Path, tmp_path: Path
+) -> None:
     shutil.copytree(
         slippery,
         tmp_path / "begun",
@@ -251,13 +298,17 @@ def test_a_study_is_carried_out_from_what_its_results_record(
 ) -> None:
     study = load_study("smoke", name="pilot", step_length=0.02)
     case: Any = SimpleNamespace(study=study, has_runs=True, solutions=np.empty(0))
-    one = ReportedStudy(directory=Path("its results"), case=case, versions={}, answers=[])
+    one = ReportedStudy(
+        directory=Path("its results"), case=case, versions={}, answers=[]
+    )
     monkeypatch.setattr(ReportedStudy, "choices", {})
     ((_, command),) = replays.page_commands(one)
     python, option, script = shlex.split(command)
     assert (python, option) == ("python", "-c")
     asked: dict[str, Any] = {}
-    monkeypatch.setattr(safevar_sumo, "load", lambda place: SimpleNamespace(study=(place, study)))
+    monkeypatch.setattr(
+        safevar_sumo, "load", lambda place: SimpleNamespace(study=(place, study))
+    )
     monkeypatch.setattr(
         safevar_sumo, "run", lambda study, **others: asked.update(study=study, **others)
     )
@@ -298,7 +349,9 @@ def test_an_answer_that_cannot_be_given_has_no_command() -> None:
 
 
 @SLOW
-def test_every_printed_command_gives_the_answer_of_the_page(slippery: Path, tmp_path: Path) -> None:
+def test_every_printed_command_gives_the_answer_of_the_page(
+    slippery: Path, tmp_path: Path
+) -> None:
     place = tmp_path / "results"
     shutil.copytree(slippery, place, ignore=shutil.ignore_patterns("answers"))
     page = html.unescape(page_of(place, ask=ASK, jobs=2))

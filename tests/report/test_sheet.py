@@ -42,11 +42,17 @@ LIMITS = [
 ]
 """Joint limits and their words; nobody asked for those of the last."""
 COMMAND = "python -m safevar_sumo tolerance results/wear"
-COLUMNS = dict.fromkeys(("characteristic", "together_low", "together_high", "sentence"), "")
-VERDICT = "The worst of 21,234 is safe. At most 0.30 % are unsafe, with 95 % confidence."
+COLUMNS = dict.fromkeys(
+    ("characteristic", "together_low", "together_high", "sentence"), ""
+)
+VERDICT = (
+    "The worst of 21,234 is safe. At most 0.30 % are unsafe, with 95 % confidence."
+)
 
 
-def answer_of(columns: Any = COLUMNS, rows: Any = LIMITS[:-1], **numbers: Any) -> Answer:
+def answer_of(
+    columns: Any = COLUMNS, rows: Any = LIMITS[:-1], **numbers: Any
+) -> Answer:
     holding = {
         "driven": True,
         "unsafe": "collision",
@@ -73,10 +79,19 @@ def answer_of(columns: Any = COLUMNS, rows: Any = LIMITS[:-1], **numbers: Any) -
 
 def speed_of(up_to: float | None = 40.0, study: Study = STUDY) -> Answer:
     """How fast vehicles within the limits may drive."""
-    row = ("all cars", up_to, 40.0, "km/h", "up to", "At 41 km/h it hits somebody in CPFA.")
+    row = (
+        "all cars",
+        up_to,
+        40.0,
+        "km/h",
+        "up to",
+        "At 41 km/h it hits somebody in CPFA.",
+    )
     numbers = {"fits": 12, "attacked": 120000, "scope": scope_of(study)}
     tables = {"cars": tabulate("Cars", dict.fromkeys([*CARS][: len(row)], ""), [row])}
-    return Answer(question="permit", study=study, verdict="Slow.", numbers=numbers, tables=tables)
+    return Answer(
+        question="permit", study=study, verdict="Slow.", numbers=numbers, tables=tables
+    )
 
 
 def reported(
@@ -97,7 +112,12 @@ def reported(
     return ReportedStudy(
         directory=Path(study.name),
         case=case,
-        versions={"libsumo": "1.28", "safevar_sumo": "0.5.0", "deap": "1.4.4", "numpy": "2.4.6"},
+        versions={
+            "libsumo": "1.28",
+            "safevar_sumo": "0.5.0",
+            "deap": "1.4.4",
+            "numpy": "2.4.6",
+        },
         answers=answers,
         later_changes=changes,
         speed=speed,
@@ -107,12 +127,19 @@ def reported(
 def html_of(study: ReportedStudy) -> str:
     """The sheet; empty if there is none."""
     tables = study.case.study
-    parts = {"name": tables.name, "title": tables.title, "anchor": "a", "versions": study.versions}
+    parts = {
+        "name": tables.name,
+        "title": tables.title,
+        "anchor": "a",
+        "versions": study.versions,
+    }
     template = template_environment(TEMPLATE_FOLDER).get_template("sheet.html.j2")
     sheet = sheet_of(study)
     if sheet is None:
         return ""
-    return str(template.module.sheet_section({**parts, "tables": tables, "sheet": sheet}))  # type: ignore[attr-defined]
+    return str(
+        template.module.sheet_section({**parts, "tables": tables, "sheet": sheet})
+    )  # type: ignore[attr-defined]
 
 
 def sheet_with(*answers: Answer, **options: Any) -> str:
@@ -120,7 +147,9 @@ def sheet_with(*answers: Answer, **options: Any) -> str:
     return words_of(html_of(reported(*answers, **options)))
 
 
-def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do() -> None:
+def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do() -> (
+    None
+):
     answer = answer_of()
     sheet = sheet_with(answer)
     for item, (*_, limit) in zip(CHARACTERISTICS, LIMITS, strict=True):
@@ -153,7 +182,9 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         assert words in sheet
     for_workshop = sheet.partition("For the manufacturer's engineer")[0]
     assert not re.search("21,?234|confidence|0.30? %", sheet), "no statistics"
-    assert not re.search(r"worn \(|CPFA|1.28|sha256", for_workshop), "no words of the engineer"
+    assert not re.search(r"worn \(|CPFA|1.28|sha256", for_workshop), (
+        "no words of the engineer"
+    )
 
 
 def test_a_limit_has_one_side_if_the_original_is_at_an_end_of_the_domain() -> None:
@@ -172,10 +203,25 @@ def test_a_clearance_is_claimed_only_with_one_parameter_set() -> None:
     ("numbers", "changes", "reason", "has_table"),
     [
         ({"rough": True}, (), "sheet: its limits are rough.", True),
-        ({}, ("libsumo",), "sheet: files or versions have changed since the results.", True),
-        ({"box": False}, (), "sheet. No limits were found that hold at the same time.", False),
+        (
+            {},
+            ("libsumo",),
+            "sheet: files or versions have changed since the results.",
+            True,
+        ),
+        (
+            {"box": False},
+            (),
+            "sheet. No limits were found that hold at the same time.",
+            False,
+        ),
         ({"kept": False}, (), "sheet. The specified limits do not hold.", False),
-        ({"driven": False}, (), "sheet. The simulated vehicle does not drive with its", False),
+        (
+            {"driven": False},
+            (),
+            "sheet. The simulated vehicle does not drive with its",
+            False,
+        ),
     ],
 )
 def test_limits_that_do_not_hold_have_no_line_to_sign_and_say_so(
@@ -185,7 +231,9 @@ def test_limits_that_do_not_hold_have_no_line_to_sign_and_say_so(
     assert f"Do not use this {reason}" in sheet
     assert "signature" not in sheet
     assert ("at least 3 mm" in sheet) is has_table
-    assert (f"Reason{VERDICT} limit of brakeTorque 0.5: the car hits" in sheet) is not has_table
+    assert (
+        f"Reason{VERDICT} limit of brakeTorque 0.5: the car hits" in sheet
+    ) is not has_table
 
 
 def test_limits_by_a_criterion_relative_to_the_original_are_not_signed() -> None:
@@ -203,7 +251,9 @@ def test_limits_by_a_criterion_relative_to_the_original_are_not_signed() -> None
         assert "Name and signature" in signed
 
 
-def test_a_sheet_has_the_reason_of_no_answer_and_there_is_none_if_nobody_asked() -> None:
+def test_a_sheet_has_the_reason_of_no_answer_and_there_is_none_if_nobody_asked() -> (
+    None
+):
     sheet = sheet_with(replace(answer_of(), numbers={}, tables={}))
     assert "Do not use this sheet. The question about limits has no answer." in sheet
     assert f"Reason{VERDICT}" in sheet
@@ -211,7 +261,8 @@ def test_a_sheet_has_the_reason_of_no_answer_and_there_is_none_if_nobody_asked()
 
 
 @pytest.mark.parametrize(
-    ("kept", "found"), [(True, "No failure of these limits was found"), (False, "limits fails.")]
+    ("kept", "found"),
+    [(True, "No failure of these limits was found"), (False, "limits fails.")],
 )
 def test_wider_tests_stand_on_the_sheet_and_their_codes_are_the_engineers(
     kept: bool, found: str
@@ -219,17 +270,24 @@ def test_wider_tests_stand_on_the_sheet_and_their_codes_are_the_engineers(
     answer = answer_of()
     row = ("CPNCO up to 60 km/h", kept, "A child is hit.", None, None)
     answer.tables["ranges"] = tabulate("Ranges", IN_RANGES, [row])
-    foreman, _, engineer = sheet_with(answer).partition("For the manufacturer's engineer")
+    foreman, _, engineer = sheet_with(answer).partition(
+        "For the manufacturer's engineer"
+    )
     assert found in foreman
     assert "Ranges of the studyCPNCO up to 60 km/h" in engineer
 
 
-def test_one_greatest_speed_of_all_vehicles_within_the_limits_in_tests_without_codes() -> None:
+def test_one_greatest_speed_of_all_vehicles_within_the_limits_in_tests_without_codes() -> (
+    None
+):
     """Those of the sheet's own limits: an answer about other cars is not theirs."""
     assert "Greatest speed" not in sheet_with(answer_of(), speed_of(30.0))
     sheet = sheet_with(answer_of(), speed_of(30.0), speed=speed_of())
     foreman, _, engineer = sheet.partition("For the manufacturer's engineer")
-    assert "Greatest speed: 40 km/h (simulated from 10 km/h on). Up to this speed every" in foreman
+    assert (
+        "Greatest speed: 40 km/h (simulated from 10 km/h on). Up to this speed every"
+        in foreman
+    )
     assert not re.search("CP[FNL]|parameter set", foreman)
     assert "in CPFA. 12 parameter sets; 120,000 simulations that search" in engineer
 
@@ -246,14 +304,17 @@ def test_a_failure_in_the_ranges_lowers_the_greatest_speed() -> None:
 def test_limits_that_are_safe_at_no_speed_have_no_line_to_sign() -> None:
     sheet = sheet_with(answer_of(), speed=speed_of(None))
     assert (
-        "Do not use this sheet. Vehicles within its limits are not safe even at 10 km/h." in sheet
+        "Do not use this sheet. Vehicles within its limits are not safe even at 10 km/h."
+        in sheet
     )
     assert "ReasonSlow." in sheet
     assert "signature" not in sheet
 
 
 def test_a_sheet_whose_speed_has_no_answer_says_so_and_calls_no_speed_unsafe() -> None:
-    refused = replace(speed_of(), verdict="No answer: it is refused.", numbers={}, tables={})
+    refused = replace(
+        speed_of(), verdict="No answer: it is refused.", numbers={}, tables={}
+    )
     sheet = sheet_with(answer_of(), speed=refused)
     assert "The question about the greatest speed has no answer." in sheet
     assert "not safe even at" not in sheet
@@ -261,13 +322,25 @@ def test_a_sheet_whose_speed_has_no_answer_says_so_and_calls_no_speed_unsafe() -
     assert "signature" not in sheet
 
 
-def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_others() -> None:
+def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_others() -> (
+    None
+):
     all_measured = replace_in(STUDY, unmeasured={})
     values = speed_values(reported(replace(answer_of(), study=all_measured)))
     assert (values["margin"], values["others"]) == (0.3, "new")
     assert values["limits"] == (
-        *("treadDepth >= 3.0", "treadDepth <= 8.0", "brakeTorque >= 0.85", "brakeTorque <= 1.0"),
-        *("brakeResponse >= 0.05", "brakeResponse <= 0.132", "payload >= 75.0", "payload <= 525.0"),
+        *(
+            "treadDepth >= 3.0",
+            "treadDepth <= 8.0",
+            "brakeTorque >= 0.85",
+            "brakeTorque <= 1.0",
+        ),
+        *(
+            "brakeResponse >= 0.05",
+            "brakeResponse <= 0.132",
+            "payload >= 75.0",
+            "payload <= 525.0",
+        ),
         *("payloadCentre >= 1.3", "payloadCentre <= 2.0"),
         *("sensorRange >= 80.0", "sensorRange <= 80.0"),
         *("sensorLatency >= 0.05", "sensorLatency <= 0.05"),
@@ -275,10 +348,15 @@ def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_other
     # What the study states of a value that nobody measured stands in place of a limit.
     joint = replace(answer_of(unsafe="drac > 6", rough=True), study=with_ranges(STUDY))
     values = speed_values(reported(joint))
-    assert not [limit for limit in values["limits"] if limit.startswith(("sensor", "brakeResp"))]
+    assert not [
+        limit for limit in values["limits"] if limit.startswith(("sensor", "brakeResp"))
+    ]
     assert (values["unsafe"], values["quick"]) == (Unsafe.parse("drac > 6"), True)
     sheet = sheet_with(joint, speed=speed_of(study=joint.study))
-    assert "these values: brake actuator delay 0.2 s; detection range of the sensors 40 m;" in sheet
+    assert (
+        "these values: brake actuator delay 0.2 s; detection range of the sensors 40 m;"
+        in sheet
+    )
     # Nobody asks where there is no speed, or nothing to work by.
     assert not speed_values(reported(replace(answer_of(), study=read_study("r13h"))))
     assert not speed_values(reported(answer_of(box=False)))
@@ -291,7 +369,9 @@ def sheet_of_shipped(name: str) -> str:
     study = read_study(name)
     items = CharacteristicSet.of(study).vehicle
     ends = [
-        item.rounded_inwards(((item.lower + item.original) / 2, (item.original + item.upper) / 2))
+        item.rounded_inwards(
+            ((item.lower + item.original) / 2, (item.original + item.upper) / 2)
+        )
         for item in items
     ]
     rows = [(item.name, *end, "") for item, end in zip(items, ends, strict=True)]
@@ -306,11 +386,16 @@ def sheet_of_shipped(name: str) -> str:
     return html_of(reported(own, speed=speed_of(study=study) if has_speed else None))
 
 
-@pytest.mark.parametrize(("name", "leads"), [("wear", True), ("native", True), ("sun", False)])
+@pytest.mark.parametrize(
+    ("name", "leads"), [("wear", True), ("native", True), ("sun", False)]
+)
 def test_a_workshop_can_measure_most_of_a_worn_car_and_not_an_engines_drag(
     name: str, leads: bool
 ) -> None:
-    assert reported(replace(answer_of(), study=read_study(name))).has_workshop_parts is leads
+    assert (
+        reported(replace(answer_of(), study=read_study(name))).has_workshop_parts
+        is leads
+    )
 
 
 def test_limits_that_a_workshop_cannot_decide_have_no_sheet_to_sign() -> None:

@@ -32,8 +32,12 @@ def made_up_study(
 ) -> Study:
     smoke = load_study("smoke")
     vehicle = replace(smoke.vehicle, characteristics=dict(characteristics))
-    search = replace(smoke.search, algorithms=list(algorithms), runs=runs, evaluations=100)
-    return replace(smoke, **{"name": "made-up", "vehicle": vehicle, "search": search, **changes})
+    search = replace(
+        smoke.search, algorithms=list(algorithms), runs=runs, evaluations=100
+    )
+    return replace(
+        smoke, **{"name": "made-up", "vehicle": vehicle, "search": search, **changes}
+    )
 
 
 def row(
@@ -49,7 +53,8 @@ def row(
     """A solution; a safety degree of 0 or less is a collision, without TET and TIT."""
     crash = sd <= 0
     changes = [
-        abs(value - original) / original for value, original in zip(values, UNCHANGED, strict=True)
+        abs(value - original) / original
+        for value, original in zip(values, UNCHANGED, strict=True)
     ]
     return {
         "algorithm": algorithm,
@@ -67,7 +72,15 @@ def row(
 
 
 def frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    numbers = [*CHARACTERISTICS, "f_safe", "f_diff", "safety_degree", "tet", "tit", "ave_dece"]
+    numbers = [
+        *CHARACTERISTICS,
+        "f_safe",
+        "f_diff",
+        "safety_degree",
+        "tet",
+        "tit",
+        "ave_dece",
+    ]
     return pd.DataFrame(rows, columns=list(row())).astype(dict.fromkeys(numbers, float))
 
 

@@ -88,7 +88,8 @@ def test_who_returns_the_five_worst_is_not_rewarded_by_the_common_rule(
     answer: Answer, case: Case
 ) -> None:
     over_runs, common = (
-        answer.tables[name].set_index(["baseline", "metric"]) for name in ("rq2-runs", "rq2-common")
+        answer.tables[name].set_index(["baseline", "metric"])
+        for name in ("rq2-runs", "rq2-common")
     )
     worst = ("FiveWorst", "safety_degree")
     assert over_runs.loc[worst, "effect_size"] == 0, "its mean is better in every run"
@@ -96,7 +97,9 @@ def test_who_returns_the_five_worst_is_not_rewarded_by_the_common_rule(
     best = case.evaluations.groupby(["algorithm", "run"])["safety_degree"].min()
     found = common.loc[("FiveWorst", "best_safety_degree")]
     won = [ours < theirs for ours, theirs in product(best["nsga2"], best["FiveWorst"])]
-    assert found["effect_size"] == np.mean(won), "of all that it has evaluated, whoever returns it"
+    assert found["effect_size"] == np.mean(won), (
+        "of all that it has evaluated, whoever returns it"
+    )
     assert len(common) == len(over_runs) + 2
     remarks = " ".join(answer.only("rq2-runs").tables["remarks"]["remark"])
     assert "The solutions of FiveWorst, NSGA-II are not all" in remarks
@@ -113,12 +116,18 @@ def test_the_table_has_the_median_and_quartiles_of_the_hypervolume_of_all_so_far
         found = [one for one in rows if one["algorithm"] == name][number]
         count = found["evaluations"]
         runs = case.evaluations.query(f"algorithm == '{name}'").groupby("run")
-        different = [group[:count] for _, group in runs]  # a journal has each setting once
-        points = [(group[OBJECTIVES].to_numpy(float) - low) / width for group in different]
+        different = [
+            group[:count] for _, group in runs
+        ]  # a journal has each setting once
+        points = [
+            (group[OBJECTIVES].to_numpy(float) - low) / width for group in different
+        ]
         volumes = [moocore.hypervolume(run, ref=[1.1] * 3) for run in points]
         assert found["case"] == "mine"
         expected = np.percentile(volumes, [50, 25, 75])
-        assert [found[key] for key in ("hypervolume", "low", "high")] == pytest.approx(expected)
+        assert [found[key] for key in ("hypervolume", "low", "high")] == pytest.approx(
+            expected
+        )
 
 
 def test_the_figure_shows_all_that_was_evaluated_and_marks_what_is_returned(
@@ -126,10 +135,16 @@ def test_the_figure_shows_all_that_was_evaluated_and_marks_what_is_returned(
 ) -> None:
     (axis,) = draw_convergence(case).axes
     medians = answer.tables["convergence"].groupby("algorithm")["hypervolume"].last()
-    returned = compute_indicators(case)["hypervolume"].groupby(level="algorithm").median()
+    returned = (
+        compute_indicators(case)["hypervolume"].groupby(level="algorithm").median()
+    )
     names = ["nsga2", "rs", "FiveWorst"]
-    assert [line.get_ydata()[-1] for line in axis.lines[:3]] == pytest.approx([*medians[names]])
-    assert np.asarray(axis.collections[-1].get_offsets())[:, 1] == pytest.approx([*returned[names]])
+    assert [line.get_ydata()[-1] for line in axis.lines[:3]] == pytest.approx(
+        [*medians[names]]
+    )
+    assert np.asarray(axis.collections[-1].get_offsets())[:, 1] == pytest.approx(
+        [*returned[names]]
+    )
     assert medians["FiveWorst"] > 3 * returned["FiveWorst"], "five of what was found"
 
 
@@ -139,11 +154,14 @@ def test_whether_runs_can_be_significant_follows_from_the_exact_distribution(
 ) -> None:
     smallest = {
         "RQ1": scipy.stats.wilcoxon(np.arange(1, m + 1), method="exact").pvalue,
-        "RQ2": scipy.stats.mannwhitneyu(range(m), range(m, m + n), method="exact").pvalue,
+        "RQ2": scipy.stats.mannwhitneyu(
+            range(m), range(m, m + n), method="exact"
+        ).pvalue,
     }
     for question, p_value in smallest.items():
         found = [
-            can_be_significant(question, m, n, 7 * p_value * share, 7) for share in (0.999, 1.001)
+            can_be_significant(question, m, n, 7 * p_value * share, 7)
+            for share in (0.999, 1.001)
         ]
         assert found == [False, True]
 
@@ -161,10 +179,18 @@ def test_what_was_not_tested_is_neither_significant_nor_not() -> None:
     answer = answer_questions(
         [made_up(*rows, original={"safety_degree": 2.0, "tit": 0.5, "ave_dece": 6.0})]
     )
-    for name, untested in (("rq1", 3), ("rq1-runs", 3), ("rq2", 2), ("rq2-runs", 2), ("a12", 2)):
+    for name, untested in (
+        ("rq1", 3),
+        ("rq1-runs", 3),
+        ("rq2", 2),
+        ("rq2-runs", 2),
+        ("a12", 2),
+    ):
         table = answer.to_dict()["tables"][name]["rows"]
         values = [one["significant"] for one in table]
-        assert [value is None for value in values] == [one["effect_size"] is None for one in table]
+        assert [value is None for value in values] == [
+            one["effect_size"] is None for one in table
+        ]
         assert (values.count(None), True in values) == (untested, True)
     assert re.search(r"│ ?TET .* - ?│", answer.render("text", "rq1"))
 
@@ -177,7 +203,8 @@ def test_a_study_prints_tests_only_where_its_runs_can_be_significant(
     assert "RQ2 over runs" in text
     assert "RQ1 over runs" not in text
     (told,) = re.findall(
-        r"None of the (\d+) tests of RQ1 can be signif.* a test needs at least (\d+) runs", text
+        r"None of the (\d+) tests of RQ1 can be signif.* a test needs at least (\d+) runs",
+        text,
     )
     tests, needed = map(int, told)
     assert tests / 2 ** (needed - 1) < 0.01 <= tests / 2 ** (needed - 2)

@@ -23,7 +23,10 @@ from safevar_sumo.cli.program import command_function
 from safevar_sumo.questions.answer import Answer, contents_of
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.research_questions.answer import answer_questions
-from safevar_sumo.questions.research_questions.figures import draw_convergence, draw_pareto_fronts
+from safevar_sumo.questions.research_questions.figures import (
+    draw_convergence,
+    draw_pareto_fronts,
+)
 from safevar_sumo.questions.research_questions.fronts import (
     compute_convergence,
     compute_indicators,
@@ -45,12 +48,16 @@ from tests.research_questions.cases import made_up, made_up_study, row, three_al
 
 def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() -> None:
     case = made_up(
-        row(sd=1, f_diff=0.5), row("rs", sd=0.5, f_diff=0.7), row("rs", run=1, sd=1, f_diff=0.6)
+        row(sd=1, f_diff=0.5),
+        row("rs", sd=0.5, f_diff=0.7),
+        row("rs", run=1, sd=1, f_diff=0.6),
     )
     assert sorted(reference_front(case).tolist()) == [[0.5, 0.7, 0], [1, 0.5, 0]]
     result = compute_indicators(case)
     assert result.loc[("nsga2", 0), "igd"] == pytest.approx(math.hypot(0.5, 0.2) / 2)
-    assert result.loc[("rs", 1), "igd"] == pytest.approx((0.1 + math.hypot(0.5, 0.1)) / 2)
+    assert result.loc[("rs", 1), "igd"] == pytest.approx(
+        (0.1 + math.hypot(0.5, 0.1)) / 2
+    )
     assert result.loc[("nsga2", 0), "igd_plus"] == pytest.approx(0.5), (
         "a whole width of f_safe away from one of two"
     )
@@ -60,7 +67,9 @@ def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() 
     assert wide.loc[("rs", 0), "hypervolume"] == pytest.approx(2 * 1 * 2)
 
 
-def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title() -> None:
+def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title() -> (
+    None
+):
     seen = [
         {**row(name, run, sd=2 - i / 100), "evaluation": i}
         for name, ends in (("nsga2", (100, 100)), ("mine", (20, 33)))
@@ -68,7 +77,8 @@ def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title()
         for i in range(end)
     ]
     case = made_up(
-        *(row(name, run) for name in ("nsga2", "mine") for run in (0, 1)), evaluations=seen
+        *(row(name, run) for name in ("nsga2", "mine") for run in (0, 1)),
+        evaluations=seen,
     )
     case = dataclasses.replace(case, titles={"mine": "My search"})
     ends = compute_convergence(case).groupby(["algorithm", "run"])["evaluations"].max()
@@ -80,7 +90,8 @@ def test_a_line_of_convergence_ends_where_its_algorithm_ends_and_has_its_title()
     }
     figures = (draw_convergence(case), draw_pareto_fronts(case))
     labels = [
-        "".join(text.get_text() for text in figure.legends[0].get_texts()) for figure in figures
+        "".join(text.get_text() for text in figure.legends[0].get_texts())
+        for figure in figures
     ]
     assert all("My search" in label and "mine" not in label for label in labels)
     assert "My search (2 runs)\nmean: 26 simulations" in labels[0]
@@ -97,7 +108,9 @@ def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(
     there = compare_samples(x, y)
     back = compare_samples(y, x)
     assert there.effect_size == pytest.approx(won / (len(x) * len(y)))
-    assert back.oriented(larger_is_better=False).effect_size == pytest.approx(there.effect_size)
+    assert back.oriented(larger_is_better=False).effect_size == pytest.approx(
+        there.effect_size
+    )
     assert 0 <= there.p_value <= 1
     assert back.p_value == pytest.approx(there.p_value)
 
@@ -105,7 +118,11 @@ def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(
 def test_exact_p_of_separated_samples_is_two_orders_of_all() -> None:
     result = compare_samples(np.arange(8), 100 + np.arange(8))
     assert result.p_value == pytest.approx(2 / math.comb(16, 8))
-    assert (result.effect_size, result.magnitude, result.method) == (0, "large", EXACT_TEST)
+    assert (result.effect_size, result.magnitude, result.method) == (
+        0,
+        "large",
+        EXACT_TEST,
+    )
 
 
 def test_an_empty_sample_is_undefined_not_zero_and_nan_is_refused() -> None:
@@ -173,30 +190,35 @@ def test_the_interval_of_samples_apart_has_a_width() -> None:
     low, high = effect_interval(1.0, 10, 10, 0.05)
     # Hanley and McNeil's (1982), for exponential values
     q1 = low / (2 - low)
-    variance = (low * (1 - low) + 9 * (q1 - low**2) + 9 * ((2 * low**2 / (1 + low)) - low**2)) / 100
+    variance = (
+        low * (1 - low) + 9 * (q1 - low**2) + 9 * ((2 * low**2 / (1 + low)) - low**2)
+    ) / 100
     assert (1 - low) / math.sqrt(variance) == pytest.approx(scipy.stats.norm.ppf(0.975))
     assert high == 1
     assert effect_interval(0.0, 10, 10, 0.05) == pytest.approx((0, 1 - low))
 
 
 @pytest.mark.parametrize(
-    ("size", "alpha", "rank"), [(10, 0.05, 2), (30, 0.05, 10), (8, 0.01, 1), (12, 0.01, 2)]
+    ("size", "alpha", "rank"),
+    [(10, 0.05, 2), (30, 0.05, 10), (8, 0.01, 1), (12, 0.01, 2)],
 )
 def test_the_interval_of_a_median_lies_between_the_order_statistics_of_tables_of_the_sign_test(
     size: int, alpha: float, rank: int
 ) -> None:
     values = np.random.default_rng(1).permutation(size) + 1
     assert median_interval(values, alpha) == (rank, size + 1 - rank)
-    assert np.isnan([median_interval(values[:7], 0.01), median_interval([], 0.01)]).all(), (
-        "too few values"
-    )
+    assert np.isnan(
+        [median_interval(values[:7], 0.01), median_interval([], 0.01)]
+    ).all(), "too few values"
 
 
 def rich_case(**changes: Any) -> Case:
     """Two algorithms, two runs, changes of one to three characteristics, collisions; every run has
     evaluations.
     """
-    values = [(1000 + 50 * i, 2 - 0.1 * (i % 3), 0.1 if i % 2 else 0.2) for i in range(8)]
+    values = [
+        (1000 + 50 * i, 2 - 0.1 * (i % 3), 0.1 if i % 2 else 0.2) for i in range(8)
+    ]
     rows = [
         row(
             algorithm,
@@ -295,7 +317,10 @@ def test_the_table_for_a_paper_marks_each_metric_that_is_significant() -> None:
         assert text == f"{effect:.2f}{'*' if is_significant else ''}{letter}"
     assert short["significant"].any()
     lines = answer.only("a12").render("latex")
-    assert len(re.findall(r"^(IGD\+|HV|IGD|SD|TET|TIT|aveDece) & ", lines, re.MULTILINE)) == 7
+    assert (
+        len(re.findall(r"^(IGD\+|HV|IGD|SD|TET|TIT|aveDece) & ", lines, re.MULTILINE))
+        == 7
+    )
     assert "for the 14 tests of RQ2" in lines
     assert "IGD+" in lines.partition("HV")[0]
     assert not re.search(r"^IGD & ", lines.partition("HV")[0], re.MULTILINE)
@@ -378,11 +403,15 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
         assert table["significant"].any() == stands_out
         assert (few in "".join(remarks["remark"])) is not stands_out
     imported = answer_questions([dataclasses.replace(case, has_runs=False)])
-    assert imported.tables["rq1"]["significant"].any(), "the runs of imported solutions are unknown"
+    assert imported.tables["rq1"]["significant"].any(), (
+        "the runs of imported solutions are unknown"
+    )
 
 
 @SLOW
-def test_readers_see_a_long_table_crosswise_and_every_table_within_100_columns() -> None:
+def test_readers_see_a_long_table_crosswise_and_every_table_within_100_columns() -> (
+    None
+):
     text = answer_about("two").render("text", "rq3.2")
     assert re.search(r"setting +┃ *characteristic +┃ *1 ┃ *2 ┃ *3 ┃ *any ", text)
     assert re.search(r"made-up +│ *mass +│", text)

@@ -35,7 +35,10 @@ from safevar_sumo.questions.research_questions.comparisons import (
     rq2,
     rq2_runs,
 )
-from safevar_sumo.questions.research_questions.fronts import compute_convergence, count_evaluations
+from safevar_sumo.questions.research_questions.fronts import (
+    compute_convergence,
+    count_evaluations,
+)
 from safevar_sumo.questions.research_questions.statistics import ALPHA, compare_samples
 from safevar_sumo.records import JsonObject
 from tests.in_process import SLOW
@@ -50,11 +53,13 @@ def only(frame: pd.DataFrame, **wanted: Any) -> JsonObject:
 
 
 def test_rq1_is_small_where_solutions_are_more_unsafe() -> None:
-    frame = rq1(made_up(*(row(sd=1 + i / 10, tet=2, tit=1, ave_dece=3) for i in range(5))))
+    frame = rq1(
+        made_up(*(row(sd=1 + i / 10, tet=2, tit=1, ave_dece=3) for i in range(5)))
+    )
     assert frame["metric"].tolist() == ["safety_degree", "tet", "tit", "ave_dece"]
-    assert frame[["effect_size", "magnitude", "n1", "n2"]].drop_duplicates().values.tolist() == [
-        [0, "large", 5, 5]
-    ]
+    assert frame[
+        ["effect_size", "magnitude", "n1", "n2"]
+    ].drop_duplicates().values.tolist() == [[0, "large", 5, 5]]
     safer = rq1(made_up(*(row(sd=3, tet=0.5, tit=0.1, ave_dece=7) for _ in range(5))))
     assert safer["effect_size"].tolist() == [1, 1, 1, 1]
 
@@ -90,7 +95,8 @@ def test_rq2_is_high_where_nsga2_is_better() -> None:
     ]
     assert frame["effect_size"].tolist() == [1] * 7
     exchanged = [
-        {**one, "algorithm": {"rs": "nsga2", "nsga2": "rs"}[one["algorithm"]]} for one in rows
+        {**one, "algorithm": {"rs": "nsga2", "nsga2": "rs"}[one["algorithm"]]}
+        for one in rows
     ]
     assert rq2(made_up(*exchanged))["effect_size"].tolist() == [0] * 7
 
@@ -104,7 +110,10 @@ def test_rq2_compares_the_algorithm_asked_for_else_nsga2_else_the_first() -> Non
         ("safe_fuzzer", "safe_fuzzer", ["nsga2", "rs"]),
     ):
         frame = rq2_runs(case, Choices(asked))
-        assert (set(frame["algorithm"]), list(frame["baseline"].unique())) == ({first}, others)
+        assert (set(frame["algorithm"]), list(frame["baseline"].unique())) == (
+            {first},
+            others,
+        )
         expected = compare_samples(means[first], means["rs"])
         chosen = only(frame, metric="safety_degree", baseline="rs")
         assert (chosen["p_value"], chosen["effect_size"]) == (
@@ -112,15 +121,22 @@ def test_rq2_compares_the_algorithm_asked_for_else_nsga2_else_the_first() -> Non
             1 - expected.effect_size,
         )
     without = made_up(
-        *(row(name, run, sd=sd) for name, sd in (("rs", 1.0), ("mine", 2.0)) for run in (0, 1))
+        *(
+            row(name, run, sd=sd)
+            for name, sd in (("rs", 1.0), ("mine", 2.0))
+            for run in (0, 1)
+        )
     )
-    answer = answer_questions([dataclasses.replace(without, titles={"mine": "My search"})]).only(
-        "rq2"
-    )
+    answer = answer_questions(
+        [dataclasses.replace(without, titles={"mine": "My search"})]
+    ).only("rq2")
     assert (
-        only(answer.tables["rq2"], algorithm="rs", baseline="mine", metric="safety_degree")[
-            "effect_size"
-        ]
+        only(
+            answer.tables["rq2"],
+            algorithm="rs",
+            baseline="mine",
+            metric="safety_degree",
+        )["effect_size"]
         == 1
     )
     assert re.search(r"RS +│ ?My search", answer.render("text"))
@@ -145,19 +161,22 @@ def test_rq2_and_a_table_say_how_many_settings_each_algorithm_simulated() -> Non
     case = made_up(*rows, evaluations=seen)
     counts = count_evaluations(case)
     assert (
-        counts[["requested", "simulated"]].to_numpy().tolist() == [[100, 46]] * 2 + [[40, 40]] * 2
+        counts[["requested", "simulated"]].to_numpy().tolist()
+        == [[100, 46]] * 2 + [[40, 40]] * 2
     )
     answer = answer_questions([case])
     table = answer.tables["rq2"]
-    assert table[["evaluations", "baseline_evaluations"]].drop_duplicates().to_numpy().tolist() == [
-        [46, 40]
-    ]
+    assert table[
+        ["evaluations", "baseline_evaluations"]
+    ].drop_duplicates().to_numpy().tolist() == [[46, 40]]
     note = "NSGA-II 46 of 100 (equal vehicles are simulated once); RS 40 of 100 (it ended early)."
     assert any(note in remark for remark in answer.tables["remarks"]["remark"])
     assert "46" in answer.render("text", "evaluations")
     imported = answer_questions([made_up(*rows, has_runs=False)])
     assert imported.tables["rq2"]["evaluations"].isna().all()
-    assert "number of their simulations" in "".join(imported.tables["remarks"]["remark"])
+    assert "number of their simulations" in "".join(
+        imported.tables["remarks"]["remark"]
+    )
 
 
 def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
@@ -174,7 +193,9 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
             for _ in range(40)
         )
     )
-    paper, runs = (only(frame, metric="safety_degree") for frame in (rq2(case), rq2_runs(case)))
+    paper, runs = (
+        only(frame, metric="safety_degree") for frame in (rq2(case), rq2_runs(case))
+    )
     assert paper["p_value"] < 1e-30
     assert (runs["n1"], runs["n2"], runs["effect_size"]) == (
         8,
@@ -187,8 +208,13 @@ def test_solutions_of_one_run_are_not_taken_for_independent() -> None:
         > ALPHA / 10
     )
     original = only(rq1_runs(case), algorithm="nsga2", metric="safety_degree")
-    assert original["p_value"] == 2 * 2 / 2**8, "all signed ranks but the smallest are negative"
-    assert (original["effect_size"], original["p_holm"] >= original["p_value"] * 2) == (1 / 8, True)
+    assert original["p_value"] == 2 * 2 / 2**8, (
+        "all signed ranks but the smallest are negative"
+    )
+    assert (original["effect_size"], original["p_holm"] >= original["p_value"] * 2) == (
+        1 / 8,
+        True,
+    )
 
 
 def test_collisions_in_which_the_original_is_not_safe_either_are_no_findings() -> None:
@@ -200,7 +226,9 @@ def test_collisions_in_which_the_original_is_not_safe_either_are_no_findings() -
         for name in ("nsga2", "rs")
         for i in range(100)
     ]
-    case = made_up(row(sd=-1.0, f_diff=0.5), row("rs", sd=1.0, f_diff=0.5), evaluations=seen)
+    case = made_up(
+        row(sd=-1.0, f_diff=0.5), row("rs", sd=1.0, f_diff=0.5), evaluations=seen
+    )
     degrees = np.where(case.evaluations["evaluation"] == 1, 0.1, 2.0)
     joint = dataclasses.replace(
         case,
@@ -220,10 +248,17 @@ def test_a_reader_chooses_the_level_of_significance() -> None:
     assert not strict["significant"].any()
     assert not strict["enough_runs"].any(), "12 runs cannot reach such a level"
     assert loose["significant"].any()
-    widths = [frame["effect_size_high"] - frame["effect_size_low"] for frame in (strict, loose)]
+    widths = [
+        frame["effect_size_high"] - frame["effect_size_low"]
+        for frame in (strict, loose)
+    ]
     assert (widths[0] > widths[1]).all()
     medians = median_runs(case, Choices(alpha=0.05))
-    means = case.solutions.groupby(["algorithm", "run"])["safety_degree"].mean()["rs"].sort_values()
+    means = (
+        case.solutions.groupby(["algorithm", "run"])["safety_degree"]
+        .mean()["rs"]
+        .sort_values()
+    )
     median = only(medians, algorithm="rs", metric="safety_degree")
     assert (median["median"], median["median_low"], median["median_high"]) == (
         means.median(),
@@ -240,7 +275,11 @@ def test_algorithms_are_compared_after_equal_numbers_of_simulations(
     (2.394 + 0.842)^2 / (6 * 0.1667^2) = 62.8 runs show 0.6667 at 0.05 / 3, for three tests.
     """
     monkeypatch.setattr(budgets, "BUDGETS", (10, 20))
-    points = {"a": row(sd=1.0, f_diff=0.1), "b": row(sd=-1.0, f_diff=0.5), "-": row(sd=9.0)}
+    points = {
+        "a": row(sd=1.0, f_diff=0.1),
+        "b": row(sd=-1.0, f_diff=0.5),
+        "-": row(sd=9.0),
+    }
     points["x"] = row(f_diff=math.nan)
     journals = {"nsga2": ["-----a--------b", "a----", "xxxxxxxxxxb"]}
     journals["rs"] = [f"{'-' * 20}a", "a", "x"]
@@ -251,11 +290,20 @@ def test_algorithms_are_compared_after_equal_numbers_of_simulations(
         for number, point in enumerate(journal)
     ]
     case = made_up(
-        points["a"], points["b"], evaluations=seen, finished=[*product(journals, (0, 1, 2))]
+        points["a"],
+        points["b"],
+        evaluations=seen,
+        finished=[*product(journals, (0, 1, 2))],
     )
     table = answer_questions([case], Choices(alpha=0.05), ["budget"]).tables["budget"]
     assert "; 95 % intervals)" in table.attrs["title"]
-    names = ["simulations", "effect_size", "runs_needed", "hypervolume", "hypervolume_baseline"]
+    names = [
+        "simulations",
+        "effect_size",
+        "runs_needed",
+        "hypervolume",
+        "hypervolume_baseline",
+    ]
     assert table[[*names, "unsafe"]].to_numpy() == pytest.approx(
         np.array(
             [
@@ -275,7 +323,9 @@ def test_minimal_causes_of_runs_are_compared_if_they_were_counted() -> None:
         for name in case.algorithms
         for run in range(8)
     ]
-    frame = pd.DataFrame(counts, columns=["algorithm", "run", "failures", "examined", "causes"])
+    frame = pd.DataFrame(
+        counts, columns=["algorithm", "run", "failures", "examined", "causes"]
+    )
     choices = Choices(causes={case.name: frame})
     found = only(rq2_runs(case, choices), metric="causes", baseline="rs")
     assert (found["effect_size"], found["n1"], found["significant"]) == (1, 8, True)
@@ -290,7 +340,11 @@ def test_a_run_without_solutions_is_the_worst_run() -> None:
     """One of two algorithms finds something in a single run, as in two runs of the other one."""
     rows = [row("nsga2", 0, sd=0.5), row("rs", 0), row("rs", 1)]
     runs = [*product(("nsga2", "rs"), range(3))]
-    empty = [row(*run, f_diff=math.nan) for run in runs if run not in {("nsga2", 0), *runs[3:5]}]
+    empty = [
+        row(*run, f_diff=math.nan)
+        for run in runs
+        if run not in {("nsga2", 0), *runs[3:5]}
+    ]
     seen = [{**one, "evaluation": 0} for one in [*rows, *empty]]
     case = made_up(*rows, evaluations=seen, finished=runs)
     answer = answer_questions([case])
@@ -316,12 +370,18 @@ def test_a_run_without_solutions_is_the_worst_run() -> None:
     ("changes", "reason"),
     [
         ({"finished": []}, "no run is finished"),
-        ({}, "returned none of 2 settings that have a value of every objective; of these, 1 is"),
+        (
+            {},
+            "returned none of 2 settings that have a value of every objective; of these, 1 is",
+        ),
         (
             {"f_diff": math.nan},
             "none of 0 settings that have a value of every objective; of these, none is",
         ),
-        ({"original_safety_degree": 0.4}, "in none of 2 encounters the original vehicle keeps at"),
+        (
+            {"original_safety_degree": 0.4},
+            "in none of 2 encounters the original vehicle keeps at",
+        ),
     ],
 )
 def test_results_without_a_solution_say_why(changes: JsonObject, reason: str) -> None:
@@ -343,7 +403,9 @@ HEAVY, GRIPLESS, BOTH = (1100.0, 2.0, 0.1), (1000.0, 1.0, 0.1), (1200.0, 1.5, 0.
 
 
 def test_critical_solutions_are_strictly_below_the_original() -> None:
-    case = made_up(row(sd=2.0), row(sd=1.999), row(sd=-1), row("rs", sd=1), row(sd=math.nan))
+    case = made_up(
+        row(sd=2.0), row(sd=1.999), row(sd=-1), row("rs", sd=1), row(sd=math.nan)
+    )
     assert critical_solutions(case)["safety_degree"].tolist() == [1.999, -1]
     with pytest.raises(UnanswerableError, match="safety degree"):
         critical_solutions(made_up(row(), original={}))
@@ -368,10 +430,13 @@ def test_rq31_counts_runs_without_any() -> None:
 
 def test_rq32_shares_and_ranks() -> None:
     frame = rq32(
-        made_up(row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), row(values=HEAVY))
+        made_up(
+            row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), row(values=HEAVY)
+        )
     )
     percents = {
-        (one["characteristic"], one["j"]): one["percent"] for one in frame.to_dict("records")
+        (one["characteristic"], one["j"]): one["percent"]
+        for one in frame.to_dict("records")
     }
     assert [percents["mass", j] for j in ("1", "2", "3", "any")] == pytest.approx(
         [200 / 3, 100, np.nan, 75], nan_ok=True
@@ -390,14 +455,20 @@ def test_rq33_tells_increases_from_decreases() -> None:
         )
     )
     cells = {
-        (one["characteristic"], one["direction"], one["j"]): (one["pc"], one["delta"], one["n"])
+        (one["characteristic"], one["direction"], one["j"]): (
+            one["pc"],
+            one["delta"],
+            one["n"],
+        )
         for one in frame.to_dict("records")
     }
     assert cells["mass", "increase", "1"] == (pytest.approx(0.2), 200, 2)
     assert cells["mass", "decrease", "any"] == (pytest.approx(0.1), -100, 1)
     assert cells["mass", "increase", "any"][1] == 200
     assert cells["grip", "decrease", "2"][0] == 0.25
-    assert cells["lag", "increase", "any"] == pytest.approx((np.nan, np.nan, 0), nan_ok=True)
+    assert cells["lag", "increase", "any"] == pytest.approx(
+        (np.nan, np.nan, 0), nan_ok=True
+    )
 
 
 def test_the_footer_of_rq33() -> None:
@@ -423,14 +494,21 @@ def test_the_footer_of_rq33() -> None:
         assert result["percent"] == pytest.approx(percent, nan_ok=True)
     assert only(frame, quantity="avgSD_cS", j="2")["n"] == 0
     zero = only(
-        rq33_safety(made_up(*rows, original={**ORIGINAL, "tet": 0.0})), quantity="TET", j="any"
+        rq33_safety(made_up(*rows, original={**ORIGINAL, "tet": 0.0})),
+        quantity="TET",
+        j="any",
     )
-    assert (zero["value"], zero["percent"]) == pytest.approx((1.75, np.nan), nan_ok=True)
+    assert (zero["value"], zero["percent"]) == pytest.approx(
+        (1.75, np.nan), nan_ok=True
+    )
 
 
 def test_collisions_and_their_share() -> None:
     frame = count_collisions(made_up(row(sd=-1), row(sd=0), row(sd=1), row("rs")))
-    assert frame.to_numpy().tolist() == [["nsga2", 3, 2, pytest.approx(2 / 3)], ["rs", 1, 0, 0]]
+    assert frame.to_numpy().tolist() == [
+        ["nsga2", 3, 2, pytest.approx(2 / 3)],
+        ["rs", 1, 0, 0],
+    ]
 
 
 @SLOW
@@ -443,6 +521,10 @@ def test_equal_solutions_of_a_run_are_counted_and_said_in_pooled_tables() -> Non
         assert twice in " ".join(answer.only(name).tables["remarks"]["remark"])
     assert twice not in " ".join(answer.only("rq1-runs").tables["remarks"]["remark"])
     assert answer.numbers["solutions"] == 5
-    assert "0 of 1 different solution collide" in answer.verdict, "as the verdict of study counts"
-    different = answer_questions([made_up(row("nsga2", 0), row("nsga2", 1), row("rs", 0))])
+    assert "0 of 1 different solution collide" in answer.verdict, (
+        "as the verdict of study counts"
+    )
+    different = answer_questions(
+        [made_up(row("nsga2", 0), row("nsga2", 1), row("rs", 0))]
+    )
     assert "equal an earlier" not in " ".join(different.tables["remarks"]["remark"])

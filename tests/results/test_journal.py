@@ -139,13 +139,17 @@ def edited(line: bytes, **columns: object) -> bytes:
     """The line with other columns and its checksum as it was; None leaves a column out."""
     table = {**json.loads(line), **columns}
     return (
-        json.dumps({name: column for name, column in table.items() if column is not None}).encode()
+        json.dumps(
+            {name: column for name, column in table.items() if column is not None}
+        ).encode()
         + b"\n"
     )
 
 
 ALTERATIONS: dict[str, Callable[[bytes], bytes]] = {
-    "an outcome that does not exist": lambda line: line.replace(b"stopped", b"exploded"),
+    "an outcome that does not exist": lambda line: line.replace(
+        b"stopped", b"exploded"
+    ),
     "another outcome": lambda line: line.replace(b'"collision"', b'"stopped"'),
     "a digit": lambda line: line.replace(b"11.1", b"11.2"),
     "a digit at the end of a number": lambda line: line.replace(
@@ -160,7 +164,9 @@ ALTERATIONS: dict[str, Callable[[bytes], bytes]] = {
     "spaces": edited,
     "no checksum": lambda line: edited(line, crc32=None),
     "another checksum": lambda line: edited(line, crc32=1),
-    "its checksum as text": lambda line: edited(line, crc32=str(json.loads(line)["crc32"])),
+    "its checksum as text": lambda line: edited(
+        line, crc32=str(json.loads(line)["crc32"])
+    ),
     "nothing": lambda line: b"",
     "zeros": lambda line: line.replace(b":", b"\0", 2),
     "twice": lambda line: 2 * line,
@@ -168,16 +174,22 @@ ALTERATIONS: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("alteration", ALTERATIONS)
-def test_an_altered_line_and_all_after_it_are_not_believed(alteration: str, tmp_path: Path) -> None:
+def test_an_altered_line_and_all_after_it_are_not_believed(
+    alteration: str, tmp_path: Path
+) -> None:
     """A reader leaves the file as it is; what is lost is simulated again."""
     path = tmp_path / "a.jsonl"
     ends = write(path)
     whole = path.read_bytes().splitlines(keepends=True)
-    altered = {line: ALTERATIONS[alteration](whole[line]) for line in range(1, BATCHES + 1)}
+    altered = {
+        line: ALTERATIONS[alteration](whole[line]) for line in range(1, BATCHES + 1)
+    }
     numbers = [line for line in altered if altered[line] != whole[line]]
     assert numbers
     for line in numbers:
-        path.write_bytes(damaged := b"".join([*whole[:line], altered[line], *whole[line + 1 :]]))
+        path.write_bytes(
+            damaged := b"".join([*whole[:line], altered[line], *whole[line + 1 :]])
+        )
         intact = line - (alteration != "twice")
         content = read_journal(path, HEAD)
         assert holds_the_first(intact, content)
@@ -191,7 +203,9 @@ def test_an_altered_line_and_all_after_it_are_not_believed(alteration: str, tmp_
         assert holds_the_first(BATCHES, read_journal(path, HEAD))
 
 
-def test_other_solutions_and_lines_in_another_order_are_not_believed(tmp_path: Path) -> None:
+def test_other_solutions_and_lines_in_another_order_are_not_believed(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "a.jsonl"
     write(path)
     whole = path.read_bytes()
@@ -244,7 +258,9 @@ def test_a_line_with_wrong_values_and_a_right_checksum_is_simulated_again(
     journal.close()
 
 
-def test_the_zeros_that_a_crash_of_the_machine_leaves_are_cut_off(tmp_path: Path) -> None:
+def test_the_zeros_that_a_crash_of_the_machine_leaves_are_cut_off(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "a.jsonl"
     path.write_bytes(b"\0" * 99)
     Journal(path, HEAD).close()
@@ -271,7 +287,9 @@ def test_a_reader_follows_a_journal_that_grows_line_by_line(tmp_path: Path) -> N
     assert (reader.asked(), reader.left, reader.is_finished) == (asked, 0, True)
 
 
-@pytest.mark.parametrize(("study", "run"), [("other", "nsga2-00"), ("study", "nsga2-01")])
+@pytest.mark.parametrize(
+    ("study", "run"), [("other", "nsga2-00"), ("study", "nsga2-01")]
+)
 @pytest.mark.parametrize("opened", [Journal, read_journal])
 def test_a_journal_of_another_study_or_run_is_refused(
     tmp_path: Path, opened: Callable[..., object], study: str, run: str
@@ -289,16 +307,22 @@ def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) 
     code = "from safevar_sumo.results import Journal\nfrom pathlib import Path\n"
     code += f"J = Journal(Path({str(path)!r}), {HEAD})\n"
     code += "print('locked', flush=True)\nimport time\ntime.sleep(60)\n"
-    other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    other = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
+    )
     assert other.stdout.readline() == "locked\n"
-    with pytest.raises(SafevarError, match=r"a\.jsonl: another process works on this run"):
+    with pytest.raises(
+        SafevarError, match=r"a\.jsonl: another process works on this run"
+    ):
         Journal(path, HEAD)
     other.kill()
     Journal(path, HEAD).close()  # waits until the other has ended
     other.communicate()
 
 
-def test_a_retry_drops_the_first_batch_that_failed_and_all_after_it(tmp_path: Path) -> None:
+def test_a_retry_drops_the_first_batch_that_failed_and_all_after_it(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "a.jsonl"
     whole = Evaluations.concatenate([batch(0), batch(1)])
     journal = Journal(path, HEAD)

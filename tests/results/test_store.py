@@ -49,12 +49,17 @@ NAMES = ("a", "b")
 def evaluations(*safety: float) -> Evaluations:
     values = np.array(safety)
     exposure = {
-        name: np.where(values <= 0, np.nan, time) for name, time in (("tet", 0.2), ("tit", 0.1))
+        name: np.where(values <= 0, np.nan, time)
+        for name, time in (("tet", 0.2), ("tit", 0.1))
     }
     return made_up_evaluations(
         values,
         settings=np.arange(2.0 * len(values)).reshape(-1, 2),
-        metrics={"safety_degree": values, **exposure, "ave_dece": np.full(len(values), 5.0)},
+        metrics={
+            "safety_degree": values,
+            **exposure,
+            "ave_dece": np.full(len(values), 5.0),
+        },
         f_diff=values * 0 + 0.5,
         f_num_diff=values * 0 + 2,
     )
@@ -74,7 +79,9 @@ def written(path: Path, study: Study) -> ResultsDirectory:
 def wide(study: Study) -> Evaluations:
     """One evaluation with as many characteristics as the study has."""
     one = evaluations(1.0)
-    return dataclasses.replace(one, settings=np.ones((1, len(study.vehicle.characteristics))))
+    return dataclasses.replace(
+        one, settings=np.ones((1, len(study.vehicle.characteristics)))
+    )
 
 
 @pytest.fixture
@@ -101,7 +108,9 @@ def test_solutions_have_the_promised_columns_in_a_fixed_order() -> None:
     ]
     assert frame["run"].tolist() == [0, 1, 1]
     assert frame["f_safe"].tolist() == [3.0, -1.0, 2.0]
-    pd.testing.assert_frame_equal(frame, solutions_frame(NAMES, reversed(result.items())))
+    pd.testing.assert_frame_equal(
+        frame, solutions_frame(NAMES, reversed(result.items()))
+    )
 
 
 def test_undefined_values_stay_undefined() -> None:
@@ -117,10 +126,15 @@ def test_undefined_values_stay_undefined() -> None:
         "f_diff": 0.5,
         "f_num_diff": 2,
     }
-    assert "nan" not in solutions_frame(NAMES, [(("nsga2", 0), evaluations(-1.5))]).to_csv()
+    assert (
+        "nan"
+        not in solutions_frame(NAMES, [(("nsga2", 0), evaluations(-1.5))]).to_csv()
+    )
 
 
-def test_results_of_another_study_are_not_overwritten(tmp_path: Path, study: Study) -> None:
+def test_results_of_another_study_are_not_overwritten(
+    tmp_path: Path, study: Study
+) -> None:
     written(tmp_path, study)
     results_directory(tmp_path, study)
     results_directory(tmp_path, with_search(study, runs=7))
@@ -134,7 +148,13 @@ def test_results_in_other_encounters_or_with_another_margin_of_the_original_are_
     tmp_path: Path,
 ) -> None:
     def joint(meaning: str = "", upper: float = 20.0, margin: float = 0.3) -> Study:
-        distance = {"unit": "m", "original": 12, "lower": 8, "upper": upper, "meaning": meaning}
+        distance = {
+            "unit": "m",
+            "original": 12,
+            "lower": 8,
+            "upper": upper,
+            "meaning": meaning,
+        }
         return load_study(
             "smoke",
             scenario={"over": {"distance": distance}, "margin": margin},
@@ -151,16 +171,18 @@ def test_results_in_other_encounters_or_with_another_margin_of_the_original_are_
             results_directory(tmp_path, other)
 
 
-def test_a_change_without_effect_on_results_is_accepted(tmp_path: Path, study: Study) -> None:
+def test_a_change_without_effect_on_results_is_accepted(
+    tmp_path: Path, study: Study
+) -> None:
     written(tmp_path, study)
     for other in (
         replace(study, title="Another title", published={}),
         with_search(study, time_limit=7, runs=3, evaluations=900),
         with_search(study, algorithms=["rs"]),
     ):
-        assert identity_digest(results_directory(tmp_path, other).manifest) == identity_digest(
-            results_directory(tmp_path, study).manifest
-        )
+        assert identity_digest(
+            results_directory(tmp_path, other).manifest
+        ) == identity_digest(results_directory(tmp_path, study).manifest)
 
 
 def test_results_of_listed_encounters_do_not_depend_on_ranges() -> None:
@@ -182,9 +204,13 @@ def turned(record: Any, key: str) -> Any:
     return replace(record, **{key: dict(reversed(getattr(record, key).items()))})
 
 
-def test_the_order_of_a_table_counts_where_settings_or_points_are_arrays_in_it() -> None:
+def test_the_order_of_a_table_counts_where_settings_or_points_are_arrays_in_it() -> (
+    None
+):
     wear, joint = load_study("wear"), load_study("sun", encounters="ranges")
-    matrix = replace(wear.matrix, tests=[turned(test, "over") for test in wear.matrix.tests])
+    matrix = replace(
+        wear.matrix, tests=[turned(test, "over") for test in wear.matrix.tests]
+    )
     for study, order, changes in (
         (
             wear,
@@ -200,9 +226,13 @@ def test_the_order_of_a_table_counts_where_settings_or_points_are_arrays_in_it()
         after = manifest_of(replace(study, **changes), {})
         differences = [*manifest_differences(before, after)]
         assert (
-            (identity_digest(before) == identity_digest(after)) == (not differences) == (not order)
+            (identity_digest(before) == identity_digest(after))
+            == (not differences)
+            == (not order)
         )
-        assert all(text.startswith(order) and matters for _, text, matters in differences)
+        assert all(
+            text.startswith(order) and matters for _, text, matters in differences
+        )
 
 
 @pytest.mark.parametrize(
@@ -214,14 +244,20 @@ def test_the_order_of_a_table_counts_where_settings_or_points_are_arrays_in_it()
         ("pymoo", {"pymoo", "cma"}),
     ],
 )
-def test_a_manifest_names_the_packages_that_its_study_uses(name: str, more: set[str]) -> None:
+def test_a_manifest_names_the_packages_that_its_study_uses(
+    name: str, more: set[str]
+) -> None:
     algorithms = {"algorithms": ["pymoo:NSGA3"]}
-    study = load_study("smoke", search=algorithms) if name == "pymoo" else load_study(name)
+    study = (
+        load_study("smoke", search=algorithms) if name == "pymoo" else load_study(name)
+    )
     assert {*packages_of(study)} == {"safevar_sumo", "libsumo", "deap", "numpy", *more}
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"study": 3', "\x00"])
-def test_a_file_that_is_no_manifest_is_refused(tmp_path: Path, study: Study, text: str) -> None:
+def test_a_file_that_is_no_manifest_is_refused(
+    tmp_path: Path, study: Study, text: str
+) -> None:
     (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(InputError, match=r"manifest\.json"):
         results_directory(tmp_path, study)
@@ -241,16 +277,23 @@ def test_simulations_depend_on_files_and_the_number_of_results_but_not_on_new_ke
     def changed(**layers: object) -> list[tuple[str, bool]]:
         return [
             (text, changes_simulations)
-            for _, text, changes_simulations in manifest_differences(stored, {**stored, **layers})
+            for _, text, changes_simulations in manifest_differences(
+                stored, {**stored, **layers}
+            )
         ]
 
-    assert changed(study={**tables, "new": False}, versions={"numpy": "2", "libsumo": "1"}) == [
+    assert changed(
+        study={**tables, "new": False}, versions={"numpy": "2", "libsumo": "1"}
+    ) == [
         ("new was None and is False now", False),
         ("version of numpy was '1' and is '2' now", False),
     ]
     assert not changed(study={**tables, "title": "new"})
     assert changed(
-        study={**tables, "weather": "fog"}, files={}, results=2, versions={"libsumo": "2"}
+        study={**tables, "weather": "fog"},
+        files={},
+        results=2,
+        versions={"libsumo": "2"},
     ) == [
         (f"weather was {tables['weather']!r} and is 'fog' now", True),
         ("x.py no longer exists", True),
@@ -273,15 +316,23 @@ FRAME = pd.DataFrame(
 
 
 def test_rows_count_within_their_run() -> None:
-    assert list(map(str, handles_of(FRAME))) == ["nsga2:0:0", "nsga2:0:1", "nsga2:3:0", "rs:0:0"]
+    assert list(map(str, handles_of(FRAME))) == [
+        "nsga2:0:0",
+        "nsga2:0:1",
+        "nsga2:3:0",
+        "rs:0:0",
+    ]
     for place, handle in enumerate(handles_of(FRAME)):
         assert row_of_handle(FRAME, SolutionId.parse(str(handle))) == place
 
 
 @pytest.mark.parametrize(
-    ("handle", "legal"), [("nsga2:0:2", "nsga2:0:1"), ("nsga2:1:0", "nsga2:0:1, nsga2:3:0, rs:0:0")]
+    ("handle", "legal"),
+    [("nsga2:0:2", "nsga2:0:1"), ("nsga2:1:0", "nsga2:0:1, nsga2:3:0, rs:0:0")],
 )
-def test_the_error_for_a_missing_solution_names_the_present_ones(handle: str, legal: str) -> None:
+def test_the_error_for_a_missing_solution_names_the_present_ones(
+    handle: str, legal: str
+) -> None:
     with pytest.raises(InputError) as refused:
         row_of_handle(FRAME, SolutionId.parse(handle))
     assert handle in str(refused.value)
@@ -297,7 +348,8 @@ def test_chosen_by_what_they_are_among_the_unsafe() -> None:
 def test_without_a_collision_half_the_distance_is_unsafe() -> None:
     safe = FRAME[FRAME["outcome"] == "stopped"]
     wide, narrow = (
-        Unsafe.default({"safety_degree": degree}, safe["outcome"]) for degree in (4.1, 4.0)
+        Unsafe.default({"safety_degree": degree}, safe["outcome"])
+        for degree in (4.1, 4.0)
     )
     assert str(choose_handle(safe, wide, "smallest")) == "rs:0:0"
     with pytest.raises(InputError, match="no unsafe solution"):
@@ -345,8 +397,14 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
     manifest["versions"]["safevar_sumo"] = release
     (copied / "manifest.json").write_text(json.dumps(manifest))
     before = contents(copied)
-    for command in (("tables", str(copied)), ("study", "smoke", "--status", "--out", str(copied))):
-        message = (f"in format {number}", f"the release that wrote them, safevar_sumo {release}")
+    for command in (
+        ("tables", str(copied)),
+        ("study", "smoke", "--status", "--out", str(copied)),
+    ):
+        message = (
+            f"in format {number}",
+            f"the release that wrote them, safevar_sumo {release}",
+        )
         refused(*command, message=message)
     assert contents(copied) == before
 
@@ -366,13 +424,16 @@ def test_what_is_no_file_in_place_of_a_journal_is_refused_at_once(
         ("report", str(copied)),
     ):
         refused(
-            *command, message=("rs-00.jsonl: is no file", "or no file: the run then begins anew")
+            *command,
+            message=("rs-00.jsonl: is no file", "or no file: the run then begins anew"),
         )
     assert contents(copied) == before
 
 
 def as_of_another_study(journal: Path) -> None:
-    journal.write_bytes(re.sub(rb'"study":"\w+"', b'"study":"other"', journal.read_bytes()))
+    journal.write_bytes(
+        re.sub(rb'"study":"\w+"', b'"study":"other"', journal.read_bytes())
+    )
 
 
 def made_anew(make: Callable[[Path], object], path: Path) -> None:
@@ -381,7 +442,9 @@ def made_anew(make: Callable[[Path], object], path: Path) -> None:
 
 
 IN_THE_WAY: dict[str, Callable[[Path], object]] = {
-    "journal of another study": lambda out: as_of_another_study(out / "runs/rs-00.jsonl"),
+    "journal of another study": lambda out: as_of_another_study(
+        out / "runs/rs-00.jsonl"
+    ),
     "journal without a manifest": lambda out: [
         as_of_another_study(out / "runs/rs-00.jsonl"),
         (out / "manifest.json").unlink(),
@@ -419,7 +482,9 @@ def status_of(place: Path) -> dict[str, dict[str, Any]]:
     return {row["algorithm"]: row for row in status["tables"]["algorithms"]["rows"]}
 
 
-def test_the_status_of_a_study_agrees_with_its_journals(slippery: Path, case: Case) -> None:
+def test_the_status_of_a_study_agrees_with_its_journals(
+    slippery: Path, case: Case
+) -> None:
     before = contents(slippery)
     status = status_of(slippery)
     assert contents(slippery) == before
@@ -439,7 +504,12 @@ def test_a_study_under_way(copied: Path) -> None:
         nsga2.read_bytes()[: len(nsga2.read_bytes()) * 2 // 3]
     )  # torn, as while somebody writes
     begun, waiting = status_of(copied).values()
-    assert (begun["finished"], waiting["finished"], waiting["simulated"], waiting["best"]) == (
+    assert (
+        begun["finished"],
+        waiting["finished"],
+        waiting["simulated"],
+        waiting["best"],
+    ) == (
         0,
         0,
         0,
@@ -461,7 +531,10 @@ def test_results_of_a_study_whose_search_was_a_key_are_read_by_their_release(
     file = tmp_path / "manifest.json"
     file.write_text(
         json.dumps(
-            {**manifest, "study": {**manifest["study"], "wider": "smoke", "correlations": []}}
+            {
+                **manifest,
+                "study": {**manifest["study"], "wider": "smoke", "correlations": []},
+            }
         )
     )
     assert read_manifest(tmp_path) == manifest

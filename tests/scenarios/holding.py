@@ -10,7 +10,13 @@ import numpy as np
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.records import Command, FloatArray, Nominal, Observation, SimulationRuns
+from safevar_sumo.records import (
+    Command,
+    FloatArray,
+    Nominal,
+    Observation,
+    SimulationRuns,
+)
 from safevar_sumo.scenarios import Scenario
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System, assemble
@@ -31,7 +37,9 @@ class Hold(Ads):
     def drive(self, seen: Observation, memory: Any) -> tuple[Command, Any]:
         throttle, brake = memory = memory or (seen.throttle, seen.brake)
         brakes = np.broadcast_to(seen.time >= self._brakes_at, seen.speed.shape)
-        return Command(np.where(brakes, 0.0, throttle), np.where(brakes, 1.0, brake)), memory
+        return Command(
+            np.where(brakes, 0.0, throttle), np.where(brakes, 1.0, brake)
+        ), memory
 
 
 class Pedals(Ads):
@@ -43,12 +51,17 @@ class Pedals(Ads):
     def start(self, n: int, nominal: Nominal, step: float) -> None: ...
 
     def drive(self, seen: Observation, memory: None) -> tuple[Command, None]:
-        throttle, brake = (np.zeros(len(seen.speed)) + value for value in self._pedals(seen))
+        throttle, brake = (
+            np.zeros(len(seen.speed)) + value for value in self._pedals(seen)
+        )
         return Command(throttle, brake), None
 
 
 def driven(
-    scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = CARLA
+    scenario: Scenario,
+    ads: Any = None,
+    settings: FloatArray | None = None,
+    system: System = CARLA,
 ) -> SimulationRuns:
     """Simulates the original vehicle of a system, or settings, in a scenario; without an ADS, the
     vehicle keeps its speed.
@@ -56,7 +69,8 @@ def driven(
     alone = system.at(system.points[0]._replace(scenario=scenario))
     system = replace(alone, ads=ads or Hold())
     return drive_worst(
-        system, system.characteristics.original_settings if settings is None else settings
+        system,
+        system.characteristics.original_settings if settings is None else settings,
     )
 
 

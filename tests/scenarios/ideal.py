@@ -35,11 +35,15 @@ class Ideal(Vehicle):
 
     UNITS: ClassVar[dict[str, str]] = {}
 
-    def prepare(self, characteristics: Any, road_friction: Any, step: float, *_: Any) -> Any:
+    def prepare(
+        self, characteristics: Any, road_friction: Any, step: float, *_: Any
+    ) -> Any:
         return step, len(next(iter(characteristics.values())))
 
     def sumo_type(self, prepared: Any) -> SumoType:
-        return SumoType(*(np.full(prepared[1], value) for value in (1500.0, 3.0, 9.9, 70.0, 1e-3)))
+        return SumoType(
+            *(np.full(prepared[1], value) for value in (1500.0, 3.0, 9.9, 70.0, 1e-3))
+        )
 
     def at_rest(self, prepared: Any) -> Rolling:
         return Rolling(*np.zeros((4, prepared[1])))
@@ -52,7 +56,8 @@ class Ideal(Vehicle):
 
     def advance(self, prepared: Any, state: Any, command: Any) -> Rolling:
         speed = np.maximum(
-            state.speed + (3.0 * command.throttle - 9.9 * command.brake) * prepared[0], 0.0
+            state.speed + (3.0 * command.throttle - 9.9 * command.brake) * prepared[0],
+            0.0,
         )
         return Rolling(speed, command.throttle, command.brake, state.gear)
 
@@ -61,15 +66,21 @@ def ideal(system: System) -> System:
     """A system with the vehicle without drag or lag."""
     vehicle = Ideal()
     return replace(
-        system, vehicle=vehicle, nominal=calibration_drive(vehicle, system.characteristics)
+        system,
+        vehicle=vehicle,
+        nominal=calibration_drive(vehicle, system.characteristics),
     )
 
 
-def met_at_once(system: System, scenario: TrackScenario, ads: Ads, n: int) -> SimulationRuns:
+def met_at_once(
+    system: System, scenario: TrackScenario, ads: Ads, n: int
+) -> SimulationRuns:
     """Runs of the original vehicle in N encounters, whose parameters are arrays."""
     samples = round(float(np.max(scenario.duration)) / STEP) + 1
     points = (Point(scenario, system.points[0].weather),)
-    traffic = Traffic(points, np.arange(n), n_encounters=n, n_samples=samples, step=STEP)
+    traffic = Traffic(
+        points, np.arange(n), n_encounters=n, n_samples=samples, step=STEP
+    )
     settings = np.tile(system.characteristics.original, (n, 1))
     world = LaneWorld(traffic, np.zeros(n) + scenario.start_speed, STEP)
     return drive(replace(system, ads=ads, points=points), settings, world, traffic)
@@ -108,7 +119,9 @@ def point_mass(
     for time in np.arange(0.0, 40.0, step):
         is_dangerous, hardest = rule(time, v, other(time), gap, acceleration)
         danger = np.where(is_dangerous, np.minimum(danger, time), danger)
-        before = np.where(time >= danger, np.minimum(np.maximum(braking, released), hardest), 0.0)
+        before = np.where(
+            time >= danger, np.minimum(np.maximum(braking, released), hardest), 0.0
+        )
         rising = np.minimum(before + 12.65 * step, hardest)
         braking = np.where(time >= danger + 0.75, rising, before)
         acceleration = -(before + braking) / 2
@@ -133,5 +146,7 @@ def agreement(runs: SimulationRuns, expected: Mass, path: float) -> tuple[Any, A
     is_in_path = runs.trace.active & (np.abs(runs.trace.lateral) < path)
     gap = np.where(is_in_path, runs.trace.gap, np.inf).min(axis=0)
     with np.errstate(invalid="ignore"):  # nobody is ever in the path
-        late = np.nan_to_num(np.where(hits, closing - expected.speed, expected.least - gap))
+        late = np.nan_to_num(
+            np.where(hits, closing - expected.speed, expected.least - gap)
+        )
     return hits == expected.hits, late

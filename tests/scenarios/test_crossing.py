@@ -96,16 +96,25 @@ def test_a_turned_road_changes_nothing(
 ) -> None:
     ours = load_study(study)
     mine = load_study(
-        study, scenario={"parameters": {"network": moved(tmp_path, ours.scenario.model, forth)}}
+        study,
+        scenario={
+            "parameters": {"network": moved(tmp_path, ours.scenario.model, forth)}
+        },
     )
     system = assemble(ours)
-    settings = np.vstack([system.characteristics.original, system.characteristics.lower])
+    settings = np.vstack(
+        [system.characteristics.original, system.characteristics.lower]
+    )
     here = drive_worst(system, settings)
     there = drive_worst(assemble(mine), settings)
     assert here.outcome.tolist() == there.outcome.tolist()
     for name in ("gap", "lateral", "speed"):
-        assert np.allclose(getattr(here.trace, name), getattr(there.trace, name), atol=0.02), name
-    way, same = (run.trace.position[-1] - run.trace.position[0] for run in (here, there))
+        assert np.allclose(
+            getattr(here.trace, name), getattr(there.trace, name), atol=0.02
+        ), name
+    way, same = (
+        run.trace.position[-1] - run.trace.position[0] for run in (here, there)
+    )
     assert np.allclose(way, same, atol=0.02), "a position is along the way"
 
 
@@ -165,9 +174,14 @@ def test_the_gap_to_a_pedestrian_ends_at_the_strip_that_he_walks_on() -> None:
 
 @pytest.mark.parametrize(
     ("front", "over"),
-    [(PATH + WIDTH / 2 + LENGTH - 0.01, False), (PATH + WIDTH / 2 + LENGTH + 0.01, True)],
+    [
+        (PATH + WIDTH / 2 + LENGTH - 0.01, False),
+        (PATH + WIDTH / 2 + LENGTH + 0.01, True),
+    ],
 )
-def test_the_vehicle_has_passed_once_its_rear_has_left_the_strip(front: float, over: bool) -> None:
+def test_the_vehicle_has_passed_once_its_rear_has_left_the_strip(
+    front: float, over: bool
+) -> None:
     scenario = PedestrianCrossing()
     world = ArtificialWorld(front, 0.0)
     scene, _ = scenario.observe(world, STEP, scenario.begin(world))
@@ -194,7 +208,9 @@ def test_the_pedestrian_has_left_the_lane_when_he_walks_away_beyond_its_edge(
     assert scenario.observe(world, STEP, memory)[0].over[0] == over
 
 
-def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distance() -> None:
+def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distance() -> (
+    None
+):
     """At 1.8 m/s (0.09 m a step) the pedestrian turns, once only, in the step after which the next
     would lead beyond 0.7 m.
     """
@@ -212,19 +228,29 @@ def test_the_pedestrian_turns_in_the_last_step_that_keeps_him_within_the_distanc
 
 
 def trace(
-    gap: list[float], speed: list[float], lateral: list[float], lateral_speed: list[float]
+    gap: list[float],
+    speed: list[float],
+    lateral: list[float],
+    lateral_speed: list[float],
 ) -> Trace:
-    columns = (np.array(values)[:, np.newaxis] for values in (speed, gap, lateral, lateral_speed))
+    columns = (
+        np.array(values)[:, np.newaxis]
+        for values in (speed, gap, lateral, lateral_speed)
+    )
     v, gaps, across, across_speed = columns
     return made_up_runs(STEP, v, gaps, lateral=across, lateral_speed=across_speed).trace
 
 
-def test_closing_speed_of_a_pedestrian_has_both_speeds_along_the_line_of_sight() -> None:
+def test_closing_speed_of_a_pedestrian_has_both_speeds_along_the_line_of_sight() -> (
+    None
+):
     """Vehicle's centre at (0, 0), pedestrian at (4, -3): distance 5, cos(theta) = 0.8; v cos +
     v_ped sin = 0.8 * 6 +
     0.6 * 1.5.
     """
-    encounter = PedestrianCrossing().encounter(trace([4.0 - LENGTH / 2], [6.0], [-3.0], [1.5]))
+    encounter = PedestrianCrossing().encounter(
+        trace([4.0 - LENGTH / 2], [6.0], [-3.0], [1.5])
+    )
     assert encounter.distance[0, 0] == pytest.approx(5.0 - LENGTH / 2)
     assert encounter.closing_speed[0, 0] == pytest.approx(0.8 * 6 + 0.6 * 1.5)
     assert encounter.separation[0, 0] == pytest.approx(4.0 - LENGTH / 2)

@@ -63,15 +63,25 @@ def crossing(test: str, speed: float, location: float) -> Iterator[Cell]:
     """A cell and its variants; the target arrives after 6 s, or as soon as it can."""
     row = CROSSING[test]
     width = Crossing().vut_width
-    variants = [{}, {"start_share": 0.75}, *({"heading": float(turn)} for turn in row.headings)]
+    variants = [
+        {},
+        {"start_share": 0.75},
+        *({"heading": float(turn)} for turn in row.headings),
+    ]
     for variant in variants:
         share = variant.get("start_share", 1.0)
         target_speed_ms = row.speed * KMH
         arrival = 6.0 * share
         if row.start is not None:
             distance = (row.start + (location / 100 - 0.5) * width) * share
-            arrival = max(6.0, math.ceil((distance + row.run_up) / target_speed_ms * 2) / 2)
-        forward = -row.side * math.sin(math.radians(variant.get("heading", 0.0))) * target_speed_ms
+            arrival = max(
+                6.0, math.ceil((distance + row.run_up) / target_speed_ms * 2) / 2
+            )
+        forward = (
+            -row.side
+            * math.sin(math.radians(variant.get("heading", 0.0)))
+            * target_speed_ms
+        )
         yield Cell(
             Crossing(test=test, speed=speed, impact_location=location, **variant),
             arrival,
@@ -80,10 +90,14 @@ def crossing(test: str, speed: float, location: float) -> Iterator[Cell]:
 
 
 def junction(test: str, speed: float, target_speed: float) -> Iterator[Cell]:
-    yield Cell(Crossing(test=test, speed=speed, target_speed=target_speed), 6.0, speed * KMH)
+    yield Cell(
+        Crossing(test=test, speed=speed, target_speed=target_speed), 6.0, speed * KMH
+    )
 
 
-def behind(test: str, speed: float, location: float, target_speed: float) -> Iterator[Cell]:
+def behind(
+    test: str, speed: float, location: float, target_speed: float
+) -> Iterator[Cell]:
     """Cells with a standing or slower target and a gap of 5 s."""
     turns = (0.0, -10.0, 20.0) if target_speed == 0 else (0.0,)
     closing = (speed - target_speed) * KMH
@@ -106,7 +120,8 @@ def behind_braking(test: str, speed: float, location: float) -> Iterator[Cell]:
         gap = headway * speed * KMH
         closing = min(math.sqrt(2 * deceleration * gap), (speed - 2) * KMH)
         braking_time = (
-            closing / deceleration + max(gap - closing**2 / (2 * deceleration), 0) / closing
+            closing / deceleration
+            + max(gap - closing**2 / (2 * deceleration), 0) / closing
         )
         scenario = CarToCar(
             test=test,
@@ -118,9 +133,13 @@ def behind_braking(test: str, speed: float, location: float) -> Iterator[Cell]:
         yield Cell(scenario, 3 + braking_time, closing)
 
 
-def along(test: str, speed: float, location: float, target_speed: float) -> Iterator[Cell]:
+def along(
+    test: str, speed: float, location: float, target_speed: float
+) -> Iterator[Cell]:
     yield Cell(
-        Along(test=test, speed=speed, impact_location=location, target_speed=target_speed),
+        Along(
+            test=test, speed=speed, impact_location=location, target_speed=target_speed
+        ),
         6.0,
         (speed - target_speed) * KMH,
     )
@@ -138,7 +157,9 @@ def edge_cells() -> Iterator[Cell]:
     yield from behind("CCRm", 130, 100, 70)
     yield from behind_braking("CMRb", 50, 90)
     yield from behind_braking("CCRb", 130, -25)
-    yield from behind_braking("CCRb", 90, 50)  # some gaps close just at the end of a step
+    yield from behind_braking(
+        "CCRb", 90, 50
+    )  # some gaps close just at the end of a step
     yield from along("CBLA", 80, 10, 20)
 
 
@@ -153,9 +174,13 @@ def middle_beside(scenario: Any) -> float:
 
 
 def check(cells: list[Cell]) -> None:
-    points = tuple(Point(cell.scenario, WEATHERS["clear"], str(k)) for k, cell in enumerate(cells))
+    points = tuple(
+        Point(cell.scenario, WEATHERS["clear"], str(k)) for k, cell in enumerate(cells)
+    )
     system = replace(CARLA, ads=Hold(), points=points)
-    for cell, there in zip(cells, simulate_all_points(system, original_of(system)), strict=True):
+    for cell, there in zip(
+        cells, simulate_all_points(system, original_of(system)), strict=True
+    ):
         run = there.runs
         scenario = cell.scenario
         assert run.outcome[0] == Outcome.COLLISION, scenario
@@ -163,13 +188,17 @@ def check(cells: list[Cell]) -> None:
         late = at_contact(run, run.trace.time) - cell.arrival
         assert abs(late) * scenario.speed * KMH < 0.05, (late, scenario)
         lateral = at_contact(run, run.trace.lateral[:, 0])
-        expected = (scenario.impact_location / 100 - 0.5) * scenario.vut_width + middle_beside(
-            scenario
-        )
+        expected = (
+            scenario.impact_location / 100 - 0.5
+        ) * scenario.vut_width + middle_beside(scenario)
         assert abs(lateral - expected) < 0.02 * scenario.vut_width, scenario
         middle = 100 * (expected / scenario.vut_width + 0.5)
-        assert run.contact.place == pytest.approx(min(max(middle, 0), 100), abs=2), scenario
-        assert run.relative_speed[0] == pytest.approx(cell.relative, abs=0.1 * KMH), scenario
+        assert run.contact.place == pytest.approx(min(max(middle, 0), 100), abs=2), (
+            scenario
+        )
+        assert run.relative_speed[0] == pytest.approx(cell.relative, abs=0.1 * KMH), (
+            scenario
+        )
 
 
 @SLOW
@@ -202,8 +231,12 @@ def hit_at_any_time(scenario: Any) -> list[str]:
     """The outcomes of such vehicles, which are the same in SUMO."""
     n = 30
     arrival = driven(scenario).trace.time[-1]
-    brakes_at = np.append(np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0)
-    system = replace(CARLA, ads=Hold(brakes_at), points=(Point(scenario, WEATHERS["clear"]),))
+    brakes_at = np.append(
+        np.random.default_rng(4).uniform(arrival - 3, arrival + 0.3, n - 1), 99.0
+    )
+    system = replace(
+        CARLA, ads=Hold(brakes_at), points=(Point(scenario, WEATHERS["clear"]),)
+    )
     return assert_same(system, np.repeat(original_of(system), n, axis=0))
 
 
@@ -218,7 +251,9 @@ def test_whoever_walks_into_a_side_hits_the_vehicle_before_it_moves(
     assert hit_at_any_time(scenario).count(Outcome.COLLISION) > 5
 
 
-def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direction() -> None:
+def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direction() -> (
+    None
+):
     """The line from the front's middle to the cyclist's middle passes the corner 1 m beside the
     vehicle, 1 m before the impact.
     """
@@ -265,7 +300,9 @@ def test_the_originals_avoid_every_shipped_point_and_with_half_their_brakes_some
     collided = np.stack(
         [
             one.evaluations.collided
-            for one in simulate_all_points(system, original_and_half_its_brakes(study, system))
+            for one in simulate_all_points(
+                system, original_and_half_its_brakes(study, system)
+            )
         ]
     )
     assert not collided[:, 0].any()

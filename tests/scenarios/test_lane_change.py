@@ -70,8 +70,12 @@ def test_the_competent_driver_answers_cut_ins_by_the_rule() -> None:
     )
     beside = (3.5 - PATH) / scenario.lateral_speed
     perceived = 0.375 / scenario.lateral_speed + 0.4
-    expected = rule(v / 3.6, scenario.gap, scenario.target_speed / 3.6, beside, perceived)
-    same, late = agreement(met_at_once(IDEAL, scenario, CompetentDriver(), N), expected, PATH)
+    expected = rule(
+        v / 3.6, scenario.gap, scenario.target_speed / 3.6, beside, perceived
+    )
+    same, late = agreement(
+        met_at_once(IDEAL, scenario, CompetentDriver(), N), expected, PATH
+    )
     is_ahead = scenario.gap - (v - scenario.target_speed) / 3.6 * beside > 0
     assert 0.1 < expected.hits.mean() < 0.9
     assert_near(same[is_ahead], late[is_ahead & same])
@@ -84,10 +88,14 @@ def test_the_competent_driver_answers_cut_outs_by_the_rule() -> None:
     v = draw(20.0, 130.0)
     lateral_speed = draw(0.5, 1.8)
     gap = v / 3.6 * CAR.width / lateral_speed * draw(1.0, 2.0)
-    scenario = CutOut(speed=v, headway=2.0, gap=gap, lateral_speed=lateral_speed, **BODY)
+    scenario = CutOut(
+        speed=v, headway=2.0, gap=gap, lateral_speed=lateral_speed, **BODY
+    )
     perceived = np.maximum(0.375 / lateral_speed + 0.4, CAR.width / 2 / lateral_speed)
     expected = rule(v / 3.6, 2.0 * v / 3.6 + CAR.length + gap, 0.0, 0.0, perceived)
-    same, late = agreement(met_at_once(IDEAL, scenario, CompetentDriver(), N), expected, PATH)
+    same, late = agreement(
+        met_at_once(IDEAL, scenario, CompetentDriver(), N), expected, PATH
+    )
     assert 0.1 < expected.hits.mean() < 0.9
     assert_near(same, late[same])
 
@@ -108,8 +116,12 @@ def test_a_cut_in_moves_as_it_says() -> None:
         (car,) = one.tracks(np.array([[0.0], [1.0], [2.0], [3.0], [5.0], [7.0], [9.0]]))
         rear = car.x[:, 0] - CAR.length / 2
         assert rear[1] - 25.0 == pytest.approx(30.0)
-        assert (car.y[:, 0] * sign).tolist() == pytest.approx([3.5, 3.5, 1.75, 0.0, 0.0, 0.0, 0.0])
-        assert car.speed[:, 0].tolist() == pytest.approx([20.0, 20.0, 20.0, 20.0, 10.0, 0.0, 0.0])
+        assert (car.y[:, 0] * sign).tolist() == pytest.approx(
+            [3.5, 3.5, 1.75, 0.0, 0.0, 0.0, 0.0]
+        )
+        assert car.speed[:, 0].tolist() == pytest.approx(
+            [20.0, 20.0, 20.0, 20.0, 10.0, 0.0, 0.0]
+        )
         assert rear[-1] - rear[1] == pytest.approx(2 * 20.0 + 20.0**2 / (2 * 5.0))
 
 
@@ -126,7 +138,9 @@ def test_a_cut_out_hides_the_standing_car_until_the_leader_is_aside() -> None:
     assert gap[shown] == pytest.approx(
         20.0 + CAR.length + 60.0 - 20.0 * (run.trace.time[shown] - 1.0)
     )
-    assert at_contact(run, run.trace.time) == pytest.approx(1.0 + (20.0 + CAR.length + 60.0) / 20.0)
+    assert at_contact(run, run.trace.time) == pytest.approx(
+        1.0 + (20.0 + CAR.length + 60.0) / 20.0
+    )
 
 
 def test_whose_collision_it_is() -> None:
@@ -139,7 +153,9 @@ def test_whose_collision_it_is() -> None:
         (border - 0.3, "left", "passed"),
         (border + 0.3, "front", "collision"),
     ):
-        run = driven(CutIn(speed=80.0, target_speed=60.0, gap=gap, **BODY), Hold(), system=WEAR)
+        run = driven(
+            CutIn(speed=80.0, target_speed=60.0, gap=gap, **BODY), Hold(), system=WEAR
+        )
         assert (run.contact.side[0], run.outcome[0]) == (side, outcome)
     mirrored = driven(
         CutIn(speed=80.0, target_speed=60.0, gap=border - 0.3, side="right", **BODY),
@@ -150,12 +166,20 @@ def test_whose_collision_it_is() -> None:
 
 
 @SLOW
-def test_the_original_avoids_all_encounters_and_the_regulations_driver_all_but_two() -> None:
+def test_the_original_avoids_all_encounters_and_the_regulations_driver_all_but_two() -> (
+    None
+):
     """He waits for a TTC of 2 s, which is too late before a standing car at 60 km/h."""
     too_fast = {"cut_out, speed 60, wet", "cut_out, speed 80, wet"}
     for ads, failures in (
         ({"model": "aeb"}, set()),
-        ({"model": "competent_driver", "parameters": {"leader_braking": ANY_BRAKING}}, too_fast),
+        (
+            {
+                "model": "competent_driver",
+                "parameters": {"leader_braking": ANY_BRAKING},
+            },
+            too_fast,
+        ),
     ):
         system = assemble(load_study("alks", ads=ads))
         results = simulate_all_points(system, original_of(system))
@@ -165,7 +189,9 @@ def test_the_original_avoids_all_encounters_and_the_regulations_driver_all_but_t
         }
         assert len(degrees) == 15
         assert {name for name, degree in degrees.items() if degree < 0} == failures
-        assert all(degree >= 0.3 for name, degree in degrees.items() if name not in failures)
+        assert all(
+            degree >= 0.3 for name, degree in degrees.items() if name not in failures
+        )
 
 
 SCRIPT = """
@@ -214,7 +240,11 @@ def test_a_leader_brakes_down_to_a_stop() -> None:
     """R157's following: the leader's way to a stop is v^2 / (2 b), and the run lasts until he
     stands.
     """
-    one = CarToCar(test="CCRb", speed=72.0, headway=2.0, target_deceleration=8.0, final_speed=0.0)
+    one = CarToCar(
+        test="CCRb", speed=72.0, headway=2.0, target_deceleration=8.0, final_speed=0.0
+    )
     run = driven(one, Hold(), system=WEAR)
-    assert at_contact(run, run.trace.time) == pytest.approx((40.0 + 60.0 + 20.0**2 / 16.0) / 20.0)
+    assert at_contact(run, run.trace.time) == pytest.approx(
+        (40.0 + 60.0 + 20.0**2 / 16.0) / 20.0
+    )
     assert one.duration >= 3.0 + 20.0 / 8.0

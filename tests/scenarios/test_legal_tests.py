@@ -16,16 +16,34 @@ from tests.in_process import SLOW, InlinePool, run
 from tests.made_up import original_of
 
 KMH = 1 / 3.6
-ALLOWED = {20: 0, 30: 0, 40: 0, 41: 10, 42: 10, 43: 15, 45: 15, 46: 25, 50: 25, 51: 30, 55: 30}
+ALLOWED = {
+    20: 0,
+    30: 0,
+    40: 0,
+    41: 10,
+    42: 10,
+    43: 15,
+    45: 15,
+    46: 25,
+    50: 25,
+    51: 30,
+    55: 30,
+}
 """R152's second step as proposed: test speeds and allowed impact speeds [km/h]."""
 
 
 @pytest.mark.parametrize("reaction", [0.3, 0.75, 1.2])
-def test_what_a_braking_leader_leaves_is_that_of_the_closed_form(reaction: float) -> None:
+def test_what_a_braking_leader_leaves_is_that_of_the_closed_form(
+    reaction: float,
+) -> None:
     """80 km/h, 12 m, 5 m/s^2: 36.7 - 22.2 T m at the end, with 10 m/s^2 after T."""
     speed = 80 * KMH
     test = CarToCar(
-        test="CCRb", speed=80.0, headway=12 / speed, target_deceleration=5.0, final_speed=0.0
+        test="CCRb",
+        speed=80.0,
+        headway=12 / speed,
+        target_deceleration=5.0,
+        final_speed=0.0,
     )
     (leader,) = test.tracks(np.arange(0.0, 12.0, 0.01)[:, np.newaxis])
     rear = float(leader.x[-1, 0]) - leader.length / 2
@@ -38,7 +56,9 @@ def test_a_person_on_the_road_may_stand() -> None:
     times = np.arange(0.0, 6.0, 0.5)[:, np.newaxis]
     for speed, way in ((0.0, 0.0), (5.0, 5 * KMH * 5.5 - 1.0)):
         (person,) = Along(speed=50.0, target_speed=speed).tracks(times)
-        covered = float(np.broadcast_to(person.x, times.shape)[-1, 0]) - float(person.x[0, 0])
+        covered = float(np.broadcast_to(person.x, times.shape)[-1, 0]) - float(
+            person.x[0, 0]
+        )
         assert covered == pytest.approx(way, abs=0.02)
 
 
@@ -53,7 +73,9 @@ def test_the_new_car_passes_the_test_of_the_study(name: str) -> None:
     system = assemble(load_study(name))
     assert not drive_and_score(system, original_of(system)).collided[0]
     mass = system.nominal.mass
-    assert mass - assemble(load_study("wear")).nominal.mass == (450 if name == "r152_laden" else 0)
+    assert mass - assemble(load_study("wear")).nominal.mass == (
+        450 if name == "r152_laden" else 0
+    )
 
 
 FAST = "impact at 35 km/h, speed 60, clear"
@@ -69,7 +91,11 @@ def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_
     system = assemble(load_study("r152"))
     setting = original_of(system).copy()
     setting[0, system.characteristics.names.index("sensorRange")] = 15.0
-    (hit,) = (one for one in simulate_all_points(system, setting) if one.evaluations.collided[0])
+    (hit,) = (
+        one
+        for one in simulate_all_points(system, setting)
+        if one.evaluations.collided[0]
+    )
     assert hit.point.name == FAST
     speed = float(hit.runs.relative_speed[0])
     assert 10 * KMH < speed < 35 * KMH
@@ -88,12 +114,17 @@ def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_
 
 def test_a_point_fails_by_the_criterion_of_its_study() -> None:
     """The limits page: 62 % of the brake torque keep 6.43 m/s^2, 61 % do not."""
-    for share, told in ("0.61", "fails 1 of 1 test cases: type 0"), ("0.62", "fails no test case"):
+    for share, told in (
+        ("0.61", "fails 1 of 1 test cases: type 0"),
+        ("0.62", "fails no test case"),
+    ):
         assert told in run("simulate", "r13h", "--set", f"brakeTorque={share}").stdout
 
 
 @SLOW
-def test_a_question_about_the_study_asks_by_its_criterion_and_names_the_source() -> None:
+def test_a_question_about_the_study_asks_by_its_criterion_and_names_the_source() -> (
+    None
+):
     answer = sv.rules("r152", samples=40, pool=InlinePool())
     assert "Criterion: impact_excess > 0 (UN R152" in answer.verdict
     assert "not checked against the regulation's text" in answer.verdict

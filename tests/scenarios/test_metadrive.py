@@ -15,7 +15,9 @@ from tests.manual import ROOT, files_of
 PAGE = "docs/simulators.md"
 pytestmark = SLOW
 if os.environ.get("SAFEVAR_METADRIVE") != "required":
-    pytest.importorskip("panda3d")  # MetaDrive's engine; MetaDrive itself takes seconds to import
+    pytest.importorskip(
+        "panda3d"
+    )  # MetaDrive's engine; MetaDrive itself takes seconds to import
 
 
 @pytest.fixture
@@ -43,7 +45,9 @@ def test_the_page_says_what_the_driver_does(page: str) -> None:
 def test_the_calls_of_the_page_fit_the_client_of_carla(in_tmp: Path) -> None:
     """Of all calls only that is a fault which is misspelt here."""
     carla = pytest.importorskip("carla")
-    Path("carla").symlink_to(Path(carla.__file__).parent)  # which does not say that it has types
+    Path("carla").symlink_to(
+        Path(carla.__file__).parent
+    )  # which does not say that it has types
     source = (ROOT / "docs" / "my_carla.py").read_text()
     Path("my_carla.py").write_text(source.replace(".load_world(", ".load_wurld("))
     printed = api.run(["--strict", "--config-file=", "my_carla.py"])[0]

@@ -55,7 +55,9 @@ SEARCH = {
 def mine(folder: Path, search: dict[str, Any], **tables: Any) -> Study:
     folder.joinpath("own.py").write_text(MINE)
     scenario = {"model": "own:Mine", "over": search}
-    return load_study("wear", matrix=None, scenario=scenario, encounters="ranges", **tables)
+    return load_study(
+        "wear", matrix=None, scenario=scenario, encounters="ranges", **tables
+    )
 
 
 @SLOW
@@ -72,7 +74,9 @@ def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> No
         parameters = system.characteristics.scenario.named(setting[~of_vehicle])
         alone = assemble(
             load_study(
-                "wear", matrix=None, scenario={"model": "own:Mine", "parameters": parameters}
+                "wear",
+                matrix=None,
+                scenario={"model": "own:Mine", "parameters": parameters},
             )
         )
         both = drive_and_score(
@@ -91,7 +95,10 @@ def test_a_matrix_runs_over_them(in_tmp: Path) -> None:
     test = {"name": "scooter", "over": {"gap": [40, 50], "scooter": [10.0]}}
     study = load_study("wear", matrix={"tests": [test]}, scenario={"model": "own:Mine"})
     names = [point.name for point in assemble(study).points]
-    assert names == ["scooter, gap 40, scooter 10.0, wet", "scooter, gap 50, scooter 10.0, wet"]
+    assert names == [
+        "scooter, gap 40, scooter 10.0, wet",
+        "scooter, gap 50, scooter 10.0, wet",
+    ]
 
 
 TRAFFIC = """
@@ -114,7 +121,9 @@ class Mine(Struct, frozen=True, kw_only=True):
 """
 
 
-def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path) -> None:
+def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(
+    in_tmp: Path,
+) -> None:
     methods = "".join(
         f"\n    def {name}(self, *arguments):\n        return"
         f" LeadVehicleStopped().{name}(*arguments)\n"
@@ -123,7 +132,11 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path
     (in_tmp / "own.py").write_text(TRAFFIC + methods)
     search = {"distance": {"unit": "m", "original": 50, "lower": 30, "upper": 60}}
     system = assemble(
-        load_study("native", scenario={"model": "own:Mine", "over": search}, encounters="ranges")
+        load_study(
+            "native",
+            scenario={"model": "own:Mine", "over": search},
+            encounters="ranges",
+        )
     )
     assert "by distance" in reason_against_scenes(system)
     settings = drawn(system, 3, 4)
@@ -132,10 +145,14 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(in_tmp: Path
         parameters = {"distance": float(setting[-1])}
         alone = assemble(
             load_study(
-                "native", scenario={"model": "lead_vehicle_stopped", "parameters": parameters}
+                "native",
+                scenario={"model": "lead_vehicle_stopped", "parameters": parameters},
             )
         )
-        assert drive_and_score(alone, setting[:-1][np.newaxis]).outcome[0] == found.outcome[row]
+        assert (
+            drive_and_score(alone, setting[:-1][np.newaxis]).outcome[0]
+            == found.outcome[row]
+        )
 
 
 def test_a_list_of_ones_own_scenario_names_it_and_claims_no_check(in_tmp: Path) -> None:

@@ -25,11 +25,15 @@ SPEED = 72.0 / 3.6
 STEP = 0.05
 
 
-def rows_of(name: str, times: Any, x: float, y: float, speed: float = 0.0, **pose: float) -> Any:
+def rows_of(
+    name: str, times: Any, x: float, y: float, speed: float = 0.0, **pose: float
+) -> Any:
     """Rows of a body that moves along the lane from a place ahead and to the left of `ego`."""
     turn, size = pose.get("turn", 0.0), pose.get("size", LENGTH)
     for time in times:
-        place = complex(x + speed * (time - times[0]), y) * complex(math.cos(turn), math.sin(turn))
+        place = complex(x + speed * (time - times[0]), y) * complex(
+            math.cos(turn), math.sin(turn)
+        )
         yield time, name, 7.0 + place.real, -3.0 + place.imag, turn, speed, size, WIDTH
 
 
@@ -73,15 +77,20 @@ def test_who_stands_beside_the_way_is_passed_at_the_lateral_gap(in_tmp: Path) ->
     assert result.encounter.separation.min() == pytest.approx(3.1 - WIDTH, abs=1e-6)
 
 
-def test_a_heading_turns_the_way_round_through_pi_as_the_shorter_way(in_tmp: Path) -> None:
+def test_a_heading_turns_the_way_round_through_pi_as_the_shorter_way(
+    in_tmp: Path,
+) -> None:
     halves = [(0.0, 3.1), (1.0, -3.1)]
     row = "{},van,60,30,{},0,4,2\n"
     Path("walk.csv").write_text(
-        f"{','.join(COLUMNS)}\n0,ego,0,0,0,1,4,2\n" + "".join(row.format(*one) for one in halves)
+        f"{','.join(COLUMNS)}\n0,ego,0,0,0,1,4,2\n"
+        + "".join(row.format(*one) for one in halves)
     )
     (track,) = RecordedTracks(file="walk.csv").tracks(np.array([[0.0], [0.5], [1.0]]))
     assert track.along[1, 0] == pytest.approx(-1.0)
-    assert track.left[:, 0] == pytest.approx([math.sin(3.1), 0.0, math.sin(-3.1)], abs=1e-9)
+    assert track.left[:, 0] == pytest.approx(
+        [math.sin(3.1), 0.0, math.sin(-3.1)], abs=1e-9
+    )
 
 
 def test_a_body_is_there_from_its_first_to_its_last_row_alone(in_tmp: Path) -> None:
@@ -91,8 +100,12 @@ def test_a_body_is_there_from_its_first_to_its_last_row_alone(in_tmp: Path) -> N
     late = rows_of("late", [4.0, 5.0], 44.0, 0.0)
     result = held(early, late, rows_of("inside", [30.0, 31.0], 0.0, 0.0), steady)
     assert result.outcome[0] == Outcome.PASSED
-    assert result.encounter.separation[:21, 0].min() == pytest.approx(40.0 - SPEED, abs=1e-6)
-    hidden = np.flatnonzero(~np.broadcast_to(result.trace.visible, result.trace.gap.shape)[:, 0])
+    assert result.encounter.separation[:21, 0].min() == pytest.approx(
+        40.0 - SPEED, abs=1e-6
+    )
+    hidden = np.flatnonzero(
+        ~np.broadcast_to(result.trace.visible, result.trace.gap.shape)[:, 0]
+    )
     assert hidden.size == 0 or hidden.min() > 20
     alone = held(rows_of("late", [1.0, 3.0], 44.0, 0.0))
     assert alone.outcome[0] == Outcome.COLLISION
@@ -129,7 +142,13 @@ def test_results_and_packs_depend_on_the_bytes_of_the_file(in_tmp: Path) -> None
     write()
     Path("walk.csv").write_text(PAGE["walk.csv"].replace("45.0", "45.5"))
     refused("rules", "results", message=("walk.csv has changed since",))
-    refused("study", "walk.toml", "--out", "results", message=("walk.csv has changed since",))
+    refused(
+        "study",
+        "walk.toml",
+        "--out",
+        "results",
+        message=("walk.csv has changed since",),
+    )
 
 
 def test_a_matrix_plays_several_files(in_tmp: Path) -> None:
@@ -165,15 +184,53 @@ def test_the_lines_of_the_page_make_a_table_of_a_log_of_esmini(
     header = "".join(f"#{number} {name} , " for number in (1, 2) for name in NAMES)
     lines = []
     for index in range(3):
-        ego = ["Ego", 0, 10.0, 0, 0, 1.4, 0.0, 0.9, 5.0, 2.0, 1.8, index * 1.0, 0.0, 0.0, 0.0, 0.0]
-        van = ["Van", 1, 5.0, 0, 0, 2.0, 0.0, 0.9, 6.0, 2.2, 2.5, 30.0, index * 0.5, 0.0]
-        lines.append(f"{index}, {index * 0.1:.6f}, {logged(ego, [*van, math.pi / 2, 0.0])}\n")
+        ego = [
+            "Ego",
+            0,
+            10.0,
+            0,
+            0,
+            1.4,
+            0.0,
+            0.9,
+            5.0,
+            2.0,
+            1.8,
+            index * 1.0,
+            0.0,
+            0.0,
+            0.0,
+            0.0,
+        ]
+        van = [
+            "Van",
+            1,
+            5.0,
+            0,
+            0,
+            2.0,
+            0.0,
+            0.9,
+            6.0,
+            2.2,
+            2.5,
+            30.0,
+            index * 0.5,
+            0.0,
+        ]
+        lines.append(
+            f"{index}, {index * 0.1:.6f}, {logged(ego, [*van, math.pi / 2, 0.0])}\n"
+        )
     Path("log.csv").write_text(LOG.format(header) + "".join(lines))
     Path("from_esmini.py").write_text(PAGE["from_esmini.py"])
     monkeypatch.setattr("sys.argv", ["from_esmini.py", "log.csv", "walk.csv"])
     runpy.run_path("from_esmini.py")
     scenario = RecordedTracks(file="walk.csv", ego="Ego")
-    assert (scenario.vut_length, scenario.vut_width, scenario.duration) == (5.0, 2.0, 0.2)
+    assert (scenario.vut_length, scenario.vut_width, scenario.duration) == (
+        5.0,
+        2.0,
+        0.2,
+    )
     (van,) = scenario.tracks(np.array([[0.0], [0.1]]))
     assert (van.name, van.length[0, 0], van.width[0, 0]) == ("Van", 6.0, 2.2)
     assert van.x[:, 0] == pytest.approx(30.0 - 1.4 - 2.5)

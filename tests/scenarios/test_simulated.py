@@ -157,7 +157,9 @@ def test_runs_with_a_trace_are_measured_as_those_of_sumo(wall: Path) -> None:
     assert found.outcome.tolist()[:2] == ["stopped", "collision"]
     assert found.f_safe[0] == pytest.approx(40 - 15 * (0.5 + braking / 2), abs=0.55)
     assert found.f_safe[1] == -found.collision_speed[1]
-    assert found.collision_speed[1] == pytest.approx((15**2 - 2 * 3 * 17.5) ** 0.5, abs=0.2)
+    assert found.collision_speed[1] == pytest.approx(
+        (15**2 - 2 * 3 * 17.5) ** 0.5, abs=0.2
+    )
     assert found.metrics["ave_dece"][0] == pytest.approx(8, abs=0.3)
     runs = simulators.simulate_each(system, np.array([[4.0, 0.0]]))
     ttc = runs.trace.gap[:, 0] / np.maximum(runs.trace.speed[:, 0], 1e-9)
@@ -168,7 +170,9 @@ def test_runs_with_a_trace_are_measured_as_those_of_sumo(wall: Path) -> None:
 def test_metrics_that_a_trace_does_not_define_are_undefined(wall: Path) -> None:
     change = "lambda r: {k: r[k] for k in ('time', 'speed', 'separation', 'outcome')}"
     found = drive_and_score(wrong_system(wall, change), np.array([[8.0, 0.0]]))
-    assert np.isnan([found.metrics[name][0] for name in METRICS if name != "safety_degree"]).all()
+    assert np.isnan(
+        [found.metrics[name][0] for name in METRICS if name != "safety_degree"]
+    ).all()
     assert found.f_safe[0] > 0
 
 
@@ -206,7 +210,9 @@ def test_a_rig_states_its_metrics_itself(wall: Path) -> None:
 def test_each_setting_alone_gives_the_bytes_of_a_batch(wall: Path) -> None:
     system = system_of(wall)
     rows = np.linspace([3, 0], [9, 1], 8)
-    alone = Evaluations.concatenate([drive_and_score(system, row) for row in np.split(rows, 8)])
+    alone = Evaluations.concatenate(
+        [drive_and_score(system, row) for row in np.split(rows, 8)]
+    )
     assert not [*differences(drive_and_score(system, rows).results, alone.results)]
 
 
@@ -230,16 +236,22 @@ def test_a_struct_that_returns_lists_is_a_simulator_too(wall: Path) -> None:
     both = [
         drive_and_score(
             system_of(
-                wall, scenario={"model": f"models:{name}", "over": search}, encounters="ranges"
+                wall,
+                scenario={"model": f"models:{name}", "over": search},
+                encounters="ranges",
             ),
             rows,
         )
         for name in ("Wall", "Listed")
     ]
     assert both[0].f_safe.tolist() == both[1].f_safe.tolist()
-    tests = [{"name": name, "model": f"models:{name}"} for name in ("Wall", "Listed", "Rig")]
+    tests = [
+        {"name": name, "model": f"models:{name}"} for name in ("Wall", "Listed", "Rig")
+    ]
     system = system_of(wall, matrix={"tests": tests})
-    assert drive_and_score(system, np.array([[8.0, 0.0]])).f_safe[0] == pytest.approx(18, abs=0.5)
+    assert drive_and_score(system, np.array([[8.0, 0.0]])).f_safe[0] == pytest.approx(
+        18, abs=0.5
+    )
 
 
 KEEPS = """
@@ -318,11 +330,15 @@ class Dies(Served):
 
 
 @pytest.mark.parametrize("name", ["Derives", "Served"])
-def test_each_setting_has_an_object_that_was_created_with_its_fields(wall: Path, name: str) -> None:
+def test_each_setting_has_an_object_that_was_created_with_its_fields(
+    wall: Path, name: str
+) -> None:
     """What is derived at creation is that of the test point, and of no run before."""
     (wall.parent / "keeps.py").write_text(KEEPS)
     tests = [{"name": "a", "over": {"speed": [20.0, 60.0, 90.0]}}]
-    system = system_of(wall, scenario={"model": f"keeps:{name}"}, matrix={"tests": tests})
+    system = system_of(
+        wall, scenario={"model": f"keeps:{name}"}, matrix={"tests": tests}
+    )
     for _ in range(2):
         at_points = simulate_all_points(system, np.array([[8.0, 0.0], [8.0, 0.0]]))
         degrees = [point.evaluations.f_safe.tolist() for point in at_points]
@@ -341,7 +357,11 @@ def test_a_process_opens_its_worker_once_and_ends_it(wall: Path, name: str) -> N
     assert json_of("check", "wall.toml")["numbers"]["passed"]
     run("simulate", "wall.toml")
     kept.close_simulator()
-    assert Path("log").read_text().split("\n") == [f"{name} open 0", f"{name} close 0", ""]
+    assert Path("log").read_text().split("\n") == [
+        f"{name} open 0",
+        f"{name} close 0",
+        "",
+    ]
     wrong = KEEPS.replace("def open_worker(cls, worker)", "def open_worker(cls)")
     (wall.parent / "keeps.py").write_text(wrong)
     refused("check", "wall.toml", message=("open_worker that does not take (worker)",))
@@ -379,7 +399,10 @@ def test_runs_have_one_time_step(wall: Path) -> None:
             "speed and position disagree",
         ),
         ("position=r['position'] * 3.6", "speed and position disagree"),
-        ("position=r['position'] * 0 + 1, gap=r['gap'] / 3.6", "speed and position disagree"),
+        (
+            "position=r['position'] * 0 + 1, gap=r['gap'] / 3.6",
+            "speed and position disagree",
+        ),
         ("gap=20 + (r['gap'] - 40) / 1.6", "speed and gap disagree"),
         ("gap=40 + (r['gap'] - 40) / 1.4", ""),
         (
@@ -404,7 +427,10 @@ def test_a_speed_that_disagrees_with_the_way_is_a_finding(
     [
         ('{"decel": setting["decel"], "delay": 0}', "simulate never reads delay"),
         ("{**setting}", "drac is undefined in all runs"),
-        ('{"decel": setting.get("decel"), "delay": dict(setting)["delay"]}', "drac is undefined"),
+        (
+            '{"decel": setting.get("decel"), "delay": dict(setting)["delay"]}',
+            "drac is undefined",
+        ),
     ],
 )
 def test_what_a_study_names_and_a_simulator_never_has_is_a_finding_of_check_alone(
@@ -414,7 +440,9 @@ def test_what_a_study_names_and_a_simulator_never_has_is_a_finding_of_check_alon
     with (wall.parent / "models.py").open("a") as file:
         file.write(f"{code}        return Rig.simulate(self, setting)\n")
     study = STUDY.replace("models:Wall", "models:Part")
-    wall.write_text(study if "never" in told else study.replace("ttc", 'also = ["drac"]\nttc', 1))
+    wall.write_text(
+        study if "never" in told else study.replace("ttc", 'also = ["drac"]\nttc', 1)
+    )
     printed = run("check", "wall.toml", expect=1).stdout
     parts = [line.partition(":")[0] for line in printed.splitlines()[2:6]]
     assert parts == ["where", "found", "expected", "what to do"]
@@ -427,24 +455,49 @@ def test_versions_belong_to_the_identity_of_results(wall: Path) -> None:
     versions = manifest_now(study, assemble(study))["versions"]
     assert versions["version of Wall"] == "1.2"
     assert versions["numpy"] == np.__version__
-    (wall.parent / "models.py").write_text(MODELS.replace('("numpy",)', '("no_such_simulator",)'))
+    (wall.parent / "models.py").write_text(
+        MODELS.replace('("numpy",)', '("no_such_simulator",)')
+    )
     with pytest.raises(InputError, match="no_such_simulator"):
         manifest_now(study, assemble(study))
 
 
 @SLOW
 def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
-    run("simulate", "wall.toml", "--set", "decel=4", "--plot", "a.png", "--animate", "a.html")
+    run(
+        "simulate",
+        "wall.toml",
+        "--set",
+        "decel=4",
+        "--plot",
+        "a.png",
+        "--animate",
+        "a.html",
+    )
     assert Path("a.png").stat().st_size
     assert "wall" in Path("a.html").read_text()
     wall.write_text(STUDY.replace("models:Wall", "models:Rig"))
-    refused("simulate", "wall.toml", "--animate", "b.html", message=("needs the position",))
-    refused("simulate", "wall.toml", "--trace", "b.csv", message=("states metrics alone",))
-    refused("study", "wall.toml", "--engine", "sumo", "--out", "r", message=("no other engine",))
+    refused(
+        "simulate", "wall.toml", "--animate", "b.html", message=("needs the position",)
+    )
+    refused(
+        "simulate", "wall.toml", "--trace", "b.csv", message=("states metrics alone",)
+    )
+    refused(
+        "study",
+        "wall.toml",
+        "--engine",
+        "sumo",
+        "--out",
+        "r",
+        message=("no other engine",),
+    )
 
 
 @SLOW
-def test_a_cause_ends_where_the_formula_does_and_weather_is_not_said(wall: Path) -> None:
+def test_a_cause_ends_where_the_formula_does_and_weather_is_not_said(
+    wall: Path,
+) -> None:
     """Failures are explained without reference drivers."""
     found = json_of("explain", "wall.toml")
     assert found["numbers"]["collisions"] is None
@@ -476,27 +529,42 @@ class Ends(Wall):
 
 
 @SLOW
-def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(wall: Path) -> None:
+def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(
+    wall: Path,
+) -> None:
     """The worst run counts, each is in the journal, and without repeats the study is refused."""
     (wall.parent / "noisy.py").write_text(NOISY)
     wall.write_text(STUDY.replace("models:Wall", "noisy:Drifts"))
     assert "repeats = N" in run("check", "wall.toml", expect=1).stdout
     wall.write_text(STUDY.replace('"models:Wall"', '"noisy:Drifts"\nrepeats = 4'))
     assert json_of("check", "wall.toml")["numbers"]["passed"]
-    found = drive_and_score(system_of(wall), np.array([[8.0, 0.0], [3.0, 0.0], [9.0, 0.5]]))
+    found = drive_and_score(
+        system_of(wall), np.array([[8.0, 0.0], [3.0, 0.0], [9.0, 0.5]])
+    )
     rounds = np.stack([found.metrics[f"safety_degree_{k}"] for k in range(1, 5)])
     assert found.f_safe == pytest.approx(rounds.min(axis=0))
     assert found.metrics["unsafe_share"].tolist() == [0, 1, 0]
     assert len({*rounds[:, 0]}) == 4
     assert found.outcome.tolist() == ["stopped", "collision", "stopped"]
     run("study", "wall.toml", "--out", "results")
-    assert '"safety_degree_4":[' in next(Path("results/runs").glob("*.jsonl")).read_text()
+    assert (
+        '"safety_degree_4":[' in next(Path("results/runs").glob("*.jsonl")).read_text()
+    )
 
 
 def test_the_worst_run_and_the_share_of_unsafe_runs_count() -> None:
     """Metres and metres per second have no mean."""
     degrees = np.array([2.0, 9.0, 2.0, 5.0, 2.0, 6.0, -6.0, 7.0])
-    names = ["stopped", "passed", "passed", "stopped", "stopped", "timeout", "timeout", "timeout"]
+    names = [
+        "stopped",
+        "passed",
+        "passed",
+        "stopped",
+        "stopped",
+        "timeout",
+        "timeout",
+        "timeout",
+    ]
     outcome = np.where(degrees < 0, "collision", names)
     of_runs = {
         **dict.fromkeys(METRICS, np.full(8, np.nan)),
@@ -544,7 +612,10 @@ def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
     assert names == ["unsafe_share", "f_diff", "f_num_diff"]
     own = wall.read_text() + 'objectives = ["safety_degree", "f_diff"]\n'
     (wall.parent / "own.toml").write_text(own)
-    names = [one.name for one in system_of(wall.parent / "own.toml").measuring.scoring.objectives]
+    names = [
+        one.name
+        for one in system_of(wall.parent / "own.toml").measuring.scoring.objectives
+    ]
     assert names == ["f_safe", "f_diff"]
     found = json_of("simulate", "wall.toml", "--set", "delay=0.15")
     assert (
@@ -561,7 +632,9 @@ def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
         assert low < share < high
     for delay, holds in ((0.05, False), (0.02, None)):
         limits = [f"delay <= {delay}"]
-        answer = sv.tolerance("wall.toml", limits=limits, simulations=2000, pool=InlinePool())
+        answer = sv.tolerance(
+            "wall.toml", limits=limits, simulations=2000, pool=InlinePool()
+        )
         assert answer.numbers["kept"] is holds
     run("study", "wall.toml", "--out", "results")
     assert "unsafe_share" in Path("results/solutions.csv").read_text()
@@ -570,20 +643,30 @@ def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
 def test_noise_of_one_seed_is_a_remark(wall: Path) -> None:
     noisy = STUDY.replace("delay = {", 'delay = { meaning = "noise of the brake",')
     wall.write_text(noisy)
-    assert any("noise of one seed" in remark for remark in without_effect(system_of(wall)))
+    assert any(
+        "noise of one seed" in remark for remark in without_effect(system_of(wall))
+    )
     (wall.parent / "models.py").write_text(
         MODELS.replace("    speed:", "    seed: int = 1\n    speed:")
     )
-    wall.write_text(f'{noisy}\n[[matrix.tests]]\nname = "a"\nover = {{ seed = [1, 2, 3] }}\n')
+    wall.write_text(
+        f'{noisy}\n[[matrix.tests]]\nname = "a"\nover = {{ seed = [1, 2, 3] }}\n'
+    )
     system = system_of(wall)
     assert not without_effect(system)
-    assert [point.name for point in system.points] == ["a, seed 1", "a, seed 2", "a, seed 3"]
+    assert [point.name for point in system.points] == [
+        "a, seed 1",
+        "a, seed 2",
+        "a, seed 3",
+    ]
 
 
 @SLOW
 @pytest.mark.usefixtures("worker_processes")
 @pytest.mark.parametrize("often", [1, 2])
-def test_a_simulator_that_ends_its_process_is_started_again_once(wall: Path, often: int) -> None:
+def test_a_simulator_that_ends_its_process_is_started_again_once(
+    wall: Path, often: int
+) -> None:
     """What was simulated before is kept; the error names the setting and the command."""
     end = f"len(open('ended', 'a+').write('x') and open('ended').read()) <= {often}"
     (wall.parent / "noisy.py").write_text(NOISY.replace("END", end))
@@ -622,9 +705,13 @@ SECONDS = f"1234.{os.getpid()}"
 """Time that a child process sleeps, as no other test's."""
 
 
-def with_failures(wall: Path, failure: str, limit: float = 3.2, failed: str = "skip") -> None:
+def with_failures(
+    wall: Path, failure: str, limit: float = 3.2, failed: str = "skip"
+) -> None:
     text = (
-        FAILS.replace("SECONDS", SECONDS).replace("FAILURE", failure).replace("LIMIT", str(limit))
+        FAILS.replace("SECONDS", SECONDS)
+        .replace("FAILURE", failure)
+        .replace("LIMIT", str(limit))
     )
     (wall.parent / "fails.py").write_text(text)
     study = STUDY.replace("models:Wall", "fails:Fails")
@@ -643,20 +730,24 @@ def children() -> int:
 @SLOW
 @pytest.mark.usefixtures("worker_processes")
 @pytest.mark.parametrize("failure", ["1 / 0", "os._exit(7)", "time.sleep(60)"])
-def test_settings_that_fail_may_be_skipped_and_tried_again(wall: Path, failure: str) -> None:
+def test_settings_that_fail_may_be_skipped_and_tried_again(
+    wall: Path, failure: str
+) -> None:
     """They are infeasible and counted; `check` names them; children end with their simulator."""
     with_failures(wall, failure)
     options = ("study", "wall.toml", "--out", "results", "--jobs", "1")
     printed = run(*options).stdout
     number = int(re.search(r"(\d+) settings? could not be simulated", printed)[1])
-    journals = "".join(path.read_text() for path in Path("results/runs").glob("*.jsonl"))
+    journals = "".join(
+        path.read_text() for path in Path("results/runs").glob("*.jsonl")
+    )
     assert journals.count('"simulator-error"') == number > 0
     assert "--set decel=3" in journals or failure == "1 / 0"
     assert children() == 0
     printed = run("check", "wall.toml", expect=None)
-    assert {"1 / 0": "division", "os._exit(7)": "code 7"}.get(failure, "time limit") in (
-        printed.stdout + printed.stderr
-    )
+    assert {"1 / 0": "division", "os._exit(7)": "code 7"}.get(
+        failure, "time limit"
+    ) in (printed.stdout + printed.stderr)
     assert children() == 0
     before = Path("count").stat().st_size
     run(*options, "--retry-failed")
@@ -679,7 +770,10 @@ def test_an_attempt_counts_as_a_death_only_when_its_process_has_died(
         if number == 0:
             with simulators._attempt("it", system):
                 pass
-    with pytest.raises(UserCodeError, match="two workers died"), simulators._attempt("it", system):
+    with (
+        pytest.raises(UserCodeError, match="two workers died"),
+        simulators._attempt("it", system),
+    ):
         pass
     assert {path.name for path in folder.iterdir()} == {"dead-0", "dead-1"}
 
@@ -709,10 +803,20 @@ class Leaks(Rig):
         "atexit.register(time.sleep, 999)",
     ],
 )
-def test_threads_and_exit_functions_of_a_simulator_keep_no_command(wall: Path, damage: str) -> None:
+def test_threads_and_exit_functions_of_a_simulator_keep_no_command(
+    wall: Path, damage: str
+) -> None:
     Path("leaks.py").write_text(LEAKS.replace("DAMAGE", damage))
     wall.write_text(STUDY.replace("models:Wall", "leaks:Leaks"))
-    command = [sys.executable, "-m", "safevar_sumo", "study", "wall.toml", "--jobs", "1"]
+    command = [
+        sys.executable,
+        "-m",
+        "safevar_sumo",
+        "study",
+        "wall.toml",
+        "--jobs",
+        "1",
+    ]
     assert subprocess.run([*command, "--out", "results"], timeout=200).returncode == 0
     assert Path("results/solutions.csv").exists()
 
@@ -839,7 +943,10 @@ def test_an_interrupted_question_of_another_simulator_begins_anew(
     monkeypatch.setenv("SAFEVAR_CACHE", str(wall.parent / "cache"))
 
     def ask() -> float:
-        with keep_simulations("risk"), open_evaluator(sv.load_study(str(wall)), InlinePool()) as it:
+        with (
+            keep_simulations("risk"),
+            open_evaluator(sv.load_study(str(wall)), InlinePool()) as it,
+        ):
             it.account.is_question = True
             it.begin({"all": 1})
             found = it.evaluate(np.array([[8.0, 0.0], [4.0, 0.0]]), "all")
@@ -862,14 +969,18 @@ def test_an_interrupted_question_of_another_simulator_begins_anew(
 @SLOW
 @pytest.mark.usefixtures("worker_processes")
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_study_repeats_three_settings_in_another_process(wall: Path, jobs: int) -> None:
+def test_a_study_repeats_three_settings_in_another_process(
+    wall: Path, jobs: int
+) -> None:
     """A hash of a text is the same in all workers, a process's number is not."""
     options = ("study", "wall.toml", "--out", f"results-{jobs}", "--jobs", f"{jobs}")
     for value in ("1 + hash('a') % 9973", "1 + os.getpid() % 997"):
         (wall.parent / "reads.py").write_text(READS.replace("READ", value, 1))
         wall.write_text(STUDY.replace("models:Wall", "reads:Reads"))
         if "pid" in value:
-            refused(*options[:3], "other", *options[4:], message=("in another process",))
+            refused(
+                *options[:3], "other", *options[4:], message=("in another process",)
+            )
         else:
             run(*options)
             assert "in a new process" in run("check", "wall.toml", expect=1).stdout
@@ -880,12 +991,16 @@ def test_a_study_repeats_three_settings_in_another_process(wall: Path, jobs: int
 def test_what_an_object_keeps_of_another_point_is_found(wall: Path) -> None:
     """Here an object that is put into the simulator in its first run."""
     lazy = "getattr(self, 'road', None) or type('Road', (), {'length': self.gap})()"
-    text = READS.replace("READ", f"(self.__dict__.setdefault('road', {lazy})).length / 40", 1)
+    text = READS.replace(
+        "READ", f"(self.__dict__.setdefault('road', {lazy})).length / 40", 1
+    )
     (wall.parent / "reads.py").write_text(text)
     tests = '\n[[matrix.tests]]\nname = "a"\nover = { gap = [40.0, 60.0] }\n'
     wall.write_text(STUDY.replace("models:Wall", "reads:Reads") + tests)
     assert "in a new process" in run("check", "wall.toml", expect=1).stdout
-    refused("study", "wall.toml", "--out", "results", message=("points in another order",))
+    refused(
+        "study", "wall.toml", "--out", "results", message=("points in another order",)
+    )
 
 
 @SLOW
@@ -893,7 +1008,13 @@ def test_a_library_of_the_search_counts_if_the_simulator_uses_it(wall: Path) -> 
     run("study", "wall.toml", "--out", "results")
     manifest = Path("results/manifest.json")
     manifest.write_text(manifest.read_text().replace(np.__version__, "1.0"))
-    refused("study", "wall.toml", "--out", "results", message=("version of numpy was '1.0'",))
+    refused(
+        "study",
+        "wall.toml",
+        "--out",
+        "results",
+        message=("version of numpy was '1.0'",),
+    )
     stored, now = ({"versions": {"numpy": one}, "study": {}} for one in ("1.0", "1.1"))
     for libraries, matters in ([], False), (["numpy"], True):
         (change,) = manifest_differences(stored, {**now, "libraries": libraries})

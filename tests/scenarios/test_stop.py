@@ -34,7 +34,9 @@ def distances(system: System, **changes: float) -> FloatArray:
     """Stopping distances of the original vehicle with some changes, from every speed [m]."""
     values = system.characteristics.named(system.characteristics.original) | changes
     results = simulate_all_points(system, np.array([[*values.values()]]))
-    return np.array([result.evaluations.metrics["stopping_distance"][0] for result in results])
+    return np.array(
+        [result.evaluations.metrics["stopping_distance"][0] for result in results]
+    )
 
 
 @pytest.mark.parametrize(
@@ -47,11 +49,14 @@ def test_a_stop_by_constant_friction_is_v_squared_over_two_mu_g(
     """From the first brake force on: a delay of the brake changes nothing, also within a step."""
     speeds = np.array([10.0, 30.0, 50.0, 80.0, 81.7, 120.0, 250.0])
     system = stops(
-        {"name": "polished", "road_friction": friction, "visibility": 1.0}, *speeds.tolist()
+        {"name": "polished", "road_friction": friction, "visibility": 1.0},
+        *speeds.tolist(),
     )
     mu = system.vehicle.tyre_friction * friction  # type: ignore[attr-defined]
     expected = (speeds / KMH_PER_MS) ** 2 / (2 * mu * GRAVITY)
-    assert distances(system, brakeResponse=brake_response) == pytest.approx(expected, abs=0.01)
+    assert distances(system, brakeResponse=brake_response) == pytest.approx(
+        expected, abs=0.01
+    )
 
 
 def test_the_driving_system_is_not_asked_and_simulate_says_how_far_it_went() -> None:

@@ -30,7 +30,9 @@ SPEED = 72.0 / 3.6
 class Cast(TrackScenario):
     """Bodies that a test names, around a vehicle at 72 km/h."""
 
-    def __init__(self, *cast: Any, duration: float = 6.0, test_speed: float | None = None) -> None:
+    def __init__(
+        self, *cast: Any, duration: float = 6.0, test_speed: float | None = None
+    ) -> None:
         # type: ignore[misc]
         self.cast = cast
         self.duration = duration
@@ -45,7 +47,9 @@ def standing(x: float) -> Any:
     return lambda times: Track.of("standing", "car", x, 0.0)
 
 
-def moving(name: str, x: float, y: float, vx: float, vy: float, kind: str = "car") -> Any:
+def moving(
+    name: str, x: float, y: float, vx: float, vy: float, kind: str = "car"
+) -> Any:
     return lambda times: Track.of(name, kind, x + vx * times, y + vy * times, vx, vy)
 
 
@@ -68,7 +72,9 @@ def test_a_cast_of_five_is_hit_by_whoever_comes_first() -> None:
     run = held(*cast)
     assert run.outcome[0] == Outcome.COLLISION
     end = run.trace.last_active[0]
-    assert run.trace.time[end] == pytest.approx(math.ceil((60 - 0.25) / SPEED / 0.05) * 0.05)
+    assert run.trace.time[end] == pytest.approx(
+        math.ceil((60 - 0.25) / SPEED / 0.05) * 0.05
+    )
     assert run.trace.lateral[end, 0] == pytest.approx(-4.0 + 1.2 * run.trace.time[end])
     gone = held(*cast[:4])
     assert gone.outcome[0] == Outcome.PASSED
@@ -79,7 +85,9 @@ def test_a_cast_of_five_is_hit_by_whoever_comes_first() -> None:
 
 def test_who_is_not_there_neither_moves_nor_jumps() -> None:
     late = moving("late", -20.0, 4.0, 30.0, 0.0)
-    arrives = held(lambda times: late(times)._replace(length=np.where(times < 1, 0.0, 4.0)))
+    arrives = held(
+        lambda times: late(times)._replace(length=np.where(times < 1, 0.0, 4.0))
+    )
     assert arrives.outcome[0] == Outcome.TIMEOUT
     gone = [np.full((1, 1), value) for value in (0.0, 0.0, 60.0, 4.0, 1.0, 0.0, 10.0)]
     assert Moving.of(Track("gone", "car", *gone), 0.05, WIDTH).level.tolist() == [0]
@@ -95,10 +103,16 @@ def test_a_contact_at_the_side_counts_but_in_a_test_of_the_front() -> None:
     assert held(cast, test_speed=SPEED).outcome[0] != Outcome.COLLISION
 
 
-@pytest.mark.parametrize(("kind", "middle"), [("adult", 1.15 + 0.25), ("car", 1.15 + 1.712 / 2)])
-def test_a_driver_watches_his_corridor_up_to_the_bodys_side(kind: str, middle: float) -> None:
+@pytest.mark.parametrize(
+    ("kind", "middle"), [("adult", 1.15 + 0.25), ("car", 1.15 + 1.712 / 2)]
+)
+def test_a_driver_watches_his_corridor_up_to_the_bodys_side(
+    kind: str, middle: float
+) -> None:
     for beside, brakes in ((middle - 0.01, True), (middle + 0.01, False)):
-        run = driven(Cast(lambda times, y=beside: Track.of("body", kind, 60.0, y)), Aeb())
+        run = driven(
+            Cast(lambda times, y=beside: Track.of("body", kind, 60.0, y)), Aeb()
+        )
         assert (run.trace.brake[run.trace.active] == 1).any() == brakes
 
 
@@ -108,8 +122,12 @@ def test_what_stands_before_another_body_hides_it_until_it_leaves() -> None:
     gap = run.trace.gap[:, 0]
     shown = int(np.argmax(np.abs(np.diff(gap)) > 10)) + 1
     lateral = 1.75 * run.trace.time[shown]
-    assert gap[shown] == pytest.approx(110.0 - 4.023 / 2 - SPEED * run.trace.time[shown])
-    assert lateral - 0.9 < WIDTH / 2 + 2.2, "only after the leader has gone far enough to the side"
+    assert gap[shown] == pytest.approx(
+        110.0 - 4.023 / 2 - SPEED * run.trace.time[shown]
+    )
+    assert lateral - 0.9 < WIDTH / 2 + 2.2, (
+        "only after the leader has gone far enough to the side"
+    )
     assert run.outcome[0] == Outcome.COLLISION
 
 
@@ -135,7 +153,9 @@ def test_a_braking_leader_is_avoided_only_once_he_has_stopped_braking() -> None:
     assert gap.min() == pytest.approx(1.63, abs=0.005), (
         "4.95 m at 12 m/s, where the leader still brakes"
     )
-    assert gap[run.trace.speed[run.trace.active] >= 12].min() == pytest.approx(4.95, abs=0.02)
+    assert gap[run.trace.speed[run.trace.active] >= 12].min() == pytest.approx(
+        4.95, abs=0.02
+    )
 
 
 def body_of(*quantities: Any) -> Body:
@@ -170,7 +190,8 @@ def test_distance_and_overlap_of_bodies_agree_with_points_on_them(
     assert distance == pytest.approx(np.hypot(*outside).min(), abs=0.06)
     depth = float(
         find_overlaps(
-            body_of([0, 0], [1, 0], LENGTH, WIDTH), body_of([x, y], [cosine, sine], length, width)
+            body_of([0, 0], [1, 0], LENGTH, WIDTH),
+            body_of([x, y], [cosine, sine], length, width),
         )[0]
     )
     assert (depth > 1e-9) == (distance == 0) or abs(depth) < 1e-6

@@ -23,7 +23,12 @@ from safevar_sumo.plugins import read_only
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
 from safevar_sumo.search.baselines import Ranges
-from safevar_sumo.search.genetic import Individual, fitness_class, run_tournament, select_survivors
+from safevar_sumo.search.genetic import (
+    Individual,
+    fitness_class,
+    run_tournament,
+    select_survivors,
+)
 from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
 from safevar_sumo.search.surrogate import _learn
 from safevar_sumo.study import ORIGINAL_DEGREE
@@ -33,7 +38,9 @@ from tests.made_up import made_up_evaluations
 
 SUN = CharacteristicSet.of(load_study("sun"))
 POPULATION = 20
-OURS = [pytest.param(name, marks=SLOW if name == "surrogate" else ()) for name in ALGORITHMS]
+OURS = [
+    pytest.param(name, marks=SLOW if name == "surrogate" else ()) for name in ALGORITHMS
+]
 """Our algorithms; fitting models takes seconds."""
 REQUIRED = {
     "pymoo:RNSGA2": {"ref_points": [[0.5, 0.3, 6.0], [1.0, 0.1, 4.0]]},
@@ -59,8 +66,12 @@ def evaluated(
 
 def sphere(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
     """The nearer a setting is to the lower ends of the domains, the safer it is."""
-    share = (settings - characteristics.lower) / (characteristics.upper - characteristics.lower)
-    return evaluated(characteristics, settings, np.add.accumulate(share**2, axis=1)[:, -1])
+    share = (settings - characteristics.lower) / (
+        characteristics.upper - characteristics.lower
+    )
+    return evaluated(
+        characteristics, settings, np.add.accumulate(share**2, axis=1)[:, -1]
+    )
 
 
 def failing(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
@@ -72,7 +83,9 @@ def failing(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluat
     return dataclasses.replace(good, outcome=outcome, metrics=metrics)
 
 
-def steps_of(search: Search, evaluate: Callable[[FloatArray], Evaluations]) -> Iterator[Any]:
+def steps_of(
+    search: Search, evaluate: Callable[[FloatArray], Evaluations]
+) -> Iterator[Any]:
     """The requests of a search, then its result."""
     answer = None
     try:
@@ -135,12 +148,16 @@ def test_the_budget_is_kept_to_the_evaluation(name: str, evaluations: int) -> No
         for name in (*ALGORITHMS, *PYMOO_ALGORITHMS)
     ],
 )
-def test_every_algorithm_keeps_the_contract_and_runs_in_turn_are_runs_alone(name: str) -> None:
+def test_every_algorithm_keeps_the_contract_and_runs_in_turn_are_runs_alone(
+    name: str,
+) -> None:
     """Two runs that take turns, while others draw from numpy's global state."""
     alone = [list(begun(built(name), seed, 130, failing)) for seed in (1, 2)]
     np.random.seed(5)
     in_turn = []
-    for pair in zip_longest(*(begun(built(name), seed, 130, failing) for seed in (1, 2))):
+    for pair in zip_longest(
+        *(begun(built(name), seed, 130, failing) for seed in (1, 2))
+    ):
         in_turn.append(pair)
         state = np.random.random()
     np.random.seed(5)
@@ -154,7 +171,9 @@ def test_every_algorithm_keeps_the_contract_and_runs_in_turn_are_runs_alone(name
         assert np.all((every >= SUN.lower) & (every <= SUN.upper))
         assert np.array_equal(SUN.filter(every), every)
         assert len(result)
-        assert {row.tobytes() for row in result.settings} <= {row.tobytes() for row in every}
+        assert {row.tobytes() for row in result.settings} <= {
+            row.tobytes() for row in every
+        }
         assert result.valid.all()
     assert not np.array_equal(*in_turn[0]) or name == "pymoo:DIRECT", "another seed"
 
@@ -163,7 +182,9 @@ def test_every_algorithm_keeps_the_contract_and_runs_in_turn_are_runs_alone(name
 def test_the_result_is_non_dominated(name: str) -> None:
     solutions = searched(name, 7, 600)[0]
     assert len(solutions) > 0
-    objectives = np.stack([solutions.f_safe, solutions.f_diff, solutions.f_num_diff], axis=1)
+    objectives = np.stack(
+        [solutions.f_safe, solutions.f_diff, solutions.f_num_diff], axis=1
+    )
     assert moocore.is_nondominated(objectives, keep_weakly=True).all()
 
 
@@ -171,7 +192,9 @@ def test_a_generation_is_fifty_and_changes_between_one_and_all() -> None:
     _, asked = searched("safe_fuzzer", 1, 500)
     assert [len(settings) for settings in asked] == [50] * 10
     changed = np.concatenate([SUN.number_changed(settings) for settings in asked])
-    assert set(changed) == set(range(1, 13)), "k is uniform in 1..n before the first update"
+    assert set(changed) == set(range(1, 13)), (
+        "k is uniform in 1..n before the first update"
+    )
     assert np.bincount(changed.astype(int))[1:].min() > 500 / 12 / 2
 
 
@@ -180,19 +203,31 @@ def test_safe_fuzzer_ends_after_five_generations_without_improvement() -> None:
         (Characteristic(name="c", unit="-", original=5.0, lower=4.0, upper=6.0),)
     )
 
-    def constant(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
-        return evaluated(characteristics, np.full_like(settings, 6.0), np.ones(len(settings)))
+    def constant(
+        characteristics: CharacteristicSet, settings: FloatArray
+    ) -> Evaluations:
+        return evaluated(
+            characteristics, np.full_like(settings, 6.0), np.ones(len(settings))
+        )
 
-    _, asked = searched("safe_fuzzer", 4, 5000, characteristics=single, evaluate=constant)
+    _, asked = searched(
+        "safe_fuzzer", 4, 5000, characteristics=single, evaluate=constant
+    )
     assert sum(len(settings) for settings in asked) == 500 + 5 * 50
 
 
-def test_a_score_is_relative_to_its_generation_and_the_fifty_best_are_the_result() -> None:
+def test_a_score_is_relative_to_its_generation_and_the_fifty_best_are_the_result() -> (
+    None
+):
     solutions, asked = searched("safe_fuzzer", 6, 5000)
     scores = []
     for generation in (sphere(SUN, settings) for settings in asked):
-        sd_norm = (generation.f_safe - generation.f_safe.min()) / np.ptp(generation.f_safe)
-        scores.append((6 * sd_norm + generation.f_diff + (generation.f_num_diff - 1) / 11) / 8)
+        sd_norm = (generation.f_safe - generation.f_safe.min()) / np.ptp(
+            generation.f_safe
+        )
+        scores.append(
+            (6 * sd_norm + generation.f_diff + (generation.f_num_diff - 1) / 11) / 8
+        )
     best = np.argsort(np.concatenate(scores), kind="stable")[:50]
     assert np.array_equal(solutions.settings, np.concatenate(asked)[best])
     lowest = np.minimum.accumulate([score.min() for score in scores])
@@ -203,7 +238,9 @@ def test_a_score_is_relative_to_its_generation_and_the_fifty_best_are_the_result
 
 
 @SLOW
-def test_the_surrogate_finds_more_than_nsga2_with_four_times_as_many_simulations() -> None:
+def test_the_surrogate_finds_more_than_nsga2_with_four_times_as_many_simulations() -> (
+    None
+):
     few, many = (
         PUBLISHED_SCORING.values(searched(name, 1, count)[0])
         for name, count in (("surrogate", 100), ("nsga2", 400))
@@ -213,10 +250,14 @@ def test_the_surrogate_finds_more_than_nsga2_with_four_times_as_many_simulations
 
 
 def test_the_surrogate_uses_its_budget_where_no_original_vehicle_is_safe() -> None:
-    def never_safe(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
+    def never_safe(
+        characteristics: CharacteristicSet, settings: FloatArray
+    ) -> Evaluations:
         found = sphere(characteristics, settings)
         degrees = np.full(len(settings), -1.0)
-        return dataclasses.replace(found, metrics={**found.metrics, ORIGINAL_DEGREE: degrees})
+        return dataclasses.replace(
+            found, metrics={**found.metrics, ORIGINAL_DEGREE: degrees}
+        )
 
     scoring = msgspec.structs.replace(PUBLISHED_SCORING, safe_original=0.0)
     _, asked = searched("surrogate", 1, 45, evaluate=never_safe, scoring=scoring)
@@ -225,7 +266,8 @@ def test_the_surrogate_uses_its_budget_where_no_original_vehicle_is_safe() -> No
 
 TWO = CharacteristicSet(
     tuple(
-        Characteristic(name=name, unit="-", original=50.0, lower=0.0, upper=100.0) for name in "ab"
+        Characteristic(name=name, unit="-", original=50.0, lower=0.0, upper=100.0)
+        for name in "ab"
     )
 )
 
@@ -250,17 +292,22 @@ def test_survivors_are_those_of_deap(
     expected = []
     for front in fronts:
         tools.emo.assignCrowdingDist(front)
-        expected += sorted(front, key=lambda one: one.fitness.crowding_dist, reverse=True)
+        expected += sorted(
+            front, key=lambda one: one.fitness.crowding_dist, reverse=True
+        )
     places = [
         next(i for i, one in enumerate(ours) if one is survivor)
         for survivor in select_survivors(ours, number)
     ]
     assert places == [
-        next(i for i, one in enumerate(deaps) if one is survivor) for survivor in expected[:number]
+        next(i for i, one in enumerate(deaps) if one is survivor)
+        for survivor in expected[:number]
     ]
 
 
-def test_feasible_individuals_survive_before_infeasible_ones_which_the_violation_orders() -> None:
+def test_feasible_individuals_survive_before_infeasible_ones_which_the_violation_orders() -> (
+    None
+):
     worst_feasible, best, slightly, badly = individuals(
         (9, 9, 9), (0, 1, 0), (-9, 0, 0), (-99, 0, 0)
     )
@@ -287,7 +334,9 @@ def test_a_tournament_is_won_by_rank_then_by_crowding_distance() -> None:
 
 def problem() -> Problem:
     original = evaluated(TWO, TWO.original_settings, np.array([5.0]))
-    return Problem(characteristics=TWO, original=original, evaluations=1000, population=POPULATION)
+    return Problem(
+        characteristics=TWO, original=original, evaluations=1000, population=POPULATION
+    )
 
 
 def window(settings: list[list[float]], safety: list[float]) -> Evaluations:
@@ -302,7 +351,9 @@ def test_models_predict_beyond_what_is_known_and_changes_are_computed() -> None:
     assert predicted.f_diff[0] == predicted.f_num_diff[0] == 1
 
 
-def test_ranges_narrow_to_means_of_the_unsafe_alone_and_never_across_the_original() -> None:
+def test_ranges_narrow_to_means_of_the_unsafe_alone_and_never_across_the_original() -> (
+    None
+):
     ranges = Ranges(problem())
     ranges.narrow(window([[60, 50], [80, 40], [90, 10], [0, 0]], [4.0, 4.9, 5.0, 6.0]))
     assert ranges.upper.tolist() == [70, 100]
@@ -313,19 +364,25 @@ def test_ranges_narrow_to_means_of_the_unsafe_alone_and_never_across_the_origina
     ("settings", "most"),
     [([[60, 50], [60, 40]], 2), ([[60, 50], [60, 50], [60, 40]], 1), ([[60, 50]], 1)],
 )
-def test_the_number_of_changes_is_rounded_half_up(settings: list[list[float]], most: int) -> None:
+def test_the_number_of_changes_is_rounded_half_up(
+    settings: list[list[float]], most: int
+) -> None:
     ranges = Ranges(problem())
     ranges.narrow(window(settings, [1.0] * len(settings)))
     assert ranges.max_changes == most, "a mean of 1.5 makes 2, of 4/3 makes 1"
 
 
-@pytest.mark.parametrize("options", [{"tournament_size": 3}, {"mutation_probability": 1.0}])
+@pytest.mark.parametrize(
+    "options", [{"tournament_size": 3}, {"mutation_probability": 1.0}]
+)
 def test_options_change_what_a_search_asks_for(options: dict[str, object]) -> None:
     asked, usual = (list(begun(built("nsga2", **one), 1, 200)) for one in (options, {}))
     assert not np.array_equal(asked[-2], usual[-2])
 
 
 def test_what_user_code_was_sent_and_returns_can_go_to_another_process() -> None:
-    sent = read_only(dataclasses.replace(sphere(SUN, np.ones((2, len(SUN)))), reasons={b"1": "?"}))
+    sent = read_only(
+        dataclasses.replace(sphere(SUN, np.ones((2, len(SUN)))), reasons={b"1": "?"})
+    )
     returned = pickle.loads(pickle.dumps(sent.take([1])))
     assert (len(returned), returned.reasons) == (1, {b"1": "?"})

@@ -40,20 +40,27 @@ def test_arguments_reach_the_algorithm() -> None:
         )
     }
     assert sizes == {91: 91, 15: 15, 2: 2}
-    assert [len(asked) for asked in begun(built("pymoo:GA"), 1, 60)][:3] == [POPULATION] * 3, (
-        "the study's population"
-    )
-    assert [len(asked) for asked in begun(built("pymoo:GA", pop_size=9), 1, 60)][:3] == [9] * 3
+    assert [len(asked) for asked in begun(built("pymoo:GA"), 1, 60)][:3] == [
+        POPULATION
+    ] * 3, "the study's population"
+    assert [len(asked) for asked in begun(built("pymoo:GA", pop_size=9), 1, 60)][
+        :3
+    ] == [9] * 3
 
 
 @pytest.mark.parametrize(
     "name",
     [
         "pymoo:GA",
-        *(pytest.param(f"pymoo:{name}", marks=SLOW) for name in ("CMAES", "DE", "NSGA2", "MOEAD")),
+        *(
+            pytest.param(f"pymoo:{name}", marks=SLOW)
+            for name in ("CMAES", "DE", "NSGA2", "MOEAD")
+        ),
     ],
 )
-def test_an_encounter_in_which_the_original_is_not_safe_is_infeasible(name: str) -> None:
+def test_an_encounter_in_which_the_original_is_not_safe_is_infeasible(
+    name: str,
+) -> None:
     """The original vehicle is safe in the upper half of the first domain: there the sphere, which
     an algorithm for one objective minimises alone, is 1/4 or more.
     """
@@ -120,7 +127,10 @@ def test_an_option_with_which_pymoo_fails_is_refused_with_its_message(
     name: str, table: JsonObject, error: str, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError) as refused:
-        run(with_pymoo([f"pymoo:{name}"], parameters={f"pymoo:{name}": table}), tmp_path / "out")
+        run(
+            with_pymoo([f"pymoo:{name}"], parameters={f"pymoo:{name}": table}),
+            tmp_path / "out",
+        )
     assert error in str(refused.value)
     assert str(refused.value).count("\n") == 1
 
@@ -148,13 +158,18 @@ def test_an_algorithm_that_leaves_most_of_its_budget_is_named_unless_it_says_so(
         < counts["rs"]
     )
     remark = str(warned[-1].message)
-    assert f"PSO (pymoo) {counts['pymoo_PSO']} of 60 (equal vehicles are simulated once)" in remark
+    assert (
+        f"PSO (pymoo) {counts['pymoo_PSO']} of 60 (equal vehicles are simulated once)"
+        in remark
+    )
     assert f"CMAES (pymoo) {counts['pymoo_CMAES']} of 60 (it ended early)" in remark
     assert "SafeFuzzer" not in remark
     assert remark in str(tables(results.directory).to_dict())
 
 
-def test_without_pymoo_the_error_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pymoo_the_error_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "pymoo.config", None)
     with pytest.raises(InputError, match=r"pip install '\.\[pymoo\]'"):
         pymoo_algorithm("pymoo:GA")

@@ -30,7 +30,8 @@ def zdt3(x: FloatArray) -> FloatArray:
     first = x[:, 0]
     g = 1 + 9 * x[:, 1:].mean(axis=1)
     return np.stack(
-        [first, g * (1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first))], axis=1
+        [first, g * (1 - np.sqrt(first / g) - first / g * np.sin(10 * np.pi * first))],
+        axis=1,
     )
 
 
@@ -91,7 +92,9 @@ class StandardScoring:
 
 
 def standard_problem(
-    standard: StandardProblem, evaluations: int = EVALUATIONS, population: int = POPULATION
+    standard: StandardProblem,
+    evaluations: int = EVALUATIONS,
+    population: int = POPULATION,
 ) -> Problem:
     unit = Unfiltered(
         tuple(
@@ -111,14 +114,17 @@ def standard_problem(
 
 def result_of(search: Search, problem: Problem) -> Evaluations:
     *_, result = steps_of(
-        search, lambda asked: evaluated(problem.characteristics, asked, np.zeros(len(asked)))
+        search,
+        lambda asked: evaluated(problem.characteristics, asked, np.zeros(len(asked))),
     )
     return result  # type: ignore[no-any-return]
 
 
 def front_of_ours(standard: StandardProblem, seed: int) -> FloatArray:
     problem = standard_problem(standard)
-    result = result_of(ALGORITHMS["nsga2"]().search(problem, np.random.default_rng(seed)), problem)
+    result = result_of(
+        ALGORITHMS["nsga2"]().search(problem, np.random.default_rng(seed)), problem
+    )
     return problem.scoring.values(result)
 
 
@@ -142,7 +148,9 @@ def front_of_jmetal(standard: StandardProblem, seed: int) -> FloatArray:
             return "standard"
 
         def evaluate(self, solution: Any) -> Any:
-            solution.objectives = standard.objectives(np.array([solution.variables]))[0].tolist()
+            solution.objectives = standard.objectives(np.array([solution.variables]))[
+                0
+            ].tolist()
             return solution
 
     random.seed(seed)
@@ -150,7 +158,9 @@ def front_of_jmetal(standard: StandardProblem, seed: int) -> FloatArray:
     search = NSGAII(
         problem=Theirs(),
         population_size=POPULATION,
-        mutation=PolynomialMutation(probability=1 / standard.variables, distribution_index=20),
+        mutation=PolynomialMutation(
+            probability=1 / standard.variables, distribution_index=20
+        ),
         crossover=SBXCrossover(probability=0.9, distribution_index=20),
         termination_criterion=StoppingByEvaluations(max_evaluations=EVALUATIONS),
         offspring_population_size=POPULATION,
@@ -165,7 +175,10 @@ def front_of_jmetal(standard: StandardProblem, seed: int) -> FloatArray:
 def test_hypervolumes_reach_those_of_the_second_implementation(problem: str) -> None:
     standard = PROBLEMS[problem]
     ours, others = (
-        [moocore.hypervolume(front(standard, seed), ref=standard.reference) for seed in SEEDS]
+        [
+            moocore.hypervolume(front(standard, seed), ref=standard.reference)
+            for seed in SEEDS
+        ]
         for front in (front_of_ours, front_of_jmetal)
     )
     assert np.mean(ours) >= 0.98 * np.mean(others), (np.mean(ours), np.mean(others))

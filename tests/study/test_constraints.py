@@ -87,7 +87,11 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     below = ("--unsafe", "below=2.5", "--fits", "0")
     explained = json_of("explain", "out", *below, "--top", "2", "--quick")
     tolerance = json_of(
-        "tolerance", "bound.toml", *below, "--characteristics", "tireFric,mass,maxBrakeTorque"
+        "tolerance",
+        "bound.toml",
+        *below,
+        "--characteristics",
+        "tireFric,mass,maxBrakeTorque",
     )
     boundaries = [cause["boundary"] for cause in explained["tables"]["causes"]["rows"]]
     alone = [
@@ -109,7 +113,9 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
         assert "mass - maxBrakeTorque at least 700 kg" in words, question
 
 
-def test_random_settings_of_a_narrow_region_are_as_many_as_asked_for_and_all_feasible() -> None:
+def test_random_settings_of_a_narrow_region_are_as_many_as_asked_for_and_all_feasible() -> (
+    None
+):
     region = region_of(load_study("rain_realistic"))
     lower = region.characteristics.lower
     upper = region.characteristics.upper
@@ -121,8 +127,12 @@ def test_random_settings_of_a_narrow_region_are_as_many_as_asked_for_and_all_fea
     assert region.feasible(region.characteristics.filter(drawn)).all()
 
 
-def test_an_unfeasible_setting_is_simulated_only_where_that_is_asked_for(bound: Path) -> None:
-    with pytest.raises(InputError, match="violates a constraint: mass - maxBrakeTorque = 540 kg"):
+def test_an_unfeasible_setting_is_simulated_only_where_that_is_asked_for(
+    bound: Path,
+) -> None:
+    with pytest.raises(
+        InputError, match="violates a constraint: mass - maxBrakeTorque = 540 kg"
+    ):
         sv.simulate("bound.toml", {"mass": 2040})
     assert sv.simulate("bound.toml", {"mass": 2040}, beyond=True).outcome
     with pytest.raises(InputError, match="violates a constraint"):

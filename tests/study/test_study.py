@@ -19,7 +19,15 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.results.identity import evaluation_keys
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
-from safevar_sumo.study import Limit, Origin, Study, limits_of, study_names, tables_of, write_study
+from safevar_sumo.study import (
+    Limit,
+    Origin,
+    Study,
+    limits_of,
+    study_names,
+    tables_of,
+    write_study,
+)
 from safevar_sumo.study.file_schema import schema_text
 from safevar_sumo.sumo.system import assemble
 
@@ -28,7 +36,9 @@ VALIDATOR = jsonschema.Draft7Validator(json.loads(STUDY_SCHEMA.read_text()))
 
 def is_accepted(text: str) -> bool:
     """An editor has no number that is not one: it becomes null."""
-    return VALIDATOR.is_valid(msgspec.json.decode(msgspec.json.encode(tomllib.loads(text))))
+    return VALIDATOR.is_valid(
+        msgspec.json.decode(msgspec.json.encode(tomllib.loads(text)))
+    )
 
 
 def with_remarks(study: str, **changes: Any) -> tuple[Study, list[str]]:
@@ -68,8 +78,12 @@ def test_an_axis_of_all_tests_that_no_test_takes_is_named(in_tmp: Path) -> None:
     shared = "[scenario.over]\nspeed = { at = [20, 35], upper = 45 }\n"
     Path("mine.toml").write_text(f'extends = "wear"\n{shared}')
     _, remarks = with_remarks("mine.toml")
-    assert remarks == ["scenario.over.speed has no effect: each test has an axis of this name"]
-    Path("mine.toml").write_text(f'extends = "wear"\n{shared}[[matrix.tests]]\nname = "one"\n')
+    assert remarks == [
+        "scenario.over.speed has no effect: each test has an axis of this name"
+    ]
+    Path("mine.toml").write_text(
+        f'extends = "wear"\n{shared}[[matrix.tests]]\nname = "one"\n'
+    )
     _, remarks = with_remarks("mine.toml")
     assert not [text for text in remarks if "no effect" in text]
 
@@ -83,7 +97,8 @@ def test_a_study_without_a_title_is_called_as_itself_and_never_as_the_study_that
     Path("headed.toml").write_text('extends = "metric.toml"\ntitle = "A heading"\n')
     Path("heir.toml").write_text('extends = "headed.toml"\n')
     titles = [
-        read_study(f"{name}.toml").title for name in ("mine", "metric", "rash", "headed", "heir")
+        read_study(f"{name}.toml").title
+        for name in ("mine", "metric", "rash", "headed", "heir")
     ]
     assert titles == ["mine", "own", "rash", "A heading", "A heading"]
 
@@ -117,7 +132,10 @@ ROWS = read_study("native").vehicle.characteristics
 
 
 def test_a_text_replaces_a_limit_of_the_study_and_names_follow_the_study() -> None:
-    stated = {"decel": Limit(at_least=5, source="workshop"), "mass": Limit(at_most=1900)}
+    stated = {
+        "decel": Limit(at_least=5, source="workshop"),
+        "mass": Limit(at_most=1900),
+    }
     texts = ["decel >= 6.5", "actuatorLag<=.3", " mass >= 1.4e3", "mass <= 1800"]
     limits = limits_of(texts, ROWS, stated)
     assert list(limits) == ["mass", "decel", "actuatorLag"]
@@ -125,31 +143,47 @@ def test_a_text_replaces_a_limit_of_the_study_and_names_follow_the_study() -> No
     assert limits["decel"].interval(ROWS["decel"]) == (6.5, 9.5)
     assert limits["actuatorLag"].interval(ROWS["actuatorLag"]) == (0.1, 0.3)
     assert limits["mass"].interval(ROWS["mass"]) == (1400, 1800)
-    assert limits_of([], ROWS, stated) == {"mass": stated["mass"], "decel": stated["decel"]}
+    assert limits_of([], ROWS, stated) == {
+        "mass": stated["mass"],
+        "decel": stated["decel"],
+    }
 
 
 @pytest.mark.parametrize("name", study_names())
 def test_a_study_that_another_process_received_has_the_same_tables(name: str) -> None:
     study = read_study(
-        name, variation={next(iter(read_study(name).domains)): {"distribution": "triangular"}}
+        name,
+        variation={
+            next(iter(read_study(name).domains)): {"distribution": "triangular"}
+        },
     )
     assert json.loads(json.dumps(tables_of(study))) == tables_of(study)
     assert tables_of(pickle.loads(pickle.dumps(study))) == tables_of(study)
-    assert read_study(tables_of(study)) == msgspec.structs.replace(study, origin=Origin())
+    assert read_study(tables_of(study)) == msgspec.structs.replace(
+        study, origin=Origin()
+    )
 
 
 def test_limits_change_no_result_and_a_study_without_them_keeps_its_tables() -> None:
-    study = read_study("native", limits={"decel": {"at_least": 6, "source": "workshop manual"}})
-    assert evaluation_keys(tables_of(study)) == evaluation_keys(tables_of(read_study("native")))
+    study = read_study(
+        "native", limits={"decel": {"at_least": 6, "source": "workshop manual"}}
+    )
+    assert evaluation_keys(tables_of(study)) == evaluation_keys(
+        tables_of(read_study("native"))
+    )
     assert "limits" not in tables_of(read_study("native"))
     assert read_study(tables_of(study)).limits == study.limits
 
 
-def test_what_was_not_measured_changes_no_result_and_is_not_inherited(in_tmp: Path) -> None:
+def test_what_was_not_measured_changes_no_result_and_is_not_inherited(
+    in_tmp: Path,
+) -> None:
     stated = {"decel": {"value": 8, "source": "assumption"}, "mass": 1600}
     study = read_study("native", unmeasured=stated)
     assert study.unmeasured_values == {"decel": 8, "mass": 1600}
-    assert evaluation_keys(tables_of(study)) == evaluation_keys(tables_of(read_study("native")))
+    assert evaluation_keys(tables_of(study)) == evaluation_keys(
+        tables_of(read_study("native"))
+    )
     assert read_study(tables_of(study)).unmeasured == study.unmeasured
     write_study(in_tmp / "mine.toml", study, "")
     assert read_study("mine.toml").unmeasured == study.unmeasured
@@ -160,7 +194,12 @@ def test_what_was_not_measured_changes_no_result_and_is_not_inherited(in_tmp: Pa
 def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
     scenario = {"model": "crossing", "parameters": {"test": "CPNA", "speed": 30}}
     study = read_study(
-        {"extends": "wear", "name": "mine", "scenario": scenario, "matrix": {"tests": []}}
+        {
+            "extends": "wear",
+            "name": "mine",
+            "scenario": scenario,
+            "matrix": {"tests": []},
+        }
     )
     assert study.matrix is None
     assert [point.scenario.test for point in assemble(study).points] == ["CPNA"]
@@ -179,11 +218,17 @@ def test_what_is_about_tests_that_a_study_replaces_ends_with_them() -> None:
     crash = {"tests": [{**CRASH, "over": {"speed": [20, 40]}}]}
     assert read_study("alks", matrix=crash).constraints == []
     assert read_study("alks", matrix={"tests": []}, weather="clear").constraints == []
-    cut_out = next(test for test in tables_of(read_study("alks"))["matrix"]["tests"][1:])
-    (kept,) = read_study("alks", matrix={"tests": [cut_out, *crash["tests"]]}).constraints
+    cut_out = next(
+        test for test in tables_of(read_study("alks"))["matrix"]["tests"][1:]
+    )
+    (kept,) = read_study(
+        "alks", matrix={"tests": [cut_out, *crash["tests"]]}
+    ).constraints
     assert kept.tests == ["cut_out"]
 
-    varied = {"walking_speed": {"distribution": "normal", "mean": 1.8, "deviation": 0.2}}
+    varied = {
+        "walking_speed": {"distribution": "normal", "mean": 1.8, "deviation": 0.2}
+    }
     base = tables_of(read_study("sun", encounters="ranges", variation=varied))
     heir = read_study({"extends": "sun", "name": "heir", "variation": {}}, matrix=crash)
     assert {*heir.scenario.over} == {"road_friction", "recognition_delay"}
@@ -202,7 +247,9 @@ def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
     assert study.matrix is None
     text = "mine.toml: has a different scenario than 'wear', so not its [matrix]"
     assert remarks == [f"{text}, vut_length of [scenario], vut_width of [scenario]"]
-    own, _ = with_remarks("wear", scenario=scenario, matrix={"tests": [{"name": "own"}]})
+    own, _ = with_remarks(
+        "wear", scenario=scenario, matrix={"tests": [{"name": "own"}]}
+    )
     assert [test.name for test in own.matrix.tests] == ["own"]
     same, remarks = with_remarks(
         "wear", scenario={"model": "crossing", "parameters": {"speed": 30}}
@@ -210,18 +257,35 @@ def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
     assert (same.matrix, remarks) == (read_study("wear").matrix, [])
 
 
-def test_a_study_of_another_scenario_says_which_parameters_it_does_not_inherit() -> None:
+def test_a_study_of_another_scenario_says_which_parameters_it_does_not_inherit() -> (
+    None
+):
     scenario = {"model": "car_to_car", "parameters": {"vut_length": 4.7, "speed": 30}}
     _, (remark,) = with_remarks("sun", scenario=scenario)
     lost = "distance of [scenario], recognition_delay of [scenario], road_friction of [scenario]"
     assert remark.endswith(f"{lost}, walking_speed of [scenario]")
 
 
-def test_a_value_counts_in_tests_and_a_range_of_the_same_parameter_in_its_place() -> None:
-    over = {"impact_location": {"original": 50, "lower": 20, "upper": 80, "short_name": "place"}}
-    scenario = {"model": "crossing", "parameters": {"impact_location": 25}, "over": over}
+def test_a_value_counts_in_tests_and_a_range_of_the_same_parameter_in_its_place() -> (
+    None
+):
+    over = {
+        "impact_location": {
+            "original": 50,
+            "lower": 20,
+            "upper": 80,
+            "short_name": "place",
+        }
+    }
+    scenario = {
+        "model": "crossing",
+        "parameters": {"impact_location": 25},
+        "over": over,
+    }
     for encounters, place in ("tests", 25), ("ranges", 50):
-        study = read_study("wear", encounters=encounters, scenario=scenario, matrix={"tests": []})
+        study = read_study(
+            "wear", encounters=encounters, scenario=scenario, matrix={"tests": []}
+        )
         assert assemble(study).points[0].scenario.impact_location == place
 
 
@@ -236,4 +300,6 @@ def test_a_study_of_another_driving_system_says_all_that_it_does_not_inherit() -
     assert study.spread == {}
     assert len(remarks) == 1
     assert remarks[0].endswith("has a different ADS than 'wear', so not its [spread]")
-    assert with_remarks("wear_rss")[1] == [], "a shipped study leaves keys out on purpose"
+    assert with_remarks("wear_rss")[1] == [], (
+        "a shipped study leaves keys out on purpose"
+    )

@@ -48,7 +48,9 @@ class Block(Vehicle):
 
     UNITS: Mapping[str, str] = {"brakes": "-"}
 
-    def prepare(self, characteristics: Any, road_friction: Any, step: float, *_: Any) -> Prepared:
+    def prepare(
+        self, characteristics: Any, road_friction: Any, step: float, *_: Any
+    ) -> Prepared:
         return Prepared(BRAKING * characteristics["brakes"] * road_friction, step)
 
     def sumo_type(self, prepared: Prepared) -> SumoType:
@@ -68,9 +70,14 @@ class Block(Vehicle):
         return seen, state
 
     def advance(self, prepared: Prepared, state: State, command: Command) -> State:
-        change = (PULL * command.throttle - prepared.braking * command.brake) * prepared.step
+        change = (
+            PULL * command.throttle - prepared.braking * command.brake
+        ) * prepared.step
         return State(
-            np.maximum(state.speed + change, 0.0), command.throttle, command.brake, state.gear
+            np.maximum(state.speed + change, 0.0),
+            command.throttle,
+            command.brake,
+            state.gear,
         )
 
 

@@ -32,11 +32,14 @@ def test_a_result_depends_neither_on_the_batch_nor_on_its_size(
     system = assemble(load_study(study))
     population = drawn(system, n, seed)
     together = drive_and_score(system, population)
-    some = data.draw(st.lists(st.integers(0, n - 1), min_size=1, max_size=n, unique=True))
+    some = data.draw(
+        st.lists(st.integers(0, n - 1), min_size=1, max_size=n, unique=True)
+    )
     for rows in (some, [0]):
         assert not [
             *differences(
-                together.take(rows).results, drive_and_score(system, population[rows]).results
+                together.take(rows).results,
+                drive_and_score(system, population[rows]).results,
             )
         ]
 
@@ -45,7 +48,9 @@ def test_the_original_vehicle_does_not_collide(
     any_system: System, request: pytest.FixtureRequest
 ) -> None:
     original = drive_and_score(any_system, original_of(any_system))
-    if request.node.callspec.id == "autoware_december":  # what docs/autoware.md is about
+    if (
+        request.node.callspec.id == "autoware_december"
+    ):  # what docs/autoware.md is about
         assert original.outcome[0] == Outcome.COLLISION
         return
     assert original.outcome[0] in (Outcome.STOPPED, Outcome.PASSED)
@@ -64,7 +69,12 @@ def test_vehicles_at_the_ends_of_all_domains_move_and_have_a_typed_outcome(
     ends[np.arange(n), np.arange(n)] = characteristics.lower
     ends[np.arange(n, 2 * n), np.arange(n)] = characteristics.upper
     run = drive_worst(any_system, ends[any_system.region.feasible(ends)])
-    assert set(run.outcome) <= {Outcome.STOPPED, Outcome.PASSED, Outcome.COLLISION, Outcome.TIMEOUT}
+    assert set(run.outcome) <= {
+        Outcome.STOPPED,
+        Outcome.PASSED,
+        Outcome.COLLISION,
+        Outcome.TIMEOUT,
+    }
     assert np.all(run.trace.speed.max(axis=0) > 1.0)
 
 
@@ -133,7 +143,13 @@ def observed(delay: float) -> tuple[FloatArray, FloatArray]:
     scene changes linearly.
     """
     perception = Perception(
-        [Weather(name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay)], STEP, 1
+        [
+            Weather(
+                name="any", road_friction=1.0, visibility=0.7, recognition_delay=delay
+            )
+        ],
+        STEP,
+        1,
     )
     seen = []
     for time in TIMES:
@@ -151,7 +167,12 @@ def observed(delay: float) -> tuple[FloatArray, FloatArray]:
             [
                 [
                     values[0]
-                    for values in (one.gap, one.closing_speed, one.lateral, one.lateral_speed)
+                    for values in (
+                        one.gap,
+                        one.closing_speed,
+                        one.lateral,
+                        one.lateral_speed,
+                    )
                 ]
                 for one in seen
             ]
@@ -160,7 +181,9 @@ def observed(delay: float) -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.0863, 0.1, 0.15])
-def test_the_scene_is_observed_with_delay_and_the_own_speed_without(delay: float) -> None:
+def test_the_scene_is_observed_with_delay_and_the_own_speed_without(
+    delay: float,
+) -> None:
     speed, scene = observed(delay)
     then = np.maximum(TIMES - delay, 0.0)
     assert speed == pytest.approx(5 + TIMES)
@@ -175,7 +198,13 @@ def test_the_scene_is_observed_with_delay_and_the_own_speed_without(delay: float
 
 def test_an_obstacle_that_appears_is_not_interpolated_from_infinity() -> None:
     perception = Perception(
-        [Weather(name="any", road_friction=1.0, visibility=1.0, recognition_delay=0.03)], STEP, 1
+        [
+            Weather(
+                name="any", road_friction=1.0, visibility=1.0, recognition_delay=0.03
+            )
+        ],
+        STEP,
+        1,
     )
     nothing = np.zeros(1)
     gaps = [

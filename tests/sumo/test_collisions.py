@@ -23,14 +23,22 @@ CHECKED = {"collision.mingap-factor": "0", "collision.check-junctions": "true"}
 OPTIONS = {
     "none at all": {},
     "SUMO's minGap": {"collision.action": "warn", "collision.check-junctions": "true"},
-    "no action": {"collision.action": "none", "intermodal-collision.action": "none", **CHECKED},
+    "no action": {
+        "collision.action": "none",
+        "intermodal-collision.action": "none",
+        **CHECKED,
+    },
     "accidents ignored": {"ignore-accidents": "true"},
     "colliders removed": {
         "collision.action": "remove",
         "intermodal-collision.action": "remove",
         **CHECKED,
     },
-    "colliders teleported": {"collision.action": "teleport", "time-to-teleport": "1", **CHECKED},
+    "colliders teleported": {
+        "collision.action": "teleport",
+        "time-to-teleport": "1",
+        **CHECKED,
+    },
     "colliders stop": {
         "collision.action": "warn",
         "collision.stoptime": "9",
@@ -67,7 +75,9 @@ def own_network(folder: Path, shipped: str) -> Path:
 def set_options(folder: Path, options: dict[str, str]) -> None:
     file = folder / "scenario.sumocfg"
     text = re.sub(r".*(ollision|ballistic|teleport).*\n", "", file.read_text())
-    elements = "".join(f'\n<{name} value="{value}"/>' for name, value in options.items())
+    elements = "".join(
+        f'\n<{name} value="{value}"/>' for name, value in options.items()
+    )
     file.write_text(text.replace("<processing>", f"<processing>{elements}"))
 
 
@@ -83,7 +93,9 @@ def simulated(
     base: str, network: Path, changes: dict[str, float], **tables: object
 ) -> sv.Simulation:
     scenario = {"model": network.name, "parameters": {"network": str(network)}}
-    return sv.simulate({"extends": base, "name": "mine", "scenario": scenario, **tables}, changes)
+    return sv.simulate(
+        {"extends": base, "name": "mine", "scenario": scenario, **tables}, changes
+    )
 
 
 @SLOW
@@ -101,7 +113,9 @@ def test_no_option_of_a_users_file_decides_what_a_collision_is(
         (2.27, -6.62), abs=0.005
     )
     hit = simulated(
-        "rain", crossing, {"tireFric": 1.0, "maxBrakeTorque": 1200.0, "dampRateZeroT_CE": 1.0}
+        "rain",
+        crossing,
+        {"tireFric": 1.0, "maxBrakeTorque": 1200.0, "dampRateZeroT_CE": 1.0},
     )
     assert hit.metrics["safety_degree"] == pytest.approx(-2.80, abs=0.005)
 
@@ -135,8 +149,12 @@ def test_options_of_the_web_wizard_give_the_same_answer_and_leave_json_alone(
         f'parameters = {{ network = "{network}" }}\n'
     )
     changes = [f"{name}={value}" for name, value in WEAK_BRAKES.items()]
-    answer = json_of("simulate", str(study), "--set", changes[0], "--set", changes[1], "--json")
-    shipped = sv.simulate({"extends": "native", "name": "finer", "step_length": 0.05}, WEAK_BRAKES)
+    answer = json_of(
+        "simulate", str(study), "--set", changes[0], "--set", changes[1], "--json"
+    )
+    shipped = sv.simulate(
+        {"extends": "native", "name": "finer", "step_length": 0.05}, WEAK_BRAKES
+    )
     assert answer["numbers"]["safety_degree"] == shipped.metrics["safety_degree"] < 0
     assert answer["tables"]["results"]["rows"][0]["original"] == "stopped"
     assert capfd.readouterr().out == ""  # of SUMO itself
@@ -156,13 +174,21 @@ def test_one_remark_names_the_options_that_are_overruled(tmp_path: Path) -> None
             "collision.action": "warn",
             "collision.mingap-factor": "0.0",
         },
-        {"step-method.ballistic": "true", "time-to-teleport": "0", "time-to-teleport.bidi": "-5"},
+        {
+            "step-method.ballistic": "true",
+            "time-to-teleport": "0",
+            "time-to-teleport.bidi": "-5",
+        },
     ):
         set_options(network, options)
         assert network_remarks(str(network)) == []
     set_options(
         network,
-        {"step-method.ballistic": "true", "time-to-teleport": "300", "collision.action": "none"},
+        {
+            "step-method.ballistic": "true",
+            "time-to-teleport": "300",
+            "collision.action": "none",
+        },
     )
     (remark,) = network_remarks(str(network))
     assert (
@@ -240,7 +266,10 @@ def test_centres_are_half_of_both_lengths_apart_where_bodies_touch(
     shift = float(other) - 4.7  # the rear stays where it is
     rewrite(
         network / "traffic.rou.xml",
-        ('id="vut" vClass="passenger" length="4.7"', f'id="vut" vClass="passenger" length="{own}"'),
+        (
+            'id="vut" vClass="passenger" length="4.7"',
+            f'id="vut" vClass="passenger" length="{own}"',
+        ),
         (
             'id="parked" vClass="passenger" length="4.7"',
             f'id="parked" vClass="passenger" length="{other}"',
@@ -264,10 +293,14 @@ def test_a_hit_on_a_moving_car_is_as_bad_as_it_closes(
     """`relative_impact_speed` is that of the moment of contact, within the last step."""
     scenario = {"model": "car_to_car", "parameters": parameters}
     system = assemble(sv.load_study("sun", scenario=scenario, ads={"model": "aeb"}))
-    weak = system.characteristics.setting({"maxBrakeTorque": 600.0, "tireFric": 0.5}, beyond=True)
+    weak = system.characteristics.setting(
+        {"maxBrakeTorque": 600.0, "tireFric": 0.5}, beyond=True
+    )
     ((_, evaluations, runs),) = simulate_all_points(system, weak[np.newaxis])
     assert evaluations.outcome[0] == "collision"
-    assert evaluations.f_safe[0] == pytest.approx(other - runs.collision_speed[0], abs=1e-9)
+    assert evaluations.f_safe[0] == pytest.approx(
+        other - runs.collision_speed[0], abs=1e-9
+    )
     assert (
         -evaluations.f_safe[0]
         <= runs.relative_speed[0]

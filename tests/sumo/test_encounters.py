@@ -42,7 +42,11 @@ MARGIN = 4.0
 
 
 def domain(lower: float, upper: float, original: float | None = None) -> dict[str, Any]:
-    return {"lower": lower, "upper": upper, "original": lower if original is None else original}
+    return {
+        "lower": lower,
+        "upper": upper,
+        "original": lower if original is None else original,
+    }
 
 
 SPEED, PLACE = domain(30, 60), domain(20, 80, 50)
@@ -55,9 +59,17 @@ CASES = {
     "walker": (
         "sun",
         {"model": "pedestrian_crossing"},
-        {"distance": domain(8, 20), "walking_speed": domain(1, 2.4), "lateral_start": domain(4, 8)},
+        {
+            "distance": domain(8, 20),
+            "walking_speed": domain(1, 2.4),
+            "lateral_start": domain(4, 8),
+        },
     ),
-    "parked": ("lgsvl", {"model": "lead_vehicle_stopped"}, {"distance": domain(40, 70)}),
+    "parked": (
+        "lgsvl",
+        {"model": "lead_vehicle_stopped"},
+        {"distance": domain(40, 70)},
+    ),
     "far": (
         "wear",
         {"model": "crossing", "parameters": {"test": "CPFA"}},
@@ -162,7 +174,8 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
 
 def assert_the_same_in_sumo(system: System, settings: FloatArray) -> None:
     recorded, in_sumo = (
-        drive_and_score(replace(system, in_sumo=in_sumo), settings) for in_sumo in (False, True)
+        drive_and_score(replace(system, in_sumo=in_sumo), settings)
+        for in_sumo in (False, True)
     )
     assert in_sumo.outcome.tolist() == recorded.outcome.tolist()
     assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)
@@ -175,10 +188,19 @@ def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
     widest = free_parameters(SCENARIOS[scenario["model"]])
     search = {name: domain(one.lower, one.upper) for name, one in widest.items()}
     system = assemble(
-        load_study(base, matrix=None, scenario={**scenario, "over": search}, encounters="ranges")
+        load_study(
+            base,
+            matrix=None,
+            scenario={**scenario, "over": search},
+            encounters="ranges",
+        )
     )
-    corners = product(*((one.lower, one.upper) for one in system.characteristics.scenario))
-    settings = np.array([[*system.characteristics.vehicle.original, *corner] for corner in corners])
+    corners = product(
+        *((one.lower, one.upper) for one in system.characteristics.scenario)
+    )
+    settings = np.array(
+        [[*system.characteristics.vehicle.original, *corner] for corner in corners]
+    )
     assert_the_same_in_sumo(system, settings)
 
 
@@ -196,7 +218,9 @@ def planted(**changes: Any) -> Study:
         "encounters": "ranges",
         "vehicle": {
             "model": "planted:Block",
-            "characteristics": {"brakes": {"unit": "-", "original": 1, "lower": 0.2, "upper": 1}},
+            "characteristics": {
+                "brakes": {"unit": "-", "original": 1, "lower": 0.2, "upper": 1}
+            },
         },
         "ads": {"model": "planted:AtGap"},
         "metrics": {"ttc_threshold": 1.5},
@@ -219,13 +243,23 @@ def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) ->
     margin; a share b of its brakes collides if s / b > gap. So the least wear that ever collides
     leaves b = 1 - margin / gap of the brakes.
     """
-    search = {"algorithms": ["nsga2"], "population": 40, "evaluations": 1200, "runs": 1, "seed": 1}
-    results = load_runs(searched(planted(step_length=0.01, search=search), tmp_path / "out"))
+    search = {
+        "algorithms": ["nsga2"],
+        "population": 40,
+        "evaluations": 1200,
+        "runs": 1,
+        "seed": 1,
+    }
+    results = load_runs(
+        searched(planted(step_length=0.01, search=search), tmp_path / "out")
+    )
     solutions = results.solutions
     collisions = solutions[solutions["outcome"] == "collision"]
     assert collisions["brakes"].max() == pytest.approx(1 - MARGIN / GAP, rel=0.01)
     everything = results.evaluations
-    stops = (everything["speed"] * KMH) ** 2 / (2 * BRAKING * everything["road_friction"])
+    stops = (everything["speed"] * KMH) ** 2 / (
+        2 * BRAKING * everything["road_friction"]
+    )
     ratio = stops / everything["brakes"] / GAP
     collided = everything["outcome"] == "collision"
     assert ratio[collided].min() > 0.99
@@ -235,12 +269,16 @@ def test_the_border_that_nsga_ii_finds_is_that_of_the_formula(tmp_path: Path) ->
 
 
 @SLOW
-def test_a_setting_whose_original_collides_too_is_never_a_solution(tmp_path: Path) -> None:
+def test_a_setting_whose_original_collides_too_is_never_a_solution(
+    tmp_path: Path,
+) -> None:
     """In half of the encounters here the original collides; all algorithms simulate them and report
     none.
     """
     over = {"speed": domain(50, 90), "road_friction": domain(0.5, 1, 1)}
-    study = planted(scenario={"model": "car_to_car", "parameters": {"headway": 2.0}, "over": over})
+    study = planted(
+        scenario={"model": "car_to_car", "parameters": {"headway": 2.0}, "over": over}
+    )
     results = load_runs(searched(study, tmp_path / "out"))
     for algorithm, rows in results.evaluations.groupby("algorithm"):
         assert (rows["original_safety_degree"] < MARGIN).mean() > 0.1, algorithm
@@ -303,5 +341,6 @@ def test_a_cause_is_wear_in_its_encounter_and_says_whether_the_original_encounte
         assert cause["boundary"]["brakes"] == pytest.approx(stop / GAP, rel=0.03)
     at_original = (50 * KMH) ** 2 / (2 * BRAKING) / GAP
     assert [*answer.tables["causes"]["elsewhere"]] == [
-        changes["brakes"] < at_original for changes in answer.tables["causes"]["changes"]
+        changes["brakes"] < at_original
+        for changes in answer.tables["causes"]["changes"]
     ]

@@ -13,7 +13,13 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.part import at_point
-from safevar_sumo.records import Command, FloatArray, Outcome, SimulationRuns, differences
+from safevar_sumo.records import (
+    Command,
+    FloatArray,
+    Outcome,
+    SimulationRuns,
+    differences,
+)
 from safevar_sumo.scenarios import Crossing, Point, Scenario
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study
@@ -46,7 +52,9 @@ SYSTEM = assemble(study(TESTS))
 
 
 @SLOW
-def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each_other() -> None:
+def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each_other() -> (
+    None
+):
     population = drawn(SYSTEM, 3, 3)
     points = simulate_all_points(SYSTEM, population)
     assert [one.point.name for one in points][:3] == [
@@ -57,10 +65,13 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
     assert len(points) == 10
     for one in points[::3]:
         alone = drive_and_score(SYSTEM.at(one.point), population)
-        assert not [*differences(alone.results, one.evaluations.results)], one.point.name
+        assert not [*differences(alone.results, one.evaluations.results)], (
+            one.point.name
+        )
     whole = drive_and_score(SYSTEM, population)
     assert (
-        whole.f_safe.tolist() == np.min([one.evaluations.f_safe for one in points], axis=0).tolist()
+        whole.f_safe.tolist()
+        == np.min([one.evaluations.f_safe for one in points], axis=0).tolist()
     )
     collided = [one.evaluations.collided for one in points]
     assert whole.collided.tolist() == np.any(collided, axis=0).tolist()
@@ -77,7 +88,10 @@ HOLDS_HALF = Pedals(lambda seen: (0.5, 0))
 
 
 def run(
-    scenario: Scenario, ads: Any = None, settings: FloatArray | None = None, system: System = SUN
+    scenario: Scenario,
+    ads: Any = None,
+    settings: FloatArray | None = None,
+    system: System = SUN,
 ) -> SimulationRuns:
     alone = system.at(system.points[0]._replace(scenario=scenario))
     system = replace(alone, ads=ads or HOLDS_HALF)
@@ -120,7 +134,10 @@ def test_a_vehicle_that_cannot_hold_the_speed_makes_the_test_invalid_unless_it_b
     assert runs.outcome[0] == Outcome.INVALID_TEST
     assert runs.test_speed_error[0] * 3.6 < -0.5
     assert np.isnan(runs.collision_speed[0])
-    assert run(steep, Pedals(lambda seen: (0, 0.5)), system=WEAK).outcome[0] == Outcome.STOPPED
+    assert (
+        run(steep, Pedals(lambda seen: (0, 0.5)), system=WEAK).outcome[0]
+        == Outcome.STOPPED
+    )
 
 
 @pytest.mark.parametrize(
@@ -136,7 +153,11 @@ def test_a_test_is_invalid_beyond_1_km_h_too_fast_and_half_a_km_h_too_slow(
     state = vehicle.at_speed(prepared, np.array([50 / 3.6]))
     all_open = np.ones(1, dtype=bool)
     robot = DrivingRobot(
-        [Point(CarToCar(speed=50), SUN.points[0].weather)], vehicle, prepared, state, 0.05
+        [Point(CarToCar(speed=50), SUN.points[0].weather)],
+        vehicle,
+        prepared,
+        state,
+        0.05,
     )
     robot.drive(
         Command(state.throttle, state.brake),
@@ -146,10 +167,14 @@ def test_a_test_is_invalid_beyond_1_km_h_too_fast_and_half_a_km_h_too_slow(
     assert robot.invalid.tolist() == [invalid]
 
 
-def test_a_setting_with_an_invalid_test_has_no_verdict_unless_it_collides_elsewhere() -> None:
+def test_a_setting_with_an_invalid_test_has_no_verdict_unless_it_collides_elsewhere() -> (
+    None
+):
     tests = [
         MatrixTest(
-            name="CCRs", parameters={"test": "CCRs", "grade": 20.0}, over={"speed": [10, 50]}
+            name="CCRs",
+            parameters={"test": "CCRs", "grade": 20.0},
+            over={"speed": [10, 50]},
         )
     ]
     steep = assemble(
@@ -157,7 +182,9 @@ def test_a_setting_with_an_invalid_test_has_no_verdict_unless_it_collides_elsewh
     )
     steep = replace(steep, vehicle=WEAK.vehicle)
     original = original_of(SUN)
-    assert [str(one.evaluations.outcome[0]) for one in simulate_all_points(steep, original)] == [
+    assert [
+        str(one.evaluations.outcome[0]) for one in simulate_all_points(steep, original)
+    ] == [
         "stopped",
         "invalid-test",
     ]
@@ -167,16 +194,21 @@ def test_a_setting_with_an_invalid_test_has_no_verdict_unless_it_collides_elsewh
     assert not evaluations.failed[0]
     assert np.isnan(evaluations.f_safe[0])
     assert (
-        drive_and_score(replace(steep, ads=HOLDS_HALF), original).outcome[0] == Outcome.COLLISION
+        drive_and_score(replace(steep, ads=HOLDS_HALF), original).outcome[0]
+        == Outcome.COLLISION
     ), "at 10 km/h, where the speed is held"
 
 
-def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_vehicle() -> None:
+def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_vehicle() -> (
+    None
+):
     far = CarToCar(test="CCRs", speed=50.0, headway=20.0)
     coasts = run(far, Pedals(lambda seen: (0.5 * (seen.time < 2), 0)))
     assert coasts.outcome[0] != Outcome.INVALID_TEST
     assert coasts.trace.throttle[41:, 0].max() == 0
-    faster = run(far, Pedals(lambda seen: (0, 0.5) if 1.0 <= seen.time < 1.1 else (1, 0)))
+    faster = run(
+        far, Pedals(lambda seen: (0, 0.5) if 1.0 <= seen.time < 1.1 else (1, 0))
+    )
     assert abs(faster.test_speed_error[0]) * 3.6 < 0.5
     assert faster.trace.speed.max() * 3.6 > 60
 
@@ -185,7 +217,12 @@ def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_veh
     ("middle", "along", "speed", "contact"),
     [
         # own: 4 m by 2 m at the origin, east at 10 m/s; the other: 0.6 m by 0.4 m
-        ((2.1, 0.0), (0.0, 1.0), 0.0, ("front", 0.01, 0.0)),  # reach 2 + 0.2; overlaps by 0.1
+        (
+            (2.1, 0.0),
+            (0.0, 1.0),
+            0.0,
+            ("front", 0.01, 0.0),
+        ),  # reach 2 + 0.2; overlaps by 0.1
         (
             (2.1, -1.2),
             (0.0, 1.0),
@@ -199,7 +236,12 @@ def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_veh
             ("right", 0.05, None),
         ),  # along since 0.12 s, across by 0.05 m at 1 m/s
         ((-1.0, 1.25), (0.0, -1.0), 1.0, ("left", 0.05, None)),
-        ((-2.2, 0.0), (1.0, 0.0), 12.0, ("rear", 0.05, None)),  # 2 m/s faster, reach 2 + 0.3
+        (
+            (-2.2, 0.0),
+            (1.0, 0.0),
+            12.0,
+            ("rear", 0.05, None),
+        ),  # 2 m/s faster, reach 2 + 0.3
     ],
 )
 def test_bodies_touch_at_the_side_where_the_overlap_began_last(
@@ -221,25 +263,40 @@ def names(study: Study) -> list[str]:
     return [point.name for point in assemble(study).points]
 
 
-def test_one_study_has_listed_encounters_and_ranges_and_is_reduced_to_a_test_or_point() -> None:
+def test_one_study_has_listed_encounters_and_ranges_and_is_reduced_to_a_test_or_point() -> (
+    None
+):
     wear, one = load_study("wear"), "CPNA, speed 20, impact_location 50, wet"
     points = names(wear)
     assert (len(points), points[3], points[8]) == (26, "CPFA, speed 40, wet", one)
     assert names(at_point(wear, one)) == [one]
     assert names(at_point(wear, "CPFA")) == points[:4]
-    assert [*load_study("wear", encounters="ranges").ranges] == ["speed", "impact_location"]
+    assert [*load_study("wear", encounters="ranges").ranges] == [
+        "speed",
+        "impact_location",
+    ]
 
 
 @SLOW
-def test_a_setting_meets_only_tests_whose_ranges_and_constraints_have_its_encounter() -> None:
+def test_a_setting_meets_only_tests_whose_ranges_and_constraints_have_its_encounter() -> (
+    None
+):
     """The cut-out takes gaps from 20 m, and at 130 km/h from 69 m."""
     study = load_study("alks", encounters="ranges")
     system = assemble(study)
     settings = np.tile(system.characteristics.original, (3, 1))
-    for name, values in {"gap": (10, 60, 60), "speed": (60, 130, 80), "brakeTorque": 0.6}.items():
+    for name, values in {
+        "gap": (10, 60, 60),
+        "speed": (60, 130, 80),
+        "brakeTorque": 0.6,
+    }.items():
         settings[:, [*system.characteristics.names].index(name)] = values
     least = np.full(3, np.inf)
-    for name, met in {"cut_in": [0, 1, 2], "cut_out": [2], "following": [0, 1, 2]}.items():
+    for name, met in {
+        "cut_in": [0, 1, 2],
+        "cut_out": [2],
+        "following": [0, 1, 2],
+    }.items():
         alone = assemble(at_point(study, name))
         own = alone.characteristics.of_others(system.characteristics, settings[met])
         least[met] = np.minimum(least[met], drive_and_score(alone, own).f_safe)

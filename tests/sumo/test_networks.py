@@ -19,7 +19,12 @@ from safevar_sumo.replay.export import converted, open_drive
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import drive_worst
-from safevar_sumo.sumo.network import built_network, copied_network, open_network, program_of_sumo
+from safevar_sumo.sumo.network import (
+    built_network,
+    copied_network,
+    open_network,
+    program_of_sumo,
+)
 from safevar_sumo.sumo.network_check import check_network
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import SLOW
@@ -28,7 +33,9 @@ FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
-def test_the_recipe_builds_the_network_that_is_kept(folder: str, tmp_path: Path) -> None:
+def test_the_recipe_builds_the_network_that_is_kept(
+    folder: str, tmp_path: Path
+) -> None:
     shutil.copytree(NETWORKS / folder, tmp_path / folder)
     subprocess.run(
         [program_of_sumo("netconvert", folder), "-c", "network.netccfg"],
@@ -53,15 +60,21 @@ def test_a_network_has_the_road_that_netconvert_makes_of_it(folder: str) -> None
 def test_without_sumos_programs_what_needs_them_says_so(
     mine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rewritten(mine / "network.edg.xml", 'width="4"', 'width="3.9"')  # a network that is in no cache
+    rewritten(
+        mine / "network.edg.xml", 'width="4"', 'width="3.9"'
+    )  # a network that is in no cache
     monkeypatch.setitem(sys.modules, "sumo", None)
-    with pytest.raises(InputError, match=r"netccfg: needs SUMO's program netconvert\n.*\[sumo\]"):
+    with pytest.raises(
+        InputError, match=r"netccfg: needs SUMO's program netconvert\n.*\[sumo\]"
+    ):
         check_network(str(mine))
     with pytest.raises(InputError, match=r"sumo-gui\n.*\[sumo\]"):
         program_of_sumo("sumo-gui", "gui")
     (mine / "network.netccfg").unlink()
     check_network(str(mine))
-    with pytest.raises(InputError, match=r"an export of .*mine: needs SUMO's program netconvert\n"):
+    with pytest.raises(
+        InputError, match=r"an export of .*mine: needs SUMO's program netconvert\n"
+    ):
         open_drive(open_network(str(mine)))
 
 
@@ -127,7 +140,11 @@ def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> Non
             world.api.simulationStep()
             there = world.actor_poses()
             first, second = (
-                {name[2:]: place for name, place in there.items() if name.startswith(copy)}
+                {
+                    name[2:]: place
+                    for name, place in there.items()
+                    if name.startswith(copy)
+                }
                 for copy in ("0.", "1.")
             )
             assert first == second
@@ -142,11 +159,15 @@ def rewritten(file: Path, old: str, new: str) -> None:
 
 
 def on(network: Path) -> System:
-    return assemble(load_study("smoke", scenario={"parameters": {"network": str(network)}}))
+    return assemble(
+        load_study("smoke", scenario={"parameters": {"network": str(network)}})
+    )
 
 
 def roads(network: Path, n: int = 1) -> ElementTree.Element:
-    return ElementTree.parse(copied_network(open_network(str(network)), n).network).getroot()
+    return ElementTree.parse(
+        copied_network(open_network(str(network)), n).network
+    ).getroot()
 
 
 @SLOW
@@ -155,7 +176,11 @@ def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
     (mine / "network.typ.xml").write_text(
         '<types><type id="slow" speed="7" numLanes="1" width="3" disallow="pedestrian"/></types>'
     )
-    rewritten(mine / "network.netccfg", "</input>", '<type-files value="network.typ.xml"/></input>')
+    rewritten(
+        mine / "network.netccfg",
+        "</input>",
+        '<type-files value="network.typ.xml"/></input>',
+    )
     rewritten(
         mine / "network.edg.xml",
         'id="departure" from="crossing" to="east" numLanes="1" width="4" speed="70"'
@@ -179,7 +204,12 @@ def test_a_built_network_without_sources_gives_the_same_results(mine: Path) -> N
         ]
     )
     expected = drive_worst(on(mine), settings).trace.gap
-    for name in ("network.nod.xml", "network.edg.xml", "network.con.xml", "network.netccfg"):
+    for name in (
+        "network.nod.xml",
+        "network.edg.xml",
+        "network.con.xml",
+        "network.netccfg",
+    ):
         (mine / name).unlink()
     assert np.array_equal(drive_worst(on(mine), settings).trace.gap, expected)
     (mine / "network.net.xml").rename(mine / "town.net.xml")
@@ -217,7 +247,9 @@ def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
     for name in ("traffic.rou.xml", "scenario.sumocfg"):
         shutil.copy(NETWORKS / "along" / name, tmp_path / name)
     root = roads(tmp_path / "town.net.xml", 2)
-    plain = ElementTree.parse(built_network(open_network(str(tmp_path / "town.net.xml")))).getroot()
+    plain = ElementTree.parse(
+        built_network(open_network(str(tmp_path / "town.net.xml")))
+    ).getroot()
     originals = {
         one.attrib["id"]
         for one in plain.iter()
@@ -240,12 +272,18 @@ def test_no_id_of_a_built_network_belongs_to_two_copies(tmp_path: Path) -> None:
 
 
 @SLOW
-def test_a_file_that_options_of_sumo_add_is_one_of_the_networks_files(mine: Path) -> None:
+def test_a_file_that_options_of_sumo_add_is_one_of_the_networks_files(
+    mine: Path,
+) -> None:
     (mine / "more.add.xml").write_text('<additional><vType id="more"/></additional>')
     rewritten(
-        mine / "scenario.sumocfg", "</input>", '<additional-files value="more.add.xml"/></input>'
+        mine / "scenario.sumocfg",
+        "</input>",
+        '<additional-files value="more.add.xml"/></input>',
     )
     check_network(str(mine))
     before = open_network(str(mine)).digests
-    (mine / "more.add.xml").write_text('<additional><vType id="more" length="7"/></additional>')
+    (mine / "more.add.xml").write_text(
+        '<additional><vType id="more" length="7"/></additional>'
+    )
     assert open_network(str(mine)).digests != before

@@ -18,7 +18,9 @@ from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import SLOW
 from tests.made_up import drawn, original_of
 
-CREEPS = "braking lead vehicle, 50 km/h, headway 0.864, target_deceleration 4.905, clear"
+CREEPS = (
+    "braking lead vehicle, 50 km/h, headway 0.864, target_deceleration 4.905, clear"
+)
 """A test at whose end many vehicles still roll towards the leader, who stands."""
 
 
@@ -36,7 +38,9 @@ def test_a_run_that_goes_on_ends_as_one_that_had_the_time(creeping: System) -> N
     population = drawn(creeping, 60, 3)
     found = drive_and_score(creeping, population)
     assert set(found.outcome) <= {Outcome.STOPPED, Outcome.COLLISION}
-    assert not [*differences(found.results, drive_and_score(patient, population).results)]
+    assert not [
+        *differences(found.results, drive_and_score(patient, population).results)
+    ]
 
 
 def test_the_other_runs_of_a_batch_do_not_change(creeping: System) -> None:
@@ -52,7 +56,9 @@ def test_the_other_runs_of_a_batch_do_not_change(creeping: System) -> None:
 @pytest.mark.parametrize("in_sumo", [False, True])
 def test_the_new_car_stops_behind_the_leader(creeping: System, in_sumo: bool) -> None:
     heard = []
-    runs = drive_all(replace(creeping, in_sumo=in_sumo), original_of(creeping), heard.append)
+    runs = drive_all(
+        replace(creeping, in_sumo=in_sumo), original_of(creeping), heard.append
+    )
     assert runs.outcome[0] == Outcome.STOPPED
     assert runs.trace.speed[-1, 0] == 0
     assert runs.trace.gap[-1, 0] == pytest.approx(0.7035, abs=1e-4)
@@ -63,12 +69,16 @@ def test_the_new_car_stops_behind_the_leader(creeping: System, in_sumo: bool) ->
 def test_an_encounter_that_ended_before_its_collision_counts_as_one() -> None:
     system = assemble(at_point(load_study("alks", encounters="ranges"), "cut_in"))
     (point,) = system.points
-    patient = system.at(point._replace(scenario=replace_in(point.scenario, duration=60.0)))
+    patient = system.at(
+        point._replace(scenario=replace_in(point.scenario, duration=60.0))
+    )
     population = drawn(system, 300, 1)
     found = drive_and_score(system, population, with_originals=False)
     assert not [
         *differences(
             found.take(found.collided).results,
-            drive_and_score(patient, population, with_originals=False).take(found.collided).results,
+            drive_and_score(patient, population, with_originals=False)
+            .take(found.collided)
+            .results,
         )
     ]

@@ -50,11 +50,14 @@ def assert_same(system: System, settings: FloatArray) -> list[str]:
     outcomes = []
     tolerance = ROUNDING if len(system.characteristics.scenario) else 0.0
     results = (
-        simulate_all_points(replace(system, in_sumo=in_sumo), settings) for in_sumo in (False, True)
+        simulate_all_points(replace(system, in_sumo=in_sumo), settings)
+        for in_sumo in (False, True)
     )
     for recorded, copies in zip(*results, strict=True):
         assert not [
-            *differences(recorded.evaluations.results, copies.evaluations.results, tolerance)
+            *differences(
+                recorded.evaluations.results, copies.evaluations.results, tolerance
+            )
         ]
         pairs = [*zip(recorded.runs.contact, copies.runs.contact, strict=True)]
         pairs += [
@@ -70,7 +73,9 @@ def assert_same(system: System, settings: FloatArray) -> list[str]:
     return outcomes
 
 
-def test_vehicles_in_recorded_scenes_give_the_same_bits_as_in_sumo(any_system: System) -> None:
+def test_vehicles_in_recorded_scenes_give_the_same_bits_as_in_sumo(
+    any_system: System,
+) -> None:
     assert reason_against_scenes(any_system) == ""
     assert_same(any_system, drawn(any_system, 60, 5))
 
@@ -81,7 +86,9 @@ def test_the_distance_of_a_step_has_sumos_order_of_operations() -> None:
     """
     before = np.array([0.0, 0.49783446695015615])
     after = np.array([0.4348049848410796, 1.0073508794958133])
-    there = np.array([28.196, 28.208445861673756]) + distance_covered(before, after, 0.05)
+    there = np.array([28.196, 28.208445861673756]) + distance_covered(
+        before, after, 0.05
+    )
     assert there.tolist() == [28.206870124621027, 28.246075495334903]
 
 
@@ -103,7 +110,9 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
 
 def test_a_shipped_scenario_on_a_users_network_is_simulated_in_sumo() -> None:
     scenario = SCENARIOS["pedestrian_crossing"](network="my_town")
-    assert "my_town" in Scenes().reason_against_scenes([Point(scenario, weather_of("clear"))])
+    assert "my_town" in Scenes().reason_against_scenes(
+        [Point(scenario, weather_of("clear"))]
+    )
 
 
 @pytest.fixture
@@ -112,12 +121,16 @@ def reacting(in_tmp: Path) -> Path:
     shutil.copytree(NETWORKS / "pedestrian_crossing", in_tmp / "reacting")
     options = in_tmp / "reacting" / "scenario.sumocfg"
     lines = options.read_text().splitlines()
-    options.write_text("\n".join(line for line in lines if "mingap-to-vehicle" not in line))
+    options.write_text(
+        "\n".join(line for line in lines if "mingap-to-vehicle" not in line)
+    )
     return in_tmp
 
 
 @SLOW
-def test_a_scenario_whose_pedestrian_reacts_is_simulated_in_sumo_by_default(reacting: Path) -> None:
+def test_a_scenario_whose_pedestrian_reacts_is_simulated_in_sumo_by_default(
+    reacting: Path,
+) -> None:
     study = load_study(
         "smoke",
         scenario={"parameters": {"network": "reacting"}},
@@ -142,12 +155,16 @@ def test_a_point_whose_runs_end_before_those_of_another_one_is_repeated_to_its_o
     ]
     ads = {"model": "idm", "parameters": {}}
     car = {"model": "car_to_car", "parameters": {}}
-    system = assemble(load_study("wear", ads=ads, scenario=car, matrix={"tests": tests}))
+    system = assemble(
+        load_study("wear", ads=ads, scenario=car, matrix={"tests": tests})
+    )
     assert drive_and_score(system, original_of(system)).outcome.tolist() == ["timeout"]
     verify_everywhere(system, original_of(system))
 
 
-def test_driven_speeds_lead_to_the_same_places_and_collisions_in_sumo(any_system: System) -> None:
+def test_driven_speeds_lead_to_the_same_places_and_collisions_in_sumo(
+    any_system: System,
+) -> None:
     verify_everywhere(any_system, drawn(any_system, 20, 7))
 
 
@@ -159,7 +176,8 @@ def test_who_reacts_against_the_claim_is_at_another_place_in_sumo(
     scenario = {"model": "claims:Claims", "parameters": {"network": "reacting"}}
     system = assemble(load_study("native", scenario=scenario))
     with pytest.raises(
-        InputError, match=r"at [\d.]+ s is .* in the recorded scene and .* in SUMO, with mass = "
+        InputError,
+        match=r"at [\d.]+ s is .* in the recorded scene and .* in SUMO, with mass = ",
     ):
         verify_everywhere(system, drawn(system, 60, 5))
 
@@ -173,7 +191,9 @@ STANDS = (
 BRAKES = f"{FIRST}brakes without an obstacle"
 
 
-def reason(study: str | Study, pedals: Callable[[Observation], tuple[object, object]]) -> str:
+def reason(
+    study: str | Study, pedals: Callable[[Observation], tuple[object, object]]
+) -> str:
     return why_no_verdict(replace(assemble(load_study(study)), ads=Pedals(pedals)))
 
 
@@ -184,7 +204,9 @@ def reason(study: str | Study, pedals: Callable[[Observation], tuple[object, obj
         (lambda seen: (0, 0), STANDS),
         (
             lambda seen: (0.02, seen.gap < 5),
-            STANDS.replace("0.0 of", "0.5 of").replace("0 of the thr", "0.02 of the thr"),
+            STANDS.replace("0.0 of", "0.5 of").replace(
+                "0 of the thr", "0.02 of the thr"
+            ),
         ),
         (lambda seen: (0.9 * (seen.time < 1.5), seen.time > 1.5), BRAKES + NO_VERDICT),
         (
@@ -202,7 +224,9 @@ def test_who_stands_creeps_or_brakes_for_nobody_gets_no_verdict(
 
 
 def test_a_driving_system_that_brakes_for_nobody_is_named_with_its_points() -> None:
-    test = at_point(load_study("euro_ncap_car_to_car"), "CCRm, speed 50, impact_location 50, clear")
+    test = at_point(
+        load_study("euro_ncap_car_to_car"), "CCRm, speed 50, impact_location 50, clear"
+    )
     assert reason(test, lambda seen: (0, 0)) == ""
     assert reason(test, lambda seen: (0, 1)) == BRAKES + NO_VERDICT
     assert reason(test, lambda seen: (0, 0.1 * (seen.time == 0))).startswith(
@@ -212,7 +236,9 @@ def test_a_driving_system_that_brakes_for_nobody_is_named_with_its_points() -> N
 
 @SLOW
 def test_the_reason_counts_the_points_and_names_one() -> None:
-    said = reason("euro_ncap_car_to_car", lambda seen: (0, seen.speed > 3))  # not at 10 km/h
+    said = reason(
+        "euro_ncap_car_to_car", lambda seen: (0, seen.speed > 3)
+    )  # not at 10 km/h
     assert said.startswith(f"{BRAKES} at 24 of 27 points, such as CCRs, speed 20, ")
 
 
@@ -271,6 +297,15 @@ def test_every_command_begins_with_the_reason(still: str) -> None:
     assert run(
         "study", still, "--runs", "1", "--evaluations", "20", "--out", "results"
     ).stdout.startswith(STANDS)
-    run("report", "results", "--ask", "rules --samples 32 --unsafe collision", "--out", "page.html")
-    page = re.sub("</?span>", "", Path("page.html").read_text())  # a sentence has a line of its own
+    run(
+        "report",
+        "results",
+        "--ask",
+        "rules --samples 32 --unsafe collision",
+        "--out",
+        "page.html",
+    )
+    page = re.sub(
+        "</?span>", "", Path("page.html").read_text()
+    )  # a sentence has a line of its own
     assert f'<div class="first">\n<p>{STANDS}' in page

@@ -103,7 +103,10 @@ def bare_sumo(traffic: Path, step: Callable[[Any, str], None]) -> np.ndarray:
         for _ in range(161):
             world.api.simulationStep()
             rows.append(
-                (world.api.vehicle.getSpeed("vut"), 80.3 - world.api.vehicle.getPosition("vut")[0])
+                (
+                    world.api.vehicle.getSpeed("vut"),
+                    80.3 - world.api.vehicle.getPosition("vut")[0],
+                )
             )
             step(world.api, "vut")
     return np.array(rows)
@@ -121,7 +124,10 @@ def with_attributes(folder: Path, attributes: str) -> Path:
 
 
 def refuse_difference(
-    runs: System, traffic: Path, step: Callable[[Any, str], None], speed_error: float = 1e-6
+    runs: System,
+    traffic: Path,
+    step: Callable[[Any, str], None],
+    speed_error: float = 1e-6,
 ) -> None:
     """The speeds are SUMO's, and so is the place: SUMO ends its last step at once, ours at its
     end.
@@ -153,25 +159,37 @@ def test_a_vehicle_without_delays_drives_as_in_bare_sumo(name: str) -> None:
         'carFollowModel="IDM"',
     ],
 )
-def test_sumos_driver_has_the_attributes_of_the_traffic_file(attributes: str, in_tmp: Path) -> None:
+def test_sumos_driver_has_the_attributes_of_the_traffic_file(
+    attributes: str, in_tmp: Path
+) -> None:
     """All but tau, which the study varies: without delays it drives as in bare SUMO."""
     traffic = with_attributes(in_tmp / "net", f'mass="900" tau="0.3" {attributes}')
     scenario = {"parameters": {"network": str(traffic.parent)}}
     runs = system("idle", CONTROLLERS, vehicle=NO_DELAYS, scenario=scenario)
     unused = (
-        f"{traffic}: no effect on vehicle 'vut': mass = 900, tau = 0.3; the study's vehicle and ADS"
+        f"{traffic}: no effect on vehicle 'vut': mass = 900, tau = 0.3; the"
+        " study's vehicle and ADS"
     )
     assert any(remark.startswith(unused) for remark in without_effect(runs))
     traffic.write_text(traffic.read_text().replace('tau="0.3"', 'tau="1" accel="2.6"'))
-    refuse_difference(runs, traffic, lambda *_: None, 0.02 if "IDM" in attributes else 1e-6)
+    refuse_difference(
+        runs, traffic, lambda *_: None, 0.02 if "IDM" in attributes else 1e-6
+    )
 
 
 @SLOW
-def test_between_two_actions_sumos_driver_asks_for_what_he_decided(in_tmp: Path) -> None:
+def test_between_two_actions_sumos_driver_asks_for_what_he_decided(
+    in_tmp: Path,
+) -> None:
     """A lag lets through a part of it in the first step, and more in the next ones."""
-    vehicle = {**NO_DELAYS, "characteristics": {**NO_DELAY, **{"actuatorLag": {"original": 0.2}}}}
+    vehicle = {
+        **NO_DELAYS,
+        "characteristics": {**NO_DELAY, **{"actuatorLag": {"original": 0.2}}},
+    }
     for action in ("0.1", "1"):
-        traffic = with_attributes(in_tmp / action, f'sigma="0" actionStepLength="{action}"')
+        traffic = with_attributes(
+            in_tmp / action, f'sigma="0" actionStepLength="{action}"'
+        )
         scenario = {"parameters": {"network": str(traffic.parent)}}
         runs = system("idle", CONTROLLERS, vehicle=vehicle, scenario=scenario)
         run = drive_worst(runs, changed(runs))
@@ -185,7 +203,8 @@ def test_delays_that_sumos_driver_does_not_know_cost_him_his_gap() -> None:
     assert run.outcome[0] == Outcome.STOPPED or run.collision_speed[0] < 3
     assert last_gap(run) < 2  # of the 2.5 m that he wants
     assert any(
-        "knows neither the delays nor the brakes" in remark for remark in without_effect(runs)
+        "knows neither the delays nor the brakes" in remark
+        for remark in without_effect(runs)
     )
     close, far = top_speeds(runs)
     assert close > far + 1  # m/s: the study's headway is his
@@ -208,7 +227,9 @@ def braking(run: SimulationRuns) -> np.ndarray:
 
 
 def native(**characteristics: object) -> tuple[System, SimulationRuns]:
-    runs = assemble(load_study("native", vehicle={**NO_DELAYS, "characteristics": characteristics}))
+    runs = assemble(
+        load_study("native", vehicle={**NO_DELAYS, "characteristics": characteristics})
+    )
     return runs, drive_worst(runs, changed(runs))
 
 
@@ -234,7 +255,10 @@ def test_krauss_brakes_softer_with_a_longer_tau_and_stops_where_sumos_krauss_doe
 
 def test_in_native_tau_softens_braking_and_a_lag_makes_collisions_harder() -> None:
     runs = assemble(load_study("native"))
-    by_tau = [braking(drive_worst(runs, changed(runs, tau=tau))) for tau in (0.5, 1.0, 1.5, 2.0)]
+    by_tau = [
+        braking(drive_worst(runs, changed(runs, tau=tau)))
+        for tau in (0.5, 1.0, 1.5, 2.0)
+    ]
     assert np.all(np.diff([one.max() for one in by_tau]) < -0.5)
     assert np.all(np.diff([one.mean() for one in by_tau]) < -0.3)
     lags = np.concatenate(
@@ -254,10 +278,14 @@ def test_tau_drives_idm_and_a_line_says_where_it_or_decel_has_no_effect() -> Non
         return others
 
     stops = assemble(
-        load_study({"extends": "native", "name": "stops", "scenario": {"model": "stop"}})
+        load_study(
+            {"extends": "native", "name": "stops", "scenario": {"model": "stop"}}
+        )
     )
     settings = [changed(stops, decel=decel) for decel in (8.82, 8.83, 9.0, 9.5)]
-    hardest = drive_and_score(stops, np.concatenate(settings)).metrics["stopping_distance"]
+    hardest = drive_and_score(stops, np.concatenate(settings)).metrics[
+        "stopping_distance"
+    ]
     assert hardest[0] > hardest[1] == hardest[2] == hardest[3]
     grippy = load_study("native", vehicle={"parameters": {"tyre_friction": 1.0}})
     assert without_effect(assemble(grippy)) == []

@@ -86,7 +86,9 @@ def system(name: str, script: str = SCRIPT, **tables: object) -> System:
     Path("my_controller.py").write_text(script)
     study = load_study("native", **tables)
     return assemble(
-        msgspec.structs.replace(study, ads=ModelTable(model=f"my_controller:{name}", kind="traci"))
+        msgspec.structs.replace(
+            study, ads=ModelTable(model=f"my_controller:{name}", kind="traci")
+        )
     )
 
 
@@ -98,7 +100,9 @@ def changed(of: System, **values: float) -> np.ndarray:
 def test_a_module_that_imports_traci_reads_the_simulation() -> None:
     Path("helper.py").write_text(HELPER)
     runs = system("step", USES_HELPER)
-    assert drive_worst(runs, changed(runs)).trace.speed.max() == pytest.approx(5, abs=0.7)
+    assert drive_worst(runs, changed(runs)).trace.speed.max() == pytest.approx(
+        5, abs=0.7
+    )
     assert {type(sys.modules[name]) for name in ("traci", "libsumo")} == {ModuleType}, (
         "the import is for controllers alone"
     )
@@ -133,10 +137,14 @@ def test_a_controller_reads_other_actors_through_the_sensors() -> None:
     }
     runs = system("step", LOOKS, weather=weather)
     trace = drive_worst(runs, changed(runs, reactionTime=0.25, sensorRange=80)).trace
-    leader, x, number, listed = np.loadtxt("looks.csv", delimiter=",")[: len(trace.time)].T
+    leader, x, number, listed = np.loadtxt("looks.csv", delimiter=",")[
+        : len(trace.time)
+    ].T
     gap = np.concatenate([np.repeat(trace.gap[0, :], 4), trace.gap[:, 0]])
     late = gap[: len(leader)]  # 3.5 steps, rounded to 4
-    near = late <= 40  # also the leader, whose gap is that of the bumpers without minGap
+    near = (
+        late <= 40
+    )  # also the leader, whose gap is that of the bumpers without minGap
     assert 0 < near.sum() < len(near)
     assert leader[near] == pytest.approx(late[near] - 2.5, abs=1e-6)  # without minGap
     assert np.all(leader[~near] == -1)
@@ -169,16 +177,23 @@ class Reads:
 
 def test_no_function_returns_ids_or_actors_of_other_copies() -> None:
     runs = system("Reads", SUBSCRIBES)
-    drive_worst(runs, np.repeat(changed(runs, sensorRange=120, reactionTime=0.1), 3, axis=0))
+    drive_worst(
+        runs, np.repeat(changed(runs, sensorRange=120, reactionTime=0.1), 3, axis=0)
+    )
 
 
-@pytest.mark.parametrize(("mode", "acceleration"), [(0, 20.0), (1, 16.0), (2, 2.0), (4, 20.0)])
+@pytest.mark.parametrize(
+    ("mode", "acceleration"), [(0, 20.0), (1, 16.0), (2, 2.0), (4, 20.0)]
+)
 def test_each_bit_of_a_speed_mode_is_one_limit(mode: int, acceleration: float) -> None:
     commands = CommandedSpeed(step=0.5)
     commands.command("setSpeedMode", 0.0, 10.0, (mode,))
     commands.command("setSpeed", 0.0, 10.0, (20,))
     assert commands.mode == mode
-    assert commands.acceleration(10.0, 0.0, sumo_speed=18.0, accel=2.0, decel=5.0) == acceleration
+    assert (
+        commands.acceleration(10.0, 0.0, sumo_speed=18.0, accel=2.0, decel=5.0)
+        == acceleration
+    )
 
 
 def test_the_vehicle_model_limits_a_commanded_acceleration() -> None:

@@ -32,7 +32,9 @@ Repeated = list[tuple[Point, FloatArray]]
 
 @pytest.fixture
 def study() -> Study:
-    return load_study("alks", search={"algorithms": ["rs"], "runs": 1, "evaluations": 8})
+    return load_study(
+        "alks", search={"algorithms": ["rs"], "runs": 1, "evaluations": 8}
+    )
 
 
 @pytest.fixture
@@ -71,7 +73,9 @@ def test_a_fault_of_the_fast_engine_in_one_test_of_a_matrix_is_found(
     for module in (matrix, verification):
         monkeypatch.setattr(module, "drive_all", faulty)
     for _ in range(2):
-        with pytest.raises(InputError, match=r"gap at .* in the recorded scene and .* in SUMO"):
+        with pytest.raises(
+            InputError, match=r"gap at .* in the recorded scene and .* in SUMO"
+        ):
             searched(study, tmp_path)
         assert (tmp_path / "solutions.csv").exists()
 
@@ -92,7 +96,9 @@ def test_each_setting_drives_at_its_worst_point_and_one_of_each_test_has_its_tur
     assert sum(len(rows) for _, rows in repeated) == 2 * len(settings)
 
 
-def test_a_sample_has_unsafe_solutions_once_and_others_that_the_seed_draws(study: Study) -> None:
+def test_a_sample_has_unsafe_solutions_once_and_others_that_the_seed_draws(
+    study: Study,
+) -> None:
     """Of two runs whose settings are partly the same."""
     rng = np.random.default_rng(1)
     settings = rng.random((5000, len(study.domains)))
@@ -111,11 +117,16 @@ def test_a_sample_has_unsafe_solutions_once_and_others_that_the_seed_draws(study
     keys = [row.tobytes() for row in sample.settings]
     assert len(keys) == len({*keys}) == MAX_REPEATED
     assert {*keys[:UNSAFE_REPEATED]} <= collided
-    known = {row.tobytes(): point for row, point in zip(settings, requested.points, strict=True)}
+    known = {
+        row.tobytes(): point
+        for row, point in zip(settings, requested.points, strict=True)
+    }
     assert [known[key] for key in keys] == sample.points.tolist()
     assert np.array_equal(sample.settings, chosen().settings)
     other = with_search(study, seed=7)
-    assert not np.array_equal(sample.settings, choose_sample(other, original, runs).settings)
+    assert not np.array_equal(
+        sample.settings, choose_sample(other, original, runs).settings
+    )
 
 
 def test_a_search_without_a_solution_is_verified_too(study: Study) -> None:

@@ -55,7 +55,11 @@ def prepare(
 ) -> Any:
     """The constants of vehicles with these settings, shape (N, n)."""
     values = dict(
-        zip(SYSTEMS[model].characteristics.names, np.ascontiguousarray(settings.T), strict=True)
+        zip(
+            SYSTEMS[model].characteristics.names,
+            np.ascontiguousarray(settings.T),
+            strict=True,
+        )
     )
     return SYSTEMS[model].vehicle.prepare(
         values, road, step, slope_of(np.full(len(settings), grade)), water
@@ -81,7 +85,9 @@ def drive(
     states = [_rolling(vehicle.at_rest(prepared), prepared, rolling)]
     for k in range(round(duration / step)):
         throttle, brake = pedals(round(k * step, 9))
-        command = Command(np.zeros(len(settings)) + throttle, np.zeros(len(settings)) + brake)
+        command = Command(
+            np.zeros(len(settings)) + throttle, np.zeros(len(settings)) + brake
+        )
         states.append(vehicle.advance(prepared, states[-1], command))
     return Drive(prepared, states, step)
 

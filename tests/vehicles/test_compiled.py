@@ -40,7 +40,9 @@ def plain() -> ModuleType:
 
 
 @pytest.mark.parametrize("n", [1, 65])
-def test_a_step_has_the_bits_of_a_plain_loop_over_one_vehicle(n: int, plain: ModuleType) -> None:
+def test_a_step_has_the_bits_of_a_plain_loop_over_one_vehicle(
+    n: int, plain: ModuleType
+) -> None:
     """From rest through all gears, with held gears, to a standstill with locked wheels; the first
     and the last of n.
     """
@@ -64,7 +66,9 @@ def test_a_step_has_the_bits_of_a_plain_loop_over_one_vehicle(n: int, plain: Mod
         for k, i in enumerate((0, n - 1)):
             one = alone[k]
             for _ in range(p.substeps):
-                one = plain.move(cars[k], p.law, one, float(throttle[i]), float(brake[i]))
+                one = plain.move(
+                    cars[k], p.law, one, float(throttle[i]), float(brake[i])
+                )
             if one.brake > 0 and one.speed < cars[k].standstill:
                 one = one._replace(speed=0.0, wheel_speed=0.0)
             alone[k] = one
@@ -89,7 +93,11 @@ def loaded(folder: str) -> str:
     """
     environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
     done = subprocess.run(
-        [sys.executable, "-c", LOADING], env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-c", LOADING],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return done.stdout.strip() + done.stderr
 
@@ -107,7 +115,11 @@ def test_without_a_cache_functions_are_compiled_in_silence(
     exec(compile("def double(x):\n    return 2.0 * x", "nowhere", "exec"), code)
     double = compiled.compiled(code["double"])
     assert not compiled.is_compiled(lambda: double(1.0))
-    assert (double(1.5), compiled.is_compiled(lambda: double(1.0)), *capfd.readouterr()) == (
+    assert (
+        double(1.5),
+        compiled.is_compiled(lambda: double(1.0)),
+        *capfd.readouterr(),
+    ) == (
         3.0,
         True,
         "",
@@ -129,5 +141,9 @@ def test_progress_says_that_the_vehicle_is_compiled_once_a_pool(
     monkeypatch.setattr(type(CARLA), "compile", compile_model)
     pool = InlinePool()
     for name in ("rain", "rain", "lgsvl"):
-        compile_vehicle(load_study(name), pool, lambda stage, done, total: shown.append(stage))
-    assert (asked, shown) == (([True], []) if is_ready else ([True, False], [COMPILING]))
+        compile_vehicle(
+            load_study(name), pool, lambda stage, done, total: shown.append(stage)
+        )
+    assert (asked, shown) == (
+        ([True], []) if is_ready else ([True, False], [COMPILING])
+    )

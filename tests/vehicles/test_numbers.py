@@ -60,7 +60,8 @@ def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
             speed=np.full(1, 20.0), wheel_speed=np.full(1, 20.0 / 0.355)
         )
         slowed.append(
-            20.0 - float(CARLA.advance(p, state, Command(np.zeros(1), np.zeros(1))).speed[0])
+            20.0
+            - float(CARLA.advance(p, state, Command(np.zeros(1), np.zeros(1))).speed[0])
         )
     # The wheels' inertia takes part: four wheels of 20 kg, I / r^2 = 40 kg.
     assert slowed[1] - slowed[0] == pytest.approx(
@@ -68,7 +69,9 @@ def test_air_slows_carlas_vehicle_by_half_rho_cd_a_v_squared() -> None:
     )
 
 
-def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_and_waits_two_seconds() -> None:
+def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_and_waits_two_seconds() -> (
+    None
+):
     # The values of sun are fitted.
     vehicle = replace(CARLA, shift_up=0.65, shift_down=0.5, shift_latency=2.0)
     names = SYSTEMS["carla"].characteristics
@@ -115,7 +118,10 @@ def test_carlas_gearbox_shifts_as_soon_as_the_selector_lets_go_of_the_gear() -> 
     for _ in range(100):
         state = step("carla", CARLA.hold_gear(p, state, one > 0), throttle=1.0)
         assert state.target_gear[0] == 1
-    assert step("carla", CARLA.hold_gear(p, state, one < 0), throttle=1.0).target_gear[0] == 2
+    assert (
+        step("carla", CARLA.hold_gear(p, state, one < 0), throttle=1.0).target_gear[0]
+        == 2
+    )
 
 
 @pytest.mark.parametrize(
@@ -123,9 +129,17 @@ def test_carlas_gearbox_shifts_as_soon_as_the_selector_lets_go_of_the_gear() -> 
     [
         (
             "carla",
-            {"max_speed": 53.9045, "accel": 10.1634, "decel": 7.03054, "actuator_lag": 0.258097},
+            {
+                "max_speed": 53.9045,
+                "accel": 10.1634,
+                "decel": 7.03054,
+                "actuator_lag": 0.258097,
+            },
         ),
-        ("lgsvl", {"max_speed": 177.340, "accel": 6.47418, "decel": 9.81, "mass": 2120.0}),
+        (
+            "lgsvl",
+            {"max_speed": 177.340, "accel": 6.47418, "decel": 9.81, "mass": 2120.0},
+        ),
     ],
 )
 def test_sumo_is_told_what_a_vehicle_can_do(model: str, told: dict[str, float]) -> None:
@@ -134,20 +148,27 @@ def test_sumo_is_told_what_a_vehicle_can_do(model: str, told: dict[str, float]) 
     wheels of 0.35 m; 450 N m through 4.17 by 2.56; brakes that reach g.
     """
     found = SYSTEMS[model].vehicle.sumo_type(prepared(model))
-    assert {name: getattr(found, name)[0] for name in told} == pytest.approx(told, rel=1e-5)
+    assert {name: getattr(found, name)[0] for name in told} == pytest.approx(
+        told, rel=1e-5
+    )
 
 
 def test_lgsvls_gearbox_and_traction_control_have_their_numbers() -> None:
     """At least 0.7 s between changes; torque from 0.325 of the largest, by 337.5 N m/s."""
     states = drive("lgsvl", original("lgsvl"), full_throttle, 12).states
-    changes = np.flatnonzero(np.diff(np.array([float(state.gear[0]) for state in states]))) * STEP
+    changes = (
+        np.flatnonzero(np.diff(np.array([float(state.gear[0]) for state in states])))
+        * STEP
+    )
     assert len(changes) > 2
     assert np.diff(changes).min() >= 0.7 - STEP / 2
     torque = [float(state.traction_torque[0]) for state in states[:4]]
     assert torque == pytest.approx([0.325 * 450 + 337.5 * STEP * k for k in range(4)])
 
 
-@pytest.mark.parametrize(("share", "gear"), [(0.12, 2), (0.14, 3), (0.32, 3), (0.34, 4)])
+@pytest.mark.parametrize(
+    ("share", "gear"), [(0.12, 2), (0.14, 3), (0.32, 3), (0.34, 4)]
+)
 def test_lgsvls_gearbox_shifts_up_at_033_and_down_at_013_of_the_engines_maximum(
     share: float, gear: int
 ) -> None:
@@ -184,11 +205,17 @@ def test_lgsvls_tyres_follow_unitys_curve(slip: float, share: float) -> None:
     assert force == pytest.approx(share * (2120 * GRAVITY + 2 * speed * speed))
 
 
-@pytest.mark.parametrize(("visibility", "is_seen"), [(1.0, True), (0.8, True), (0.7, False)])
-def test_sumos_sensor_sees_less_far_in_bad_sight(visibility: float, is_seen: bool) -> None:
+@pytest.mark.parametrize(
+    ("visibility", "is_seen"), [(1.0, True), (0.8, True), (0.7, False)]
+)
+def test_sumos_sensor_sees_less_far_in_bad_sight(
+    visibility: float, is_seen: bool
+) -> None:
     vehicle = SYSTEMS["sumo"].vehicle
     p = prepared("sumo")
-    result, _ = vehicle.sense(p, vehicle.at_rest(p), seen(0.0, 1.0, 60.0, visibility=visibility))
+    result, _ = vehicle.sense(
+        p, vehicle.at_rest(p), seen(0.0, 1.0, 60.0, visibility=visibility)
+    )
     assert bool(np.isfinite(result.gap[0])) == is_seen, "80 m in clear sight"
 
 
@@ -202,7 +229,8 @@ def test_a_braked_sumo_vehicle_does_not_go_on_speeding_up_during_the_lag() -> No
     for _ in range(40):
         state = vehicle.advance(p, state, Command(np.ones(1), np.zeros(1)))
     released, braked = (
-        vehicle.advance(p, state, Command(np.zeros(1), np.full(1, brake))) for brake in (0.0, 0.1)
+        vehicle.advance(p, state, Command(np.zeros(1), np.full(1, brake)))
+        for brake in (0.0, 0.1)
     )
     assert released.speed[0] > state.speed[0]
     assert braked.speed[0] <= state.speed[0]
@@ -216,12 +244,16 @@ def test_a_calibration_drive_finds_what_the_brake_adds_to_coasting() -> None:
 def tyre_force(friction: float, load: float, speed: float, rim: float) -> float:
     """Force of four tyres [N], from the shader's cubic as PhysX writes it."""
     slip = (rim - speed) / (max(rim, speed) + CARLA.slip_offset)
-    k = min(4 * GRAVITY * CARLA.longitudinal_stiffness * abs(slip) / (friction * load), 3.0)
+    k = min(
+        4 * GRAVITY * CARLA.longitudinal_stiffness * abs(slip) / (friction * load), 3.0
+    )
     return float(np.sign(slip) * friction * load * (k - k * k / 3 + k**3 / 27))
 
 
 @pytest.mark.parametrize("setting", drawn("carla", 5, 21), ids=range(5))
-def test_driving_and_braking_follow_the_differential_equations(setting: np.ndarray) -> None:
+def test_driving_and_braking_follow_the_differential_equations(
+    setting: np.ndarray,
+) -> None:
     """Stated bound: 0.1 m/s against an adaptive integrator with a tolerance of 1e-8, from the first
     gear on until 0.5 m/s.
     """
@@ -240,7 +272,10 @@ def test_driving_and_braking_follow_the_differential_equations(setting: np.ndarr
         x = engine / limit
         torque = (
             CARLA.engine_torque
-            * min(400 + 100 * x * 5800 / 1890, 500 - 100 * (x * 5800 - 1890) / (5730 - 1890))
+            * min(
+                400 + 100 * x * 5800 / 1890,
+                500 - 100 * (x * 5800 - 1890) / (5730 - 1890),
+            )
             * (x <= 1)
         )
         damping = (
@@ -251,13 +286,19 @@ def test_driving_and_braking_follow_the_differential_equations(setting: np.ndarr
         force = tyre_force(friction, mass * GRAVITY, speed, radius * wheel)
         braking = brake * 4 * values["maxBrakeTorque"] * np.tanh(wheel / 0.01)
         return [
-            (force - 0.5 * AIR_DENSITY * FRONTAL_AREA * values["dragCoeff"] * speed * speed) / mass,
+            (
+                force
+                - 0.5 * AIR_DENSITY * FRONTAL_AREA * values["dragCoeff"] * speed * speed
+            )
+            / mass,
             (ratio * clutch - 4 * values["dampRate"] * wheel - braking - radius * force)
             / (4 * 0.5 * 20 * radius * radius),
             (throttle * torque - damping * engine - clutch) / ENGINE_INERTIA,
         ]
 
-    begin = next(k for k, state in enumerate(run.states) if state.gear[0] > 0 and k * STEP >= 0.8)
+    begin = next(
+        k for k, state in enumerate(run.states) if state.gear[0] > 0 and k * STEP >= 0.8
+    )
     first = run.states[begin]
     times = np.arange(begin, len(run.states)) * STEP
     exact = solve_ivp(
@@ -272,13 +313,19 @@ def test_driving_and_braking_follow_the_differential_equations(setting: np.ndarr
     ).y[0]
     simulated = run.speed[begin:, 0]
     moving = exact > 0.5
-    assert np.count_nonzero(moving & (times > 1.7)) > 5, "the vehicle brakes for some time"
+    assert np.count_nonzero(moving & (times > 1.7)) > 5, (
+        "the vehicle brakes for some time"
+    )
     assert np.abs(simulated - exact)[moving].max() < 0.1
 
 
 def test_a_camera_on_smaller_wheels_overestimates_the_gap() -> None:
     population = ends("carla", "radius")
     constants = prepare("carla", population)
-    result, _ = CARLA.sense(constants, CARLA.at_rest(constants), seen(0.0, 0.0, np.full(5, 8.0)))
+    result, _ = CARLA.sense(
+        constants, CARLA.at_rest(constants), seen(0.0, 0.0, np.full(5, 8.0))
+    )
     assert np.all(np.diff(result.gap) < 0)
-    assert np.interp(35.5, population[:, 10], result.gap) == pytest.approx(8.0, rel=1e-3)
+    assert np.interp(35.5, population[:, 10], result.gap) == pytest.approx(
+        8.0, rel=1e-3
+    )

@@ -61,7 +61,9 @@ def kinetic_energy(model: str, run: Drive) -> FloatArray:
             ]
         )
     if isinstance(SYSTEMS[model].vehicle, Lgsvl):
-        return np.stack([(p.body * s.speed**2 + p.inertia * s.wheel_speed**2) / 2 for s in states])
+        return np.stack(
+            [(p.body * s.speed**2 + p.inertia * s.wheel_speed**2) / 2 for s in states]
+        )
     return np.stack([p.mass * s.speed**2 / 2 for s in states])
 
 
@@ -74,7 +76,12 @@ def test_energy_is_never_created(model: str) -> None:
     rng = default_rng(12)
     throttle = rng.choice([0.0, 0.4, 1.0], (8, n))
     brake = rng.choice([0.0, 0.0, 0.3, 1.0], (8, n))
-    run = drive(model, drawn(model, n, 13), lambda time: (throttle[int(time)], brake[int(time)]), 8)
+    run = drive(
+        model,
+        drawn(model, n, 13),
+        lambda time: (throttle[int(time)], brake[int(time)]),
+        8,
+    )
     energy = kinetic_energy(model, run)
     gained = np.diff(energy, axis=0)
     throttle = np.stack([state.throttle for state in run.states])
@@ -96,16 +103,26 @@ def test_energy_is_never_created(model: str) -> None:
 
 # Measurements in which a characteristic acts, over a grid of its domain.
 def speed_at(
-    time: float, pedals: Callable[[float], tuple[float, float]] = full_throttle, road: float = 1.0
+    time: float,
+    pedals: Callable[[float], tuple[float, float]] = full_throttle,
+    road: float = 1.0,
 ) -> Callable[..., FloatArray]:
-    return lambda model, population: drive(model, population, pedals, time, road=road).speed[-1]
+    return lambda model, population: drive(
+        model, population, pedals, time, road=road
+    ).speed[-1]
 
 
 def stopping_distance(
     brake: float, road: float = 1.0, water: float = 0.0
 ) -> Callable[..., FloatArray]:
     return lambda model, population: drive(
-        model, population, lambda time: (0.0, brake), 15, rolling=8.0, road=road, water=water
+        model,
+        population,
+        lambda time: (0.0, brake),
+        15,
+        rolling=8.0,
+        road=road,
+        water=water,
     ).distance[-1]
 
 
@@ -177,9 +194,12 @@ SENSED = {
 
 
 @pytest.mark.parametrize(
-    ("model", "name"), [(model, name) for model, acting in ACTS.items() for name in acting]
+    ("model", "name"),
+    [(model, name) for model, acting in ACTS.items() for name in acting],
 )
-def test_a_characteristic_acts_in_the_direction_that_physics_says(model: str, name: str) -> None:
+def test_a_characteristic_acts_in_the_direction_that_physics_says(
+    model: str, name: str
+) -> None:
     measure, direction = ACTS[model][name]
     measured = direction * measure(model, ends(model, name))
     assert measured[-1] > measured[0]
@@ -188,7 +208,9 @@ def test_a_characteristic_acts_in_the_direction_that_physics_says(model: str, na
 
 @pytest.mark.parametrize("model", MODELS)
 def test_every_characteristic_is_tested_to_act(model: str) -> None:
-    assert set(ACTS[model]) | SENSED.get(model, set()) == set(SYSTEMS[model].characteristics.names)
+    assert set(ACTS[model]) | SENSED.get(model, set()) == set(
+        SYSTEMS[model].characteristics.names
+    )
 
 
 def test_what_comes_into_sight_is_where_it_is_whatever_was_before() -> None:
@@ -225,16 +247,22 @@ def sensed_gaps(model: str, name: str) -> tuple[FloatArray, FloatArray]:
         gap = np.full(5, 130.0 - 10 * k * STEP)
         sensed, state = vehicle.sense(prepared, state, seen(k * STEP, 0.0, gap))
         gaps.append(sensed.gap)
-    return population[:, SYSTEMS[model].characteristics.names.index(name)], np.stack(gaps)
+    return population[:, SYSTEMS[model].characteristics.names.index(name)], np.stack(
+        gaps
+    )
 
 
 @pytest.mark.parametrize("model", ["sumo", "worn"])
 def test_a_sensor_sees_nothing_beyond_its_range(model: str) -> None:
     reach, gaps = sensed_gaps(model, "sensorRange")
-    assert np.allclose(np.where(np.isfinite(gaps), gaps, 0).max(axis=0), reach, atol=0.6)
+    assert np.allclose(
+        np.where(np.isfinite(gaps), gaps, 0).max(axis=0), reach, atol=0.6
+    )
 
 
-@pytest.mark.parametrize(("model", "name"), [("sumo", "reactionTime"), ("worn", "sensorLatency")])
+@pytest.mark.parametrize(
+    ("model", "name"), [("sumo", "reactionTime"), ("worn", "sensorLatency")]
+)
 def test_a_slow_sensor_reports_the_past(model: str, name: str) -> None:
     latency, gaps = sensed_gaps(model, name)
     assert np.allclose(gaps[200], 130.0 - 10 * 200 * STEP + 10 * latency)
@@ -246,27 +274,47 @@ def test_a_drive_that_reaches_two_speeds_of_the_tables_has_an_acceleration() -> 
     assert not _accelerations([0.0, 0.3]).any()
 
 
-SPEEDS = (10, 20, 30, 40, 50, 60)  # km/h, where the original vehicles' gearboxes hold their gear
+SPEEDS = (
+    10,
+    20,
+    30,
+    40,
+    50,
+    60,
+)  # km/h, where the original vehicles' gearboxes hold their gear
 
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
 @pytest.mark.parametrize(
     ("kmh", "grade"), [*((kmh, 0) for kmh in SPEEDS), (20, 6), (40, -3), (40, -12)]
 )
-def test_nothing_changes_while_the_pedals_stay(model: str, kmh: float, grade: float) -> None:
+def test_nothing_changes_while_the_pedals_stay(
+    model: str, kmh: float, grade: float
+) -> None:
     vehicle = SYSTEMS[model].vehicle
     prepared = prepare(model, original(model), grade=grade)
     before = state = vehicle.at_start(prepared, np.full(1, kmh / 3.6))
     assert state.speed == pytest.approx(kmh / 3.6)
     for _ in range(200):
         state = vehicle.advance(prepared, state, Command(before.throttle, before.brake))
-    for name in ("speed", "wheel_speed", "engine_speed", "engine_rpm", "gear", "traction_torque"):
+    for name in (
+        "speed",
+        "wheel_speed",
+        "engine_speed",
+        "engine_rpm",
+        "gear",
+        "traction_torque",
+    ):
         if hasattr(state, name):
-            assert getattr(state, name) == pytest.approx(getattr(before, name), rel=1e-12), name
+            assert getattr(state, name) == pytest.approx(
+                getattr(before, name), rel=1e-12
+            ), name
 
 
 @pytest.mark.parametrize("model", sorted(SYSTEMS))
-def test_a_vehicle_that_starts_on_a_slope_too_slippery_to_hold_becomes_slower(model: str) -> None:
+def test_a_vehicle_that_starts_on_a_slope_too_slippery_to_hold_becomes_slower(
+    model: str,
+) -> None:
     vehicle = SYSTEMS[model].vehicle
     prepared = prepare(model, original(model), grade=12.0, road=0.03)
     state = vehicle.at_start(prepared, np.full(1, 10.0))
@@ -275,12 +323,18 @@ def test_a_vehicle_that_starts_on_a_slope_too_slippery_to_hold_becomes_slower(mo
 
 @SLOW
 @pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
-def test_the_depart_speed_of_the_traffic_is_honoured(study: str, tmp_path: Path) -> None:
+def test_the_depart_speed_of_the_traffic_is_honoured(
+    study: str, tmp_path: Path
+) -> None:
     traffic = tmp_path / "net" / "traffic.rou.xml"
     shutil.copytree(NETWORKS / load_study(study).scenario.model, traffic.parent)
     head, vut, tail = traffic.read_text().partition('<vehicle id="vut"')
-    traffic.write_text(head + vut + tail.replace('departSpeed="0"', 'departSpeed="5"', 1))
-    system = assemble(load_study(study, scenario={"parameters": {"network": str(traffic.parent)}}))
+    traffic.write_text(
+        head + vut + tail.replace('departSpeed="0"', 'departSpeed="5"', 1)
+    )
+    system = assemble(
+        load_study(study, scenario={"parameters": {"network": str(traffic.parent)}})
+    )
     trace = drive_worst(system, original_of(system)).trace
     assert trace.speed[0, 0] == 5
     assert abs(trace.speed[1, 0] - 5) < 0.3, (
@@ -292,7 +346,9 @@ G = 9.81
 ANGLE = math.atan(0.08)
 
 
-def test_a_grade_is_the_tangent_of_the_slopes_angle_and_none_is_level_to_the_bit() -> None:
+def test_a_grade_is_the_tangent_of_the_slopes_angle_and_none_is_level_to_the_bit() -> (
+    None
+):
     slope = slope_of(np.array([8.0, -8.0, 0.0]))
     assert slope.back == pytest.approx([G * math.sin(ANGLE), -G * math.sin(ANGLE), 0.0])
     assert slope.down == pytest.approx([G * math.cos(ANGLE), G * math.cos(ANGLE), G])
@@ -333,9 +389,13 @@ def test_the_way_to_stop_is_v2_over_twice_what_the_tyres_hold_and_the_slope_adds
 def test_whoever_stands_with_the_brake_on_stays_and_nobody_rolls_back(
     model: str, grade: float
 ) -> None:
-    braked = drive(model, original(model), lambda time: (0.0, 1.0), 20.0, rolling=5.0, grade=grade)
+    braked = drive(
+        model, original(model), lambda time: (0.0, 1.0), 20.0, rolling=5.0, grade=grade
+    )
     assert np.all(braked.speed[-100:] == 0)
-    released = drive(model, original(model), lambda time: (0.0, 0.0), 3.0, grade=grade).speed[-1, 0]
+    released = drive(
+        model, original(model), lambda time: (0.0, 0.0), 3.0, grade=grade
+    ).speed[-1, 0]
     assert released == 0 if grade > 0 else released > 1
 
 
@@ -349,7 +409,11 @@ def test_a_thousand_times_too_much_is_another_unit(model: str) -> None:
         tables: JsonObject = {"parameters": {name: 1000 * getattr(vehicle, name, 0)}}
         if row is not None:
             ends = ("original", "lower", "upper")
-            tables = {"characteristics": {name: {end: 1000 * getattr(row, end) for end in ends}}}
+            tables = {
+                "characteristics": {
+                    name: {end: 1000 * getattr(row, end) for end in ends}
+                }
+            }
         with pytest.raises(InputError, match=rf"vehicle\.\w+\.{name}"):
             assemble(load_study(study.name, name="another", vehicle=tables))
 
@@ -361,5 +425,7 @@ def test_an_own_vehicle_may_say_that_everything_is_plausible(in_tmp: Path) -> No
     )
     vehicle = {"model": "own:Own", "parameters": {"kerb_mass": 300}}
     characteristics = msgspec.to_builtins(load_study("wear").vehicle.characteristics)
-    study = load_study("wear", spread={}, vehicle={**vehicle, "characteristics": characteristics})
+    study = load_study(
+        "wear", spread={}, vehicle={**vehicle, "characteristics": characteristics}
+    )
     assert assemble(study).vehicle.kerb_mass == 300  # type: ignore[attr-defined]

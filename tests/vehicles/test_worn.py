@@ -49,7 +49,9 @@ HEALTHY = {
 
 def prepared(road: float, **changes: float):  # type: ignore[no-untyped-def]
     return CAR.prepare(
-        {name: np.array([value]) for name, value in {**HEALTHY, **changes}.items()}, road, 0.05
+        {name: np.array([value]) for name, value in {**HEALTHY, **changes}.items()},
+        road,
+        0.05,
     )
 
 
@@ -74,10 +76,16 @@ def test_two_axles_brake_together_and_none_beyond_the_friction_of_its_load(
     mu = float(p.grip)
     force = float(p.brake[0] * p.mass[0])
     values = {**HEALTHY, **changes}
-    centre = (CAR.kerb_mass * CAR.kerb_centre + values["payload"] * values["payloadCentre"]) / mass
+    centre = (
+        CAR.kerb_mass * CAR.kerb_centre + values["payload"] * values["payloadCentre"]
+    ) / mass
 
     def excess_force(a: float) -> float:
-        front = mass * (GRAVITY * (CAR.wheelbase - centre) + a * CAR.centre_height) / CAR.wheelbase
+        front = (
+            mass
+            * (GRAVITY * (CAR.wheelbase - centre) + a * CAR.centre_height)
+            / CAR.wheelbase
+        )
         return (
             min(CAR.front_share * force, mu * front)
             + min((1 - CAR.front_share) * force, mu * (mass * GRAVITY - front))
@@ -99,7 +107,9 @@ def test_sumo_is_told_what_the_worn_car_can_do() -> None:
     dry = CAR.sumo_type(prepared(1.0))
     icy = CAR.sumo_type(prepared(0.1))
     assert dry.accel[0] == pytest.approx(3900 / (1500 + 75))
-    assert (icy.accel[0], icy.decel[0]) == pytest.approx((0.1079 * GRAVITY, 0.1079 * GRAVITY))
+    assert (icy.accel[0], icy.decel[0]) == pytest.approx(
+        (0.1079 * GRAVITY, 0.1079 * GRAVITY)
+    )
     assert dry.actuator_lag[0] == pytest.approx(0.1 + 0.05)
 
 
@@ -118,7 +128,9 @@ PAGE = " ".join(Path("docs/trust_wear.md").read_text(encoding="utf-8").split())
 
 
 @cache
-def stopping_distances(speed: float, water: float, grip: float, *treads: float) -> FloatArray:
+def stopping_distances(
+    speed: float, water: float, grip: float, *treads: float
+) -> FloatArray:
     """Stops of the study `stop` from a speed [km/h] on a road with water [mm] and a grip [-], with
     tyres that alone limit the brakes [m].
     """
@@ -129,8 +141,15 @@ def stopping_distances(speed: float, water: float, grip: float, *treads: float) 
         "water": water,
     }
     tests = [{"name": "stop", "over": {"speed": [speed]}}]
-    tables = {"extends": "stop", "name": "one", "weather": weather, "matrix": {"tests": tests}}
-    system = assemble(load_study({**tables, "vehicle": {"parameters": {"brake_force": 40000.0}}}))
+    tables = {
+        "extends": "stop",
+        "name": "one",
+        "weather": weather,
+        "matrix": {"tests": tests},
+    }
+    system = assemble(
+        load_study({**tables, "vehicle": {"parameters": {"brake_force": 40000.0}}})
+    )
     settings = np.array([[tread, *[*HEALTHY.values()][1:]] for tread in treads])
     return drive_and_score(system, settings).metrics["stopping_distance"]
 
@@ -140,8 +159,13 @@ def simulated_stop(row: dict[str, str]) -> float:
     source = fit.source_of(row)
     grip = fit.GRIPS.get(source)
     new = fit.NEW_TREADS.get(source, fit.NEW_TREAD)
-    road = fit.water_of(row, FITTED), FITTED[f"grip {grip}"] if grip else CAR.tyre_friction
-    worn, as_new = stopping_distances(float(row["speed_kmh"]), *road, float(row["tread_mm"]), new)
+    road = (
+        fit.water_of(row, FITTED),
+        FITTED[f"grip {grip}"] if grip else CAR.tyre_friction,
+    )
+    worn, as_new = stopping_distances(
+        float(row["speed_kmh"]), *road, float(row["tread_mm"]), new
+    )
     return float(worn if row["distance_m"] else worn / as_new)
 
 
@@ -158,10 +182,14 @@ def test_published_stops_are_repeated_as_the_page_of_trust_says() -> None:
         unit, digits = ("m", 1) if row["distance_m"] else ("times new", 2)
         values = f"{published:.{digits}f} {unit}|{here:.{digits}f}|{here - published:+.{digits}f}"
         error = f"{100 * (here / published - 1):+.0f} %"
-        assert (f"|{source}|{row['speed_kmh']}|{row['tread_mm']}|{values}|{error}|") in PAGE
+        assert (
+            f"|{source}|{row['speed_kmh']}|{row['tread_mm']}|{values}|{error}|"
+        ) in PAGE
     assert np.median(errors) <= 0.06
     assert max(errors) <= 0.25
-    middle, largest = (f"{100 * error:.1f} %" for error in (np.median(errors), max(errors)))
+    middle, largest = (
+        f"{100 * error:.1f} %" for error in (np.median(errors), max(errors))
+    )
     assert f"median error of the stops is {middle}, the largest {largest}." in PAGE
 
 
@@ -177,12 +205,20 @@ def test_the_handbooks_wet_rows_have_its_order() -> None:
     assert error <= 0.08
     assert f"mean error {error:.3f}, rank correlation {rank:.3f}" in PAGE
     shallow = [row["water_mm"] == "0.2" and row["speed_kmh"] == "50" for row in wet]
-    assert f"up to {(here - published)[shallow].max():.2f} too grippy at 50 km/h and 0.2 mm" in PAGE
+    assert (
+        f"up to {(here - published)[shallow].max():.2f} too grippy at 50 km/h and 0.2 mm"
+        in PAGE
+    )
 
 
 @pytest.mark.parametrize(
     ("speed", "tread", "low", "high"),
-    [(80, 1.6, 1.3, 1.5), (80, 3, 1.12, 1.28), (120, 1.6, 1.8, 3.0), (30, 1.6, 1.0, 1.25)],
+    [
+        (80, 1.6, 1.3, 1.5),
+        (80, 3, 1.12, 1.28),
+        (120, 1.6, 1.8, 3.0),
+        (30, 1.6, 1.0, 1.25),
+    ],
 )
 def test_a_millimetre_of_water_costs_worn_tyres_what_tests_measured(
     speed: float, tread: float, low: float, high: float
@@ -207,11 +243,15 @@ def test_a_wet_stop_is_the_integral_of_speed_over_friction(speed: float) -> None
     )
 
 
-def test_friction_falls_with_speed_water_and_lost_tread_and_on_a_dry_road_not_at_all() -> None:
+def test_friction_falls_with_speed_water_and_lost_tread_and_on_a_dry_road_not_at_all() -> (
+    None
+):
     speeds = np.linspace(1, 60, 13)[:, np.newaxis]
     treads = np.linspace(0, 9, 91)
     dry, damp, wet = (
-        lifted_friction(1.0, lift_of(water, treads, CAR.water_lift, CAR.road_texture), speeds)
+        lifted_friction(
+            1.0, lift_of(water, treads, CAR.water_lift, CAR.road_texture), speeds
+        )
         for water in (0.0, 0.5, 2.0)
     )
     assert (dry == 1).all()
@@ -224,10 +264,16 @@ WET_ROAD = {"name": "wet", "road_friction": 0.71, "visibility": 1.0, "water": 1.
 LATE = ("brakeResponse", "sensorLatency")
 ASSUMPTIONS = {
     "as shipped": {},
-    "grip of the road 20 % lower": {"weather": {**WET_ROAD, "road_friction": 0.8 * 0.71}},
+    "grip of the road 20 % lower": {
+        "weather": {**WET_ROAD, "road_friction": 0.8 * 0.71}
+    },
     "water 20 % deeper": {"weather": {**WET_ROAD, "water": 1.2}},
-    "`water_lift` 20 % larger": {"vehicle": {"parameters": {"water_lift": 1.2 * CAR.water_lift}}},
-    "brakes 20 % weaker": {"vehicle": {"parameters": {"brake_force": 0.8 * CAR.brake_force}}},
+    "`water_lift` 20 % larger": {
+        "vehicle": {"parameters": {"water_lift": 1.2 * CAR.water_lift}}
+    },
+    "brakes 20 % weaker": {
+        "vehicle": {"parameters": {"brake_force": 0.8 * CAR.brake_force}}
+    },
     "healthy brake delay 20 % longer": {
         "vehicle": {"characteristics": {"brakeResponse": {"original": 0.12}}}
     },
@@ -250,9 +296,12 @@ LIMITED = {
 
 @SLOW
 @pytest.mark.parametrize("assumption", ASSUMPTIONS)
-def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(assumption: str) -> None:
+def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(
+    assumption: str,
+) -> None:
     evaluator = Evaluator(
-        load_study({"extends": "wear", "name": "other", **ASSUMPTIONS[assumption]}), InlinePool()
+        load_study({"extends": "wear", "name": "other", **ASSUMPTIONS[assumption]}),
+        InlinePool(),
     )
     columns = [list(evaluator.characteristics.names).index(name) for name in LIMITED]
     cells = []
@@ -274,7 +323,9 @@ def test_the_shipped_constants_are_what_the_script_prints() -> None:
     printed = subprocess.run(
         [sys.executable, "calibration/wet_friction.py"], capture_output=True, text=True
     ).stdout
-    constants = (Path(wet_road.__file__).parent / "wet_friction.toml").read_text(encoding="utf-8")
+    constants = (Path(wet_road.__file__).parent / "wet_friction.toml").read_text(
+        encoding="utf-8"
+    )
     assert constants.partition("\n\n")[2].strip() in printed
     study = tomllib.loads(Path("studies/wear.toml").read_text(encoding="utf-8"))
     assert tomllib.loads(printed.partition("[handbook]")[2].partition("\n\n")[2]) == {
@@ -295,7 +346,10 @@ def test_the_shipped_constants_are_what_the_script_prints() -> None:
         ("fog", False),
         ("night", False),
         ({"name": "polished", "road_friction": 0.6, "visibility": 1.0}, False),
-        ({"name": "puddles", "road_friction": 1.0, "visibility": 1.0, "water": 2.0}, True),
+        (
+            {"name": "puddles", "road_friction": 1.0, "visibility": 1.0, "water": 2.0},
+            True,
+        ),
     ],
 )
 def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(
@@ -306,7 +360,9 @@ def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(
             "extends": "wear",
             "name": "one",
             "weather": weather,
-            "matrix": {"tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]},
+            "matrix": {
+                "tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]
+            },
         }
     )
     new, worn = drive_and_score(
@@ -320,7 +376,9 @@ SUN = CharacteristicSet.of(load_study("sun"))
 
 
 def one(lower: float, original: float, upper: float) -> Characteristic:
-    return Characteristic(name="c", unit="-", original=original, lower=lower, upper=upper)
+    return Characteristic(
+        name="c", unit="-", original=original, lower=lower, upper=upper
+    )
 
 
 @pytest.mark.parametrize(
@@ -355,14 +413,26 @@ def test_filter_is_idempotent_and_keeps_or_restores(settings: np.ndarray) -> Non
 
 def test_a_plausible_value_is_at_most_1000_times_the_largest_of_the_domain() -> None:
     values = np.array([1e5, 1.001e5, 0.0, -1e5])
-    assert one(0, 50, 100).is_legal(values, beyond=True).tolist() == [True, False, True, True]
-    assert one(1, 50, 100).is_legal(values, beyond=True).tolist() == [True, False, False, False]
+    assert one(0, 50, 100).is_legal(values, beyond=True).tolist() == [
+        True,
+        False,
+        True,
+        True,
+    ]
+    assert one(1, 50, 100).is_legal(values, beyond=True).tolist() == [
+        True,
+        False,
+        False,
+        False,
+    ]
 
 
 def test_a_change_of_just_the_threshold_is_noise() -> None:
     """Numbers that are exact in binary: 2 % of a width of 100."""
     exact = CharacteristicSet((one(0, 50, 100),))
-    assert exact.filter(np.array([[52.0], [48.0], [52.5], [47.5]])).ravel().tolist() == [
+    assert exact.filter(
+        np.array([[52.0], [48.0], [52.5], [47.5]])
+    ).ravel().tolist() == [
         50,
         50,
         52.5,
@@ -380,7 +450,11 @@ def seen_at(gap: Any, time: float = 0.0) -> Observation:
         "lateral_speed": zeros,
     }
     return Observation(
-        time=time, gap=zeros + gap, visibility=1.0, obstacle_width=zeros + 0.5, **columns
+        time=time,
+        gap=zeros + gap,
+        visibility=1.0,
+        obstacle_width=zeros + 0.5,
+        **columns,
     )
 
 
@@ -393,18 +467,26 @@ def sensors(**values: float | list[float]) -> tuple[WornVehicle, Any, Any]:
     original = {name: np.full(n, row.original) for name, row in table.items()}
     given = {name: np.zeros(n) + value for name, value in values.items()}
     vehicle = WornVehicle()
-    prepared = vehicle.prepare({**original, "sensorLatency": np.full(n, 1e-9), **given}, 1.0, 0.05)
+    prepared = vehicle.prepare(
+        {**original, "sensorLatency": np.full(n, 1e-9), **given}, 1.0, 0.05
+    )
     return vehicle, prepared, vehicle.at_speed(prepared, np.full(n, 10.0))
 
 
-def test_an_angle_of_one_degree_puts_a_pedestrian_outside_a_corridor_beyond_92_metres() -> None:
+def test_an_angle_of_one_degree_puts_a_pedestrian_outside_a_corridor_beyond_92_metres() -> (
+    None
+):
     """1.6 m / tan(1 degree) = 91.66 m; nearer he is inside, at every angle in proportion to 1 /
     tan.
     """
     for angle in (-4.0, 1.0, 2.0):
         border = 1.6 / abs(math.tan(math.radians(angle)))
-        vehicle, prepared, state = sensors(sensorAngle=[angle, angle], sensorRange=200.0)
-        seen, _ = vehicle.sense(prepared, state, seen_at(np.array([border - 0.01, border + 0.01])))
+        vehicle, prepared, state = sensors(
+            sensorAngle=[angle, angle], sensorRange=200.0
+        )
+        seen, _ = vehicle.sense(
+            prepared, state, seen_at(np.array([border - 0.01, border + 0.01]))
+        )
         assert is_in_the_way(seen, corridor=1.6 - 0.25).tolist() == [True, False]
     assert 1.6 / math.tan(math.radians(1.0)) == pytest.approx(91.66, abs=0.01)
     unseen, _ = vehicle.sense(prepared, state, seen_at(np.array([np.inf, np.inf])))
@@ -438,8 +520,12 @@ def test_a_study_without_them_drives_as_with_none() -> None:
     with_them = assemble(load_study("sensing", matrix=None))
     without = assemble(load_study("wear", matrix=None))
     settings = drawn(without, 6, 2)
-    ours = drive_and_score(with_them, np.concatenate([settings, np.zeros((6, 2))], axis=1))
+    ours = drive_and_score(
+        with_them, np.concatenate([settings, np.zeros((6, 2))], axis=1)
+    )
     assert ours.f_safe.tolist() == drive_and_score(without, settings).f_safe.tolist()
     angled = with_them.characteristics.original.copy()
     angled[with_them.characteristics.names.index("sensorAngle")] = 2.5
-    assert with_them.characteristics.largest_change(angled[np.newaxis]).tolist() == [0.25]
+    assert with_them.characteristics.largest_change(angled[np.newaxis]).tolist() == [
+        0.25
+    ]

@@ -84,7 +84,14 @@ PAIR_COLUMNS: Columns = {
 @question
 @contents(
     *("decision", "unsafe", "margin", "settings", *UNSAFE_IN.values(), "p", "a12"),
-    *("better_in", "worse_in", "limits_grown", "limits_shrunk", "outside", "not_simulated"),
+    *(
+        "better_in",
+        "worse_in",
+        "limits_grown",
+        "limits_shrunk",
+        "outside",
+        "not_simulated",
+    ),
     *(*ENDS, "metres_earlier", "metres_later"),
     *(f"{side}_{name}" for side in SIDES for name in ("gap", "needless_braking")),
     "benign_scenes",
@@ -143,23 +150,33 @@ def compare(
 
     # The same settings in both.
     # Of few simulations a third, a sixth in each study; the others are for the limits.
-    pairs, outside = pairs_of((subject, other), common, criteria, evaluator.at_most(samples, 6))
+    pairs, outside = pairs_of(
+        (subject, other), common, criteria, evaluator.at_most(samples, 6)
+    )
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings, valid)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
-    titles = ("A", "B") if study.name == second.study.name else (study.name, second.study.name)
+    titles = (
+        ("A", "B")
+        if study.name == second.study.name
+        else (study.name, second.study.name)
+    )
 
     # What differs: settings, limits, the original vehicles, safety degrees.
     alone = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
-    of_originals, of_new_cars = compare_originals(evaluators, originals, criteria, titles[0])
+    of_originals, of_new_cars = compare_originals(
+        evaluators, originals, criteria, titles[0]
+    )
     differences = [
         *of_new_cars,
         *compare_counts(counts, titles[0]),
         *compare_limits(alone),
         *compare_values(tested.p, tested.a12),
     ]
-    decided, why = _decide(differences, titles, of_originals, missing_in_words(evaluators, titles))
+    decided, why = _decide(
+        differences, titles, of_originals, missing_in_words(evaluators, titles)
+    )
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
         **decided,
@@ -169,7 +186,11 @@ def compare(
     summary = summary_of(numbers, tested.pairs, titles)
     table = _table(common, settings)
     sentences = [
-        *([second.no_verdict] if second.no_verdict not in ("", evaluator.no_verdict) else []),
+        *(
+            [second.no_verdict]
+            if second.no_verdict not in ("", evaluator.no_verdict)
+            else []
+        ),
         why,
         *_basis_in_words(criteria[0], common, limits),
         *counted_in_words(study, pairs.number_infeasible),
@@ -180,7 +201,12 @@ def compare(
         verdict=" ".join(sentences),
         tested=_test_in_words(tested, titles),
         numbers=numbers,
-        tables={"summary": summary, "limits": alone, "pairs": tested.pairs, "settings": table},
+        tables={
+            "summary": summary,
+            "limits": alone,
+            "pairs": tested.pairs,
+            "settings": table,
+        },
         folded=("settings",),
         failures=(why,) if why.startswith(DO_NOT_RELEASE) else (),
         draw=partial(draw_pairs, titles=titles),
@@ -233,11 +259,15 @@ def _criteria(
 
 
 def _default_criterion(
-    subjects: Sequence[Subject], evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]
+    subjects: Sequence[Subject],
+    evaluators: Sequence[Evaluator],
+    originals: Sequence[Evaluations],
 ) -> Unsafe:
     """A collision if any vehicle of either system collides, else a safety degree."""
     defaults = list[Unsafe]()
-    for subject, evaluator, original in zip(subjects, evaluators, originals, strict=True):
+    for subject, evaluator, original in zip(
+        subjects, evaluators, originals, strict=True
+    ):
         default = evaluator.choose_criterion(None, subject, original)
         if default == Unsafe():
             return default
@@ -245,7 +275,9 @@ def _default_criterion(
     return defaults[0]
 
 
-def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]) -> pd.DataFrame:
+def _settings_frame(
+    common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]
+) -> pd.DataFrame:
     """The settings with their values in A, B's values where they differ, and `SETTING_COLUMNS`."""
     names = common.evaluators[0].characteristics.names
     frame, settings, runs = pairs
@@ -256,7 +288,8 @@ def _settings_frame(common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsaf
         for column in np.flatnonzero(common.shift).tolist()
     }
     return pd.concat(
-        [frame.drop(columns="solution"), of_pairs, pd.DataFrame({**values, **moved})], axis=1
+        [frame.drop(columns="solution"), of_pairs, pd.DataFrame({**values, **moved})],
+        axis=1,
     )
 
 
@@ -269,13 +302,19 @@ def _table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
         ),
         **SETTING_COLUMNS,
     }
-    columns |= {item.name: Column(item.unit, item.words, is_shown=False) for item in members}
+    columns |= {
+        item.name: Column(item.unit, item.words, is_shown=False) for item in members
+    }
     for column in np.flatnonzero(common.shift).tolist():
         item = members[column]
         meaning = f"{item.name} in B, the same change of another original"
         columns[f"b_{item.name}"] = Column(item.unit, meaning, is_shown=False)
-    order = settings["unsafe_in"].map([*UNSAFE_IN].index).sort_values(kind="stable").index
-    return tabulate("The same settings in both systems", columns, settings.loc[order, [*columns]])
+    order = (
+        settings["unsafe_in"].map([*UNSAFE_IN].index).sort_values(kind="stable").index
+    )
+    return tabulate(
+        "The same settings in both systems", columns, settings.loc[order, [*columns]]
+    )
 
 
 class _PairedTest(NamedTuple):
@@ -302,7 +341,10 @@ def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
         if len(means) >= fewest_runs("RQ1"):
             pairs = means
-            names = [f"{name}-{int(run):02d} of {side.upper()}" for side, name, run in pairs.index]
+            names = [
+                f"{name}-{int(run):02d} of {side.upper()}"
+                for side, name, run in pairs.index
+            ]
             unit = "runs"
     # The p-value of pairs, and the probability that A's value is greater: above 0.5 A is better.
     sides = pairs.to_numpy(dtype=float).T
@@ -326,8 +368,12 @@ def _decide(
     """
     a, b = titles
     in_order = sorted(differences, key=lambda one: -one.weight)
-    worse, better = ([one for one in in_order if one.is_better is sign] for sign in (False, True))
-    worst, best = (max([one.weight for one in some], default=COMFORT) for some in (worse, better))
+    worse, better = (
+        [one for one in in_order if one.is_better is sign] for sign in (False, True)
+    )
+    worst, best = (
+        max([one.weight for one in some], default=COMFORT) for some in (worse, better)
+    )
     brakes_elsewhere = of_originals["metres_earlier"] or of_originals["metres_later"]
     is_unknown = not of_originals["benign_scenes"] and (better or brakes_elsewhere)
     decision = DECIDE
@@ -335,7 +381,9 @@ def _decide(
         what = f"and {a} were not simulated in the same encounters"
     elif worst == COLLISION or worst > best:
         decision = DO_NOT_RELEASE
-        but = ", but brakes less often without need" if better and best == COMFORT else ""
+        but = (
+            ", but brakes less often without need" if better and best == COMFORT else ""
+        )
         what = f"is less safe than {a}{but}"
     elif worse and better:
         what = f"is better than {a} in some things and worse in others"
@@ -351,8 +399,16 @@ def _decide(
             what = f"does not differ from {a} in anything that was measured"
     shown = [*worse[: MAX_REASONS - bool(better)], *better][:MAX_REASONS]
     phrases = dict.fromkeys(difference.phrase for difference in shown)
-    sentences = [f"{decision}: {b} {what}.", *lacks, *(f"{b} {phrase}." for phrase in phrases)]
-    numbers = {"decision": decision.lower(), "better_in": len(better), "worse_in": len(worse)}
+    sentences = [
+        f"{decision}: {b} {what}.",
+        *lacks,
+        *(f"{b} {phrase}." for phrase in phrases),
+    ]
+    numbers = {
+        "decision": decision.lower(),
+        "better_in": len(better),
+        "worse_in": len(worse),
+    }
     return numbers, " ".join(sentences)
 
 
@@ -366,7 +422,9 @@ def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
     )
 
 
-def _basis_in_words(unsafe: Unsafe, common: CommonDomain, limits: Sequence[str]) -> Iterator[str]:
+def _basis_in_words(
+    unsafe: Unsafe, common: CommonDomain, limits: Sequence[str]
+) -> Iterator[str]:
     """What counts as unsafe, within which limits, and around which originals."""
     if not unsafe.is_collision or unsafe.keep:
         yield f"Unsafe means: {unsafe.description}."

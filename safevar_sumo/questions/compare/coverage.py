@@ -40,9 +40,13 @@ def cases_of(side: Evaluator) -> Iterator[tuple[str, Point, TestCase]]:
         model = (test and test.model) or scenario.model
         stated = {**scenario.parameters, **(test.parameters if test else {})}
         for point in points:
-            driven = {key: value for key, value in point.parameters if key not in OF_ENCOUNTER}
+            driven = {
+                key: value for key, value in point.parameters if key not in OF_ENCOUNTER
+            }
             parameters = stated | driven
-            case = TestCase(model, parameters, point.weather, point.allowed_impact_speed)
+            case = TestCase(
+                model, parameters, point.weather, point.allowed_impact_speed
+            )
             yield (test.name if test else model), point, case
 
 
@@ -57,11 +61,15 @@ def missing_parts(side: Evaluator, other: Evaluator) -> list[str]:
     return [*dict.fromkeys(parts)]
 
 
-def missing_in_words(sides: tuple[Evaluator, Evaluator], titles: Sequence[str]) -> list[str]:
+def missing_in_words(
+    sides: tuple[Evaluator, Evaluator], titles: Sequence[str]
+) -> list[str]:
     """What each of two systems lacks, as sentences: `earlier lacks the test CCRs.`"""
     a, b = sides
     sentences = []
-    for title, parts in zip(titles, (missing_parts(a, b), missing_parts(b, a)), strict=True):
+    for title, parts in zip(
+        titles, (missing_parts(a, b), missing_parts(b, a)), strict=True
+    ):
         shown = parts[:MAX_PARTS_NAMED]
         if len(parts) > MAX_PARTS_NAMED:
             shown.append(f"{len(parts) - MAX_PARTS_NAMED} more")
@@ -93,7 +101,11 @@ def _missing_ranges(side: Evaluator, other: Evaluator) -> Iterator[str]:
         own = by_name.get(test and test.name, side.study.ranges)
         for name, domain in other.study.ranges_of(test).items():
             narrower = own.get(name)
-            if narrower is None or narrower.lower > domain.lower or narrower.upper < domain.upper:
+            if (
+                narrower is None
+                or narrower.lower > domain.lower
+                or narrower.upper < domain.upper
+            ):
                 where = f" in the test {test.name}" if test else ""
                 yield f"the range of {name} from {domain.lower:g} to {domain.upper:g}{where}"
 
@@ -123,7 +135,9 @@ def _missing_sets(study: Study, other: Study) -> Iterator[str]:
 
 def _sets_of_vehicle(study: Study) -> set[tuple[tuple[str, float], ...]]:
     of_vehicle = {
-        name: values for name, values in study.spread.items() if name.startswith(OF_VEHICLE)
+        name: values
+        for name, values in study.spread.items()
+        if name.startswith(OF_VEHICLE)
     }
     return {
         tuple(zip(of_vehicle, values, strict=True))

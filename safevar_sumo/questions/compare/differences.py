@@ -19,7 +19,11 @@ from safevar_sumo.questions.counterexamples import where_in_words
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.pairs import SIDES
-from safevar_sumo.questions.repair.price import benign_scenes, drive_new_cars, needless_braking
+from safevar_sumo.questions.repair.price import (
+    benign_scenes,
+    drive_new_cars,
+    needless_braking,
+)
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.tolerance.alone import Alone
@@ -35,10 +39,12 @@ LIMIT_COLUMNS: Columns = {
     "characteristic": "characteristic of the vehicle",
     "unit": "its unit",
     **with_interval(
-        "a", Column("", "value of A's original vehicle (interval: safe alone in A)", ".10g")
+        "a",
+        Column("", "value of A's original vehicle (interval: safe alone in A)", ".10g"),
     ),
     **with_interval(
-        "b", Column("", "value of B's original vehicle (interval: safe alone in B)", ".10g")
+        "b",
+        Column("", "value of B's original vehicle (interval: safe alone in B)", ".10g"),
     ),
     "change": "how the interval changes from A to B: grown, shrunk, both, or the same",
 }
@@ -73,11 +79,15 @@ class Difference(NamedTuple):
     weight: int = SAFETY
 
 
-def summary_of(numbers: JsonObject, pairs: pd.DataFrame, titles: Sequence[str]) -> pd.DataFrame:
+def summary_of(
+    numbers: JsonObject, pairs: pd.DataFrame, titles: Sequence[str]
+) -> pd.DataFrame:
     """The table of what is compared: the new car, changed cars, needless braking, and limits."""
     both = numbers["both"]
     values: JsonObject = {
-        "original vehicle: safety degree": [numbers[f"{side}_degree"] for side in SIDES],
+        "original vehicle: safety degree": [
+            numbers[f"{side}_degree"] for side in SIDES
+        ],
         f"unsafe of {numbers['settings']} changed vehicles": [
             numbers[f"only_{side}_unsafe"] + both for side in SIDES
         ],
@@ -105,8 +115,12 @@ def compare_counts(counts: Mapping[str, int], a: str) -> list[Difference]:
     unsafe_in_a = f"{number_of(only_a + counts['both'], 'setting')} that are"
     safe_in_a = f"{number_of(only_b + counts['neither'], 'setting')} that are"
     found = [
-        Difference(f"is safe in {only_a} of {unsafe_in_a} unsafe in {a}", is_better=True),
-        Difference(f"is unsafe in {only_b} of {safe_in_a} safe in {a}", is_better=False),
+        Difference(
+            f"is safe in {only_a} of {unsafe_in_a} unsafe in {a}", is_better=True
+        ),
+        Difference(
+            f"is unsafe in {only_b} of {safe_in_a} safe in {a}", is_better=False
+        ),
     ]
     return [one for one, count in zip(found, (only_a, only_b), strict=True) if count]
 
@@ -116,7 +130,11 @@ def compare_values(p: float, a12: float) -> list[Difference]:
     if not p < ALPHA:
         return []
     is_better = a12 < 0.5
-    return [Difference(f"has a {'higher' if is_better else 'lower'} safety degree", is_better)]
+    return [
+        Difference(
+            f"has a {'higher' if is_better else 'lower'} safety degree", is_better
+        )
+    ]
 
 
 def limits_of_both(
@@ -215,7 +233,8 @@ def compare_originals(
     """
     # How both end and brake.
     in_a, in_b = (
-        bool(unsafe.of(original)[0]) for unsafe, original in zip(criteria, originals, strict=True)
+        bool(unsafe.of(original)[0])
+        for unsafe, original in zip(criteria, originals, strict=True)
     )
     braking = _needless_braking(*evaluators)
     ends = _ends_of_originals(evaluators, originals)
@@ -229,7 +248,9 @@ def compare_originals(
         found.append(Difference(phrase, is_better=in_a))
     before, after, scenes = braking.values()
     if before != after:
-        phrase = f"brakes needlessly in {after} of {scenes} benign scenes, {a} in {before}"
+        phrase = (
+            f"brakes needlessly in {after} of {scenes} benign scenes, {a} in {before}"
+        )
         found.append(Difference(phrase, after < before, COMFORT))
     return numbers, found
 
@@ -254,10 +275,16 @@ def _new_collisions(evaluators: Sequence[Evaluator], a: str) -> list[Difference]
     speed, point = max(new, key=lambda pair: pair[0])
     where = where_in_words(evaluators[1].system.points, point, point.scenario, {})
     more = (
-        f" ({len(new)} test cases are like this; this one is the fastest)" if len(new) > 1 else ""
+        f" ({len(new)} test cases are like this; this one is the fastest)"
+        if len(new) > 1
+        else ""
     )
     collision = f"collides at {speed:.2f} m/s with its original vehicle{where}"
-    return [Difference(f"{collision}, where that of {a} does not collide{more}", False, COLLISION)]
+    return [
+        Difference(
+            f"{collision}, where that of {a} does not collide{more}", False, COLLISION
+        )
+    ]
 
 
 def _collisions_of_original(side: Evaluator) -> list[tuple[TestCase, Point, float]]:
@@ -292,7 +319,8 @@ def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
     """
     # What a study searches in its scenario, these scenes do not have.
     systems = [
-        replace(side.system, characteristics=side.characteristics.vehicle) for side in (a, b)
+        replace(side.system, characteristics=side.characteristics.vehicle)
+        for side in (a, b)
     ]
     scenes = benign_scenes(a.study, systems[0])
     brakes = [needless_braking(system, scenes) for system in systems]
@@ -309,7 +337,10 @@ def _metres_earlier(a: Evaluator, b: Evaluator) -> JsonObject:
     largest [m]; None in other scenarios than A's, and where either does not brake.
     """
     metres = np.empty(0)
-    is_same_scenario = (a.study.scenario, a.study.matrix) == (b.study.scenario, b.study.matrix)
+    is_same_scenario = (a.study.scenario, a.study.matrix) == (
+        b.study.scenario,
+        b.study.matrix,
+    )
     if is_same_scenario:
         metres = _onset_places(a) - _onset_places(b)
         metres = metres[np.isfinite(metres)]
@@ -325,5 +356,7 @@ def _onset_places(evaluator: Evaluator) -> FloatArray:
     """Where the original vehicle begins to brake at each of N points, shape (N,), NaN if it does
     not [m].
     """
-    onsets, _ = drive_new_cars(evaluator.system, evaluator.characteristics.original[np.newaxis])
+    onsets, _ = drive_new_cars(
+        evaluator.system, evaluator.characteristics.original[np.newaxis]
+    )
     return np.asarray(onsets[0])

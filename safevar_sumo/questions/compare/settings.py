@@ -63,8 +63,14 @@ class Pairs(NamedTuple):
     def joined(cls, groups: Sequence[Pairs]) -> Pairs:
         """All pairs of some groups, in their order."""
         frames, settings, runs = zip(*groups, strict=True)
-        joined = [Evaluations.concatenate(of_side) for of_side in zip(*runs, strict=True)]
-        return cls(pd.concat(frames, ignore_index=True), np.concatenate(settings, axis=1), joined)
+        joined = [
+            Evaluations.concatenate(of_side) for of_side in zip(*runs, strict=True)
+        ]
+        return cls(
+            pd.concat(frames, ignore_index=True),
+            np.concatenate(settings, axis=1),
+            joined,
+        )
 
     @property
     def are_valid(self) -> BoolArray:
@@ -79,7 +85,9 @@ class Pairs(NamedTuple):
     def take(self, rows: BoolArray) -> Pairs:
         """Some of the pairs, in their order."""
         frame = self.frame[rows].reset_index(drop=True)
-        return Pairs(frame, self.settings[:, rows], [run.take(rows) for run in self.runs])
+        return Pairs(
+            frame, self.settings[:, rows], [run.take(rows) for run in self.runs]
+        )
 
 
 class CommonDomain(NamedTuple):
@@ -120,7 +128,10 @@ class CommonDomain(NamedTuple):
         shift = np.where(a.of_vehicle, b.original - a.original, 0.0)
         domains = [side.study.domains for side in evaluators]
         ends = np.array(
-            [[within(limits, name, of_study[name]) for name in a.names] for of_study in domains]
+            [
+                [within(limits, name, of_study[name]) for name in a.names]
+                for of_study in domains
+            ]
         )
 
         # Where both domains overlap.
@@ -129,8 +140,10 @@ class CommonDomain(NamedTuple):
         is_empty = lower > upper
         if is_empty.any():
             raise InputError(
-                second.source, f"{a.names[int(np.argmax(is_empty))]}: the domains of the two studies do not"
-                " overlap", "studies with a common domain of each parameter"
+                second.source,
+                f"{a.names[int(np.argmax(is_empty))]}: the domains of the two studies do not"
+                " overlap",
+                "studies with a common domain of each parameter",
             )
         return common
 
@@ -152,7 +165,9 @@ class CommonDomain(NamedTuple):
     def holds(self, settings: FloatArray) -> BoolArray:
         """Which settings, shape (2, M, n), are in both domains, shape (M,)."""
         values = settings.swapaxes(0, 1)
-        return np.asarray(((values >= self.lower) & (values <= self.upper)).all(axis=(1, 2)))
+        return np.asarray(
+            ((values >= self.lower) & (values <= self.upper)).all(axis=(1, 2))
+        )
 
     def in_both(self, settings: FloatArray) -> FloatArray:
         """A's settings, and the same in B; what rounding moves out of B's domain is put onto its
@@ -169,7 +184,11 @@ class CommonDomain(NamedTuple):
 
 def within(limits: Mapping[str, Limit], name: str, domain: Domain) -> Interval:
     """The ends of a domain within the user's limits."""
-    return limits[name].interval(domain) if name in limits else (domain.lower, domain.upper)
+    return (
+        limits[name].interval(domain)
+        if name in limits
+        else (domain.lower, domain.upper)
+    )
 
 
 def in_order_of(a: Study, b: Study) -> Study:
@@ -186,7 +205,8 @@ def in_order_of(a: Study, b: Study) -> Study:
     if units_a == units_b:
         characteristics = {name: b.domains[name] for name in a.vehicle.characteristics}
         return replace(
-            _in_order(b, [*a.ranges]), vehicle=replace(b.vehicle, characteristics=characteristics)
+            _in_order(b, [*a.ranges]),
+            vehicle=replace(b.vehicle, characteristics=characteristics),
         )
 
     def in_words(units: set[tuple[str, str]]) -> str:
@@ -205,13 +225,19 @@ def _in_order(study: Study, names: Sequence[str]) -> Study:
     place = {name: number for number, name in enumerate(names)}
 
     def ordered(axes: dict[str, AxisTable]) -> Axes:
-        return {name: axes[name] for name in sorted(axes, key=lambda name: place.get(name, -1))}
+        return {
+            name: axes[name]
+            for name in sorted(axes, key=lambda name: place.get(name, -1))
+        }
 
     return study.mapped(ordered)
 
 
 def pairs_of(
-    subjects: Sequence[Subject], common: CommonDomain, criteria: Sequence[Unsafe], samples: int
+    subjects: Sequence[Subject],
+    common: CommonDomain,
+    criteria: Sequence[Unsafe],
+    samples: int,
 ) -> tuple[Pairs, int]:
     """The solutions of both sides and the drawn settings, evaluated in both systems; and the number
     of solutions that are not in both domains.
@@ -228,7 +254,9 @@ def pairs_of(
         both = (own, common.as_in_b(own)) if side == "a" else (common.as_in_a(own), own)
         settings = np.stack(both)
         is_inside = common.holds(settings)
-        kept = [name for name in RUN_COLUMNS if name in case.solutions and case.has_runs]
+        kept = [
+            name for name in RUN_COLUMNS if name in case.solutions and case.has_runs
+        ]
         frame = case.solutions[kept].assign(
             source=side, solution=list(map(str, handles_of(case.solutions)))
         )
@@ -239,7 +267,9 @@ def pairs_of(
     return Pairs.joined(groups), outside
 
 
-def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: int) -> Pairs:
+def _draw_on_lines(
+    common: CommonDomain, criteria: Sequence[Unsafe], samples: int
+) -> Pairs:
     """`samples` settings on lines from the original vehicles to Sobol points of the common domain,
     in the encounters of these points: each nearer to where the systems begin to fail.
 
@@ -266,10 +296,14 @@ def _draw_on_lines(common: CommonDomain, criteria: Sequence[Unsafe], samples: in
         runs = common.evaluate(settings)
         frame = pd.DataFrame({"source": SAMPLE, "solution": "", LINE: lines})
         rounds.append(Pairs(frame, settings, runs))
-        are_unsafe = [unsafe.of(run) for unsafe, run in zip(criteria, runs, strict=True)]
+        are_unsafe = [
+            unsafe.of(run) for unsafe, run in zip(criteria, runs, strict=True)
+        ]
         failures = np.sum(are_unsafe, axis=0)
         step /= 2
-        shares[lines] += np.choose(failures, [step, np.where(lines % 2, step, -step), -step])
+        shares[lines] += np.choose(
+            failures, [step, np.where(lines % 2, step, -step), -step]
+        )
     return Pairs.joined(rounds)
 
 
@@ -280,7 +314,9 @@ def _common_sample(common: CommonDomain, number: int) -> FloatArray:
     lower, upper = common.ends_in_a
     factor = 1
     while True:
-        settings = lower + sobol_points(number * factor, len(lower), 0) * (upper - lower)
+        settings = lower + sobol_points(number * factor, len(lower), 0) * (
+            upper - lower
+        )
         both = common.in_both(settings)
         is_feasible = [
             side.region.feasible(values)

@@ -162,24 +162,34 @@ def explain(
     if evaluator.left is not None:
         limit = evaluator.left // (2 if of_study else 4) * len(evaluator.system.points)
     top = 0 if of_study else top
-    reasons, sample, causes, complete = choose_failures(population, evaluator, limit, top)
+    reasons, sample, causes, complete = choose_failures(
+        population, evaluator, limit, top
+    )
     of_chosen, of_sample = (
         [causes[row] if is_caused else [] for row in rows] for rows in (reasons, sample)
     )
     changed = evaluator.characteristics.changed(runs.settings[sample])
-    needed = count_needed(evaluator.characteristics, changed, of_sample, len(population.rows))
+    needed = count_needed(
+        evaluator.characteristics, changed, of_sample, len(population.rows)
+    )
     needed = needed if is_caused else needed.head(0)
 
     # What reference drivers avoid.
     has_drivers = has_reference_drivers(evaluator)
-    verdicts, collisions = assess_sample(evaluator, runs.take(runs.collided & has_drivers))
+    verdicts, collisions = assess_sample(
+        evaluator, runs.take(runs.collided & has_drivers)
+    )
 
     # Tables, numbers and the verdict.
     solutions = failures_frame(population, evaluator, reasons)
     distinct = count_distinct_causes(evaluator.characteristics, of_sample)
     of_failures = (population, evaluator, fits, solutions, of_chosen, distinct)
     tables = {
-        **(smallest_tables(smallest) if of_study else {"causes": causes_table(*of_failures)}),
+        **(
+            smallest_tables(smallest)
+            if of_study
+            else {"causes": causes_table(*of_failures)}
+        ),
         "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
         **statistics_tables(needed, len(sample), verdicts, collisions, distinct),
     }
@@ -207,7 +217,9 @@ def _plan(subject: Subject, evaluator: Evaluator, fits: int) -> int:
     points = len(evaluator.system.points)
     if isinstance(subject, Study):
         limit = evaluator.scaled(max(STUDY_LIMIT, OF_SAMPLE * points))
-        planned = planned_over_sets(subject, TO_EXPLAIN, evaluator.scaled(SAMPLED_SETTINGS), fits)
+        planned = planned_over_sets(
+            subject, TO_EXPLAIN, evaluator.scaled(SAMPLED_SETTINGS), fits
+        )
         planned[COMBINATIONS] = evaluator.scaled(MAX_SETTINGS)
     else:
         limit = evaluator.scaled(LIMIT)
@@ -217,7 +229,9 @@ def _plan(subject: Subject, evaluator: Evaluator, fits: int) -> int:
     return limit
 
 
-def _counts(population: Population, subject: Subject, analysed: int, explained: int) -> JsonObject:
+def _counts(
+    population: Population, subject: Subject, analysed: int, explained: int
+) -> JsonObject:
     """The numbers of settings, and of failures that were analysed and are explained; the unsafe
     share of drawn settings with each parameter set; how the original vehicle ends, and the number
     of collisions that the search simulated but its objectives leave out of the solutions.
@@ -226,7 +240,11 @@ def _counts(population: Population, subject: Subject, analysed: int, explained: 
     original = population.original
     over_sets = population.over_sets
     left_out = 0
-    if isinstance(subject, Case) and not subject.study.origin.point and not runs.collided.any():
+    if (
+        isinstance(subject, Case)
+        and not subject.study.origin.point
+        and not runs.collided.any()
+    ):
         left_out = int(are_collisions(subject.evaluations).sum())
     return {
         "unsafe": str(population.unsafe),
@@ -267,9 +285,13 @@ def draw_needed(answer: Answer) -> Figure:
     )
 
     # Bars over each other, the most necessary characteristic first.
-    frame = answer.tables["characteristics"].iloc[::-1]  # bars are drawn from the bottom up
+    frame = answer.tables["characteristics"].iloc[
+        ::-1
+    ]  # bars are drawn from the bottom up
     size = (6.4, 1.4 + 0.3 * max(len(frame), 4))
-    figure, ((axis,),) = new_figure(f"{answer.study.name}: changed and necessary", 1, 1, size)
+    figure, ((axis,),) = new_figure(
+        f"{answer.study.name}: changed and necessary", 1, 1, size
+    )
     names = [escape_dollars(name) for name in frame["characteristic"]]
     for column, label, colour, height in (
         ("changed", "changed", GREY, 0.8),
@@ -280,5 +302,7 @@ def draw_needed(answer: Answer) -> Figure:
     axis.set_xlim(0, 100)
     axis.set_xlabel(f"share of {answer.numbers['analysed']} failures [%]")
     axis.grid(visible=False, axis="y")
-    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=FONT_SIZE)
+    figure.legend(
+        loc="outside lower center", ncols=3, frameon=False, fontsize=FONT_SIZE
+    )
     return figure

@@ -56,9 +56,13 @@ def find_beginnings(
     unless both are minimal at the ends.
     """
     members = evaluator.characteristics
-    pending, *others = ([(cause, step.share) for cause in step.causes] for step in steps)
+    pending, *others = (
+        [(cause, step.share) for cause in step.causes] for step in steps
+    )
     known = [cause for cause, _ in pending]
-    pending += _smallest(members, known, [placed for nearer in others for placed in nearer])
+    pending += _smallest(
+        members, known, [placed for nearer in others for placed in nearer]
+    )
     beginnings = list[Beginning]()
     while pending:
         begun, smaller = _begin(evaluator, unsafe, pending)
@@ -68,7 +72,9 @@ def find_beginnings(
 
 
 def _smallest(
-    members: CharacteristicSet, known: Sequence[Cause], others: Sequence[tuple[Cause, float]]
+    members: CharacteristicSet,
+    known: Sequence[Cause],
+    others: Sequence[tuple[Cause, float]],
 ) -> list[tuple[Cause, float]]:
     """Those of other causes that contain no known one, nor a smaller one of them."""
     kinds = [{*directions(members, cause.changes)} for cause in known]
@@ -101,7 +107,9 @@ def _begin(
     members = evaluator.characteristics
     values = settings_of(members, [cause for cause, _ in placed[:number]])
     starts = members.with_original_vehicle(values)
-    ends = np.select([values > starts, values < starts], [members.upper, members.lower], starts)
+    ends = np.select(
+        [values > starts, values < starts], [members.upper, members.lower], starts
+    )
     shares = np.arange(1, steps + 1) / steps
     settings = on_lines(starts, ends, np.tile(shares, (number, 1)))
     runs = evaluator.evaluate(settings.reshape(-1, len(members)), BOUNDARIES)
@@ -127,7 +135,9 @@ def _begin(
             continue
         if group:
             (unsafe_at,) = np.nonzero(is_unsafe[row])
-            are_causes = [not fewer for fewer in smaller_causes(settings[row, unsafe_at])]
+            are_causes = [
+                not fewer for fewer in smaller_causes(settings[row, unsafe_at])
+            ]
             at = unsafe_at[are_causes][0]
 
         # The values there, and where it is safe again.
@@ -136,5 +146,7 @@ def _begin(
         # What is a rounding error of the share is none of the value.
         boundary = {name: float(f"{named[name]:.12g}") for name in cause.changes}
         again = shares[at + 1 :][is_safe[row, at + 1 :]]
-        beginnings[row] = Beginning(cause, float(shares[at]), boundary, min(again, default=np.inf))
+        beginnings[row] = Beginning(
+            cause, float(shares[at]), boundary, min(again, default=np.inf)
+        )
     return beginnings, smaller

@@ -65,7 +65,9 @@ class Enumeration(NamedTuple):
     def complete_up_to(self) -> int:
         """The largest size up to which all combinations were simulated."""
         sizes = range(1, len(self.existing) + 1)
-        whole = takewhile(lambda size: self.simulated[size] == self.existing[size], sizes)
+        whole = takewhile(
+            lambda size: self.simulated[size] == self.existing[size], sizes
+        )
         return len([*whole])
 
     @property
@@ -132,7 +134,9 @@ def enumerate_causes(
         containing[size] = [each for each in feasible if each in larger]
         left, as_causes = _robustness(evaluator, unsafe, chosen)
         if size == 1:
-            effects |= {change: value for (change,), value in zip(chosen, left, strict=True)}
+            effects |= {
+                change: value for (change,), value in zip(chosen, left, strict=True)
+            }
         for index in np.flatnonzero(left < 0).tolist():
             causes.append(as_causes[index])
             unsafe_ones.append(chosen[index])
@@ -221,13 +225,18 @@ def _robustness(
     names = members.names
     if not chosen:
         return np.zeros(0), []
-    runs = evaluator.evaluate_over_encounters(_settings(members, chosen), unsafe, COMBINATIONS)
+    runs = evaluator.evaluate_over_encounters(
+        _settings(members, chosen), unsafe, COMBINATIONS
+    )
     causes = [
         Cause(
             changes={names[column]: value for column, value in sorted(combination)},
             outcome=str(outcome),
             safety_degree=float(degree),
-            encounter={item.name: members.named(setting)[item.name] for item in members.scenario},
+            encounter={
+                item.name: members.named(setting)[item.name]
+                for item in members.scenario
+            },
             unsafe_runs=float(of_runs),
         )
         for combination, outcome, degree, setting, of_runs in zip(

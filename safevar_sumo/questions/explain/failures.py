@@ -36,7 +36,11 @@ Reasons = dict[int, str]
 """The rows of the chosen failures, with the reasons for their choice."""
 TO_EXPLAIN = "settings to explain"
 """A stage of progress."""
-REASONS = {"fewest": "fewest changes", "most_severe": "most severe", "smallest": "smallest changes"}
+REASONS = {
+    "fewest": "fewest changes",
+    "most_severe": "most severe",
+    "smallest": "smallest changes",
+}
 """Reasons for choosing a failure, by the name of the choice in `CHOICES`."""
 REQUESTED = "requested"
 """The reason for explaining a solution that the user names."""
@@ -122,7 +126,9 @@ def gather_failures(
     # All are simulated here, and judged by one criterion.
     evaluations = evaluator.evaluate(settings, TO_EXPLAIN)
     unsafe = (
-        evaluator.checked(criterion) if criterion else Unsafe.default_among(evaluations, original)
+        evaluator.checked(criterion)
+        if criterion
+        else Unsafe.default_among(evaluations, original)
     )
     is_other = (evaluations.outcome != recorded) & (recorded != UNKNOWN)
 
@@ -134,12 +140,16 @@ def gather_failures(
         counts = np.flatnonzero(~evaluations.infeasible)
         evaluations = evaluations.take(counts)
         names = [names[row] for row in counts]
-        vehicles = VariationModel(subject).draw(VEHICLES, default_rng(subject.search.seed))
+        vehicles = VariationModel(subject).draw(
+            VEHICLES, default_rng(subject.search.seed)
+        )
         over_sets = SharesOverSets.of(evaluator, unsafe, vehicles, fits=fits)
 
     # Named settings are explained whatever they do.
     rows = (
-        list(range(len(set(named)))) if named else np.flatnonzero(unsafe.of(evaluations)).tolist()
+        list(range(len(set(named))))
+        if named
+        else np.flatnonzero(unsafe.of(evaluations)).tolist()
     )
     counted = bool(named), int(is_other.sum()), left_out, over_sets
     return Population(original, evaluations, names, unsafe, rows, *counted)
@@ -157,7 +167,9 @@ def _drawn_from(study: Study, evaluator: Evaluator) -> Candidates:
     number = min(SAMPLED_SETTINGS, max(affordable, LEAST_SAMPLED_SETTINGS))
     # Of few simulations most are for the causes of what fails here.
     number = evaluator.at_most(number, 8)
-    drawn = VariationModel(study).draw(number, default_rng(study.search.seed), filtered=True)
+    drawn = VariationModel(study).draw(
+        number, default_rng(study.search.seed), filtered=True
+    )
     settings = evaluator.characteristics.filter(drawn)
     names = [f"drawn:{row}" for row in range(len(settings))]
     return settings, names, np.full(len(settings), UNKNOWN)
@@ -168,7 +180,9 @@ def _solutions_of(case: Case, named: Sequence[SolutionId]) -> Candidates:
     table = case.solutions
     characteristics = list(case.characteristics.names)
     distinct = np.flatnonzero(~table.duplicated(characteristics)).tolist()
-    chosen = list(dict.fromkeys([*(row_of_handle(table, handle) for handle in named), *distinct]))
+    chosen = list(
+        dict.fromkeys([*(row_of_handle(table, handle) for handle in named), *distinct])
+    )
     handles = handles_of(table)
     return (
         table[characteristics].to_numpy(dtype=float)[chosen],
@@ -188,7 +202,9 @@ class Chosen(NamedTuple):
     complete: int | None
 
 
-def choose_failures(population: Population, evaluator: Evaluator, limit: int, top: int) -> Chosen:
+def choose_failures(
+    population: Population, evaluator: Evaluator, limit: int, top: int
+) -> Chosen:
     """At most `top` failures that matter, and a sample of all failures; of named rows these alone.
 
     The sample are all failures, if that takes at most about `limit` simulations. What matters: a
@@ -199,7 +215,9 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
 
     # Named failures are explained all.
     settings = population.evaluations.settings
-    limit //= len(evaluator.system.points)  # an evaluation simulates a setting at every point
+    limit //= len(
+        evaluator.system.points
+    )  # an evaluation simulates a setting at every point
     if population.is_named:
         found = find_minimal_causes(evaluator, settings[rows], population.unsafe, limit)
         reasons = dict.fromkeys(rows, REQUESTED)
@@ -207,25 +225,34 @@ def choose_failures(population: Population, evaluator: Evaluator, limit: int, to
         return Chosen(reasons, rows, causes, _complete(population, rows, limit))
 
     # Causes of a sample, and of failures that matter.
-    sample = [rows[index] for index in select_affordable_rows(settings[rows], evaluator, limit)]
+    sample = [
+        rows[index]
+        for index in select_affordable_rows(settings[rows], evaluator, limit)
+    ]
     reasons = dict(list(_failures_that_matter(population).items())[:top])
     analysed = sorted({*sample, *reasons})
-    found = find_minimal_causes(evaluator, settings[analysed], population.unsafe, 2 * limit)
+    found = find_minimal_causes(
+        evaluator, settings[analysed], population.unsafe, 2 * limit
+    )
     causes = dict(zip(analysed, found, strict=True))
     runs = population.evaluations
 
     # For each distinct cause that is missing, the simplest failure that has it.
     keys = {
-        row: {directions(evaluator.characteristics, cause.changes) for cause in causes[row]}
+        row: {
+            directions(evaluator.characteristics, cause.changes)
+            for cause in causes[row]
+        }
         for row in causes
     }
-    for key in count_distinct_causes(evaluator.characteristics, [causes[row] for row in sample])[
-        "cause"
-    ]:
+    for key in count_distinct_causes(
+        evaluator.characteristics, [causes[row] for row in sample]
+    )["cause"]:
         if len(reasons) < top and not any(key in keys[row] for row in reasons):
             of_this_cause = [row for row in sample if key in keys[row]]
             simplest = min(
-                of_this_cause, key=lambda row: (runs.f_num_diff[row], runs.f_diff[row], row)
+                of_this_cause,
+                key=lambda row: (runs.f_num_diff[row], runs.f_diff[row], row),
             )
             reasons[simplest] = DISTINCT_CAUSE
     return Chosen(reasons, sample, causes, _complete(population, analysed, 2 * limit))
@@ -243,7 +270,9 @@ def _failures_that_matter(population: Population) -> Reasons:
     reasons = Reasons()
     failures = population.evaluations.take(population.rows)
     for choice, reason in REASONS.items() if population.rows else ():
-        order = np.lexsort([failures.column(name) for name in reversed(CHOICES[choice])])
+        order = np.lexsort(
+            [failures.column(name) for name in reversed(CHOICES[choice])]
+        )
         row = population.rows[order[0]]
         reasons[row] = f"{reasons[row]}; {reason}" if row in reasons else reason
     return reasons
@@ -259,7 +288,9 @@ def _endings_in_words(system: System, point: str, both: Evaluations) -> str:
     """How the runs of the original vehicle and of another vehicle end at a point."""
     contact = system.contact
     pairs = zip(both.outcome.tolist(), both.f_safe.tolist(), strict=True)
-    original, changed = (ending_in_words(outcome, degree, contact) for outcome, degree in pairs)
+    original, changed = (
+        ending_in_words(outcome, degree, contact) for outcome, degree in pairs
+    )
     return f"{f'At {point}: the' if point else 'The'} original {original}; this one {changed}."
 
 

@@ -34,13 +34,18 @@ def draw_neighbours(
     A neighbour differs from its setting by at most the filter's threshold.
     """
     n = len(characteristics)
-    offsets = np.random.default_rng(seed).uniform(-1, 1, (count, n)) * characteristics.threshold
+    offsets = (
+        np.random.default_rng(seed).uniform(-1, 1, (count, n))
+        * characteristics.threshold
+    )
     return np.clip(
         settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper
     ).reshape(-1, n)
 
 
-def robust_shares(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) -> FloatArray:
+def robust_shares(
+    evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe
+) -> FloatArray:
     """The shares of unsafe outcomes among the neighbours of M settings, shape (M, n), with each of
     `STEP_FACTORS` times the study's time step; shape (M, factors).
 
@@ -54,7 +59,9 @@ def robust_shares(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) ->
         factors = factors[:1]
     if count < LEAST_NEIGHBOURS:
         return np.full((len(settings), len(factors)), np.nan)
-    neighbours = draw_neighbours(evaluator.characteristics, settings, evaluator.seed, count)
+    neighbours = draw_neighbours(
+        evaluator.characteristics, settings, evaluator.seed, count
+    )
     shares = []
     step = evaluator.system.step
     if evaluator.system.mover.has_own_step:
@@ -63,7 +70,9 @@ def robust_shares(evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe) ->
     # The share of neighbours that are unsafe, with each length of the time step.
     with evaluator.phases.stage(NEIGHBOURS, len(neighbours) * len(factors)):
         for factor in factors:
-            step_evaluator = evaluator if factor == 1 else evaluator.with_step(step * factor)
+            step_evaluator = (
+                evaluator if factor == 1 else evaluator.with_step(step * factor)
+            )
             evaluations = step_evaluator.evaluate(neighbours, NEIGHBOURS)
             unsafe_shares, is_valid = (
                 flags.reshape(len(settings), count)

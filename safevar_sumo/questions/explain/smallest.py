@@ -55,7 +55,10 @@ SMALLEST_COLUMNS: Columns = {
         head="begins at share of the way",
     ),
     "boundary": Column(
-        "", "the values at which it begins, simulated as they stand here", EXACT, is_shown=False
+        "",
+        "the values at which it begins, simulated as they stand here",
+        EXACT,
+        is_shown=False,
     ),
     "safe_again": Column(
         "-",
@@ -75,7 +78,9 @@ SMALLEST_COLUMNS: Columns = {
     "outcome": Column("", "outcome with these changes only", is_shown=False),
 }
 STAIRCASE_COLUMNS: Columns = {
-    "share": Column("-", "share of the way to its end at which each changed part is", ".1f"),
+    "share": Column(
+        "-", "share of the way to its end at which each changed part is", ".1f"
+    ),
     "fewest": "fewest changes at this share of the way that are unsafe; - if none was found",
     "tried": "combinations of changes that were simulated",
     "causes": Column("", "the parts that are changed", head="changed parts"),
@@ -103,19 +108,33 @@ class Smallest(NamedTuple):
         """Enumerate them within what may be simulated, and see how sure they are."""
         # Of few simulations half enumerate and a third of the others find the staircase, as what is
         # not enumerated cannot be made smaller; the rest says how sure the causes are.
-        at_ends = enumerate_causes(evaluator, unsafe, evaluator.at_most(MAX_SETTINGS, 2))
-        steps = staircase(evaluator, unsafe, at_ends, evaluator.at_most(MAX_SETTINGS, 3))
-        cures = count_cures(evaluator, unsafe, at_ends, evaluator.at_most(MAX_SETTINGS // CURES, 8))
+        at_ends = enumerate_causes(
+            evaluator, unsafe, evaluator.at_most(MAX_SETTINGS, 2)
+        )
+        steps = staircase(
+            evaluator, unsafe, at_ends, evaluator.at_most(MAX_SETTINGS, 3)
+        )
+        cures = count_cures(
+            evaluator, unsafe, at_ends, evaluator.at_most(MAX_SETTINGS // CURES, 8)
+        )
         return cls(at_ends, steps, cures, _table(evaluator, unsafe, steps, fits))
 
     @property
     def numbers(self) -> JsonObject:
         at_ends = self.at_ends
-        containing = {size: len(of_size) for size, of_size in at_ends.containing.items()}
+        containing = {
+            size: len(of_size) for size, of_size in at_ends.containing.items()
+        }
         simulated = sum(containing[size] for size in self.cures)
         of_containing = (sum(containing.values()), simulated, sum(self.cures.values()))
         up_to = max(at_ends.simulated, default=0)
-        values = (at_ends.tried, up_to, at_ends.complete_up_to, len(self.table), *of_containing)
+        values = (
+            at_ends.tried,
+            up_to,
+            at_ends.complete_up_to,
+            len(self.table),
+            *of_containing,
+        )
         return dict(zip(SMALLEST_NUMBERS, values, strict=True))
 
     def sentences(self, evaluator: Evaluator, unsafe: Unsafe) -> Iterator[str]:
@@ -124,9 +143,13 @@ class Smallest(NamedTuple):
         sizes = [size for size, number in self.at_ends.existing.items() if number]
         fewest = self.at_ends.size or max(sizes, default=0)
         yield from self._first(members, unsafe)
-        yield from self._of_sizes(members, unsafe, [size for size in sizes if size <= fewest])
+        yield from self._of_sizes(
+            members, unsafe, [size for size in sizes if size <= fewest]
+        )
         yield from self._stairs(unsafe)
-        yield from self._of_sizes(members, unsafe, [size for size in sizes if size > fewest])
+        yield from self._of_sizes(
+            members, unsafe, [size for size in sizes if size > fewest]
+        )
         yield from self._containing()
         yield self._in_none(members)
         encounters = len(evaluator.critical_encounters)
@@ -152,7 +175,9 @@ class Smallest(NamedTuple):
             yield "No change is necessary: the original vehicle is unsafe in one of the encounters."
             return
         of_size = self.table[self.table["size"] == self.table["size"].min()]
-        first, *others = of_size.sort_values("begins_at", kind="stable").to_dict("records")
+        first, *others = of_size.sort_values("begins_at", kind="stable").to_dict(
+            "records"
+        )
         size = first["size"]
         way = "the ends of their domains (their ranges of values)"
         enough = f"{_count(size).capitalize()} changes together are"
@@ -191,7 +216,8 @@ class Smallest(NamedTuple):
         """How many combinations of each of some sizes are unsafe, and which."""
         simulated, existing = self.at_ends.simulated, self.at_ends.existing
         of_size = {
-            size: [one for one in self.at_ends.causes if len(one.changes) == size] for size in sizes
+            size: [one for one in self.at_ends.causes if len(one.changes) == size]
+            for size in sizes
         }
         are_whole_and_safe = {
             size: not causes and simulated[size] == existing[size]
@@ -199,17 +225,26 @@ class Smallest(NamedTuple):
         }
         for is_safe, group in groupby(sizes, are_whole_and_safe.__getitem__):
             if is_safe:
-                parts = [[*of_part] for _, of_part in groupby(group, lambda size: min(size, 3))]
-                nouns = [_noun(part, sum(existing[size] for size in part)) for part in parts]
+                parts = [
+                    [*of_part]
+                    for _, of_part in groupby(group, lambda size: min(size, 3))
+                ]
+                nouns = [
+                    _noun(part, sum(existing[size] for size in part)) for part in parts
+                ]
                 yield f"None of the {join_phrases(nouns)} {_makes_unsafe(unsafe, 0)}."
                 continue
             for size in group:
                 is_whole = simulated[size] == existing[size]
                 causes = of_size[size]
-                names = "; ".join(join_phrases(_names(members, one.changes)) for one in causes)
+                names = "; ".join(
+                    join_phrases(_names(members, one.changes)) for one in causes
+                )
                 named = f": {names}" if 0 < len(causes) <= NAMED else ""
                 which = "" if is_whole else "simulated "
-                beside = "" if is_whole else f" ({existing[size]:,} such combinations exist)"
+                beside = (
+                    "" if is_whole else f" ({existing[size]:,} such combinations exist)"
+                )
                 noun = _noun([size], simulated[size], which)
                 number = f"{len(causes):,}" if causes else "None"
                 verb = _makes_unsafe(unsafe, len(causes))
@@ -221,10 +256,15 @@ class Smallest(NamedTuple):
             self.steps[1:], lambda step: (step.size, max(step.simulated))
         ):
             steps = [*group]
-            ends = [f"{100 * steps[place].share:.0f}" for place in sorted({0, len(steps) - 1})]
+            ends = [
+                f"{100 * steps[place].share:.0f}"
+                for place in sorted({0, len(steps) - 1})
+            ]
             where = f"If all changes go {' to '.join(ends)} % of the way to the ends"
             if number:
-                enough = "1 change is" if number == 1 else f"{_count(number)} changes are"
+                enough = (
+                    "1 change is" if number == 1 else f"{_count(number)} changes are"
+                )
                 thing = "a collision" if unsafe.is_collision else "an unsafe vehicle"
                 yield f"{where}, {enough} enough for {thing}."
                 continue
@@ -254,7 +294,9 @@ class Smallest(NamedTuple):
         if not (others and self.at_ends.causes and size):
             return ""
         verb = "is" if len(others) == 1 else "are"
-        sentence = f"{join_phrases(others)} {verb} in no cause of {_up_to(size)} to an end."
+        sentence = (
+            f"{join_phrases(others)} {verb} in no cause of {_up_to(size)} to an end."
+        )
         return sentence[:1].upper() + sentence[1:]
 
 
@@ -270,7 +312,9 @@ def smallest_tables(smallest: Smallest | None) -> Frames:
         for step in (smallest.steps if smallest else ())
     ]
     title = "The fewest changes at a share of the way to the ends of their domains"
-    stairs = pd.DataFrame(rows, columns=[*STAIRCASE_COLUMNS]).astype({"fewest": "Int64"})
+    stairs = pd.DataFrame(rows, columns=[*STAIRCASE_COLUMNS]).astype(
+        {"fewest": "Int64"}
+    )
     causes = smallest.table if smallest else pd.DataFrame(columns=[*SMALLEST_COLUMNS])
     return {
         "causes": tabulate(TITLE, SMALLEST_COLUMNS, causes),
@@ -280,11 +324,20 @@ def smallest_tables(smallest: Smallest | None) -> Frames:
 
 def draw_staircase(answer: Answer) -> Figure:
     """The fewest changes over the share of the way to the ends, with the names of the parts."""
-    from safevar_sumo.questions.figures import BLUE, FONT_SIZE, escape_dollars, new_figure
+    from safevar_sumo.questions.figures import (
+        BLUE,
+        FONT_SIZE,
+        escape_dollars,
+        new_figure,
+    )
 
     # A step for each share, the original at the left.
     rows = answer.tables["staircase"].iloc[::-1].to_dict("records")
-    found = [(100 * row["share"], row["fewest"], row["causes"]) for row in rows if row["causes"]]
+    found = [
+        (100 * row["share"], row["fewest"], row["causes"])
+        for row in rows
+        if row["causes"]
+    ]
     figure, ((axis,),) = new_figure(
         f"{answer.study.name}: the fewest changes that are unsafe", 1, 1, (6.4, 3.6)
     )
@@ -305,7 +358,9 @@ def draw_staircase(answer: Answer) -> Figure:
     for row in rows:
         if not row["causes"]:
             words = f"none of {row['tried']:,}\nsimulated"
-            axis.text(100 * row["share"], 1.1, words, fontsize=FONT_SIZE - 2, ha="center")
+            axis.text(
+                100 * row["share"], 1.1, words, fontsize=FONT_SIZE - 2, ha="center"
+            )
     axis.set_xlim(0, 125)  # with room for names at the right
     axis.set_xticks(range(0, 101, 20))
     axis.grid(visible=False, axis="x")
@@ -374,7 +429,19 @@ def _are(number: int) -> str:
 
 
 def _count(number: int) -> str:
-    words = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+    words = (
+        "none",
+        "one",
+        "two",
+        "three",
+        "four",
+        "five",
+        "six",
+        "seven",
+        "eight",
+        "nine",
+        "ten",
+    )
     return words[number] if number < len(words) else f"{number:,}"
 
 

@@ -19,7 +19,11 @@ from safevar_sumo.questions.causes import (
 )
 from safevar_sumo.questions.counterexamples import values_as_printed
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.failures import Population, Reasons, compare_at_points
+from safevar_sumo.questions.explain.failures import (
+    Population,
+    Reasons,
+    compare_at_points,
+)
 from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE, robust_shares
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Model
@@ -30,7 +34,13 @@ from safevar_sumo.questions.preventability import (
     drivers_frame,
     has_reference_drivers,
 )
-from safevar_sumo.questions.tables import Column, Columns, Frames, tabulate, with_interval
+from safevar_sumo.questions.tables import (
+    Column,
+    Columns,
+    Frames,
+    tabulate,
+    with_interval,
+)
 from safevar_sumo.questions.words import EXACT, number_of
 from safevar_sumo.records import FloatArray, NamedValues
 
@@ -50,7 +60,9 @@ CAUSE_COLUMNS: Columns = {
         ".5g",
         is_shown=False,
     ),
-    "encounter": Column("", "the encounter, in which the original vehicle is safe", EXACT),
+    "encounter": Column(
+        "", "the encounter, in which the original vehicle is safe", EXACT
+    ),
     "boundary": Column(
         "",
         "smallest values of these changes that are still unsafe (rounded to the unsafe side, and"
@@ -65,20 +77,30 @@ CAUSE_COLUMNS: Columns = {
         is_shown=False,
     ),
     "fraction": Column(
-        "-", "factor by which all changes are scaled at the boundary", ".3f", is_shown=False
+        "-",
+        "factor by which all changes are scaled at the boundary",
+        ".3f",
+        is_shown=False,
     ),
     "end": Column("", "what happens just below the boundary", is_shown=False),
     "size": Column("", "number of changes", is_shown=False),
     "elsewhere": "whether these changes are unsafe in the original encounter, too",
     "outcome": Column("", "outcome with these changes only", is_shown=False),
     "safety_degree": Column(
-        "m", "safety degree with these changes only; -m/s on a collision", is_shown=False
+        "m",
+        "safety degree with these changes only; -m/s on a collision",
+        is_shown=False,
     ),
     "share": Column(
-        "-", "share of the failures that have such a cause", ".2f", head="share of failures"
+        "-",
+        "share of the failures that have such a cause",
+        ".2f",
+        head="share of failures",
     ),
     "robust_share": Column(
-        "-", "share of vehicles with nearly the values of the cause alone that are unsafe", ".2f"
+        "-",
+        "share of vehicles with nearly the values of the cause alone that are unsafe",
+        ".2f",
     ),
     "unsafe_runs": RUNS,
     "holds": Column(
@@ -88,7 +110,9 @@ CAUSE_COLUMNS: Columns = {
     ),
     "fits": "number of parameter sets that were tried",
     "avoided_by": Column(
-        "", "weakest reference driver who avoids the failure, in the same vehicle", is_shown=False
+        "",
+        "weakest reference driver who avoids the failure, in the same vehicle",
+        is_shown=False,
     ),
 }
 OF_ENCOUNTER = ("encounter", "elsewhere")
@@ -100,13 +124,19 @@ SOLUTION_COLUMNS: Columns = {
     "safety_degree": Column("m", "safety degree; in -m/s on a collision", ".2f"),
     "changed": "number of changes",
     "largest_change": Column(
-        "-", "largest change of a characteristic (share of the original value)", is_shown=False
+        "-",
+        "largest change of a characteristic (share of the original value)",
+        is_shown=False,
     ),
     "unsafe_neighbours": Column(
-        "-", "share of vehicles with nearly the values of the whole failure that are unsafe", ".2f"
+        "-",
+        "share of vehicles with nearly the values of the whole failure that are unsafe",
+        ".2f",
     ),
     "ends": Column(
-        "", "how the original vehicle and this one end, where this one is worst", is_shown=False
+        "",
+        "how the original vehicle and this one end, where this one is worst",
+        is_shown=False,
     ),
     "points": Column("", "points at which it is unsafe", is_shown=False),
     "avoided_by": (
@@ -117,9 +147,14 @@ CHARACTERISTIC_COLUMNS: Columns = {
     "characteristic": "characteristic of the vehicle",
     "changed": Column("-", "share of the failures that change it", ".2f"),
     **with_interval(
-        "needed", Column("-", "share of the failures for which it is in every minimal cause", ".2f")
+        "needed",
+        Column(
+            "-", "share of the failures for which it is in every minimal cause", ".2f"
+        ),
     ),
-    "in_some": Column("-", "share of the failures for which it is in some minimal cause", ".2f"),
+    "in_some": Column(
+        "-", "share of the failures for which it is in some minimal cause", ".2f"
+    ),
 }
 """The interval is Clopper and Pearson's, 95 %, if only a sample of the failures was analysed, else
 the share itself.
@@ -131,7 +166,9 @@ DISTINCT_COLUMNS: Columns = {
 }
 
 
-def failures_frame(population: Population, evaluator: Evaluator, reasons: Reasons) -> pd.DataFrame:
+def failures_frame(
+    population: Population, evaluator: Evaluator, reasons: Reasons
+) -> pd.DataFrame:
     """A row of `SOLUTION_COLUMNS` for each chosen failure."""
     if not reasons:
         return pd.DataFrame(columns=[*SOLUTION_COLUMNS])
@@ -144,7 +181,9 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
     # How they end beside the original, and who would have avoided the collision.
     comparisons = compare_at_points(evaluator.system, settings, unsafe)
     is_assessed = failures.collided & has_reference_drivers(evaluator)
-    assessed = iter(assess_collisions(evaluator, failures.take(is_assessed)).to_dict("records"))
+    assessed = iter(
+        assess_collisions(evaluator, failures.take(is_assessed)).to_dict("records")
+    )
     columns = {
         "solution": [population.names[row] for row in reasons],
         "reason": [*reasons.values()],
@@ -155,7 +194,9 @@ def failures_frame(population: Population, evaluator: Evaluator, reasons: Reason
         "unsafe_neighbours": robust_shares(evaluator, settings, unsafe).mean(axis=1),
         "ends": [sentence for sentence, _ in comparisons],
         "points": [list(points) for _, points in comparisons],
-        "avoided_by": [avoided_by(next(assessed)) if flag else None for flag in is_assessed],
+        "avoided_by": [
+            avoided_by(next(assessed)) if flag else None for flag in is_assessed
+        ],
     }
     return pd.DataFrame(columns)
 
@@ -185,7 +226,9 @@ def causes_table(
     if causes and study.ranges:
         at_original = [cause._replace(encounter={}) for cause in causes]
         settings = settings_of(evaluator.characteristics, at_original)
-        elsewhere = unsafe.of(evaluator.evaluate(settings, "causes in the original encounter"))
+        elsewhere = unsafe.of(
+            evaluator.evaluate(settings, "causes in the original encounter")
+        )
 
     # How many failures have a cause with the same directions; robust causes come first.
     share_of = dict(zip(distinct["cause"], distinct["share"], strict=True))
@@ -210,11 +253,19 @@ def causes_table(
         }
         for index in order.tolist()
     ]
-    frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype({"holds": "Int64", "fits": "Int64"})
+    frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype(
+        {"holds": "Int64", "fits": "Int64"}
+    )
     omitted = () if study.ranges else OF_ENCOUNTER
-    columns = {name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted}
-    table = tabulate("Minimal causes, all other characteristics as in the original", columns, frame)
-    table.attrs["lead_rows"] = np.flatnonzero(~frame["boundary"].astype(str).duplicated()).tolist()
+    columns = {
+        name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted
+    }
+    table = tabulate(
+        "Minimal causes, all other characteristics as in the original", columns, frame
+    )
+    table.attrs["lead_rows"] = np.flatnonzero(
+        ~frame["boundary"].astype(str).duplicated()
+    ).tolist()
     return table
 
 
@@ -229,7 +280,9 @@ def printed_limits(
     printed = values_as_printed(model, exact)
 
     # An encounter is rounded only where the whole changes are unsafe in it, too.
-    whole = [values | cause.changes for values, cause in zip(printed, causes, strict=True)]
+    whole = [
+        values | cause.changes for values, cause in zip(printed, causes, strict=True)
+    ]
     members = model.characteristics
     settings = np.array([members.setting(one, beyond=True) for one in whole])
     is_unsafe = model.are_unsafe(settings.reshape(-1, len(members)), BOUNDARIES)
@@ -273,7 +326,8 @@ def sureness(
         OTHER_SETS, len(studies) * sum(1 + len(cause.changes) for cause in causes)
     ):
         are_one = [
-            are_causes(evaluator.for_study(study, verified=0), causes, unsafe) for study in studies
+            are_causes(evaluator.for_study(study, verified=0), causes, unsafe)
+            for study in studies
         ]
     return robust, np.sum(are_one, axis=0).tolist(), len(studies)
 

@@ -13,7 +13,10 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.counterexamples import values_in_words
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import Population
-from safevar_sumo.questions.explain.robustness import LEAST_NEIGHBOURS, robustness_in_words
+from safevar_sumo.questions.explain.robustness import (
+    LEAST_NEIGHBOURS,
+    robustness_in_words,
+)
 from safevar_sumo.questions.preventability import FULL, LETTER
 from safevar_sumo.questions.variation import sampled_in_words
 from safevar_sumo.questions.words import (
@@ -54,9 +57,14 @@ def verdict_on_failures(
     # Without a cause, how the worst setting and the original end.
     if causes.empty:
         nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])
-        for who, run in (("worst vehicle", nearest), ("original vehicle", population.original)):
+        for who, run in (
+            ("worst vehicle", nearest),
+            ("original vehicle", population.original),
+        ):
             if len(run):
-                ending = ending_in_words(str(run.outcome[0]), float(run.f_safe[0]), contact)
+                ending = ending_in_words(
+                    str(run.outcome[0]), float(run.f_safe[0]), contact
+                )
                 yield f"The {who} {ending}."
         return
     leading = causes.iloc[0]
@@ -67,8 +75,12 @@ def verdict_on_failures(
     # Its values, its encounter, and how sure the cause is.
     members = evaluator.characteristics
     boundary = leading["boundary"]
-    encounter = encounter_in_words(members, leading.get("encounter", {}), are_printed=True)
-    where = " in an encounter in which the original vehicle is safe" if encounter else ""
+    encounter = encounter_in_words(
+        members, leading.get("encounter", {}), are_printed=True
+    )
+    where = (
+        " in an encounter in which the original vehicle is safe" if encounter else ""
+    )
     yield f"With {values_in_words(members, boundary)} the vehicle {unsafe.verbs[0]}{where}."
     yield f"The encounter has {encounter.partition(' with ')[2]}." if encounter else ""
     yield _beyond_in_words(evaluator, unsafe, boundary, leading.get("encounter", {}))
@@ -96,7 +108,9 @@ def _beyond_in_words(
     runs = evaluator.evaluate(vehicles, "vehicles beyond the values of a cause")
     share = share_in_words(unsafe.number(runs) / number)
     whose = "these values" if len(cause) > 1 else "this value"
-    number_of_them = f"Of {number} vehicles beyond {whose}, all else as in the original,"
+    number_of_them = (
+        f"Of {number} vehicles beyond {whose}, all else as in the original,"
+    )
     return f"{number_of_them} {share} {unsafe.verbs[1]}."
 
 
@@ -109,7 +123,9 @@ def others_in_words(
     yield avoided_in_words(verdicts)
     over_sets = population.over_sets
     drawn = f"vehicles {sampled_in_words(study)}"
-    yield _number_in_words(population, drawn if over_sets else "different solutions of the search")
+    yield _number_in_words(
+        population, drawn if over_sets else "different solutions of the search"
+    )
     if over_sets:
         yield over_sets.in_words().strip()
         yield from counted_in_words(study, population.left_out)

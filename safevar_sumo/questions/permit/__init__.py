@@ -20,7 +20,14 @@ from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, budget_of
 from safevar_sumo.questions.models import keeping_distance, models_of
-from safevar_sumo.questions.options import CARS_FILE, Fits, LimitTexts, Margin, Range, ValueTexts
+from safevar_sumo.questions.options import (
+    CARS_FILE,
+    Fits,
+    LimitTexts,
+    Margin,
+    Range,
+    ValueTexts,
+)
 from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
 from safevar_sumo.questions.permit.assumed import assumed_in_words, cars_of, worst_end
 from safevar_sumo.questions.permit.encounters import Span, span_of
@@ -41,7 +48,17 @@ NEED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(\S.*?)?\s*")
 
 @question
 @contents(
-    *("unsafe", "margin", "scope", "cars", "drive", "limited", "stop", "fits", "attacked"),
+    *(
+        "unsafe",
+        "margin",
+        "scope",
+        "cars",
+        "drive",
+        "limited",
+        "stop",
+        "fits",
+        "attacked",
+    ),
     *("step", "need", "not_driven_above", "rough"),
     lead="cars",
     cars=CARS,
@@ -117,7 +134,10 @@ def permit(
     _check_forms(cars, set, limits, out, is_quick=quick)
     fleet = read_cars(study, cars, set, limits, others, ignore)
     criterion = keeping_distance(
-        evaluator, evaluator.checked(unsafe or Unsafe()), margin, is_stated=unsafe is not None
+        evaluator,
+        evaluator.checked(unsafe or Unsafe()),
+        margin,
+        is_stated=unsafe is not None,
     )
     models = models_of(evaluator, criterion, fits, with_unsafe_originals=True)
     # A claim about all cars within limits gets the search of one about joint limits.
@@ -127,11 +147,15 @@ def permit(
     within = _within(members, limits, study, fleet.settings[0])
     asked = [within] if limits else cars_of(members, fleet)
     has_repairs = not quick and not limits
-    new_car, permits, repaired = _drive(evaluator, search, fleet, asked, with_repairs=has_repairs)
+    new_car, permits, repaired = _drive(
+        evaluator, search, fleet, asked, with_repairs=has_repairs
+    )
     # Further simulations, where their number has no limit.
     is_free = not limits and evaluator.account.asked is evaluator.left is None
     found = zip(asked, fleet.measured, permits, strict=True)
-    ends = [worst_end(search, members, *of_car) for of_car in found] if is_free else None
+    ends = (
+        [worst_end(search, members, *of_car) for of_car in found] if is_free else None
+    )
     result = PermitAnswer(
         study=study,
         span=span,
@@ -176,7 +200,12 @@ def _drive(
     if new_car.up_to is None:
         study = evaluator.study
         words = failure_columns([new_car.least.failure])[0]["because"]
-        raise InputError(study.source, f"the new car is not safe at {search.values[0]:g}{unit_text(search.span.unit)}: {words}", "a study in which it is, or another --unsafe")
+        raise InputError(
+            study.source,
+            f"the new car is not safe at {search.values[0]:g}"
+            f"{unit_text(search.span.unit)}: {words}",
+            "a study in which it is, or another --unsafe",
+        )
     if not with_repairs:
         return new_car, permits, [None] * len(permits)
     worn = fleet.measured & (fleet.settings != members.original)
@@ -200,32 +229,55 @@ def read_cars(
         with about("limits"):
             names = limits_of(limits, rows)
         cars = {
-            f"All cars with {join_phrases(limits)}": {name: rows[name].original for name in names}
+            f"All cars with {join_phrases(limits)}": {
+                name: rows[name].original for name in names
+            }
         }
     return read_fleet(
-        study, members, cars, values, others=others, ignore=ignore, answer_columns=[*CARS, DIGEST]
+        study,
+        members,
+        cars,
+        values,
+        others=others,
+        ignore=ignore,
+        answer_columns=[*CARS, DIGEST],
     )
 
 
 def _check_forms(
-    cars: object, values: Sequence[str], limits: Sequence[str], out: str | None, *, is_quick: bool
+    cars: object,
+    values: Sequence[str],
+    limits: Sequence[str],
+    out: str | None,
+    *,
+    is_quick: bool,
 ) -> None:
     """Refuse several forms of cars, and none; and a file that is to be written in place of the
     list, or with a rough answer.
     """
     given = [
         flag
-        for flag, value in (("--cars", cars is not None), ("--set", values), ("--limits", limits))
+        for flag, value in (
+            ("--cars", cars is not None),
+            ("--set", values),
+            ("--limits", limits),
+        )
         if value
     ]
     if len(given) != 1:
         raise InputError(
-            "permit", f"{join_phrases(given or ['no car'])} given", "--cars, --set or --limits"
+            "permit",
+            f"{join_phrases(given or ['no car'])} given",
+            "--cars, --set or --limits",
         )
     if out is None:
         return
     if is_quick:
-        raise InputError("quick", f"a rough answer is not written to {out}", "--quick without --out, or --out without --quick")
+        raise InputError(
+            "quick",
+            f"a rough answer is not written to {out}",
+            "--quick without --out, or --out without --quick",
+        )
     path = Path(out)
     if isinstance(cars, str | Path) and path.exists() and path.samefile(cars):
         raise InputError("out", f"{out} is the list itself", "another file")
@@ -243,7 +295,11 @@ def _needed(text: str | None, span: Span) -> float | None:
         or not span.low <= float(match[1]) <= span.high
     ):
         example = f"{span.high:g} {span.unit}".strip()
-        raise InputError("need", repr(text), f'from {span.low:g} to {span.high:g} with the unit, such as "{example}"')
+        raise InputError(
+            "need",
+            repr(text),
+            f'from {span.low:g} to {span.high:g} with the unit, such as "{example}"',
+        )
     return float(match[1])
 
 
@@ -260,7 +316,11 @@ def _check_driven(needed: float | None, search: PermitSearch) -> None:
 def _grid(span: Span, step: float) -> FloatArray:
     """The ends of the range, and all multiples of the step between them."""
     if (span.high - span.low) / step > MOST_VALUES:
-        raise InputError("step", f"{step:g}", f"at most {MOST_VALUES:,} steps from {span.low:g} to {span.high:g}")
+        raise InputError(
+            "step",
+            f"{step:g}",
+            f"at most {MOST_VALUES:,} steps from {span.low:g} to {span.high:g}",
+        )
     first, last = np.floor(span.low / step), np.ceil(span.high / step)
     multiples = np.round(step * np.arange(first, last + 1), 9)
     inside = multiples[(multiples > span.low) & (multiples < span.high)]

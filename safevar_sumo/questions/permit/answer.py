@@ -16,7 +16,11 @@ from safevar_sumo.campaign.identity import manifest_now
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.part import study_up_to
-from safevar_sumo.questions.permit.assumed import WorstEnd, assumed_cells, worst_end_in_words
+from safevar_sumo.questions.permit.assumed import (
+    WorstEnd,
+    assumed_cells,
+    worst_end_in_words,
+)
 from safevar_sumo.questions.permit.encounters import Span
 from safevar_sumo.questions.permit.fleet import ROUGH, YES, Fleet
 from safevar_sumo.questions.permit.rows import (
@@ -42,7 +46,9 @@ from safevar_sumo.sumo.system import assemble
 
 DIGEST = "study_digest"
 """The column of the list that holds the digest of the study, its models and versions."""
-ROUGH_LIST = "Remark: the list is a rough answer (rough = yes), whose speeds prove nothing."
+ROUGH_LIST = (
+    "Remark: the list is a rough answer (rough = yes), whose speeds prove nothing."
+)
 """What to know of a list that `--quick` wrote."""
 SHOWN_WHOLE = 50
 """Number of cars up to which one screen shows all: there the list is the answer."""
@@ -75,7 +81,9 @@ class PermitAnswer:
     assumed: str
     ends: Sequence[WorstEnd | None] | None
 
-    def of(self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[Repaired]) -> Answer:
+    def of(
+        self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[Repaired]
+    ) -> Answer:
         """The answer about the cars of a list, in its order, each with its best repair."""
         span = self.span
         rows = self._rows(fleet, permits, repaired)
@@ -84,12 +92,15 @@ class PermitAnswer:
             columns["up_to"] = columns["up_to"]._replace(head="passes the test up to")
         cars = tabulate("The cars, first those that may not drive", columns, rows)
         counts = {
-            verdict: int((cars["verdict"] == verdict).sum()) for verdict in (DRIVE, LIMITED, STOP)
+            verdict: int((cars["verdict"] == verdict).sum())
+            for verdict in (DRIVE, LIMITED, STOP)
         }
         too_slow = 0
         if self.need is not None:
             too_slow = int((~(cars["up_to"].astype(float) >= self.need)).sum())
-        ordered = cars.sort_values("up_to", kind="stable", na_position="first", ignore_index=True)
+        ordered = cars.sort_values(
+            "up_to", kind="stable", na_position="first", ignore_index=True
+        )
         ordered.attrs = {**cars.attrs, "shown_whole": SHOWN_WHOLE}
         unit = unit_text(span.unit)
         end = f"{span.name}={span.high!r}"
@@ -135,7 +146,9 @@ class PermitAnswer:
         vehicle = self.models.own.characteristics.vehicle
         new_car = self.new_car.up_to
         assert new_car is not None
-        columns = failure_columns([each.least.failure for each in permits], with_car=self.is_box)
+        columns = failure_columns(
+            [each.least.failure for each in permits], with_car=self.is_box
+        )
         own = self.models.own.unsafe
         of_all = {
             "rough": self.is_rough,
@@ -150,7 +163,11 @@ class PermitAnswer:
             fleet.names, permits, columns, repaired, cells, ends, strict=True
         ):
             verdict = verdict_of(
-                permit.up_to, new_car, self.span.high, self.need, is_proven=not self.is_quick
+                permit.up_to,
+                new_car,
+                self.span.high,
+                self.need,
+                is_proven=not self.is_quick,
             )
             words = found["because"]
             row = {
@@ -159,7 +176,9 @@ class PermitAnswer:
                 "new_car_up_to": new_car,
                 "unit": self.span.unit,
                 "verdict": verdict,
-                "because": because(permit, words, verdict, self.span, new_car, self.need),
+                "because": because(
+                    permit, words, verdict, self.span, new_car, self.need
+                ),
                 "parameter_set": permit.least.fit if words else None,
                 "repair_first": None if best is None else vehicle.names[best[0]],
                 "up_to_after_repair": None if best is None else best[1].up_to,
@@ -170,7 +189,12 @@ class PermitAnswer:
         return rows
 
     def _sentences(
-        self, fleet: Fleet, cars: pd.DataFrame, counts: Mapping[str, int], slower: str, scope: str
+        self,
+        fleet: Fleet,
+        cars: pd.DataFrame,
+        counts: Mapping[str, int],
+        slower: str,
+        scope: str,
     ) -> list[str]:
         """The verdict: how many cars may drive, what is safe, and what was not driven."""
         span = self.span
@@ -178,7 +202,11 @@ class PermitAnswer:
         top = f"{span.high:g}{unit}"
         number = len(cars)
         new_car = f"the new car {self._verb()} {self._reach(self.new_car.order)}"
-        goal = f"{top} or as fast as the new car" if self.need is None else f"{self.need:g}{unit}"
+        goal = (
+            f"{top} or as fast as the new car"
+            if self.need is None
+            else f"{self.need:g}{unit}"
+        )
         phrases = {
             DRIVE: f"up to {goal}",
             LIMITED: f"up to a lower {span.name.replace('_', ' ')}",
@@ -188,7 +216,9 @@ class PermitAnswer:
         parts = list[str]()
         for verdict, phrase in phrases.items():
             if count := counts[verdict]:
-                verb = f"{self._no_verb(count)}," if verdict == STOP else self._verb(count)
+                verb = (
+                    f"{self._no_verb(count)}," if verdict == STOP else self._verb(count)
+                )
                 parts.append(f"{count}{'' if parts else of_all} {verb} {phrase}")
         told = join_phrases(parts)
         name, up_to = cars.iloc[0][["car", "up_to"]]
@@ -196,7 +226,10 @@ class PermitAnswer:
         if number == 1:
             may = f"{self._verb()} {self._reach(up_to)}" if is_safe else self._no_verb()
             told = f"{name} {may}"
-        sentences = [f"{told}{self._measured_in_words(fleet)}; {new_car}.", self.assumed]
+        sentences = [
+            f"{told}{self._measured_in_words(fleet)}; {new_car}.",
+            self.assumed,
+        ]
         if number == 1:
             if is_safe and self.ends and not fleet.measured.all():
                 sentences.append(worst_end_in_words(self.ends[0], span))
@@ -208,7 +241,9 @@ class PermitAnswer:
         sentences.append(remark_on_phases(self.models.own.in_phases))
         if span.ending:
             tests = join_phrases(span.ending)
-            sentences.append(f"Above {top} nothing was driven, where the tests {tests} end.")
+            sentences.append(
+                f"Above {top} nothing was driven, where the tests {tests} end."
+            )
         if span.left_out:
             sentences.append(
                 f"Not driven, because they begin above {top}: {join_phrases(span.left_out)}."
@@ -242,7 +277,9 @@ class PermitAnswer:
         """That measured values count as they are least safe, behind how far cars are safe."""
         vehicle = self.models.own.characteristics.vehicle
         # Limits are no measurements.
-        is_measured = np.any(fleet.measured, axis=0, keepdims=True)[0] & (not self.is_box)
+        is_measured = np.any(fleet.measured, axis=0, keepdims=True)[0] & (
+            not self.is_box
+        )
         precise = precise_in_words(compress(vehicle, is_measured))
         return f" with the least safe value of {precise}" if precise else ""
 
@@ -257,7 +294,8 @@ class PermitAnswer:
             return f"no contact{clearance}, in {number_of(others + 1, 'parameter set')}"
         rest = f", and no contact with {number_of(others, 'other')}" if others else ""
         return (
-            f"no contact and {own.keep:g} m of clearance with the study's own parameter set{rest}"
+            f"no contact and {own.keep:g} m of clearance with the study's own"
+            f" parameter set{rest}"
         )
 
     def _tested(self) -> str:
@@ -267,7 +305,9 @@ class PermitAnswer:
         if len(values) == len(self.search.listed):
             driven = f"({join_phrases(f'{value:g}' for value in values)}{unit})"
         grid = f"{len(values)} values {driven} in each test"
-        attacked = f"{self.search.attacked:,} simulations that search for an unsafe encounter"
+        attacked = (
+            f"{self.search.attacked:,} simulations that search for an unsafe encounter"
+        )
         return f"{grid}; {'no search for an unsafe encounter' if self.is_quick else attacked}."
 
     def _listing(self, cars: pd.DataFrame, fleet: Fleet) -> pd.DataFrame:

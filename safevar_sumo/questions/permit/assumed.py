@@ -32,7 +32,9 @@ def assumed_cells(vehicle: CharacteristicSet, fleet: Fleet) -> list[str | None]:
 def _texts(vehicle: CharacteristicSet, setting: FloatArray) -> NDArray[Any]:
     """The values of a car, such as `brakeResponse 0.2 s`, shape (n,)."""
     pairs = zip(vehicle, setting, strict=True)
-    return np.array([f"{item.name} {value:{EXACT}}{item.suffix}" for item, value in pairs])
+    return np.array(
+        [f"{item.name} {value:{EXACT}}{item.suffix}" for item, value in pairs]
+    )
 
 
 def assumed_in_words(study: Study, vehicle: CharacteristicSet, fleet: Fleet) -> str:
@@ -44,11 +46,15 @@ def assumed_in_words(study: Study, vehicle: CharacteristicSet, fleet: Fleet) -> 
     phrases = list[str]()
     for column in np.flatnonzero(~is_stated):
         item = vehicle.members[column]
-        source = "by [unmeasured]" if item.name in study.unmeasured else "as in a new car"
+        source = (
+            "by [unmeasured]" if item.name in study.unmeasured else "as in a new car"
+        )
         phrases.append(f"{texts[column]} ({item.short_name}, {source})")
     if further := np.sum((fleet.measured < is_stated).any(axis=1)):
         cars = f"{further} of {len(fleet.names)} cars"
-        phrases.append(f"values in {cars} that others state (column assumed, --details)")
+        phrases.append(
+            f"values in {cars} that others state (column assumed, --details)"
+        )
     return f"Assumed, because not measured: {join_phrases(phrases)}." if phrases else ""
 
 
@@ -60,7 +66,9 @@ def cars_of(vehicle: CharacteristicSet, fleet: Fleet) -> list[Cars]:
             for setting in fleet.settings
         ]
     )
-    ends = np.where(fleet.measured[..., np.newaxis], ends, fleet.settings[..., np.newaxis])
+    ends = np.where(
+        fleet.measured[..., np.newaxis], ends, fleet.settings[..., np.newaxis]
+    )
     return [Cars.measured(*car.T) for car in ends]
 
 
@@ -110,4 +118,6 @@ def worst_end_in_words(worst: WorstEnd | None, span: Span) -> str:
         return f"{shown} none lowers the {name} on the grid."
     value = f"{max(worst.value, span.low):g}{unit_text(span.unit)}"
     end = f"{worst.name} {worst.text}"
-    return f"{shown} {end} lowers the {name} most: the car is unsafe already at {value}."
+    return (
+        f"{shown} {end} lowers the {name} most: the car is unsafe already at {value}."
+    )

@@ -59,7 +59,11 @@ class Span(NamedTuple):
         reached = f"{value:g}{unit_text(self.unit)}"
         if not with_low:
             return f"up to {reached}"
-        return f"from {self.low:g} up to {reached}" if value > self.low else f"at {reached} alone"
+        return (
+            f"from {self.low:g} up to {reached}"
+            if value > self.low
+            else f"at {reached} alone"
+        )
 
 
 class EncounterRange(NamedTuple):
@@ -142,7 +146,9 @@ class EncounterRange(NamedTuple):
         evaluations = self.model.evaluate(rows, stage)
         if evaluations.failed.any():
             reason = evaluations.reason(int(np.argmax(evaluations.failed)))
-            raise SimulationError(f"a car cannot be simulated in test {self.test!r}: {reason}")
+            raise SimulationError(
+                f"a car cannot be simulated in test {self.test!r}: {reason}"
+            )
         robustness = self.model.robustness_by(evaluations)
         return np.where(self.model.evaluator.region.feasible(rows), robustness, np.inf)
 
@@ -178,18 +184,26 @@ def span_of(study: Study, by: str | None) -> Span:
     ends: dict[str, dict[str, tuple[float, float]]] = {}
     for test, own in tests:
         searchable = searchable_in(own[0].scenario)
-        lists = {name: each for name, each in study.lists_of(test).items() if are_numbers(each)}
+        lists = {
+            name: each
+            for name, each in study.lists_of(test).items()
+            if are_numbers(each)
+        }
         for axis in lists:
             if axis in searchable or SPEED_DIMENSION in axis:
                 units[axis] = unit_of(own[0].scenario, axis)
-        of_test = {axis: (float(min(each)), float(max(each))) for axis, each in lists.items()}
+        of_test = {
+            axis: (float(min(each)), float(max(each))) for axis, each in lists.items()
+        }
         domains = study.ranges_of(test)
         of_test |= {axis: (each.lower, each.upper) for axis, each in domains.items()}
         for axis, both in of_test.items():
             ends.setdefault(axis, {})["" if test is None else test.name] = both
     speeds = [name for name, unit in units.items() if unit in SPEED_UNITS]
     name = by or SPEED_DIMENSION
-    problem = f"study {study.name!r} varies no {'speed' if by is None or not speeds else by}"
+    problem = (
+        f"study {study.name!r} varies no {'speed' if by is None or not speeds else by}"
+    )
     if not speeds:
         problem += ", and permit asks up to which speed a car is safe"
         raise InputError("permit", problem, "a study that varies a speed")
@@ -203,7 +217,9 @@ def span_of(study: Study, by: str | None) -> Span:
         unit=units[name],
         low=min(low for low, _ in ends[name].values()),
         high=high,
-        ending=tuple(test for test, (_, last) in ends[name].items() if goes_on and last == high),
+        ending=tuple(
+            test for test, (_, last) in ends[name].items() if goes_on and last == high
+        ),
         left_out=tuple(test for test, (low, _) in ends[name].items() if low > high),
     )
 
@@ -211,8 +227,12 @@ def span_of(study: Study, by: str | None) -> Span:
 def encounters_of(model: Model, span: Span) -> list[EncounterRange]:
     """The encounters of each test of a model alone, up to the end of the range that is driven."""
     ranges = list[EncounterRange]()
-    for test, alone, fixed in _tests_alone(with_ranges(model.evaluator.study).all_count, span.name):
-        evaluator = model.evaluator.for_study(in_phases(alone, assemble(alone)), verified=0)
+    for test, alone, fixed in _tests_alone(
+        with_ranges(model.evaluator.study).all_count, span.name
+    ):
+        evaluator = model.evaluator.for_study(
+            in_phases(alone, assemble(alone)), verified=0
+        )
         members = evaluator.characteristics
         low = high = fixed
         column = None
@@ -234,4 +254,8 @@ def _tests_alone(study: Study, by: str) -> Iterator[tuple[str, Study, float]]:
     for test in study.tests:
         for alone in study.points_of(test):
             listed = study.lists_of(alone).get(by)
-            yield test.name, study.with_tests([alone]), float(listed[0]) if listed else -np.inf
+            yield (
+                test.name,
+                study.with_tests([alone]),
+                float(listed[0]) if listed else -np.inf,
+            )

@@ -183,10 +183,16 @@ def _cells_of_file(path: Path) -> _Cells:
         content = read_file(path)
         text = content.decode("utf-8-sig")
     except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror or error}", "a list of cars (CSV)") from None
+        raise InputError(
+            path, f"cannot be read: {error.strerror or error}", "a list of cars (CSV)"
+        ) from None
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        raise InputError(f"{path}, line {line}", "is not encoded in UTF-8", 'UTF-8; in Excel: save as "CSV UTF-8"') from None
+        raise InputError(
+            f"{path}, line {line}",
+            "is not encoded in UTF-8",
+            'UTF-8; in Excel: save as "CSV UTF-8"',
+        ) from None
 
     # The separator, by Excel's first line or by the header.
     stated = SEPARATOR_LINE.match(text)
@@ -194,10 +200,16 @@ def _cells_of_file(path: Path) -> _Cells:
     first = 1 if stated else 0
     head = re.sub('"[^"]*"', "", lines.readline())
     lines.seek(0)
-    separator = stated[1] if stated else next((one for one in SEPARATORS if one in head), "")
+    separator = (
+        stated[1] if stated else next((one for one in SEPARATORS if one in head), "")
+    )
     place = f"{path}, line {first + 1}"
     if separator not in SEPARATORS or separator not in head:
-        raise InputError(place, repr(head.strip()), f"a header with a {', '.join(SEPARATORS.values())} between its columns")
+        raise InputError(
+            place,
+            repr(head.strip()),
+            f"a header with a {', '.join(SEPARATORS.values())} between its columns",
+        )
 
     # Records, each with its first line.
     reader = csv.reader(lines, delimiter=separator, strict=True)
@@ -208,23 +220,36 @@ def _cells_of_file(path: Path) -> _Cells:
             records.append((first + start + 1, record))
             start = reader.line_num
     except csv.Error as error:
-        raise InputError(f"{path}, line {first + start + 1}", str(error), "CSV") from None
+        raise InputError(
+            f"{path}, line {first + start + 1}", str(error), "CSV"
+        ) from None
     while len(records) > 1 and not any(cell.strip() for cell in records[-1][1]):
         records.pop()
     header = records[0][1]
     for line, record in records:
         if len(record) != len(header):
-            raise InputError(f"{path}, line {line}", number_of(len(record), "field"), f"{len(header)} fields with a {SEPARATORS[separator]} between them")
+            raise InputError(
+                f"{path}, line {line}",
+                number_of(len(record), "field"),
+                f"{len(header)} fields with a {SEPARATORS[separator]} between them",
+            )
     places = [f"{path}, line {line}" for line, _ in records[1:]]
-    return _Cells(place, header, places, [record for _, record in records[1:]], separator)
+    return _Cells(
+        place, header, places, [record for _, record in records[1:]], separator
+    )
 
 
 def _cells_of_frame(frame: pd.DataFrame) -> _Cells:
     """The cells of a frame, in which a missing value is an empty cell."""
     rows = [
-        ["" if missing else _text(cell) for cell, missing in zip(row, empty, strict=True)]
+        [
+            "" if missing else _text(cell)
+            for cell, missing in zip(row, empty, strict=True)
+        ]
         for row, empty in zip(
-            frame.itertuples(index=False, name=None), frame.isna().to_numpy(), strict=True
+            frame.itertuples(index=False, name=None),
+            frame.isna().to_numpy(),
+            strict=True,
         )
     ]
     places = [f"cars, row {label}" for label in frame.index]
@@ -235,10 +260,13 @@ def _cells_of_mapping(cars: Mapping[Any, Any], place: str) -> _Cells:
     """The cells of a mapping, in which None is an empty cell, as is a value that a car lacks."""
     for car, values in cars.items():
         if not isinstance(values, Mapping):
-            raise InputError(place, f"{car!r}: {values!r}", "a mapping of values by characteristic")
+            raise InputError(
+                place, f"{car!r}: {values!r}", "a mapping of values by characteristic"
+            )
     columns = list(dict.fromkeys(name for values in cars.values() for name in values))
     rows = [
-        [_text(car), *(_text(values.get(name)) for name in columns)] for car, values in cars.items()
+        [_text(car), *(_text(values.get(name)) for name in columns)]
+        for car, values in cars.items()
     ]
     places = [place if place == TYPED else f"{place}, {car!r}" for car in cars]
     return _Cells(place, [CAR, *map(str, columns)], places, rows)
@@ -264,28 +292,49 @@ def _columns(
         header = [text.strip() for text in cells.header]
         for name in ignore:
             check_name("", f"--ignore {name}: there is no such column", name, header)
-        names = [text if text in ignore else text.partition("[")[0].strip() for text in header]
+        names = [
+            text if text in ignore else text.partition("[")[0].strip()
+            for text in header
+        ]
         read = [column for column, text in enumerate(header) if text not in ignore]
         naming = read[0] if read else 0
         is_one = names[naming] in vehicle.names
         looks = "" if is_one else did_you_mean(names[naming], vehicle.names)
-        has_numbers = all(NUMBERS["."].fullmatch(row[naming].strip()) for row in cells.rows)
+        has_numbers = all(
+            NUMBERS["."].fullmatch(row[naming].strip()) for row in cells.rows
+        )
         if not read or is_one or (looks and has_numbers):
             problem = f"the first column is {header[naming]!r}"
-            raise InputError("", f"{problem}{looks}", "a first column that names the car")
+            raise InputError(
+                "", f"{problem}{looks}", "a first column that names the car"
+            )
 
         # Each name once, and none that means something else.
         tests = study.matrix.tests if study.matrix else []
-        varied = {*study.ranges, *(name for test in tests for name in study.axes_of(test))}
+        varied = {
+            *study.ranges,
+            *(name for test in tests for name in study.axes_of(test)),
+        }
         for column, name in enumerate(names):
             if names.count(name) > 1:
-                raise InputError("", f"the column {name!r} is there twice", "each column once")
+                raise InputError(
+                    "", f"the column {name!r} is there twice", "each column once"
+                )
             if column in read and name in varied:
-                raise InputError("", f"the column {name!r} is a parameter that the study itself varies", "characteristics of the vehicle, or --ignore")
+                raise InputError(
+                    "",
+                    f"the column {name!r} is a parameter that the study itself varies",
+                    "characteristics of the vehicle, or --ignore",
+                )
             if name in answer_columns and (column, name) != (naming, CAR):
-                raise InputError("", f"the column {name!r} has the name of a column of the answer", "another name, or all columns that --out writes")
+                raise InputError(
+                    "",
+                    f"the column {name!r} has the name of a column of the answer",
+                    "another name, or all columns that --out writes",
+                )
         return naming, {
-            column: _characteristic(names[column], header[column], vehicle) for column in read[1:]
+            column: _characteristic(names[column], header[column], vehicle)
+            for column in read[1:]
         }
 
 
@@ -297,7 +346,9 @@ def _characteristic(name: str, header: str, vehicle: CharacteristicSet) -> int:
     unit = vehicle.members[number].unit
     _, bracket, stated = header.partition("[")
     if bracket and stated.removesuffix("]").strip() != unit:
-        raise InputError("", f"the column {header!r} has another unit", f"{name} [{unit}]")
+        raise InputError(
+            "", f"the column {header!r} has another unit", f"{name} [{unit}]"
+        )
     return number
 
 
@@ -308,7 +359,11 @@ def _names(cells: _Cells, naming: int) -> list[str]:
         name = row[naming].strip()
         with about(f"{place}, column {cells.header[naming].strip()!r}"):
             if not name or not name.isprintable() or name[0] in "=+-@":
-                raise InputError("", f"{name!r} is no name of a car", "a text of one line that does not begin with =, +, - or @, as formulas do")
+                raise InputError(
+                    "",
+                    f"{name!r} is no name of a car",
+                    "a text of one line that does not begin with =, +, - or @, as formulas do",
+                )
             # Names that differ in case, blanks or the form of their characters are one.
             key = " ".join(unicodedata.normalize("NFKC", name).casefold().split())
             if key in places:
@@ -340,7 +395,10 @@ def _values(
                         faults.append(fault)
     if faults:
         first, *later = faults
-        problems = [first.problem, *(f"{fault.source}: {fault.problem}" for fault in later)]
+        problems = [
+            first.problem,
+            *(f"{fault.source}: {fault.problem}" for fault in later),
+        ]
         legal = dict.fromkeys(fault.legal for fault in faults)
         raise InputError(first.source, "\n".join(problems), "; ".join(legal))
     return settings, ~np.isnan(settings)
@@ -361,12 +419,20 @@ def _number(text: str, mark: str, item: Characteristic) -> float:
             for end in {item.lower, item.upper} - {item.original}
         ):
             return value
-        raise InputError("", f"{value:{EXACT}}, measured to within {item.error:g}, may be outside the domain", f"{domain}, also by that")
+        raise InputError(
+            "",
+            f"{value:{EXACT}}, measured to within {item.error:g}, may be outside the domain",
+            f"{domain}, also by that",
+        )
 
     # A part may be measured better than that of a new car, where that is an end of the domain.
-    problem = f"{value:{EXACT}} is outside {item.lower:g} to {item.upper:g}{item.suffix}"
+    problem = (
+        f"{value:{EXACT}} is outside {item.lower:g} to {item.upper:g}{item.suffix}"
+    )
     if item.upper == item.original and item.upper < value <= item.upper + item.error:
-        raise InputError("", problem, f"{domain}; at most {item.upper:g}: enter {item.upper:g}")
+        raise InputError(
+            "", problem, f"{domain}; at most {item.upper:g}: enter {item.upper:g}"
+        )
     # Any other value may be of another unit, with which no end of the domain is its advice.
     is_share = not item.suffix and item.is_legal(value / 100, beyond=False)
     unit = "percent" if is_share else "of another unit"
@@ -390,11 +456,19 @@ def _completed(
     settings = np.where(np.isnan(settings), stated, settings)
     missing = np.isnan(settings)
     if lacking := np.flatnonzero(missing.any(axis=1)).tolist():
-        names = ", ".join(vehicle.names[number] for number in np.flatnonzero(missing.any(axis=0)))
-        problem = f"no value of {names}, neither measured nor under [unmeasured] of the study"
+        names = ", ".join(
+            vehicle.names[number] for number in np.flatnonzero(missing.any(axis=0))
+        )
+        problem = (
+            f"no value of {names}, neither measured nor under [unmeasured] of the study"
+        )
         if len(settings) > 1:
             problem += f" ({len(lacking)} of {len(settings)} cars lack one)"
-        raise InputError(cells.places[lacking[0]], problem, "a value for each car, or --others new: as in the original vehicle")
+        raise InputError(
+            cells.places[lacking[0]],
+            problem,
+            "a value for each car, or --others new: as in the original vehicle",
+        )
     return settings
 
 

@@ -21,7 +21,9 @@ DRIVE, LIMITED, STOP = "drive", "up to", "stop"
 """
 CARS: Columns = {
     "car": "name of the car",
-    "up_to": Column("", "greatest value up to which it is safe", ".10g", head="may drive up to"),
+    "up_to": Column(
+        "", "greatest value up to which it is safe", ".10g", head="may drive up to"
+    ),
     "new_car_up_to": Column("", "that of the new car", ".10g", is_shown=False),
     "unit": Column("", "unit of these values", is_shown=False),
     "verdict": "drive, up to, or stop",
@@ -30,22 +32,36 @@ CARS: Columns = {
     "encounter": Column("", "the encounter in which it is unsafe", is_shown=False),
     "outcome": Column("", "what happens there", is_shown=False),
     "phase": PHASE_COLUMN._replace(is_shown=False),
-    "parameter_set": Column("-", "number of the set of [spread] in which it does", "d", False),
-    "repair_first": "the measured characteristic that, as new again, raises the value most",
-    "up_to_after_repair": Column("", "the greatest value then", ".10g", head="then up to"),
-    "simulate": Column("", "the command that simulates its failure", is_detail=True),
-    "assumed": Column("", "what was not measured, with its assumed value", is_detail=True),
-    "assumed_matters_most": Column(
-        "", "the assumed value that, at an end of its domain, lowers the value most", is_detail=True
+    "parameter_set": Column(
+        "-", "number of the set of [spread] in which it does", "d", False
     ),
-    "rough": Column("", "whether the answer is rough and proves nothing", is_detail=True),
-    "parameter_sets": Column("-", "number of parameter sets that were driven", "d", is_detail=True),
+    "repair_first": "the measured characteristic that, as new again, raises the value most",
+    "up_to_after_repair": Column(
+        "", "the greatest value then", ".10g", head="then up to"
+    ),
+    "simulate": Column("", "the command that simulates its failure", is_detail=True),
+    "assumed": Column(
+        "", "what was not measured, with its assumed value", is_detail=True
+    ),
+    "assumed_matters_most": Column(
+        "",
+        "the assumed value that, at an end of its domain, lowers the value most",
+        is_detail=True,
+    ),
+    "rough": Column(
+        "", "whether the answer is rough and proves nothing", is_detail=True
+    ),
+    "parameter_sets": Column(
+        "-", "number of parameter sets that were driven", "d", is_detail=True
+    ),
     "margin": Column("m", "clearance to keep with the study's own set", is_detail=True),
     "unsafe": Column("", "what is unsafe", is_detail=True),
 }
 SETS: Columns = {
     "car": "name of the car",
-    "fit": Column("-", "number of the parameter set in [spread] (0: that of the study)", "d"),
+    "fit": Column(
+        "-", "number of the parameter set in [spread] (0: that of the study)", "d"
+    ),
     "up_to": Column("", "greatest value up to which it is safe with this set", ".10g"),
     "test": "the test that limits it",
     "encounter": "the encounter in which it is unsafe",
@@ -55,7 +71,9 @@ SETS: Columns = {
 }
 
 
-NO_FAILURE: JsonObject = dict.fromkeys(("test", "encounter", "phase", "outcome", "simulate"))
+NO_FAILURE: JsonObject = dict.fromkeys(
+    ("test", "encounter", "phase", "outcome", "simulate")
+)
 """The columns that say how a car fails, where it does not."""
 
 
@@ -80,17 +98,24 @@ def failure_columns(
             failed = described[row]
             words = failed.words.partition(" (parameter set")[0]
             if with_car:
-                values = dict(zip(members.vehicle.names, settings[row].tolist(), strict=False))
+                values = dict(
+                    zip(members.vehicle.names, settings[row].tolist(), strict=False)
+                )
                 changes = change_texts(members.vehicle, values, are_printed=True)
                 words = f"with {join_phrases(changes or ['no change'])}, {words}"
             left_out = {*OF_ENCOUNTER, *members.names}
-            met = {name: value for name, value in failed.point.items() if name not in left_out}
+            met = {
+                name: value
+                for name, value in failed.point.items()
+                if name not in left_out
+            }
             met |= members.scenario.named(settings[row, ~members.of_vehicle])
             phase = met.pop(PHASE, None)
             texts = texts_of(model.evaluator.system.points[0], met)
             found[number] = {
                 "test": encounters.test or None,
-                "encounter": ", ".join(f"{name} {text}" for name, text in texts.items()) or None,
+                "encounter": ", ".join(f"{name} {text}" for name, text in texts.items())
+                or None,
                 "phase": phase,
                 "outcome": failed.breach,
                 "simulate": failed.command,
@@ -100,7 +125,12 @@ def failure_columns(
 
 
 def verdict_of(
-    up_to: float | None, new_car: float, top: float, need: float | None, *, is_proven: bool
+    up_to: float | None,
+    new_car: float,
+    top: float,
+    need: float | None,
+    *,
+    is_proven: bool,
 ) -> str:
     """What a car may do; without a falsification none may drive without a limit."""
     if up_to is None:
@@ -110,7 +140,12 @@ def verdict_of(
 
 
 def because(
-    permit: Permit, words: str, verdict: str, span: Span, new_car: float, need: float | None
+    permit: Permit,
+    words: str,
+    verdict: str,
+    span: Span,
+    new_car: float,
+    need: float | None,
 ) -> str:
     """Why a car may drive no faster, in one sentence for a foreman."""
     unit = unit_text(span.unit)
@@ -132,7 +167,9 @@ def set_rows(
 ) -> list[JsonObject]:
     """The rows of `SETS`."""
     reached = [
-        (name, each) for name, permit in zip(names, permits, strict=True) for each in permit.reached
+        (name, each)
+        for name, permit in zip(names, permits, strict=True)
+        for each in permit.reached
     ]
     found = failure_columns([each.failure for _, each in reached], with_car=with_car)
     return [

@@ -80,7 +80,9 @@ class PermitSearch:
         Number of simulations of the falsification so far.
     """
 
-    def __init__(self, models: Models, span: Span, values: FloatArray, budget: int) -> None:
+    def __init__(
+        self, models: Models, span: Span, values: FloatArray, budget: int
+    ) -> None:
         self.attacked = 0
         self._models = models
         self.span = span
@@ -108,7 +110,9 @@ class PermitSearch:
         return phases | ({REPAIR_STAGE: len(members) * each} if with_repairs else {})
 
     def _stage(self, fit: int) -> str:
-        return f"cars in parameter set {fit}" if len(self._models.members) > 1 else "cars"
+        return (
+            f"cars in parameter set {fit}" if len(self._models.members) > 1 else "cars"
+        )
 
     def reach(
         self, cars: Sequence[Cars], above: Sequence[float | None], stage: str = ""
@@ -126,7 +130,9 @@ class PermitSearch:
             waiting = [
                 car
                 for car, permit in enumerate(permits)
-                if not permit.reached or (least := above[car]) is None or permit.order > least
+                if not permit.reached
+                or (least := above[car]) is None
+                or permit.order > least
             ]
             caps = [
                 permits[car].order if found[car] and above[car] is not None else top
@@ -138,7 +144,11 @@ class PermitSearch:
                 self._ranges[model.fit] = encounters_of(model, self.span)
             name = stage or self._stage(model.fit)
             search = SpeedSearch(
-                self._ranges[model.fit], [cars[car] for car in waiting], self.values, caps, name
+                self._ranges[model.fit],
+                [cars[car] for car in waiting],
+                self.values,
+                caps,
+                name,
             )
             with model.evaluator.phases.stage(name):
                 search.drive_grid()
@@ -167,7 +177,11 @@ class PermitSearch:
         return search.failures[0]
 
     def repair_first(
-        self, cars: Sequence[Cars], worn: BoolArray, original: FloatArray, permits: Sequence[Permit]
+        self,
+        cars: Sequence[Cars],
+        worn: BoolArray,
+        original: FloatArray,
+        permits: Sequence[Permit],
     ) -> list[Repaired]:
         """For each of K cars the characteristic among its `worn` ones, shape (K, n), that, as in
         the original, raises its value most, with the car as it is then; None where no single one
@@ -195,13 +209,16 @@ class PermitSearch:
                 # The most promising repair of each car, unless a better one is known.
                 chosen = dict[int, int]()
                 for row, of_car in enumerate(bounds):
-                    for column in [column for column, most in of_car.items() if most <= known[row]]:
+                    for column in [
+                        column for column, most in of_car.items() if most <= known[row]
+                    ]:
                         del of_car[column]
                     if of_car:
                         chosen[row] = max(of_car, key=of_car.__getitem__)
                         del of_car[chosen[row]]
                 repaired = [
-                    cars[row].with_value_of(column, original) for row, column in chosen.items()
+                    cars[row].with_value_of(column, original)
+                    for row, column in chosen.items()
                 ]
                 above = [known[row] for row in chosen]
                 driven = self.reach(repaired, above, REPAIR_STAGE) if repaired else []
@@ -210,7 +227,9 @@ class PermitSearch:
                         best[row] = column, permit
                         known[row] = permit.order
                     failures[row] = [
-                        each.failure for each in permit.reached if each.failure is not None
+                        each.failure
+                        for each in permit.reached
+                        if each.failure is not None
                     ]
         return best
 
@@ -239,7 +258,9 @@ class PermitSearch:
         for number, of_range in rows.items():
             driven = np.array([setting for _, _, _, setting in of_range])
             robustness = ranges[number].robustness(driven, REPAIR_STAGE)
-            for (row, column, value, _), left in zip(of_range, robustness.tolist(), strict=True):
+            for (row, column, value, _), left in zip(
+                of_range, robustness.tolist(), strict=True
+            ):
                 if left < 0:
                     below = self.values[self.values < value]
                     most = float(below[-1]) if len(below) else -np.inf

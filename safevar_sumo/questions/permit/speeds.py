@@ -61,7 +61,9 @@ class Cars(NamedTuple):
         some.
         """
         corners = np.round(sobol_points(SPREAD, len(lower), seed=0))
-        return cls(lower, upper, np.unique(np.where(corners == 0, lower, upper), axis=0))
+        return cls(
+            lower, upper, np.unique(np.where(corners == 0, lower, upper), axis=0)
+        )
 
     @classmethod
     def within(cls, lower: FloatArray, upper: FloatArray, seed: int) -> Cars:
@@ -93,7 +95,9 @@ class Cars(NamedTuple):
         is_corner = np.isin(vehicles, [self.lower, self.upper]).all(axis=1)
         corners = vehicles[is_corner]
         half = self.together // 2
-        return np.vstack([corners[:half], vehicles[~is_corner], corners[half:]])[: self.together]
+        return np.vstack([corners[:half], vehicles[~is_corner], corners[half:]])[
+            : self.together
+        ]
 
     @property
     def number(self) -> int:
@@ -175,7 +179,9 @@ class SpeedSearch:
                 if places and alive:
                     self._drive(number, alive, np.concatenate(places))
 
-    def _places(self, encounters: EncounterRange, block: FloatArray) -> list[FloatArray]:
+    def _places(
+        self, encounters: EncounterRange, block: FloatArray
+    ) -> list[FloatArray]:
         """The encounters of a test at the values of a block. The least value of a test, which may
         be its only one, is driven with the next value of the grid.
         """
@@ -183,7 +189,9 @@ class SpeedSearch:
         next_value = self._values[np.searchsorted(self._values, begin)]
         values = [begin] if next_value in block else []
         if encounters.column is not None:
-            values += [v for v in block.tolist() if encounters.low < v <= encounters.high]
+            values += [
+                v for v in block.tolist() if encounters.low < v <= encounters.high
+            ]
         return [encounters.places(value) for value in values]
 
     def _drive(self, number: int, cars: Sequence[int], places: FloatArray) -> None:
@@ -199,7 +207,9 @@ class SpeedSearch:
         most = [np.inf if failure is None else failure.value for failure in known]
         is_open = encounters.values_in(rows) <= np.repeat(most, sizes)
         robustness = encounters.robustness(rows, self._stage)
-        rows, robustness = encounters.at_worst_phases(rows, robustness, is_open, self._stage)
+        rows, robustness = encounters.at_worst_phases(
+            rows, robustness, is_open, self._stage
+        )
         ends = np.cumsum(sizes)[:-1]
         for car, own, left in zip(
             cars, np.split(rows, ends), np.split(robustness, ends), strict=True
@@ -210,12 +220,18 @@ class SpeedSearch:
     def _met_within(self, car: int, number: int, box: Box) -> Falsification:
         """What a car has met of a test within a box, the worst first."""
         met = self._met[car][number]
-        settings = np.concatenate([np.zeros((0, len(box.lower))), *(own for own, _ in met)])
+        settings = np.concatenate(
+            [np.zeros((0, len(box.lower))), *(own for own, _ in met)]
+        )
         robustness = np.concatenate([np.zeros(0), *(left for _, left in met)])
         is_inside = box.holds(settings) & np.isfinite(robustness)
-        order = np.flatnonzero(is_inside)[np.argsort(robustness[is_inside], kind="stable")]
+        order = np.flatnonzero(is_inside)[
+            np.argsort(robustness[is_inside], kind="stable")
+        ]
         worst = order[:PARENTS]
-        return Falsification(settings[worst], np.zeros(len(worst), int), robustness[worst], 0)
+        return Falsification(
+            settings[worst], np.zeros(len(worst), int), robustness[worst], 0
+        )
 
     def _settings(self, car: int, places: FloatArray) -> FloatArray:
         """The settings in which the vehicles of a car meet encounters, some of them in each."""
@@ -224,7 +240,11 @@ class SpeedSearch:
         return np.hstack([vehicles, np.repeat(places, cars.together, axis=0)])
 
     def _note(
-        self, car: int, encounters: EncounterRange, settings: FloatArray, robustness: FloatArray
+        self,
+        car: int,
+        encounters: EncounterRange,
+        settings: FloatArray,
+        robustness: FloatArray,
     ) -> bool:
         """Keep the failure of a car at the least value, of several the worst; whether it fails."""
         failing = np.flatnonzero(robustness < 0)
@@ -236,7 +256,9 @@ class SpeedSearch:
         found = float(values[first]), float(robustness[row])
         known = self.failures[car]
         if known is None or found < (known.value, known.robustness):
-            self.failures[car] = LimitingFailure(found[0], encounters, settings[row], found[1])
+            self.failures[car] = LimitingFailure(
+                found[0], encounters, settings[row], found[1]
+            )
         return True
 
     def falsify(self, budget: int) -> None:
@@ -248,7 +270,9 @@ class SpeedSearch:
         driven.
         """
         cars = range(len(self._cars))
-        waiting = [[car for car in cars if self.up_to(car) is not None] for _ in self._ranges]
+        waiting = [
+            [car for car in cars if self.up_to(car) is not None] for _ in self._ranges
+        ]
         attempt = 0
         while any(waiting):
             attempt += 1
@@ -275,15 +299,22 @@ class SpeedSearch:
         # All cars side by side, each from what it met on the grid.
         met = [self._met_within(car, number, box) for car, box in boxes.items()]
         stream = encounters.model.fit, number, attempt
-        rngs = [Stream.PERMIT.generator(self._cars[car].number, *stream) for car in boxes]
+        rngs = [
+            Stream.PERMIT.generator(self._cars[car].number, *stream) for car in boxes
+        ]
         share = max(budget // len(self._ranges), LEAST_BUDGET)
         judge = partial(encounters.robustness, stage=self._stage)
         results = falsify_all(
-            *([*boxes.values()], [judge], [()] * len(boxes), share, rngs, GENERATION), begun=met
+            *([*boxes.values()], [judge], [()] * len(boxes), share, rngs, GENERATION),
+            begun=met,
         )
         failing = list[int]()
         for car, found in zip(boxes, results, strict=True):
             self.attacked += found.simulated
-            settings = encounters.model.characteristics.with_printed_encounters(found.settings)
-            failing += [car] if self._note(car, encounters, settings, found.robustness) else []
+            settings = encounters.model.characteristics.with_printed_encounters(
+                found.settings
+            )
+            failing += (
+                [car] if self._note(car, encounters, settings, found.robustness) else []
+            )
         return failing

@@ -115,7 +115,11 @@ def repair(
     study = evaluator.study
     evaluator.system.require("a driving system", "repair")
     if out is not None and quick:
-        raise InputError("quick", f"a rough repair is not written to {out}", "--quick without --out, or --out without --quick")
+        raise InputError(
+            "quick",
+            f"a rough repair is not written to {out}",
+            "--quick without --out, or --out without --quick",
+        )
     if out is not None:
         _check_file(Path(out), study)
     criterion = evaluator.checked(unsafe or Unsafe())
@@ -141,7 +145,11 @@ def repair(
         for model in models.members
     ]
     problem = problems[0]
-    between = [each for one in problems for each in ([] if at_tests else one.between(unsafe_today))]
+    between = [
+        each
+        for one in problems
+        for each in ([] if at_tests else one.between(unsafe_today))
+    ]
     between += [each for one in problems for each in one.in_phases()]
     vehicles, is_repairable = _worst_first(problem, _first_vehicles(problem, subject))
     survivors = Survivors([], len(problems), ())
@@ -150,7 +158,9 @@ def repair(
             survivors = find_survivors(problems, between, vehicles[is_repairable])
     worst = vehicles[np.argmax(is_repairable)]
     not_repairable = _not_repairable(problem, vehicles[~is_repairable])
-    answer = answer_of(problem, models, survivors, problem.worst_today(worst), not_repairable)
+    answer = answer_of(
+        problem, models, survivors, problem.worst_today(worst), not_repairable
+    )
     if out is not None and answer.numbers["repairs"]:
         write_repair(Path(out), answer)
     return answer
@@ -170,22 +180,32 @@ def _first_vehicles(problem: RepairProblem, subject: Subject) -> FloatArray:
     ]
     if not isinstance(subject, Study):
         failures = subject.solutions[problem.unsafe.rows(subject.solutions)]
-        settings.append(failures[list(promise.region.characteristics.names)].to_numpy(dtype=float))
+        settings.append(
+            failures[list(promise.region.characteristics.names)].to_numpy(dtype=float)
+        )
     rows = np.unique(np.concatenate(settings), axis=0)
     rows = rows[problem.holds(rows)]
     if not len(rows):
         kept = f"keeps {problem.unsafe.keep:g} m" if problem.unsafe.keep else "is safe"
         study = problem.study
-        text = f"{study.name!r}: the new vehicle {kept} in none of the tested encounters"
-        raise InputError(study.source, text, "a smaller --margin, or narrower ranges of the axes")
+        text = (
+            f"{study.name!r}: the new vehicle {kept} in none of the tested encounters"
+        )
+        raise InputError(
+            study.source, text, "a smaller --margin, or narrower ranges of the axes"
+        )
     return rows
 
 
-def _worst_first(problem: RepairProblem, vehicles: FloatArray) -> tuple[FloatArray, BoolArray]:
+def _worst_first(
+    problem: RepairProblem, vehicles: FloatArray
+) -> tuple[FloatArray, BoolArray]:
     """Vehicles, shape (L, n), those first that are least safe today, and which of them a driving
     system can survive: the others need another part, not a parameter.
     """
-    robustness = problem.robustness_with(problem.today, vehicles, "the driving system of today")
+    robustness = problem.robustness_with(
+        problem.today, vehicles, "the driving system of today"
+    )
     worst_first = np.argsort(robustness, kind="stable")
     ordered = vehicles[worst_first]
     is_repairable = robustness[worst_first] >= 0
@@ -203,10 +223,14 @@ def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[NamedV
         return []
     driver = problem.best_driver.evaluator
     unsafe = problem.unsafe
-    evenly_spaced = np.linspace(0, len(failures) - 1, min(len(failures), CAUSES_OF)).astype(int)
+    evenly_spaced = np.linspace(
+        0, len(failures) - 1, min(len(failures), CAUSES_OF)
+    ).astype(int)
     causes = [*chain(*find_minimal_causes(driver, failures[evenly_spaced], unsafe))]
     parts: dict[tuple[object, ...], NamedValues] = {}
-    for limits, cause in zip(find_cause_limits(driver, causes, unsafe), causes, strict=True):
+    for limits, cause in zip(
+        find_cause_limits(driver, causes, unsafe), causes, strict=True
+    ):
         # Of equal causes in many encounters only the first counts.
         kind = tuple(limits.boundary if cause.encounter else limits.boundary.items())
         parts.setdefault(kind, limits.boundary | cause.encounter)
@@ -217,8 +241,12 @@ def _check_file(path: Path, study: Study) -> None:
     """Refuse a file that is no study file, cannot be written, or is one of the study's own, before
     the work begins.
     """
-    if path.suffix != ".toml" or (path.exists() and any(map(path.samefile, study.origin.files))):
-        raise InputError("out", str(path), "a file that ends in .toml, and is not the study's own")
+    if path.suffix != ".toml" or (
+        path.exists() and any(map(path.samefile, study.origin.files))
+    ):
+        raise InputError(
+            "out", str(path), "a file that ends in .toml, and is not the study's own"
+        )
     check_writable(path, "out")
 
 
@@ -240,6 +268,12 @@ def write_repair(path: Path, answer: Answer) -> None:
         write_study(path, with_parameters(study, values), comment)
         return
     base = os.path.abspath(study.origin.called) if study.origin.called else study.name
-    tables = {"extends": base, "name": f"{study.name}-repaired", "ads": {"parameters": values}}
+    tables = {
+        "extends": base,
+        "name": f"{study.name}-repaired",
+        "ads": {"parameters": values},
+    }
     with whole_file(path, "out") as file:
-        file.write_text(f"{SCHEMA_LINE}# {comment}\n\n{tomli_w.dumps(tables)}", encoding="utf-8")
+        file.write_text(
+            f"{SCHEMA_LINE}# {comment}\n\n{tomli_w.dumps(tables)}", encoding="utf-8"
+        )

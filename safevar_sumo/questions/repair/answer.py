@@ -16,7 +16,11 @@ from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.repair.survivors import Survivors
 from safevar_sumo.questions.sampling import CONFIDENCE
-from safevar_sumo.questions.words import bound_in_words, encounter_in_words, join_phrases
+from safevar_sumo.questions.words import (
+    bound_in_words,
+    encounter_in_words,
+    join_phrases,
+)
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, NamedValues
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.study import unit_text
@@ -30,7 +34,9 @@ REPAIRS: Columns = {
     "change": "what changes, in words",
     "changed": Column("-", "number of parameters that change", is_shown=False),
     "fits": Column(
-        "-", "number of parameter sets of the vehicle model in which it holds", is_shown=False
+        "-",
+        "number of parameter sets of the vehicle model in which it holds",
+        is_shown=False,
     ),
     "largest_change": Column(
         "-", "largest change of a parameter (share of its range)", is_detail=True
@@ -42,7 +48,10 @@ REPAIRS: Columns = {
         head="brakes earlier",
     ),
     "metres_earlier_mean": Column(
-        "m", "how much earlier it brakes on average over all test cases", ".2f", is_shown=False
+        "m",
+        "how much earlier it brakes on average over all test cases",
+        ".2f",
+        is_shown=False,
     ),
     "seconds_earlier": Column(
         "s",
@@ -91,12 +100,17 @@ def answer_of(
     was tried and that a driving system can keep safe.
     """
     unsafe = problem.unsafe
-    worst = float(worst_today.column(unsafe.bound.measure if unsafe.bound else F_SAFE.name)[0])
-    kept_today = any(not problem.changed_values(change) for change, _ in survivors.changes)
+    worst = float(
+        worst_today.column(unsafe.bound.measure if unsafe.bound else F_SAFE.name)[0]
+    )
+    kept_today = any(
+        not problem.changed_values(change) for change, _ in survivors.changes
+    )
     repairs = []
     if not kept_today:
         repairs = [
-            _row(problem, change, proof, survivors.fits) for change, proof in survivors.changes
+            _row(problem, change, proof, survivors.fits)
+            for change, proof in survivors.changes
         ]
         repairs.sort(key=_cost_of)
     tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
@@ -166,9 +180,13 @@ def _verdict(
     verdict += demand
     if not_repairable:
         fewest = sorted(not_repairable, key=len)
-        parts = "; or ".join(_limits_in_words(problem, part) for part in fewest[:SHOWN_LIMITS])
+        parts = "; or ".join(
+            _limits_in_words(problem, part) for part in fewest[:SHOWN_LIMITS]
+        )
         more = len(fewest) - SHOWN_LIMITS
-        others = f" ({more} more are in the numbers, not_repairable)" if more > 0 else ""
+        others = (
+            f" ({more} more are in the numbers, not_repairable)" if more > 0 else ""
+        )
         verdict += (
             f" Remark: Even full braking at the first possible moment fails with {parts}{others}:"
             " that needs another part, not another parameter."
@@ -182,7 +200,9 @@ def _fits_in_words(models: Models, survivors: Survivors) -> str:
     if count == 1:
         return ""
     broken = (
-        f", not in {fit_names(survivors.broken)}, where it collides" if survivors.broken else ""
+        f", not in {fit_names(survivors.broken)}, where it collides"
+        if survivors.broken
+        else ""
     )
     left_out = (
         f"; left out: {fit_names([model.fit for model in models.left_out])}, where the original is"
@@ -196,7 +216,9 @@ def _fits_in_words(models: Models, survivors: Survivors) -> str:
     )
 
 
-def _row(problem: RepairProblem, change: FloatArray, proof: Proof, fits: int) -> JsonObject:
+def _row(
+    problem: RepairProblem, change: FloatArray, proof: Proof, fits: int
+) -> JsonObject:
     """A repair, its price and its proof, by the names of columns."""
     values = problem.changed_values(change)
     texts = [
@@ -239,7 +261,9 @@ def _repair_in_words(repairs: Sequence[JsonObject], wear: str, safe: str) -> str
     if repair["changed"] > 1:
         found = f"{kind} changes of the driving system that were"
     metres = repair["metres_earlier"]
-    earlier = "brakes nowhere" if metres is None else f"brakes up to {metres:.2f} m earlier"
+    earlier = (
+        "brakes nowhere" if metres is None else f"brakes up to {metres:.2f} m earlier"
+    )
     needless = "; needless braking was not measured: the study has no benign scenes"
     if repair["benign_scenes"]:
         needless = (
@@ -253,7 +277,9 @@ def _repair_in_words(repairs: Sequence[JsonObject], wear: str, safe: str) -> str
     )
 
 
-def _proof_in_words(*, proof_samples: int, proof_failures: int, at_most: float, **_: object) -> str:
+def _proof_in_words(
+    *, proof_samples: int, proof_failures: int, at_most: float, **_: object
+) -> str:
     """The validation of a change, without a full stop."""
     return (
         f"Of {proof_samples:,} worn vehicles that were sampled afterwards"

@@ -36,16 +36,27 @@ class FullBraking:
     def saves(self, settings: FloatArray) -> BoolArray:
         """Which settings are safe, shape (M,)."""
         has_encounters = len(self.evaluator.characteristics.scenario) > 0
-        if has_encounters or len(self._failures) <= HARDEST[-1] or len(settings) < LEAST_SETTINGS:
-            return robustness_of(self.evaluator.evaluate(settings, STAGE), self._unsafe) >= 0
+        if (
+            has_encounters
+            or len(self._failures) <= HARDEST[-1]
+            or len(settings) < LEAST_SETTINGS
+        ):
+            return (
+                robustness_of(self.evaluator.evaluate(settings, STAGE), self._unsafe)
+                >= 0
+            )
         is_safe = self.evaluator.region.feasible(settings)
         for points in np.split(np.argsort(-self._failures, kind="stable"), HARDEST):
             rows = np.flatnonzero(is_safe)
             selection = Selection(points=tuple(points.tolist()))
-            evaluations = self.evaluator.evaluate_selection(settings[rows], selection, STAGE)
+            evaluations = self.evaluator.evaluate_selection(
+                settings[rows], selection, STAGE
+            )
             is_safe[rows] = robustness_of(evaluations, self._unsafe) >= 0
             if evaluations.worst_points is not None:
-                np.add.at(self._failures, points[evaluations.worst_points[~is_safe[rows]]], 1)
+                np.add.at(
+                    self._failures, points[evaluations.worst_points[~is_safe[rows]]], 1
+                )
         return is_safe
 
 

@@ -46,7 +46,9 @@ def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonO
         "metres_earlier": None if most is None else float(metres[most]),
         "metres_earlier_mean": None if most is None else float(np.mean(metres[braked])),
         "seconds_earlier": None if most is None else float(seconds[most]),
-        "most_at": None if most is None else today.points[most // len(encounters)].name or None,
+        "most_at": None
+        if most is None
+        else today.points[most // len(encounters)].name or None,
         "largest_deceleration": deceleration,
         "needless_braking": sum(after) if after else None,
         "needless_braking_today": sum(before) if before else None,
@@ -60,14 +62,20 @@ def drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, 
     """
     onsets = list[Interval]()
     deceleration = 0.0
-    for result, row in product(simulate_all_points(system, encounters), range(len(encounters))):
+    for result, row in product(
+        simulate_all_points(system, encounters), range(len(encounters))
+    ):
         trace = result.runs.trace
         step = brake_onset(result.runs, row)
         onsets.append(
-            (np.nan, np.nan) if step is None else (trace.position[step, row], trace.time[step])
+            (np.nan, np.nan)
+            if step is None
+            else (trace.position[step, row], trace.time[step])
         )
         speed = trace.speed[trace.active[:, row], row]
-        deceleration = max(deceleration, float(np.max(-np.diff(speed), initial=0.0) / trace.step))
+        deceleration = max(
+            deceleration, float(np.max(-np.diff(speed), initial=0.0) / trace.step)
+        )
     return np.transpose(onsets), deceleration
 
 
@@ -78,7 +86,9 @@ def benign_scenes(study: Study, system: System) -> list[Point]:
     """
     if study.repair.benign:
         return list(
-            assemble(replace_in(study, matrix=MatrixTable(tests=study.repair.benign))).matrix
+            assemble(
+                replace_in(study, matrix=MatrixTable(tests=study.repair.benign))
+            ).matrix
         )
     searched = system.characteristics.scenario
     ends = [
@@ -87,7 +97,9 @@ def benign_scenes(study: Study, system: System) -> list[Point]:
     ]
     scenes = dict[str, Point]()
     with user_errors(system.source):
-        for point in (encounter(point, values) for values in ends for point in system.points):
+        for point in (
+            encounter(point, values) for values in ends for point in system.points
+        ):
             for description, scenario in point.scenario.benign():
                 name = f"{description}, {point.weather.name}"
                 scenes.setdefault(name, Point(scenario, point.weather, name))
@@ -103,13 +115,19 @@ def needless_braking(system: System, benign: list[Point]) -> list[bool]:
     return [
         bool(
             (
-                np.where(result.runs.trace.active, result.runs.trace.brake, 0.0) > NEEDLESS_BRAKE
+                np.where(result.runs.trace.active, result.runs.trace.brake, 0.0)
+                > NEEDLESS_BRAKE
             ).any()
         )
         for points, sees_nobody in ((benign, False), (one_per_speed, True))
         if points
         for result in simulate_all_points(
-            replace(system, points=tuple(points), sees_nobody=sees_nobody, characteristics=vehicle),
+            replace(
+                system,
+                points=tuple(points),
+                sees_nobody=sees_nobody,
+                characteristics=vehicle,
+            ),
             vehicle.original[np.newaxis],
         )
     ]

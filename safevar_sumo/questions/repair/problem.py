@@ -69,16 +69,18 @@ class Parameter(NamedTuple):
         """The rounded values at shares of the range, shape (M,)."""
         lower = self.range.lower
         upper = self.range.upper
-        digits = DIGITS + max(0, int(np.log10(max(abs(lower), abs(upper)) / (upper - lower))))
+        digits = DIGITS + max(
+            0, int(np.log10(max(abs(lower), abs(upper)) / (upper - lower)))
+        )
         exact = (
             lower * (upper / lower) ** shares
             if self.range.log
             else lower + shares * (upper - lower)
         )
         distinct, row_of = np.unique(exact, return_inverse=True)
-        return np.clip([float(f"{value:.{digits}g}") for value in distinct.tolist()], lower, upper)[
-            row_of
-        ]
+        return np.clip(
+            [float(f"{value:.{digits}g}") for value in distinct.tolist()], lower, upper
+        )[row_of]
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,9 @@ class Promise(Box):
             lower[column], upper[column] = limit.interval(rows[name])
         if (lower == upper)[everything.of_vehicle].all():
             raise InputError(
-                "promise", "promises a new vehicle only", "a limit short of the original's value"
+                "promise",
+                "promises a new vehicle only",
+                "a limit short of the original's value",
             )
         return cls(region, lower, upper)
 
@@ -132,7 +136,11 @@ class Promise(Box):
         """
         names = self.region.characteristics.names
         ends = np.transpose([self.lower, self.upper]).tolist()
-        return {name: pair for name, pair in zip(names, ends, strict=True) if pair[0] < pair[1]}
+        return {
+            name: pair
+            for name, pair in zip(names, ends, strict=True)
+            if pair[0] < pair[1]
+        }
 
     @property
     def in_words(self) -> str:
@@ -206,14 +214,21 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
         today = study.ads.parameters.get(name, getattr(ads, name, None))
         number = float(today) if isinstance(today, int | float) else math.nan
         if table is shipped:
-            row = replace_in(row, lower=min(row.lower, number), upper=max(row.upper, number))
+            row = replace_in(
+                row, lower=min(row.lower, number), upper=max(row.upper, number)
+            )
         if (
             not row.lower <= number <= row.upper
             or row.lower == row.upper
             or (row.log and row.lower <= 0)
         ):
-            raise InputError(source, f"repair.{name}: lower = {row.lower:g}, upper = {row.upper:g},"
-                f" ads.parameters.{name} = {today!r}", f"{'0 < ' if row.log else ''}lower < upper, and bounds that hold the value of today")
+            raise InputError(
+                source,
+                f"repair.{name}: lower = {row.lower:g}, upper = {row.upper:g},"
+                f" ads.parameters.{name} = {today!r}",
+                f"{'0 < ' if row.log else ''}lower < upper, and bounds that hold the"
+                " value of today",
+            )
         parameters.append(Parameter(name, row, number))
     return parameters
 
@@ -257,7 +272,10 @@ class RepairProblem:
         model = Model(self.fit, self.evaluator, self.unsafe).in_phases
         if model is None:
             return []
-        lower, upper = np.append(self.promise.lower, 0.0), np.append(self.promise.upper, 1.0)
+        lower, upper = (
+            np.append(self.promise.lower, 0.0),
+            np.append(self.promise.upper, 1.0),
+        )
         promise = Promise(model.evaluator.region, lower, upper)
         return [replace(self, evaluator=model.evaluator, promise=promise)]
 
@@ -269,7 +287,9 @@ class RepairProblem:
     @cached_property
     def today(self) -> FloatArray:
         """The parameters of today, shape (P,)."""
-        return np.array([parameter.share(parameter.today) for parameter in self.parameters])
+        return np.array(
+            [parameter.share(parameter.today) for parameter in self.parameters]
+        )
 
     def values(self, shares: FloatArray) -> FloatArray:
         """The parameters' values in their units, shape (M, P): today's value where a share is
@@ -277,7 +297,9 @@ class RepairProblem:
         """
         columns = [
             np.where(column == today, parameter.today, parameter.values(column))
-            for parameter, column, today in zip(self.parameters, shares.T, self.today, strict=True)
+            for parameter, column, today in zip(
+                self.parameters, shares.T, self.today, strict=True
+            )
         ]
         return np.stack(columns, axis=1)
 
@@ -285,7 +307,10 @@ class RepairProblem:
         """The values of the parameters that a change, one set of shape (P,), changes, by name."""
         (values,) = self.values(change[np.newaxis]).tolist()
         names = [parameter.name for parameter in self.parameters]
-        return {names[column]: values[column] for column in np.flatnonzero(change != self.today)}
+        return {
+            names[column]: values[column]
+            for column in np.flatnonzero(change != self.today)
+        }
 
     @cached_property
     def arrays(self) -> bool:
@@ -296,10 +321,14 @@ class RepairProblem:
         if self.study.ads.kind or self.study.ads.model in ADS:
             return not self.study.ads.kind
         values = self.values(sobol_points(ARRAY_CHECKS, len(self.parameters), 0))
-        settings = self.promise.at(sobol_points(ARRAY_CHECKS, len(self.promise.lower), 1))
+        settings = self.promise.at(
+            sobol_points(ARRAY_CHECKS, len(self.promise.lower), 1)
+        )
         try:
             alone, together = (
-                self._evaluate(values, settings, "is it one driving system?", arrays=arrays)
+                self._evaluate(
+                    values, settings, "is it one driving system?", arrays=arrays
+                )
                 for arrays in (False, True)
             )
         except UserCodeError:
@@ -319,37 +348,58 @@ class RepairProblem:
         all without any.
         """
         selection = Selection(
-            tuple(parameter.name for parameter in self.parameters), tuple(points) or None, arrays
+            tuple(parameter.name for parameter in self.parameters),
+            tuple(points) or None,
+            arrays,
         )
-        return self.evaluator.evaluate_selection(np.hstack([settings, values]), selection, stage)
+        return self.evaluator.evaluate_selection(
+            np.hstack([settings, values]), selection, stage
+        )
 
     def robustness_of_each(
-        self, shares: FloatArray, settings: FloatArray, stage: str, points: Sequence[int] = ()
+        self,
+        shares: FloatArray,
+        settings: FloatArray,
+        stage: str,
+        points: Sequence[int] = (),
     ) -> tuple[FloatArray, IntArray | None]:
         """What each of M sets of parameters leaves to the limit with each of L settings, shape (M,
         L), and the worst points of these M L rows; None without a matrix.
         """
         values = self.values(np.repeat(shares, len(settings), axis=0))
         evaluations = self._evaluate(
-            values, np.tile(settings, (len(shares), 1)), stage, points, arrays=self.arrays
+            values,
+            np.tile(settings, (len(shares), 1)),
+            stage,
+            points,
+            arrays=self.arrays,
         )
         return (
             robustness_of(evaluations, self.unsafe).reshape(len(shares), len(settings)),
             evaluations.worst_points,
         )
 
-    def robustness_with(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
+    def robustness_with(
+        self, change: FloatArray, settings: FloatArray, stage: str
+    ) -> FloatArray:
         """What one set of parameters leaves to the limit with each of L settings, shape (L,)."""
-        return self.robustness_of_each(change[np.newaxis], settings, stage)[0].reshape(-1)
+        return self.robustness_of_each(change[np.newaxis], settings, stage)[0].reshape(
+            -1
+        )
 
     def worst_today(self, setting: FloatArray) -> Evaluations:
         """How the ADS of today ends with one setting, shape (n,)."""
         values = self.values(self.today[np.newaxis])
         return self._evaluate(
-            values, setting[np.newaxis], "the driving system of today", arrays=self.arrays
+            values,
+            setting[np.newaxis],
+            "the driving system of today",
+            arrays=self.arrays,
         )
 
-    def robustness(self, change: FloatArray, settings: FloatArray, stage: str) -> FloatArray:
+    def robustness(
+        self, change: FloatArray, settings: FloatArray, stage: str
+    ) -> FloatArray:
         """What settings leave to the margin with one set of parameters, shape (L,); infinite where
         they do not hold, or no driving system keeps them safe.
         """
@@ -392,14 +442,18 @@ class RepairProblem:
         """
         original = self.promise.region.characteristics.original
         settings = self.evaluator.critical_encounters
-        return np.concatenate([original[np.newaxis], settings[self.promise.holds(settings)]])
+        return np.concatenate(
+            [original[np.newaxis], settings[self.promise.holds(settings)]]
+        )
 
     @cached_property
     def best_driver(self) -> FullBraking | None:
         """Full braking at the first possible moment; None where it has no approach
         (`approach_parameters`), and by a bound of a measure, of which it need not be the best.
         """
-        approach = None if self.unsafe.bound else approach_parameters(self.evaluator.system)
+        approach = (
+            None if self.unsafe.bound else approach_parameters(self.evaluator.system)
+        )
         if approach is None:
             return None
         ads = ModelTable(model="full_braking", parameters=approach)
@@ -414,5 +468,7 @@ class RepairProblem:
             return np.ones(len(settings), dtype=bool)
         is_safe = self.best_driver.saves(settings)
         unsafe = np.flatnonzero(~is_safe)
-        is_safe[unsafe] = self.robustness_with(self.today, settings[unsafe], "full braking") >= 0
+        is_safe[unsafe] = (
+            self.robustness_with(self.today, settings[unsafe], "full braking") >= 0
+        )
         return is_safe

@@ -72,7 +72,9 @@ class Search:
     def add(self, problem: int, settings: FloatArray) -> None:
         """Add counterexamples of a problem, which are tried first."""
         rows = np.concatenate([settings, self.settings_of.get(problem, settings[:0])])
-        self.settings_of[problem] = rows[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
+        self.settings_of[problem] = rows[
+            np.sort(np.unique(rows, axis=0, return_index=True)[1])
+        ]
 
     def smallest_changes(self) -> list[FloatArray]:
         """The parameters of today if they survive all counterexamples; otherwise the smallest
@@ -105,7 +107,11 @@ class Search:
                 if row is None:
                     break
                 best = changes[row]
-                ring = int(np.argmax(sizes >= np.max(np.abs(best - self.problem.today)) - 1e-12))
+                ring = int(
+                    np.argmax(
+                        sizes >= np.max(np.abs(best - self.problem.today)) - 1e-12
+                    )
+                )
                 low = float(sizes[ring - 1]) if ring else low
                 high = float(sizes[ring])
             self._least[number] = low if best is not None else max(low, high)
@@ -127,7 +133,9 @@ class Search:
         for row, subset in enumerate(subsets):
             moves[row * len(ring) : (row + 1) * len(ring), subset] = ring
         moves = moves[np.argsort(np.sum(np.abs(moves), axis=1), kind="stable")]
-        changes = (today + sizes[:, np.newaxis, np.newaxis] * moves).reshape(-1, len(today))
+        changes = (today + sizes[:, np.newaxis, np.newaxis] * moves).reshape(
+            -1, len(today)
+        )
         return changes[((changes >= 0) & (changes <= 1)).all(axis=1)]
 
     def _failure_of(self, change: FloatArray) -> Counterexample | None:
@@ -145,7 +153,9 @@ class Search:
                 worst = int(np.argmin(robustness))
                 if robustness[worst] < 0:
                     return Counterexample(
-                        rows[worst], number, () if points is None else (int(points[worst]),)
+                        rows[worst],
+                        number,
+                        () if points is None else (int(points[worst]),),
                     )
                 start = start + size
                 size = 4 * size
@@ -166,7 +176,9 @@ class Search:
                 rows = rows[self._survivors(changes[rows], [failure])]
         return None
 
-    def _survivors(self, changes: FloatArray, failures: Sequence[Counterexample]) -> IntArray:
+    def _survivors(
+        self, changes: FloatArray, failures: Sequence[Counterexample]
+    ) -> IntArray:
         """The rows of the changes that survive the settings of failures at their points; few at a
         time.
         """
@@ -175,7 +187,9 @@ class Search:
             (failure.problem, failure.points) for failure in failures
         ):
             same = [
-                each.setting for each in failures if (each.problem, each.points) == (number, points)
+                each.setting
+                for each in failures
+                if (each.problem, each.points) == (number, points)
             ]
             settings = np.array(same)
             problem = self.problems[number]

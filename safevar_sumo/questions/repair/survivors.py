@@ -11,7 +11,11 @@ from safevar_sumo.questions.box import Proof, proof_size
 from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.repair.smallest import Search
-from safevar_sumo.questions.repair.validation import MAX_UNSAFE_SHARE, find_failures, prove_change
+from safevar_sumo.questions.repair.validation import (
+    MAX_UNSAFE_SHARE,
+    find_failures,
+    prove_change,
+)
 from safevar_sumo.records import FloatArray
 
 MAX_ROUNDS = 30
@@ -34,7 +38,9 @@ class Survivors(NamedTuple):
 
 
 def find_survivors(
-    problems: Sequence[RepairProblem], between: Sequence[RepairProblem], vehicles: FloatArray
+    problems: Sequence[RepairProblem],
+    between: Sequence[RepairProblem],
+    vehicles: FloatArray,
 ) -> Survivors:
     """The smallest changes that survive in all parameter sets, also `between` the tests of a
     matrix; where none does, those of the study's own set, and the sets in which a falsification
@@ -51,14 +57,19 @@ def find_survivors(
 
     def breaks_one(problem: RepairProblem) -> bool:
         tests = between_of(problem)
-        return any(find_failures([problem], tests, change, vehicles, 0) for change, _ in changes)
+        return any(
+            find_failures([problem], tests, change, vehicles, 0)
+            for change, _ in changes
+        )
 
     broken = tuple(problem.fit for problem in problems[1:] if breaks_one(problem))
     return Survivors(changes, len(problems) - len(broken), broken)
 
 
 def _survivors_in(
-    problems: Sequence[RepairProblem], between: Sequence[RepairProblem], vehicles: FloatArray
+    problems: Sequence[RepairProblem],
+    between: Sequence[RepairProblem],
+    vehicles: FloatArray,
 ) -> list[tuple[FloatArray, Proof]]:
     """Search, attack and prove in turns until the smallest changes survive everything; none if no
     change does.
@@ -83,10 +94,14 @@ def _survivors_in(
             attacks += 1
             left = later * (attack + proof) + len(changes) * len(search.settings)
             phases.expect(attack + proof + left)
-            failures = find_failures(problems, between, change, search.settings, attacks)
+            failures = find_failures(
+                problems, between, change, search.settings, attacks
+            )
             if not failures:
                 phases.expect(proof + left)
-                proved, failures = prove_change(problems, change, attacks, failed_proofs + 1)
+                proved, failures = prove_change(
+                    problems, change, attacks, failed_proofs + 1
+                )
                 if failures:
                     failed_proofs += 1
                 else:

@@ -42,8 +42,12 @@ def find_failures(
     own = problems[0]
     # These numbers are of no `Stream`: repairs depend on them.
     rng = np.random.default_rng((own.study.search.seed, number))
-    judges = [partial(problem.robustness, change, stage=ATTACK_STAGE) for problem in problems]
-    starts = [known[: KNOWN if row == 0 else KNOWN // 8] for row in range(len(problems))]
+    judges = [
+        partial(problem.robustness, change, stage=ATTACK_STAGE) for problem in problems
+    ]
+    starts = [
+        known[: KNOWN if row == 0 else KNOWN // 8] for row in range(len(problems))
+    ]
     failures = falsify(own.promise, judges, starts, own.budget, rng).failures
     for row, problem in enumerate(between, len(problems)):
         if failures:
@@ -53,12 +57,16 @@ def find_failures(
         if problem.has_phases:
             corners = own.promise.corners(own.study.search.seed, number)[:KNOWN]
             model = Model(problem.fit, problem.evaluator, problem.unsafe)
-            rows, left = at_worst_phases(model, judge, np.concatenate([known[:KNOWN], corners]))
+            rows, left = at_worst_phases(
+                model, judge, np.concatenate([known[:KNOWN], corners])
+            )
             failures = {row: rows[left < 0]} if (left < 0).any() else {}
             continue
         # The worst known vehicles, each at some random places on the axes.
         vehicles = np.repeat(known[:KNOWN_BETWEEN], PLACES, axis=0)
-        start = problem.promise.at(rng.random((len(vehicles), len(problem.promise.lower))))
+        start = problem.promise.at(
+            rng.random((len(vehicles), len(problem.promise.lower)))
+        )
         start[:, : vehicles.shape[1]] = vehicles
         budget = own.evaluator.scaled(LEAST_SIMULATIONS)
         found = falsify(problem.promise, [judge], [start], budget, rng)
@@ -82,7 +90,9 @@ def prove_change(
     def judge(settings: FloatArray) -> Judgement:
         robustness = own.robustness(change, settings, PROOF_STAGE)
         return Judgement(
-            robustness < 0, np.zeros(len(robustness), dtype=bool), np.isfinite(robustness)
+            robustness < 0,
+            np.zeros(len(robustness), dtype=bool),
+            np.isfinite(robustness),
         )
 
     rng = Stream.REPAIRED_BOUND.generator(seed, number)

@@ -57,7 +57,10 @@ if TYPE_CHECKING:
 
     from safevar_sumo.questions.subject import Results
 
-REMARKS: Columns = {"table": "table", "remark": "what is missing or left out there, and why"}
+REMARKS: Columns = {
+    "table": "table",
+    "remark": "what is missing or left out there, and why",
+}
 
 
 @contents(
@@ -101,19 +104,37 @@ def tables(
     # The options, the cases, and the algorithm that is compared.
     {option.name: option for option in options_of(tables)}["alpha"].check(alpha)
     if table:
-        check_name("table", f"there is no table {table!r}", table, {**TABLES, "remarks": REMARKS})
+        check_name(
+            "table",
+            f"there is no table {table!r}",
+            table,
+            {**TABLES, "remarks": REMARKS},
+        )
     cases = _cases_of(results)
     if algorithm:
-        known = {label for case in cases for label in (*case.algorithms, *case.study.search.labels)}
-        check_name("algorithm", f"the results have no {algorithm!r}", label_of(algorithm), known)
+        known = {
+            label
+            for case in cases
+            for label in (*case.algorithms, *case.study.search.labels)
+        }
+        check_name(
+            "algorithm",
+            f"the results have no {algorithm!r}",
+            label_of(algorithm),
+            known,
+        )
     causes_of_cases = {
-        case.name: _causes_of_runs(case, causes, jobs) for case in cases if causes and case.has_runs
+        case.name: _causes_of_runs(case, causes, jobs)
+        for case in cases
+        if causes and case.has_runs
     }
 
     # Tables, figures, and the command that gives them.
     asked = table if table in ON_REQUEST else ""
     answer = answer_questions(
-        cases, Choices(label_of(algorithm), alpha, causes_of_cases), [asked] if asked else FUNCTIONS
+        cases,
+        Choices(label_of(algorithm), alpha, causes_of_cases),
+        [asked] if asked else FUNCTIONS,
     )
     if figures is not None:
         save_figures(cases, figures)
@@ -123,7 +144,10 @@ def tables(
     for name, value in options.items():
         words += [f"--{name}", quote(str(value))] if value not in ("", ALPHA, 0) else []
     has_runs = any(case.has_runs for case in cases)
-    lead = next((name for name in (OVER_RUNS if has_runs else POOLED) if name in answer.tables), "")
+    lead = next(
+        (name for name in (OVER_RUNS if has_runs else POOLED) if name in answer.tables),
+        "",
+    )
     folded = AS_PUBLISHED if has_runs else ()
     return replace(answer, command=" ".join(words), lead=lead, folded=folded)
 
@@ -141,7 +165,9 @@ def figures(*results: Results | str | Path) -> dict[str, Figure]:
 
 
 def _cases_of(results: Sequence[Results | str | Path]) -> list[Case]:
-    directories: list[Any] = [getattr(source, "directory", source) for source in results]
+    directories: list[Any] = [
+        getattr(source, "directory", source) for source in results
+    ]
     return load_cases(directories)
 
 
@@ -150,12 +176,17 @@ def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
     from safevar_sumo.questions.causes import causes_of_runs
     from safevar_sumo.questions.evaluator import open_evaluator
 
-    with open_progress(True) as show, open_evaluator(case.study, None, jobs, show) as evaluator:
+    with (
+        open_progress(True) as show,
+        open_evaluator(case.study, None, jobs, show) as evaluator,
+    ):
         return causes_of_runs(case, evaluator, limit)
 
 
 def answer_questions(
-    cases: Sequence[Case], choices: Choices = DEFAULT, names: Collection[str] = FUNCTIONS
+    cases: Sequence[Case],
+    choices: Choices = DEFAULT,
+    names: Collection[str] = FUNCTIONS,
 ) -> Answer:
     """Every named table of the cases; a table that no case answers has no row, and a remark says
     why.
@@ -209,7 +240,9 @@ def answer_questions(
     different = dict.fromkeys([*of_all, *remarks])
     frames["remarks"] = tabulate("Remarks", REMARKS, [*different])
     # Which runs and settings are in no table.
-    remarks_of_cases = [f"Remark: {remark}" for case in cases for remark in case.remarks]
+    remarks_of_cases = [
+        f"Remark: {remark}" for case in cases for remark in case.remarks
+    ]
     return Answer(
         question="tables",
         study=cases[0].study,
@@ -261,7 +294,9 @@ def _equal_solutions(case: Case) -> str:
     )
 
 
-def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
+def _remarks(
+    table: str, case: Case, frame: pd.DataFrame, alpha: float
+) -> Iterator[str]:
     """What a case's frame leaves out."""
     # What each table cannot say.
     remarks = list[str]()
@@ -285,7 +320,9 @@ def _remarks(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Itera
     return (remark[:1].upper() + remark[1:] for remark in remarks if remark)
 
 
-def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) -> Iterator[str]:
+def _on_pooled_tests(
+    table: str, case: Case, frame: pd.DataFrame, alpha: float
+) -> Iterator[str]:
     """What tests of pooled solutions leave out: algorithms with too few runs, and undefined
     values.
     """
@@ -312,7 +349,9 @@ def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) 
             {SAFETY_DEGREE} if case.study.ranges else {*case.original}
         )  # in a solution's encounter
         omitted = [
-            name for name, value in case.original.items() if math.isnan(value) or name not in known
+            name
+            for name, value in case.original.items()
+            if math.isnan(value) or name not in known
         ]
         if omitted:
             yield (
@@ -331,7 +370,9 @@ def _on_pooled_tests(table: str, case: Case, frame: pd.DataFrame, alpha: float) 
         )
 
 
-def remarks_on_runs(table: str, frame: pd.DataFrame, alpha: float = ALPHA) -> Iterator[str]:
+def remarks_on_runs(
+    table: str, frame: pd.DataFrame, alpha: float = ALPHA
+) -> Iterator[str]:
     """Which tests of runs have too few runs, and how tests are corrected."""
     rq = table.partition("-")[0].upper()
     tests = frame.dropna(subset="effect_size")

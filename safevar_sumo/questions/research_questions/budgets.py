@@ -12,7 +12,11 @@ import pandas as pd
 import scipy
 
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.research_questions.comparisons import Choices, rq2_runs, with_intervals
+from safevar_sumo.questions.research_questions.comparisons import (
+    Choices,
+    rq2_runs,
+    with_intervals,
+)
 from safevar_sumo.questions.research_questions.fronts import (
     frames_of_runs,
     hypervolume,
@@ -22,7 +26,20 @@ from safevar_sumo.questions.research_questions.fronts import (
     valid_evaluations,
 )
 
-BUDGETS = (100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000, 100_000, 200_000, 500_000)
+BUDGETS = (
+    100,
+    200,
+    500,
+    1_000,
+    2_000,
+    5_000,
+    10_000,
+    20_000,
+    50_000,
+    100_000,
+    200_000,
+    500_000,
+)
 """Numbers of simulations of a run after which algorithms are compared, besides its whole budget."""
 POWER = 0.8
 """Probability with which a planned number of runs shows an effect."""
@@ -43,7 +60,10 @@ def within_budgets(case: Case) -> pd.DataFrame:
     whole = case.study.search.evaluations
     budgets = np.union1d(np.minimum(BUDGETS, whole), whole)
     return pd.concat(
-        [rows.query("evaluation < @budget").assign(simulations=budget) for budget in budgets]
+        [
+            rows.query("evaluation < @budget").assign(simulations=budget)
+            for budget in budgets
+        ]
     )
 
 
@@ -68,7 +88,9 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
         If there are no evaluations or no solutions, or a single algorithm.
     """
     # Every run within each budget, also if it has no valid setting there.
-    tests = rq2_runs(case, choices)["p_value"].count()  # raises if there is a single algorithm
+    tests = rq2_runs(case, choices)[
+        "p_value"
+    ].count()  # raises if there is a single algorithm
     reference = reference_front(case)
     unsafe = case.unsafe
     runs = [
@@ -84,7 +106,9 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
         for budget, valid in within_budgets(case).groupby("simulations")
         for run, rows in frames_of_runs(case, valid)
     ]
-    growth = pd.DataFrame(runs, columns=["algorithm", "n1", "simulations", "hypervolume", "unsafe"])
+    growth = pd.DataFrame(
+        runs, columns=["algorithm", "n1", "simulations", "hypervolume", "unsafe"]
+    )
 
     # Every pair of runs; A12 is the share in which the first is better, and half of the ties.
     others = growth.rename(columns={"algorithm": "baseline", "n1": "n2"})
@@ -106,6 +130,8 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
             "unsafe_baseline": "mean",
         }
     )
-    quantiles = scipy.stats.norm.isf([choices.alpha / 2 / max(tests, 1), 1 - POWER]).sum()
+    quantiles = scipy.stats.norm.isf(
+        [choices.alpha / 2 / max(tests, 1), 1 - POWER]
+    ).sum()
     frame["runs_needed"] = np.ceil((quantiles / (frame["effect_size"] - 0.5)) ** 2 / 6)
     return with_intervals(frame, choices.alpha)

@@ -23,7 +23,12 @@ COMBINATION_SIZE = 4
 """Number of changed characteristics in the combinations that are counted."""
 COMBINATIONS_SHOWN = 3
 """Number of the most frequent combinations that are shown."""
-SAFETY_SCALES = {"avgSD_mD": SAFETY_DEGREE, "TET": "tet", "TIT": "tit", "aveDece": "ave_dece"}
+SAFETY_SCALES = {
+    "avgSD_mD": SAFETY_DEGREE,
+    "TET": "tet",
+    "TIT": "tit",
+    "aveDece": "ave_dece",
+}
 """For each quantity of `rq33_safety` with a percentage: the metric whose value for the original
 vehicle is 100 %.
 """
@@ -40,7 +45,9 @@ def critical_solutions(case: Case) -> pd.DataFrame:
     solutions = case.solutions_of(NSGA2)
     if np.isnan(case.original[SAFETY_DEGREE]):
         raise UnanswerableError(
-            case.name, "lacks the original vehicle's safety degree", "results that have it"
+            case.name,
+            "lacks the original vehicle's safety degree",
+            "results that have it",
         )
     return solutions[solutions[SAFETY_DEGREE] < case.original_degrees(solutions)]
 
@@ -106,13 +113,17 @@ def rq32(case: Case) -> pd.DataFrame:
     shares = (changes_of(case, critical_solutions(case)) != 0).astype(float)
     values = {
         (name,): column
-        for name, column in zip(case.characteristics.vehicle.names, shares.T, strict=True)
+        for name, column in zip(
+            case.characteristics.vehicle.names, shares.T, strict=True
+        )
     }
-    frame = _means_by_change_count(case, ["characteristic"], "percent", values.items()).drop(
-        columns="n"
-    )
+    frame = _means_by_change_count(
+        case, ["characteristic"], "percent", values.items()
+    ).drop(columns="n")
     frame["percent"] *= 100
-    ranks = frame["percent"].where(frame["j"] == ANY).rank(method="min", ascending=False)
+    ranks = (
+        frame["percent"].where(frame["j"] == ANY).rank(method="min", ascending=False)
+    )
     return frame.assign(rank=ranks.astype("Int64"))
 
 
@@ -131,7 +142,9 @@ def rq33(case: Case) -> pd.DataFrame:
         for name, column in zip(originals, changes.T, strict=True)
         for direction, sign in (("increase", 1), ("decrease", -1))
     }
-    frame = _means_by_change_count(case, ["characteristic", "direction"], "delta", values.items())
+    frame = _means_by_change_count(
+        case, ["characteristic", "direction"], "delta", values.items()
+    )
     frame["pc"] = (frame["delta"] / frame["characteristic"].map(originals)).abs()
     return frame
 
@@ -174,7 +187,9 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     frame = _means_by_change_count(case, ["quantity"], "value", values.items())
 
     # Relative to the original's values.
-    scale = frame["quantity"].map(SAFETY_SCALES).map(original).abs().replace(0.0, np.nan)
+    scale = (
+        frame["quantity"].map(SAFETY_SCALES).map(original).abs().replace(0.0, np.nan)
+    )
     frame["percent"] = 100 * frame["value"] / scale
     return frame
 

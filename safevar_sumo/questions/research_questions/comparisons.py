@@ -27,7 +27,12 @@ import pandas as pd
 from msgspec import structs
 
 from safevar_sumo.metrics import Measure
-from safevar_sumo.questions.case import NSGA2, Case, UnanswerableError, solutions_for_metric
+from safevar_sumo.questions.case import (
+    NSGA2,
+    Case,
+    UnanswerableError,
+    solutions_for_metric,
+)
 from safevar_sumo.questions.research_questions.fronts import (
     INDICATOR_TITLES,
     MORE_IS_BETTER,
@@ -98,7 +103,9 @@ def rq2(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     if case.has_runs and len(case.evaluations):
         simulated = count_evaluations(case).groupby("algorithm")["simulated"].mean()
     sides = {"evaluations": "algorithm", "baseline_evaluations": "baseline"}
-    evaluations = {name: frame[side].map(simulated).astype(float) for name, side in sides.items()}
+    evaluations = {
+        name: frame[side].map(simulated).astype(float) for name, side in sides.items()
+    }
     return _with_significance(frame.assign(**evaluations), choices)
 
 
@@ -115,7 +122,9 @@ def rq1_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     return tests[tests.index == "RQ1"]
 
 
-def rq2_runs(case: Case, choices: Choices = DEFAULT, further: Samples = NOTHING) -> pd.DataFrame:
+def rq2_runs(
+    case: Case, choices: Choices = DEFAULT, further: Samples = NOTHING
+) -> pd.DataFrame:
     """Compare one algorithm with every other by Mann-Whitney U, with one value per run: indicators,
     metrics' means over solutions and, if they were counted, distinct minimal causes.
 
@@ -140,7 +149,9 @@ def rq2_common(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     valid = valid_evaluations(case, case.evaluations)
     best = valid.groupby(["algorithm", "run"])[SAFETY_DEGREE].min()
     # A run without valid evaluations is worse than any other one.
-    best = best.reindex(pd.MultiIndex.from_tuples(case.finished_runs), fill_value=math.inf)
+    best = best.reindex(
+        pd.MultiIndex.from_tuples(case.finished_runs), fill_value=math.inf
+    )
     further = {(name, BEST): best[name] for name in case.algorithms}
     # The causes were counted among the solutions that the algorithms returned.
     return rq2_runs(common, choices._replace(causes={}), further)
@@ -175,7 +186,10 @@ def compare_over_runs(
     rows = {"RQ1": _test_original(case, choices, over_runs=True)}
     if len(case.algorithms) > 1:
         rows["RQ2"] = _test_opponents(case, choices, over_runs=True, further=further)
-    families = {question: _corrected(question, rows[question], choices.alpha) for question in rows}
+    families = {
+        question: _corrected(question, rows[question], choices.alpha)
+        for question in rows
+    }
     return _with_significance(pd.concat(families).droplevel(1), choices)
 
 
@@ -183,7 +197,9 @@ def _corrected(question: str, rows: list[JsonObject], alpha: float) -> pd.DataFr
     """The tests of a question over runs, which are corrected as a family."""
     tests = pd.DataFrame(rows)
     count = int(tests["p_value"].count())
-    is_enough = [can_be_significant(question, row["n1"], row["n2"], alpha, count) for row in rows]
+    is_enough = [
+        can_be_significant(question, row["n1"], row["n2"], alpha, count) for row in rows
+    ]
     return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough_runs=is_enough)
 
 
@@ -193,7 +209,9 @@ def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:
     have intervals.
     """
     p_values = tests["p_holm" if "p_holm" in tests else "p_value"]
-    is_significant = ((p_values < choices.alpha) & tests["enough_runs"]).astype("boolean")
+    is_significant = ((p_values < choices.alpha) & tests["enough_runs"]).astype(
+        "boolean"
+    )
     tests = tests.assign(significant=is_significant.where(p_values.notna()))
     if "p_holm" not in tests:
         return tests
@@ -218,10 +236,18 @@ def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     case.require_solutions()
     samples = _samples(case, choices, over_runs=True)
     rows = [
-        (algorithm, metric, len(values), values.median(), *median_interval(values, choices.alpha))
+        (
+            algorithm,
+            metric,
+            len(values),
+            values.median(),
+            *median_interval(values, choices.alpha),
+        )
         for (algorithm, metric), values in samples.items()
     ]
-    return pd.DataFrame(rows, columns=["algorithm", "metric", "runs", *INTERVAL_OF_MEDIAN])
+    return pd.DataFrame(
+        rows, columns=["algorithm", "metric", "runs", *INTERVAL_OF_MEDIAN]
+    )
 
 
 def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
@@ -235,7 +261,9 @@ def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
     case.runs_of(NSGA2)  # raises if the solutions are imported
     if case.name not in choices.causes:
         raise UnanswerableError(
-            case.name, "minimal causes are simulated only if they are asked for", "causes"
+            case.name,
+            "minimal causes are simulated only if they are asked for",
+            "causes",
         )
     return choices.causes[case.name]
 
@@ -262,7 +290,9 @@ def opponents_of(case: Case, algorithm: str) -> tuple[str, list[str]]:
     return first, others
 
 
-def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> list[JsonObject]:
+def _test_original(
+    case: Case, choices: Choices, *, over_runs: bool = False
+) -> list[JsonObject]:
     """A row for each algorithm and metric, against the original vehicle."""
     case.require_solutions()
 
@@ -281,7 +311,9 @@ def _test_original(case: Case, choices: Choices, *, over_runs: bool = False) -> 
         test = test.oriented(larger_is_better=not metric.more_is_unsafe)
         runs = test.n1 if over_runs else _finished_runs(case, algorithm)
         row = {"algorithm": algorithm, "metric": metric.name, "runs": runs}
-        is_enough = not case.has_runs or can_be_significant("RQ1", runs, 0, choices.alpha)
+        is_enough = not case.has_runs or can_be_significant(
+            "RQ1", runs, 0, choices.alpha
+        )
         row |= {"mean": values.mean(), "original": original, "enough_runs": is_enough}
         rows.append({**row, **test._asdict()})
     return rows
@@ -301,7 +333,9 @@ def _test_opponents(
     for baseline, (metric, more_is_better) in product(others, directions.items()):
         if metric in BETTER and (first, metric) not in samples:
             continue
-        test = compare_samples(*(samples.get((name, metric), ()) for name in (first, baseline)))
+        test = compare_samples(
+            *(samples.get((name, metric), ()) for name in (first, baseline))
+        )
         test = test.oriented(larger_is_better=more_is_better)
         runs = _finished_runs(case, first), _finished_runs(case, baseline)
         is_enough = not case.has_runs or can_be_significant("RQ2", *runs, choices.alpha)
@@ -327,17 +361,21 @@ def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
     if case.has_runs and len(case.solutions):
         for algorithm, rows in compute_indicators(case).groupby(level="algorithm"):
             samples |= {
-                (str(algorithm), name): rows.droplevel("algorithm")[name] for name in MORE_IS_BETTER
+                (str(algorithm), name): rows.droplevel("algorithm")[name]
+                for name in MORE_IS_BETTER
             }
     if over_runs and case.name in choices.causes:
         counts = choices.causes[case.name].groupby("algorithm")
         samples |= {
-            (str(algorithm), CAUSES): rows.set_index("run")[CAUSES] for algorithm, rows in counts
+            (str(algorithm), CAUSES): rows.set_index("run")[CAUSES]
+            for algorithm, rows in counts
         }
     return samples
 
 
-def _values(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> pd.Series[float]:
+def _values(
+    case: Case, algorithm: str, metric: Measure, over_runs: bool
+) -> pd.Series[float]:
     """A metric's defined values over the solutions that count for it; over runs, the mean of each
     run.
     """
@@ -348,10 +386,14 @@ def _values(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> pd.
     if not over_runs:
         return values
     case.runs_of(algorithm)  # raises if there are none
-    return values.groupby(solutions["run"]).agg(lambda sample: np.mean(sample.to_numpy()))
+    return values.groupby(solutions["run"]).agg(
+        lambda sample: np.mean(sample.to_numpy())
+    )
 
 
-def _originals(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> pd.Series[float]:
+def _originals(
+    case: Case, algorithm: str, metric: Measure, over_runs: bool
+) -> pd.Series[float]:
     """The original vehicle's metric beside each of `_values`; in a study that searches its
     scenario, the safety degree in the same encounters, and undefined for other metrics.
     """
@@ -360,7 +402,9 @@ def _originals(case: Case, algorithm: str, metric: Measure, over_runs: bool) -> 
         return pd.Series(case.original[metric.name], index=values.index, dtype=float)
     if metric.name != SAFETY_DEGREE:
         return pd.Series(np.nan, index=values.index, dtype=float)
-    return _values(case, algorithm, structs.replace(metric, name=ORIGINAL_DEGREE), over_runs)
+    return _values(
+        case, algorithm, structs.replace(metric, name=ORIGINAL_DEGREE), over_runs
+    )
 
 
 def describe_runs_without_solutions(case: Case) -> str:
@@ -389,6 +433,10 @@ def describe_runs_without_solutions(case: Case) -> str:
 def titles_of(cases: Iterable[Case]) -> dict[str, str]:
     """Titles of algorithms, quality indicators and the cases' metrics, by name."""
     cases = list(cases)
-    metrics = {metric.name: metric.title for case in cases for metric in case.scoring.metrics}
-    algorithms = {name: case.title_of(name) for case in cases for name in case.algorithms}
+    metrics = {
+        metric.name: metric.title for case in cases for metric in case.scoring.metrics
+    }
+    algorithms = {
+        name: case.title_of(name) for case in cases for name in case.algorithms
+    }
     return algorithms | INDICATOR_TITLES | metrics | {BEST: "best SD of a run"}

@@ -83,7 +83,8 @@ def draw_pareto_fronts(case: Case) -> Figure:
     # The front of each algorithm.
     objectives = case.scoring.objectives
     fronts = {
-        algorithm: nondominated_points(points) * [objective.sign for objective in objectives]
+        algorithm: nondominated_points(points)
+        * [objective.sign for objective in objectives]
         for algorithm in case.algorithms
         if len(points := points_of(case, case.solutions_of(algorithm)))
     }
@@ -96,7 +97,9 @@ def draw_pareto_fronts(case: Case) -> Figure:
     # A panel for each pair of objectives.
     pairs = list(combinations(range(len(objectives)), 2))
     title = f"{case.name}: non-dominated solutions of each algorithm, all runs together"
-    figure, axes = new_panels(title, len(pairs), 3, (3.2, 3.7), min_width=5.0, title_height=0.0)
+    figure, axes = new_panels(
+        title, len(pairs), 3, (3.2, 3.7), min_width=5.0, title_height=0.0
+    )
 
     # The original vehicle in the same axes.
     known_values = {
@@ -105,7 +108,8 @@ def draw_pareto_fronts(case: Case) -> Figure:
         F_SAFE.name: case.original.get(SAFETY_DEGREE, np.nan),
     }
     original = [
-        {**case.original, **known_values}.get(objective.name, np.nan) for objective in objectives
+        {**case.original, **known_values}.get(objective.name, np.nan)
+        for objective in objectives
     ]
     for axis, pair in zip(axes, pairs, strict=True):
         for (algorithm, points), colour, marker in zip(
@@ -114,13 +118,24 @@ def draw_pareto_fronts(case: Case) -> Figure:
             label = f"{escape_dollars(case.title_of(algorithm))} ({len(points)})"
             x, y = points[:, pair].T
             axis.scatter(
-                x, y, marker=marker, s=16, alpha=0.6, linewidths=0, color=colour, label=label
+                x,
+                y,
+                marker=marker,
+                s=16,
+                alpha=0.6,
+                linewidths=0,
+                color=colour,
+                label=label,
             )
         x, y = (original[i] for i in pair)
         axis.scatter(x, y, marker="*", s=80, color="black", label="original vehicle")
         if objectives[pair[0]] == F_SAFE:
             axis.axvline(
-                0, color="black", linewidth=0.8, linestyle="--", label="collision: 0 or less"
+                0,
+                color="black",
+                linewidth=0.8,
+                linestyle="--",
+                label="collision: 0 or less",
             )
         axis.set(xlabel=labels[pair[0]], ylabel=labels[pair[1]])
     _add_legend_below(figure, axes[0])
@@ -144,7 +159,9 @@ def draw_convergence(case: Case) -> Figure:
         f"mean: {means[algorithm]:,.0f} simulations"
         for algorithm, count in runs.items()
     }
-    figure, ((axis,),) = new_figure(f"{case.name}: convergence", rows=1, columns=1, size=(6.4, 4.0))
+    figure, ((axis,),) = new_figure(
+        f"{case.name}: convergence", rows=1, columns=1, size=(6.4, 4.0)
+    )
     sns.lineplot(
         growth.assign(algorithm=growth["algorithm"].map(labels)),
         x="evaluations",
@@ -170,7 +187,9 @@ def draw_convergence(case: Case) -> Figure:
         .median()
         .reindex(ends.index)
     )
-    axis.scatter(ends, returned, color=COLOURS[: len(ends)], edgecolor="black", zorder=3)
+    axis.scatter(
+        ends, returned, color=COLOURS[: len(ends)], edgecolor="black", zorder=3
+    )
     _add_legend_below(figure, axis)
     axis.get_legend().remove()
     return figure
@@ -224,7 +243,8 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
         )
         runs = counts["run"].nunique()
         axis.set(
-            xlabel="characteristics changed", ylabel=f"critical solutions per run\n({runs} runs)"
+            xlabel="characteristics changed",
+            ylabel=f"critical solutions per run\n({runs} runs)",
         )
         axis.set_title(escape_dollars(name), fontsize=FONT_SIZE)
         axis.locator_params(axis="y", integer=True, min_n_ticks=1)
@@ -241,12 +261,16 @@ def draw_changed_characteristics(case: Case) -> Figure:
 
     # Shares by characteristic and number of changes, the most frequent first.
     shares = rq32(case)
-    order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")["characteristic"]
+    order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")[
+        "characteristic"
+    ]
     table = shares.pivot(index="characteristic", columns="j", values="percent").loc[
         order, list(shares["j"].unique())
     ]
     title = f"{case.name}: characteristics changed in critical solutions"
-    figure, ((axis,),) = new_figure(title, rows=1, columns=1, size=(7.6, 1.4 + 0.3 * len(table)))
+    figure, ((axis,),) = new_figure(
+        title, rows=1, columns=1, size=(7.6, 1.4 + 0.3 * len(table))
+    )
     sns.heatmap(
         table.rename(index=escape_dollars),
         ax=axis,
@@ -274,8 +298,12 @@ def draw_change_sizes(case: Case) -> Figure:
 
     # A panel for each characteristic.
     vehicle = case.characteristics.vehicle
-    figure, axes = new_panels(title, len(vehicle), 4, (2.25, 1.85), min_width=9.0, title_height=1.0)
-    for axis, characteristic, changes in zip(axes, vehicle, changes_of_solutions.T, strict=True):
+    figure, axes = new_panels(
+        title, len(vehicle), 4, (2.25, 1.85), min_width=9.0, title_height=1.0
+    )
+    for axis, characteristic, changes in zip(
+        axes, vehicle, changes_of_solutions.T, strict=True
+    ):
         low = characteristic.lower - characteristic.original
         high = characteristic.upper - characteristic.original
 
@@ -293,12 +321,18 @@ def draw_change_sizes(case: Case) -> Figure:
         axis.set_xlim(low, high)
         axis.set_title(
             f"{escape_dollars(characteristic.name)}\n+{len(increases)}, -{len(decreases)}",
-            fontsize=min(FONT_SIZE, FONT_SIZE * LONGEST_NAME / len(characteristic.name)),
+            fontsize=min(
+                FONT_SIZE, FONT_SIZE * LONGEST_NAME / len(characteristic.name)
+            ),
         )
-        axis.set_xlabel(f"change [{as_formula(characteristic.unit)}]", fontsize=FONT_SIZE)
+        axis.set_xlabel(
+            f"change [{as_formula(characteristic.unit)}]", fontsize=FONT_SIZE
+        )
         axis.locator_params(axis="x", nbins=3, steps=[1, 2, 5, 10])
         axis.locator_params(axis="y", nbins=4, integer=True, min_n_ticks=1)
-    figure.supylabel(f"number of critical solutions (of {len(changes_of_solutions)})", fontsize=9)
+    figure.supylabel(
+        f"number of critical solutions (of {len(changes_of_solutions)})", fontsize=9
+    )
     figure.supxlabel(
         "orange, right of 0: increases; blue, left of 0: decreases; titles count them;\n"
         "each axis spans the characteristic's domain",
@@ -349,7 +383,9 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     errors = []
     drawings = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
     for case, (name, draw) in product(cases, FIGURES_OF_ONE_CASE.items()):
-        drawings[name if len(cases) == 1 else f"{case.name}-{name}"] = partial(draw, case)
+        drawings[name if len(cases) == 1 else f"{case.name}-{name}"] = partial(
+            draw, case
+        )
     for name, draw_figure in drawings.items():
         try:
             figures[name] = draw_figure()
@@ -359,7 +395,9 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     # What cannot be drawn is said.
     if not figures:
         raise errors[0]
-    for reason in dict.fromkeys(f"no figure: {error.source}: {error.problem}" for error in errors):
+    for reason in dict.fromkeys(
+        f"no figure: {error.source}: {error.problem}" for error in errors
+    ):
         warn(reason)
     return figures
 

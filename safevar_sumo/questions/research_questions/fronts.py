@@ -52,7 +52,9 @@ def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
     """
     signs = [objective.sign for objective in case.scoring.objectives]
     return (
-        frame[[objective.name for objective in case.scoring.objectives]].to_numpy(dtype=float)
+        frame[[objective.name for objective in case.scoring.objectives]].to_numpy(
+            dtype=float
+        )
         * signs
     )
 
@@ -73,7 +75,9 @@ def reference_front(case: Case) -> FloatArray:
     """
     points = points_of(case, case.solutions)
     if not len(points):
-        raise UnanswerableError(case.name, "has no solution", "results with at least one solution")
+        raise UnanswerableError(
+            case.name, "has no solution", "results with at least one solution"
+        )
     return nondominated_points(points)
 
 
@@ -105,12 +109,18 @@ def compute_indicators(case: Case) -> pd.DataFrame:
     return pd.DataFrame(rows.values(), index, list(MORE_IS_BETTER))
 
 
-def frames_of_runs(case: Case, frame: pd.DataFrame) -> list[tuple[tuple[str, int], pd.DataFrame]]:
+def frames_of_runs(
+    case: Case, frame: pd.DataFrame
+) -> list[tuple[tuple[str, int], pd.DataFrame]]:
     """The finished runs, each with its rows, in the study's order of algorithms; raises
     UnanswerableError if none of them has rows.
     """
     groups = dict(list(frame.groupby(["algorithm", "run"])))
-    runs = [(algorithm, run) for algorithm in case.algorithms for run in case.runs_of(algorithm)]
+    runs = [
+        (algorithm, run)
+        for algorithm in case.algorithms
+        for run in case.runs_of(algorithm)
+    ]
     if not runs:
         case.require_solutions()  # says that no run is finished
     if not groups.keys() & set(runs):
@@ -137,7 +147,10 @@ def nondominated_evaluations(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no evaluations.
     """
-    runs = [valid_evaluations(case, rows) for _, rows in frames_of_runs(case, case.evaluations)]
+    runs = [
+        valid_evaluations(case, rows)
+        for _, rows in frames_of_runs(case, case.evaluations)
+    ]
     fronts: list[pd.DataFrame] = [
         rows[moocore.is_nondominated(minimised_values(case, rows), keep_weakly=True)]
         for rows in runs
@@ -183,9 +196,15 @@ def count_evaluations(case: Case) -> pd.DataFrame:
     rows = []
     for (algorithm, run), group in frames_of_runs(case, case.evaluations):
         last = int(group["evaluation"].max()) + 1
-        requested = search.evaluations if last > search.evaluations - search.population else last
+        requested = (
+            search.evaluations
+            if last > search.evaluations - search.population
+            else last
+        )
         rows.append((algorithm, run, requested, len(group), search.evaluations))
-    return pd.DataFrame(rows, columns=["algorithm", "run", "requested", "simulated", "budget"])
+    return pd.DataFrame(
+        rows, columns=["algorithm", "run", "requested", "simulated", "budget"]
+    )
 
 
 def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
@@ -194,14 +213,22 @@ def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
     """
     texts = []
     for algorithm, rows in counts.groupby("algorithm", sort=False):
-        requested, simulated, budget = rows[["requested", "simulated", "budget"]].mean().round()
+        requested, simulated, budget = (
+            rows[["requested", "simulated", "budget"]].mean().round()
+        )
         end = (
-            "it stops by its own rule" if algorithm in case.stop_by_themselves else "it ended early"
+            "it stops by its own rule"
+            if algorithm in case.stop_by_themselves
+            else "it ended early"
         )
         reasons = [end] if requested < budget else []
-        reasons += ["equal vehicles are simulated once"] if simulated < requested else []
+        reasons += (
+            ["equal vehicles are simulated once"] if simulated < requested else []
+        )
         words = f" ({' and '.join(reasons)})" if reasons else ""
-        texts.append(f"{case.title_of(str(algorithm))} {simulated:,.0f} of {budget:,.0f}{words}")
+        texts.append(
+            f"{case.title_of(str(algorithm))} {simulated:,.0f} of {budget:,.0f}{words}"
+        )
     return "; ".join(texts)
 
 
@@ -214,10 +241,12 @@ def why_few_evaluations(case: Case) -> str:
 
     # Runs that simulate less than is usual.
     counts = count_evaluations(case)
-    sums = counts.groupby("algorithm", sort=False)[["simulated", "budget"]].transform("sum")
-    is_few = (sums["simulated"] < USUAL_SHARE * sums["budget"]) & ~counts["algorithm"].isin(
-        [*case.stop_by_themselves]
+    sums = counts.groupby("algorithm", sort=False)[["simulated", "budget"]].transform(
+        "sum"
     )
+    is_few = (sums["simulated"] < USUAL_SHARE * sums["budget"]) & ~counts[
+        "algorithm"
+    ].isin([*case.stop_by_themselves])
     if not is_few.any():
         return ""
     texts = describe_evaluations(case, counts[is_few])
@@ -265,9 +294,9 @@ def summarise_convergence(case: Case) -> pd.DataFrame:
     """`compute_convergence` over the runs: the median, and the quartiles as low and high; columns
     algorithm, evaluations, hypervolume, low, high.
     """
-    growth = compute_convergence(case).groupby(["algorithm", "evaluations"], sort=False)[
-        "hypervolume"
-    ]
+    growth = compute_convergence(case).groupby(
+        ["algorithm", "evaluations"], sort=False
+    )["hypervolume"]
     names = {"hypervolume": 0.5, "low": 0.25, "high": 0.75}
     return pd.DataFrame(
         {name: growth.quantile(share) for name, share in names.items()}

@@ -34,11 +34,13 @@ distinguish are ties.
 """
 EXACT_TEST = "Mann-Whitney U, two-sided, exact"
 ASYMPTOTIC_TEST = (
-    "Mann-Whitney U, two-sided, normal approximation with corrections for ties and continuity"
+    "Mann-Whitney U, two-sided, normal approximation with corrections for"
+    " ties and continuity"
 )
 EXACT_SIGNED_TEST = "Wilcoxon signed-rank, two-sided, exact"
 ASYMPTOTIC_SIGNED_TEST = (
-    "Wilcoxon signed-rank, two-sided, normal approximation with correction for continuity"
+    "Wilcoxon signed-rank, two-sided, normal approximation with correction"
+    " for continuity"
 )
 MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
 """Kitchenham's magnitudes; each holds from this value of max(A12, 1 - A12) on."""
@@ -51,7 +53,9 @@ def fewest_runs(question: str, alpha: float = ALPHA, tests: int = 1) -> int:
     return next(n for n in count(1) if can_be_significant(question, n, n, alpha, tests))
 
 
-def can_be_significant(question: str, m: int, n: int, alpha: float = ALPHA, tests: int = 1) -> bool:
+def can_be_significant(
+    question: str, m: int, n: int, alpha: float = ALPHA, tests: int = 1
+) -> bool:
     """Whether a test of m runs, of RQ2 against n runs of another algorithm, can be significant
     after Holm's correction for so many tests.
 
@@ -81,7 +85,11 @@ class TwoSampleTest(NamedTuple):
         """The test whose effect size is above 0.5 where X is better: A12, or 1 - A12 where smaller
         values are better.
         """
-        return self if larger_is_better else self._replace(effect_size=1 - self.effect_size)
+        return (
+            self
+            if larger_is_better
+            else self._replace(effect_size=1 - self.effect_size)
+        )
 
 
 def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
@@ -90,13 +98,17 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     second = rounded_to_rank(y)
     if not first.size or not second.size:
         return TwoSampleTest(np.nan, np.nan, None, first.size, second.size, None)
-    is_exact = min(first.size, second.size) <= EXACT_SAMPLE_SIZE and has_distinct_values(
-        [*first, *second]
+    is_exact = min(
+        first.size, second.size
+    ) <= EXACT_SAMPLE_SIZE and has_distinct_values([*first, *second])
+    name, method = (
+        (EXACT_TEST, "exact") if is_exact else (ASYMPTOTIC_TEST, "asymptotic")
     )
-    name, method = (EXACT_TEST, "exact") if is_exact else (ASYMPTOTIC_TEST, "asymptotic")
     test = scipy.stats.mannwhitneyu(first, second, method=method, nan_policy="raise")
     a12 = float(test.statistic) / (first.size * second.size)
-    return TwoSampleTest(float(test.pvalue), a12, magnitude_of(a12), first.size, second.size, name)
+    return TwoSampleTest(
+        float(test.pvalue), a12, magnitude_of(a12), first.size, second.size, name
+    )
 
 
 def rounded_to_rank(values: ArrayLike) -> FloatArray:
@@ -105,7 +117,9 @@ def rounded_to_rank(values: ArrayLike) -> FloatArray:
 
 
 def _decimals(values: ArrayLike) -> list[Decimal]:
-    return [Decimal(f"{value:.{RANKED_DIGITS}g}") for value in np.ravel(values).tolist()]
+    return [
+        Decimal(f"{value:.{RANKED_DIGITS}g}") for value in np.ravel(values).tolist()
+    ]
 
 
 def has_distinct_values(values: ArrayLike) -> bool:
@@ -116,7 +130,9 @@ def magnitude_of(effect_size: float) -> str:
     """The magnitude of an effect size, by Kitchenham's intervals."""
     # Without its rounding error, 1 - 0.286 is a large effect like 0.714.
     folded_effect = round(max(effect_size, 1 - effect_size), 12)
-    return next((name for limit, name in MAGNITUDES if folded_effect >= limit), "negligible")
+    return next(
+        (name for limit, name in MAGNITUDES if folded_effect >= limit), "negligible"
+    )
 
 
 def signed_rank_test(x: ArrayLike, y: ArrayLike = 0.0) -> TwoSampleTest:
@@ -133,14 +149,18 @@ def signed_rank_test(x: ArrayLike, y: ArrayLike = 0.0) -> TwoSampleTest:
     if not differences.size or np.isnan(differences).any():
         return TwoSampleTest(np.nan, np.nan, None, differences.size, 0, None)
     if not differences.any():
-        return TwoSampleTest(1.0, 0.5, magnitude_of(0.5), differences.size, 1, EXACT_SIGNED_TEST)
+        return TwoSampleTest(
+            1.0, 0.5, magnitude_of(0.5), differences.size, 1, EXACT_SIGNED_TEST
+        )
 
     # The effect, and the exact test if no values are tied.
     effect = float(np.mean(differences > 0) + np.mean(differences == 0) / 2)
     is_exact = differences.size <= MAX_EXACT_RUNS and has_distinct_values(
         [0.0, *np.abs(differences)]
     )
-    name, method = (EXACT_SIGNED_TEST, "exact") if is_exact else (ASYMPTOTIC_SIGNED_TEST, "approx")
+    name, method = (
+        (EXACT_SIGNED_TEST, "exact") if is_exact else (ASYMPTOTIC_SIGNED_TEST, "approx")
+    )
     test = scipy.stats.wilcoxon(differences, correction=not is_exact, method=method)
     return TwoSampleTest(
         float(test.pvalue), effect, magnitude_of(effect), differences.size, 1, name
@@ -172,7 +192,8 @@ def effect_interval(effect: float, m: int, n: float, alpha: float = ALPHA) -> In
         variance = value * (1 - value) / m
         if not math.isnan(n):
             variance *= (
-                1 + ((m + n) / 2 - 1) * ((1 - value) / (2 - value) + value / (1 + value))
+                1
+                + ((m + n) / 2 - 1) * ((1 - value) / (2 - value) + value / (1 + value))
             ) / n
         return (effect - value) ** 2 - limit * variance
 
@@ -180,7 +201,9 @@ def effect_interval(effect: float, m: int, n: float, alpha: float = ALPHA) -> In
         return math.nan, math.nan
     # From beside the effect, where the excess is below 0, whatever the effect.
     low, high = (
-        end if effect == end else scipy.optimize.brentq(excess, effect + 1e-9 * (end - effect), end)
+        end
+        if effect == end
+        else scipy.optimize.brentq(excess, effect + 1e-9 * (end - effect), end)
         for end in (0.0, 1.0)
     )
     return low, high

@@ -18,7 +18,17 @@ from safevar_sumo.questions.research_questions.fronts import (
 from safevar_sumo.shipped import shipped_table
 
 CAUSES = "causes"
-CHOSEN = ("rq1-runs", "rq2-runs", "rq2-common", "medians", "budget", CAUSES, "rq1", "rq2", "a12")
+CHOSEN = (
+    "rq1-runs",
+    "rq2-runs",
+    "rq2-common",
+    "medians",
+    "budget",
+    CAUSES,
+    "rq1",
+    "rq2",
+    "a12",
+)
 """The tables that depend on a reader's choices."""
 Compute = Callable[..., pd.DataFrame]
 
@@ -38,12 +48,19 @@ class PaperTable(NamedTuple):
         columns = dict[str, Column]()
         known = DATA["columns"] | table.get("own", {})
         for key in table["columns"]:
-            facts = {"meaning": known[key]} if isinstance(known[key], str) else dict(known[key])
+            facts = (
+                {"meaning": known[key]}
+                if isinstance(known[key], str)
+                else dict(known[key])
+            )
             has_interval = facts.pop("interval", False)
             column = Column(**{"unit": "", **facts})
             columns |= with_interval(key, column) if has_interval else {key: column}
         return cls(
-            table["title"], compute, columns, Wide(**table["wide"]) if "wide" in table else None
+            table["title"],
+            compute,
+            columns,
+            Wide(**table["wide"]) if "wide" in table else None,
         )
 
 
@@ -74,4 +91,7 @@ POOLED = (*AS_PUBLISHED, "collisions")
 """The tables that answer the questions about results with runs, and about imported solutions, which
 have none; those of them that pool the solutions of all runs as the paper does.
 """
-TABLES = {name: PaperTable.of(name, compute) for name, compute in (FUNCTIONS | ON_REQUEST).items()}
+TABLES = {
+    name: PaperTable.of(name, compute)
+    for name, compute in (FUNCTIONS | ON_REQUEST).items()
+}

@@ -188,7 +188,9 @@ def tolerance(
         up_to=up_to,
         tests_left_out=names_left_out(whole.study, study),
     )
-    ranges = _in_ranges(asked, evaluator, found) if is_safe and not told.is_rough else None
+    ranges = (
+        _in_ranges(asked, evaluator, found) if is_safe and not told.is_rough else None
+    )
     has_nearest = told.broken and is_safe and not is_few
     nearest = nearest_limits(last, found) if has_nearest else None
     return answer_limits(told, nearest, ranges)
@@ -196,10 +198,14 @@ def tolerance(
 
 def _original_of(evaluator: Evaluator) -> Evaluations:
     """The evaluation of the original vehicle of a part of a study."""
-    return evaluator.evaluate(evaluator.characteristics.original_settings, "original vehicle")
+    return evaluator.evaluate(
+        evaluator.characteristics.original_settings, "original vehicle"
+    )
 
 
-def _usual_settings(evaluator: Evaluator, columns: int, fits: int | None) -> dict[str, float]:
+def _usual_settings(
+    evaluator: Evaluator, columns: int, fits: int | None
+) -> dict[str, float]:
     """The phases of progress, each with the number of settings that it usually simulates."""
     study = evaluator.study
     points = len(evaluator.system.points)
@@ -217,7 +223,9 @@ def _usual_settings(evaluator: Evaluator, columns: int, fits: int | None) -> dic
 def _asked_of(asked: LimitsQuestion, evaluator: Evaluator) -> Asked:
     """The limits that are sought in a part of the study."""
     models = models_of(evaluator, asked.unsafe, asked.fits)
-    sought = asked_of(models, asked.unsafe, asked.columns, asked.limits, at_tests=asked.at_tests)
+    sought = asked_of(
+        models, asked.unsafe, asked.columns, asked.limits, at_tests=asked.at_tests
+    )
     return sought._replace(avoided=_unsafe_solutions(asked, evaluator))
 
 
@@ -254,11 +262,17 @@ def _check_drawable(evaluator: Evaluator) -> None:
         return members.lower + rng.random((number, len(members))) * width
 
     if not len(region.draw_feasible(draw, 1)):
-        raise InputError(evaluator.study.source, f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no"
-            f" box to test: {region}", "characteristics that the constraints do not tie to each other")
+        raise InputError(
+            evaluator.study.source,
+            f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no"
+            f" box to test: {region}",
+            "characteristics that the constraints do not tie to each other",
+        )
 
 
-def _in_ranges(asked: LimitsQuestion, evaluator: Evaluator, limits: FoundLimits) -> InRanges | None:
+def _in_ranges(
+    asked: LimitsQuestion, evaluator: Evaluator, limits: FoundLimits
+) -> InRanges | None:
     """What a search for counterexamples to the limits finds in the ranges that a study states
     beside its tests; to the specified ones without joint limits.
     """

@@ -94,7 +94,9 @@ def limits_before(
     center = _center_of(star)
     starts = unsafe.copy()
     starts[:, : star.size] = center
-    lines = find_boundaries(starts, unsafe, lambda cases: judge(cases) < 0, parts, lowest)
+    lines = find_boundaries(
+        starts, unsafe, lambda cases: judge(cases) < 0, parts, lowest
+    )
     lower, upper, beyond = limits.lower.copy(), limits.upper.copy(), {**limits.beyond}
     for safe, failure in zip(lines.safe, lines.unsafe, strict=True):
         (column,) = np.flatnonzero(failure[: star.size] != center).tolist()
@@ -108,7 +110,11 @@ def limits_before(
 
 
 def search_alone(
-    judge: CaseJudge, star: Space, limits: Alone, search: CaseSearch, parts: Sequence[int]
+    judge: CaseJudge,
+    star: Space,
+    limits: Alone,
+    search: CaseSearch,
+    parts: Sequence[int],
 ) -> Alone:
     """Limits of a star in which a search finds nothing, within known ones."""
     unsafe = star.lower[np.newaxis][:0]

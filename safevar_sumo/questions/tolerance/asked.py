@@ -147,7 +147,9 @@ class Asked(NamedTuple):
         """No cases."""
         return self.star.lower[np.newaxis][:0]
 
-    def search(self, fit: int, budget: int, rng: Generator, *, phases: bool = True) -> CaseSearch:
+    def search(
+        self, fit: int, budget: int, rng: Generator, *, phases: bool = True
+    ) -> CaseSearch:
         """A search for unsafe cases with a parameter set."""
         oracle, plan = self.oracle, self.effort.plan(budget)
 
@@ -180,7 +182,9 @@ class Asked(NamedTuple):
         is_free = (self.domain > 0) & ~is_given
         space = self.oracle.space(0, self.lower, self.upper)
         effort = self.effort.box
-        return Boxes(self.oracle, space, self.original, longest, is_free, printed, effort)
+        return Boxes(
+            self.oracle, space, self.original, longest, is_free, printed, effort
+        )
 
 
 def asked_of(
@@ -234,7 +238,9 @@ def effort_of(evaluator: Evaluator, cases: float, varied: int) -> Effort:
     scaled["values"] = max(scaled["values"], LEAST_VALUES)
     growths = evaluator.scaled(usual.box.growths)
     share = usual.share / evaluator.account.effort
-    return usual._replace(**scaled, share=share, box=usual.box._replace(growths=growths))
+    return usual._replace(
+        **scaled, share=share, box=usual.box._replace(growths=growths)
+    )
 
 
 def _effort_of_few(cases: int, varied: int) -> Effort:
@@ -270,9 +276,13 @@ def columns_of(names: Sequence[str], characteristics: Sequence[str]) -> list[int
     """The columns of chosen characteristics, of all without a choice."""
     chosen = [name.strip() for text in characteristics for name in text.split(",")]
     for name in chosen:
-        check_name("characteristics", f"there is no characteristic {name!r}", name, names)
+        check_name(
+            "characteristics", f"there is no characteristic {name!r}", name, names
+        )
         if chosen.count(name) > 1:
-            raise InputError("characteristics", f"{name} is given twice", "each name once")
+            raise InputError(
+                "characteristics", f"{name} is given twice", "each name once"
+            )
     return [column for column, name in enumerate(names) if not chosen or name in chosen]
 
 
@@ -284,6 +294,8 @@ def specified_limits(
     varied = [list(rows)[column] for column in columns]
     with about("limits"):
         for name in limits_of(texts, rows):
-            check_name("", f"{name} does not vary with these --characteristics", name, varied)
+            check_name(
+                "", f"{name} does not vary with these --characteristics", name, varied
+            )
         limits = limits_of(texts, rows, study.limits)
     return {name: limit for name, limit in limits.items() if name in varied}

@@ -119,7 +119,10 @@ class Boxes(NamedTuple):
         """The logarithm of the volume of boxes, shape (..., 2, n), as a share of the domain's."""
         is_open = self.width > 0
         shares = np.divide(
-            sides.sum(axis=-2), self.width, out=np.ones_like(sides[..., 0, :]), where=is_open
+            sides.sum(axis=-2),
+            self.width,
+            out=np.ones_like(sides[..., 0, :]),
+            where=is_open,
         )
         return np.asarray(np.log(np.maximum(shares, ROUNDING)).sum(axis=-1))
 
@@ -217,12 +220,18 @@ def settle(
     for number in range(MOST_CUTS):
         if len(known.inside(boxes, boxes.fixed)):
             break
-        sides = boxes.printed(without(boxes, sides, known, boxes.effort.retreat * number))
+        sides = boxes.printed(
+            without(boxes, sides, known, boxes.effort.retreat * number)
+        )
         space, places = boxes.cases_in(sides), known.at_places(boxes, sides)
         attacked, least, unsafe = 0, math.inf, places[:0]
         for search in searches:
             met = search(space, places)
-            attacked, least, unsafe = attacked + met.simulated, min(least, met.least), met.unsafe
+            attacked, least, unsafe = (
+                attacked + met.simulated,
+                min(least, met.least),
+                met.unsafe,
+            )
             if len(unsafe):
                 break
         if not len(unsafe):
@@ -231,7 +240,9 @@ def settle(
     return Settled(None, known)
 
 
-def without(boxes: Boxes, sides: FloatArray, known: Known, clearance: float) -> FloatArray:
+def without(
+    boxes: Boxes, sides: FloatArray, known: Known, clearance: float
+) -> FloatArray:
     """The largest sides within some sides that hold none of the known cases that a free side can
     cut off, by branch and bound. Limits keep off each failure by a `clearance`, in moves.
 
@@ -239,7 +250,9 @@ def without(boxes: Boxes, sides: FloatArray, known: Known, clearance: float) -> 
     one without failures is the largest; after `MOST_BRANCHES` only the best cut is followed.
     """
     extents = boxes.extents(known.cases)
-    distance = np.minimum(clearance * LEAST_MOVE * boxes.width, boxes.effort.farthest * extents)
+    distance = np.minimum(
+        clearance * LEAST_MOVE * boxes.width, boxes.effort.farthest * extents
+    )
     # A cut excludes its own failure also after rounding, so that this ends.
     ends = np.maximum(extents - distance - ROUNDING * boxes.width, 0.0)
     is_choice = boxes.is_free & (extents > 0)
@@ -262,7 +275,9 @@ def without(boxes: Boxes, sides: FloatArray, known: Known, clearance: float) -> 
         for side, column in np.argwhere(is_choice[hardest]):
             smaller = sides.copy()
             smaller[side, column] = ends[hardest, side, column]
-            heappush(waiting, (-float(boxes.log_volume(smaller)), next(numbers), smaller))
+            heappush(
+                waiting, (-float(boxes.log_volume(smaller)), next(numbers), smaller)
+            )
     raise AssertionError("the first box without failures is the largest")
 
 
@@ -286,7 +301,9 @@ def learn(boxes: Boxes, known: Known, unsafe: FloatArray, sides: FloatArray) -> 
     return Known(cases, places[: boxes.effort.places], known.boxes + 1)
 
 
-def with_fewest_changes(judge: CaseJudge, original: FloatArray, unsafe: FloatArray) -> FloatArray:
+def with_fewest_changes(
+    judge: CaseJudge, original: FloatArray, unsafe: FloatArray
+) -> FloatArray:
     """Unsafe cases with as few changes as possible, undone one after another."""
     causes = unsafe.copy()
     for column, value in enumerate(original):
@@ -318,7 +335,9 @@ def shrunk(boxes: Boxes, known: Known, sides: FloatArray) -> FloatArray:
     return np.asarray(at_share(lines.safe)[0])
 
 
-def widened(boxes: Boxes, known: Known, sides: FloatArray, rng: Generator) -> FloatArray:
+def widened(
+    boxes: Boxes, known: Known, sides: FloatArray, rng: Generator
+) -> FloatArray:
     """A box that is safe at known places, as large as a random search makes it."""
     number = max(boxes.effort.batch // max(len(known.places), 1), 1)
     for deviation in DEVIATIONS:
@@ -330,7 +349,9 @@ def widened(boxes: Boxes, known: Known, sides: FloatArray, rng: Generator) -> Fl
     return sides
 
 
-def _proposals(boxes: Boxes, sides: FloatArray, deviation: float, rng: Generator) -> FloatArray:
+def _proposals(
+    boxes: Boxes, sides: FloatArray, deviation: float, rng: Generator
+) -> FloatArray:
     """Boxes of which a random share of the sides is moved by random steps, larger than one box."""
     shape = (PROPOSALS, *sides.shape)
     is_moved = rng.random(shape) < rng.random((PROPOSALS, 1, 1))
@@ -338,7 +359,9 @@ def _proposals(boxes: Boxes, sides: FloatArray, deviation: float, rng: Generator
     moved = np.clip(sides + steps, 0.0, boxes.longest)
     moved = np.where(rng.random(shape) < WHOLE, boxes.longest, moved)
     tried = np.where(boxes.is_free, moved, boxes.longest)
-    return np.asarray(tried[boxes.log_volume(tried) > boxes.log_volume(sides) + LEAST_GAIN])
+    return np.asarray(
+        tried[boxes.log_volume(tried) > boxes.log_volume(sides) + LEAST_GAIN]
+    )
 
 
 def _are_safe(boxes: Boxes, known: Known, tried: FloatArray) -> BoolArray:

@@ -82,7 +82,9 @@ class Space(NamedTuple):
         """Half of them mix two parents, and change about one value; half move towards a worse
         parent, and by a difference of two others. The worst parents come first.
         """
-        first, second, third, fourth = parents[rng.integers(len(parents), size=(4, number))]
+        first, second, third, fourth = parents[
+            rng.integers(len(parents), size=(4, number))
+        ]
         random = self.draw(number, rng)
         mixed = np.where(rng.random(first.shape) < 0.5, first, second)
         mutated = self._mutants(mixed, random, rng)
@@ -92,16 +94,22 @@ class Space(NamedTuple):
 
         # A place has no meaning in another world.
         is_other = rng.random(number) < OTHER_WORLD
-        cases[:, self.size] = np.where(is_other, random[:, self.size], first[:, self.size])
+        cases[:, self.size] = np.where(
+            is_other, random[:, self.size], first[:, self.size]
+        )
         return self.hold(cases, rng)
 
-    def _mutants(self, cases: FloatArray, random: FloatArray, rng: Generator) -> FloatArray:
+    def _mutants(
+        self, cases: FloatArray, random: FloatArray, rng: Generator
+    ) -> FloatArray:
         """Cases of which about one value is random, a step towards that, or an end."""
         ends = np.where(rng.random(cases.shape) < 0.5, self.lower, self.upper)
         number_open = max(int(np.count_nonzero(self.lower < self.upper)), 1)
         lot = rng.random(cases.shape) * number_open
         steps = cases + STEP * (random - cases)
-        return np.select([lot < 0.4, lot < 0.8, lot < 1.2], [random, steps, ends], cases)
+        return np.select(
+            [lot < 0.4, lot < 0.8, lot < 1.2], [random, steps, ends], cases
+        )
 
 
 class SearchPlan(NamedTuple):
@@ -140,7 +148,9 @@ class Counterexamples(NamedTuple):
         values = np.concatenate([self.robustness, robustness[counts]])
         number = max(PARENTS, np.count_nonzero(values < 0))
         worst = np.argsort(values, kind="stable")[:number]
-        return Counterexamples(every_case[worst], values[worst], self.simulated + len(cases))
+        return Counterexamples(
+            every_case[worst], values[worst], self.simulated + len(cases)
+        )
 
 
 CaseSearch = Callable[[Space, FloatArray], Counterexamples]
@@ -162,5 +172,9 @@ def search_cases(
         met = met.after(cases, judge(cases))
         more -= len(met.unsafe) > 0
         parents = met.cases[:PARENTS]
-        cases = space.children(parents, size, rng) if len(parents) else space.draw(size, rng)
+        cases = (
+            space.children(parents, size, rng)
+            if len(parents)
+            else space.draw(size, rng)
+        )
     return met

@@ -66,7 +66,9 @@ class CaseWorld(NamedTuple):
         else:
             evaluator = self.model.evaluator
             of_vehicle = evaluator.characteristics.of_vehicle
-            rows = np.vstack([axes.original, evaluator.critical_encounters[:, ~of_vehicle]])
+            rows = np.vstack(
+                [axes.original, evaluator.critical_encounters[:, ~of_vehicle]]
+            )
         shares = (rows - axes.lower) / (axes.upper - axes.lower)
         return np.hstack([np.zeros((len(shares), 1)), shares[:, : self.places - 1]])
 
@@ -88,9 +90,13 @@ class Oracle:
         The progress of the question.
     """
 
-    def __init__(self, models: Sequence[Model], new_car: Unsafe, *, between: bool) -> None:
+    def __init__(
+        self, models: Sequence[Model], new_car: Unsafe, *, between: bool
+    ) -> None:
         self.worlds = [
-            world for model in models for world in worlds_of(model, new_car, between=between)
+            world
+            for model in models
+            for world in worlds_of(model, new_car, between=between)
         ]
         self.fits = [world.model.fit for world in self.worlds]
         self.vehicle = models[0].characteristics.vehicle
@@ -102,7 +108,9 @@ class Oracle:
         self._account = evaluator.account
         systems = [world.model.evaluator.system for world in self.worlds]
         self._simulations = max(map(simulations_of_setting, systems))
-        self._tries_originals = any(world.model.new_car is not None for world in self.worlds)
+        self._tries_originals = any(
+            world.model.new_car is not None for world in self.worlds
+        )
         self._counts = dict[bytes, bool]()
 
     @property
@@ -114,17 +122,23 @@ class Oracle:
         """What each of M cases leaves, shape (M,): below 0 it is unsafe, infinite where it does not
         count, or could not be simulated.
         """
-        return np.nan_to_num(self.measure(cases), nan=np.inf, posinf=np.inf, neginf=-np.inf)
+        return np.nan_to_num(
+            self.measure(cases), nan=np.inf, posinf=np.inf, neginf=-np.inf
+        )
 
     def with_failed(self, cases: FloatArray) -> FloatArray:
         """What each of M cases leaves; minus infinity where it could not be simulated."""
-        return np.nan_to_num(self.measure(cases), nan=-np.inf, posinf=np.inf, neginf=-np.inf)
+        return np.nan_to_num(
+            self.measure(cases), nan=-np.inf, posinf=np.inf, neginf=-np.inf
+        )
 
     def measure(self, cases: FloatArray) -> FloatArray:
         """What each of M cases leaves; NaN where it could not be simulated."""
         # Simulations of the original vehicle may follow.
         if (1 + self._tries_originals) * len(cases) > self.available:
-            raise Exhausted("simulations", "too few are left for the limits", "a larger number")
+            raise Exhausted(
+                "simulations", "too few are left for the limits", "a larger number"
+            )
         n = len(self.vehicle)
         robustness = np.full(len(cases), np.inf)
         numbers = np.floor(cases[:, n]).astype(int)

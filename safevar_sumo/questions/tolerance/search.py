@@ -101,7 +101,9 @@ def no_limits(asked: Asked) -> FoundLimits:
     """No limits, around an unsafe original."""
     boxes = asked.boxes(asked.domain)
     alone = Alone(asked.original, asked.original)
-    return FoundLimits(alone, {}, boxes, boxes.fixed, Known(asked.nothing, asked.nothing))
+    return FoundLimits(
+        alone, {}, boxes, boxes.fixed, Known(asked.nothing, asked.nothing)
+    )
 
 
 def _with_own_set(asked: Asked, outer: FoundLimits | None) -> FoundLimits:
@@ -115,7 +117,9 @@ def _with_own_set(asked: Asked, outer: FoundLimits | None) -> FoundLimits:
     longest = _sides_of(asked, alone)
     broken: Mapping[int, FloatArray] = {}
     if outer is not None:
-        longest = np.minimum(longest, outer.boxes.fixed if outer.sides is None else outer.sides)
+        longest = np.minimum(
+            longest, outer.boxes.fixed if outer.sides is None else outer.sides
+        )
         broken = outer.broken
     boxes = asked.boxes(longest)
     encounter = np.tile(asked.star.lower[boxes.space.size :], (len(asked.avoided), 1))
@@ -157,7 +161,11 @@ def _with_broken(asked: Asked, limits: FoundLimits, fit: int) -> FoundLimits:
     rng = Stream.SPECIFIED_BETWEEN.generator(asked.seed, fit)
     search = asked.search(fit, asked.budget(fit), rng)
     unsafe = search(limits.boxes.cases_in(limits.specified), asked.nothing).unsafe
-    return limits._replace(broken={**limits.broken, fit: unsafe[0]}) if len(unsafe) else limits
+    return (
+        limits._replace(broken={**limits.broken, fit: unsafe[0]})
+        if len(unsafe)
+        else limits
+    )
 
 
 def _with_largest_box(asked: Asked, limits: FoundLimits) -> FoundLimits:
@@ -185,7 +193,9 @@ def _with_set(asked: Asked, limits: FoundLimits, fit: int) -> FoundLimits:
     effort, seed = asked.effort, asked.seed
     rng = Stream.LIMITS_ALONE.generator(seed, fit)
     search = asked.search(fit, effort.alone, rng, phases=False)
-    alone = search_alone(asked.oracle, asked.star, limits.alone, search, effort.box.parts)
+    alone = search_alone(
+        asked.oracle, asked.star, limits.alone, search, effort.box.parts
+    )
     limits = _with_broken(asked, limits._replace(alone=alone), fit)
     if limits.sides is None or fit in limits.broken:
         return limits
@@ -195,7 +205,11 @@ def _with_set(asked: Asked, limits: FoundLimits, fit: int) -> FoundLimits:
 
 
 def _with_settled(
-    asked: Asked, limits: FoundLimits, settled: Settled, searches: list[CaseSearch], fit: int
+    asked: Asked,
+    limits: FoundLimits,
+    settled: Settled,
+    searches: list[CaseSearch],
+    fit: int,
 ) -> FoundLimits:
     """Limits with the box within another one that passes searches with a parameter set and, where
     it became smaller, random vehicles.
@@ -217,13 +231,17 @@ def _with_settled(
         proofs += 1
         proof, unsafe = _prove(asked, boxes.cases_in(sides), proofs)
         if not len(unsafe):
-            return _passed(limits._replace(proof=proof, proofs=proofs), sides, settled, fit)
+            return _passed(
+                limits._replace(proof=proof, proofs=proofs), sides, settled, fit
+            )
         known = learn(boxes, settled.known, unsafe, sides)
         settled = settled._replace(known=known)
     return limits._replace(sides=None, known=settled.known, proof=None)
 
 
-def _passed(limits: FoundLimits, sides: FloatArray, settled: Settled, fit: int) -> FoundLimits:
+def _passed(
+    limits: FoundLimits, sides: FloatArray, settled: Settled, fit: int
+) -> FoundLimits:
     """Limits with a box that passed; none if it leaves no characteristic room."""
     is_free = limits.boxes.is_free
     if is_free.any() and not sides[is_free].any():
@@ -297,10 +315,14 @@ def _prove(asked: Asked, space: Space, number: int) -> tuple[Proof, FloatArray]:
         is_unsafe = np.any(of_vehicle < 0, axis=1)
         has_failed = np.any(np.isnan(of_vehicle), axis=1) & ~is_unsafe
         counts = ~np.all(np.isposinf(of_vehicle), axis=1)
-        return Judgement(np.asarray(is_unsafe), np.asarray(has_failed), np.asarray(counts))
+        return Judgement(
+            np.asarray(is_unsafe), np.asarray(has_failed), np.asarray(counts)
+        )
 
     def draw(count: int) -> FloatArray:
-        return asked.oracle.feasible(lambda more: low + rng.random((more, n)) * width, count)
+        return asked.oracle.feasible(
+            lambda more: low + rng.random((more, n)) * width, count
+        )
 
     proof, _ = prove(draw, judge, asked.effort.share, number)
     return proof, unsafe[0]
@@ -313,11 +335,15 @@ def _beyond(asked: Asked, limits: FoundLimits) -> dict[Side, FloatArray]:
     rng = Stream.EXTENSION.generator(asked.seed)
     search = asked.search(0, QUICK * asked.effort.generation, rng)
     beyond = dict[Side, FloatArray]()
-    for side, column in np.argwhere((asked.domain > 0) & (sides < asked.domain)).tolist():
+    for side, column in np.argwhere(
+        (asked.domain > 0) & (sides < asked.domain)
+    ).tolist():
         item = asked.oracle.vehicle.members[column]
         move = max(LEAST_MOVE * boxes.width[column], 10.0**-item.digits)
         wider = sides.copy()
-        wider[side, column] = min(sides[side, column] + move, asked.domain[side, column])
+        wider[side, column] = min(
+            sides[side, column] + move, asked.domain[side, column]
+        )
         cases = known.inside(boxes, wider)
         if not len(cases):
             # A slice of the wider box: this value at its end.

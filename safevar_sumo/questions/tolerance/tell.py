@@ -17,7 +17,11 @@ from safevar_sumo.questions.tolerance.words import (
     tested_sentences,
     verdict_sentences,
 )
-from safevar_sumo.questions.words import constraints_in_words, counted_in_words, join_phrases
+from safevar_sumo.questions.words import (
+    constraints_in_words,
+    counted_in_words,
+    join_phrases,
+)
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.vehicles import Characteristic
@@ -54,7 +58,9 @@ LIMITS: Columns = {
         "whether every vehicle within the specified limits is safe in every parameter set; empty"
         " without a specified limit"
     ),
-    "fails_first": Column("", "what fails first beyond the limit", head="just beyond it"),
+    "fails_first": Column(
+        "", "what fails first beyond the limit", head="just beyond it"
+    ),
     "fails_at": Column("", "the vehicle that fails, and its encounter", is_shown=False),
     "simulate": Column("", "the command that simulates it", is_detail=True),
     "sentence": Column(
@@ -65,33 +71,45 @@ LIMITS: Columns = {
 }
 LIMITS_TITLE = "Limits, rounded to the safe side"
 FITS: Columns = {
-    "fit": Column("-", "number of the parameter set in [spread]; 0 is the study's own", "d"),
+    "fit": Column(
+        "-", "number of the parameter set in [spread]; 0 is the study's own", "d"
+    ),
     "specified": (
         "whether the specified limits hold in it; left out: the original is unsafe or keeps too"
         " little"
     ),
     "least": Column(
-        "", "smallest clearance that the search found [m], or the worst value of a metric", ".2f"
+        "",
+        "smallest clearance that the search found [m], or the worst value of a metric",
+        ".2f",
     ),
 }
 NEAREST: Columns = {
     **CHARACTERISTIC,
     "limit": Column("", "the specified value", ".10g"),
     "nearest": Column(
-        "", "the nearest value with which joint limits exist, the others as specified", ".10g"
+        "",
+        "the nearest value with which joint limits exist, the others as specified",
+        ".10g",
     ),
 }
 IN_RANGES: Columns = {
     "scope": "what they cover",
     "kept": "whether the limits above hold there in every parameter set",
     "verdict": "what a search for counterexamples found there",
-    "fails_at": Column("", "the vehicle that fails first, and its encounter", is_shown=False),
+    "fails_at": Column(
+        "", "the vehicle that fails first, and its encounter", is_shown=False
+    ),
     "simulate": Column("", "the command that simulates it", is_detail=True),
 }
-ROUGH = "a rough answer calls no limit kept: ask without --quick, or for more simulations"
+ROUGH = (
+    "a rough answer calls no limit kept: ask without --quick, or for more simulations"
+)
 
 
-def answer_limits(told: Told, nearest: FloatArray | None, ranges: InRanges | None) -> Answer:
+def answer_limits(
+    told: Told, nearest: FloatArray | None, ranges: InRanges | None
+) -> Answer:
     """The answer with limits alone and joint limits."""
     table = _limits_table(told)
     tables = {"limits": table}
@@ -124,14 +142,26 @@ def _numbers(told: Told) -> JsonObject:
     """The numbers of an answer; those about joint limits are undefined without such limits."""
     found, proof = told.limits, told.limits.proof
     numbers: JsonObject = dict.fromkeys(NUMBERS)
-    numbers |= {"unsafe": str(told.unsafe), "margin": told.unsafe.keep, "kept": told.kept}
-    numbers |= {"rough": told.is_rough, "scope": told.scope, "boxes": int(told.box is not None)}
+    numbers |= {
+        "unsafe": str(told.unsafe),
+        "margin": told.unsafe.keep,
+        "kept": told.kept,
+    }
+    numbers |= {
+        "rough": told.is_rough,
+        "scope": told.scope,
+        "boxes": int(told.box is not None),
+    }
     if told.up_to is not None:
         numbers["up_to"] = float(told.up_to.partition("=")[2])
     if not told.is_safe:
         return numbers
     tried = len(told.asked.fits)
-    numbers |= {"box": told.box is not None, "fits": tried - len(found.broken), "fits_tried": tried}
+    numbers |= {
+        "box": told.box is not None,
+        "fits": tried - len(found.broken),
+        "fits_tried": tried,
+    }
     if told.box is not None:
         attacked = sum(attack.simulated for attack in found.attacks.values())
         numbers |= {"attacked": attacked, "least_attacked": told.least}
@@ -160,7 +190,9 @@ def _limits_table(told: Told) -> pd.DataFrame:
     shown = {**LIMITS, "alone_low": end._replace(is_detail=told.box is not None)}
     texts = [text for row in rows if (text := row["fails_first"])]
     words = {text: text.removeprefix("the car ") for text in texts}
-    table = tabulate(LIMITS_TITLE, shown, [[*row.values()] for row in rows], words=words)
+    table = tabulate(
+        LIMITS_TITLE, shown, [[*row.values()] for row in rows], words=words
+    )
     members = [told.members[column] for column in told.columns]
     domains = [(item.lower, item.upper) for item in members]
     joint = table[["together_low", "together_high"]].to_numpy(float)
@@ -174,7 +206,11 @@ def _limits_table(told: Told) -> pd.DataFrame:
 def _limits_row(told: Told, column: int) -> JsonObject:
     """A row of `LIMITS`."""
     item = told.members[column]
-    row: JsonObject = {**dict.fromkeys(LIMITS), "characteristic": item.name, "unit": item.unit}
+    row: JsonObject = {
+        **dict.fromkeys(LIMITS),
+        "characteristic": item.name,
+        "unit": item.unit,
+    }
     row["original"] = item.original
     row["alone_low"], row["alone_high"] = told.alone(column)
     row["specified_low"], row["specified_high"] = told.given(column)
@@ -262,7 +298,9 @@ def _fit_rows(told: Told) -> Rows:
     states = {fit: "not kept" if fit in broken else "kept" for fit in told.asked.fits}
     states |= {model.fit: "left out" for model in told.asked.left_out}
     least = {fit: told.value_in(fit) for fit in attacks} if told.box is not None else {}
-    return [(fit, state, least.get(fit, np.nan)) for fit, state in sorted(states.items())]
+    return [
+        (fit, state, least.get(fit, np.nan)) for fit, state in sorted(states.items())
+    ]
 
 
 def _nearest_rows(told: Told, nearest: FloatArray | None) -> Rows:
@@ -272,7 +310,9 @@ def _nearest_rows(told: Told, nearest: FloatArray | None) -> Rows:
     rows = []
     for column in told.columns:
         item = told.members[column]
-        for given, value in zip(told.given(column), nearest[:, column].tolist(), strict=True):
+        for given, value in zip(
+            told.given(column), nearest[:, column].tolist(), strict=True
+        ):
             if given is not None:
                 found = None if np.isnan(value) else value
                 rows.append((item.name, item.unit, given, found))
@@ -292,15 +332,37 @@ def _row_in_ranges(told: Told, ranges: InRanges) -> tuple[object, ...]:
     if not unsafe:
         keeps = ranges.unsafe.value_in_words(ranges.unsafe.value(least))
         searched = f"{simulated:,} simulations that search for a counterexample"
-        return (scope, True, f"the limits hold: the worst of {searched} {keeps}.", None, None)
+        return (
+            scope,
+            True,
+            f"the limits hold: the worst of {searched} {keeps}.",
+            None,
+            None,
+        )
     axes = own.characteristics.scenario.names
-    axis = own.characteristics.names.index(SPEED_DIMENSION if SPEED_DIMENSION in axes else axes[0])
+    axis = own.characteristics.names.index(
+        SPEED_DIMENSION if SPEED_DIMENSION in axes else axes[0]
+    )
     settings = [ranges.asked.oracle.setting(case) for case in unsafe]
     model, setting = min(settings, key=lambda pair: float(pair[1][axis]))
     limits = told.box or told.box_of(told.limits.specified)
     within = limits.in_encounters_of(model.evaluator.region)
     failure = describe(model, {"": setting}, within).get("")
     if failure is None:
-        return (scope, False, "they do not hold: a car within them is unsafe.", None, None)
-    values = dict(zip(own.characteristics.names, failure.setting.tolist(), strict=False))
-    return (scope, False, f"they do not hold: {failure.words}.", values, failure.command)
+        return (
+            scope,
+            False,
+            "they do not hold: a car within them is unsafe.",
+            None,
+            None,
+        )
+    values = dict(
+        zip(own.characteristics.names, failure.setting.tolist(), strict=False)
+    )
+    return (
+        scope,
+        False,
+        f"they do not hold: {failure.words}.",
+        values,
+        failure.command,
+    )

@@ -101,7 +101,9 @@ class Told:
         if sides is None:
             return []
         is_closed = boxes.is_free.any(axis=0) & (sides.sum(axis=0) == 0)
-        return [self.members[column].name for column in np.flatnonzero(is_closed).tolist()]
+        return [
+            self.members[column].name for column in np.flatnonzero(is_closed).tolist()
+        ]
 
     def box_of(self, sides: FloatArray) -> Box:
         """A box of vehicles as it is printed."""
@@ -109,7 +111,10 @@ class Told:
         decimals = [item.digits + DECIMALS for item in vehicle]
         ends = np.array(
             [
-                [round(end, number) for end, number in zip(of_side.tolist(), decimals, strict=True)]
+                [
+                    round(end, number)
+                    for end, number in zip(of_side.tolist(), decimals, strict=True)
+                ]
                 for of_side in self.limits.boxes.ends(sides)
             ]
         )
@@ -149,7 +154,9 @@ class Told:
         if not (self.is_safe and self.has_scan):
             return None, None
         alone = self.limits.alone
-        low, high = (self._feasible(column, ends[column]) for ends in (alone.lower, alone.upper))
+        low, high = (
+            self._feasible(column, ends[column]) for ends in (alone.lower, alone.upper)
+        )
         return self.members[column].rounded_inwards((low, high))
 
     def _feasible(self, column: int, end: float) -> float:
@@ -171,7 +178,10 @@ class Told:
     def outside(self, column: int) -> float:
         """How far a specified limit is beyond what is safe alone; 0 if it is not."""
         low, high = self.members[column].rounded_inwards(
-            (float(self.limits.alone.lower[column]), float(self.limits.alone.upper[column]))
+            (
+                float(self.limits.alone.lower[column]),
+                float(self.limits.alone.upper[column]),
+            )
         )
         given = self.asked.given[:, column]
         return float(np.nanmax([low - given[0], given[1] - high, 0.0]))

@@ -101,7 +101,9 @@ def _outside_in_words(told: Told, column: int) -> str:
                 return f"{item.name} {value}: {failure.words} (outside by {outside})"
     end = low if high is None else high
     assert end is not None
-    return f"{item.name} {limit_text(item, end)}: the car is unsafe (outside by {outside})"
+    return (
+        f"{item.name} {limit_text(item, end)}: the car is unsafe (outside by {outside})"
+    )
 
 
 def _sets_in_words(told: Told) -> Iterator[str]:
@@ -150,9 +152,16 @@ def _box_in_words(told: Told) -> Iterator[str]:
     for model in told.asked.left_out:
         # Its words name the test and the parameter set.
         described = describe(model, {"": model.characteristics.original})
-        words = described[""].words if described else f"parameter set {model.fit} is unsafe"
+        words = (
+            described[""].words if described else f"parameter set {model.fit} is unsafe"
+        )
         yield f"With the original vehicle itself {words}: there no limit is claimed."
-    if tried == 1 and not told.asked.left_out and told.study.spread and not told.is_rough:
+    if (
+        tried == 1
+        and not told.asked.left_out
+        and told.study.spread
+        and not told.is_rough
+    ):
         yield (
             "The limits were computed with one parameter set of the vehicle model; the study's"
             " other sets were not tried."
@@ -248,7 +257,11 @@ def tested_sentences(told: Told) -> Iterator[str]:
     yield f"{corners}{searched} ({worst})."
     proof = found.proof
     if proof is not None:
-        failed = f", {proof.not_simulated} could not be simulated" if proof.not_simulated else ""
+        failed = (
+            f", {proof.not_simulated} could not be simulated"
+            if proof.not_simulated
+            else ""
+        )
         bound = bound_in_words(proof.at_most).capitalize()
         yield f"{proof.samples:,} random vehicles, none unsafe{failed}."
         yield f"{bound} of uniformly sampled vehicles within the limits are unsafe."

@@ -65,14 +65,18 @@ def walk(places: list[list[float]], step: int, seconds: float, location: Any) ->
     direction = carla.Vector3D(x=x - location.x, y=-y - location.y, z=0.0)
     distance = math.hypot(direction.x, direction.y)
     if distance > 0:
-        direction = carla.Vector3D(x=direction.x / distance, y=direction.y / distance, z=0.0)
+        direction = carla.Vector3D(
+            x=direction.x / distance, y=direction.y / distance, z=0.0
+        )
     return carla.WalkerControl(direction=direction, speed=distance / seconds)
 
 
 def spawn(world: Any, scene: Scene) -> tuple[Any, list[tuple[Scene, Any]]]:
     """Spawn the vehicle with its values, and the other actors, each with its record."""
     library = world.get_blueprint_library()
-    vehicle = world.spawn_actor(library.filter(scene["blueprint"])[0], place(**scene["start"]))
+    vehicle = world.spawn_actor(
+        library.filter(scene["blueprint"])[0], place(**scene["start"])
+    )
     vehicle.apply_physics_control(apply_values(vehicle.get_physics_control(), scene))
     patterns = {
         "pedestrian": "walker.pedestrian.*",
@@ -81,7 +85,9 @@ def spawn(world: Any, scene: Scene) -> tuple[Any, list[tuple[Scene, Any]]]:
     }
     actors = []
     for actor in scene["actors"]:
-        body = world.spawn_actor(library.filter(patterns[actor["kind"]])[0], place_at(actor, 0))
+        body = world.spawn_actor(
+            library.filter(patterns[actor["kind"]])[0], place_at(actor, 0)
+        )
         body.set_simulate_physics(False)
         actors.append((actor, body))
     return vehicle, actors
@@ -144,7 +150,9 @@ def main() -> None:
     scene = json.loads((FOLDER / "vehicle.json").read_text(encoding="utf-8"))
     client = carla.Client(options.host, options.port)
     client.set_timeout(60.0)
-    world = client.generate_opendrive_world((FOLDER / "road.xodr").read_text(encoding="utf-8"))
+    world = client.generate_opendrive_world(
+        (FOLDER / "road.xodr").read_text(encoding="utf-8")
+    )
     settings = world.get_settings()
     settings.synchronous_mode = True
     settings.fixed_delta_seconds = scene["step"]
@@ -156,7 +164,10 @@ def main() -> None:
         settings.fixed_delta_seconds = None
         world.apply_settings(settings)
     print(f"safevar_sumo: {scene['verdict']}")
-    print("CARLA: " + (f"collides at {speed:.1f} m/s" if speed is not None else "no collision"))
+    print(
+        "CARLA: "
+        + (f"collides at {speed:.1f} m/s" if speed is not None else "no collision")
+    )
 
 
 if __name__ == "__main__":
