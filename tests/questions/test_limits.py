@@ -288,7 +288,7 @@ def test_children_lie_between_beside_and_around_their_parents() -> None:
         round(value, 9) for value in between
     }
     values = children[::2, :4]
-    assert ~np.isin(values, (4.0, 5.0)).mean() == pytest.approx(1.2 / 7, abs=0.01)
+    assert 1 - np.isin(values, (4.0, 5.0)).mean() == pytest.approx(1.2 / 7, abs=0.01)
     assert np.isin(values, (0.0, 10.0)).mean() == pytest.approx(0.6 / 7, abs=0.01)
 
 
