@@ -262,8 +262,9 @@ def directory_name(study: Study) -> str:
     """The name of a directory of results: that of the study, and of the part that is searched."""
     origin = study.origin
     parts = ["ranges" if origin.ranges else "", origin.point, origin.up_to]
-    name = "-".join([study.name, *filter(None, parts)])
-    return re.sub(r"[^A-Za-z0-9_.=-]+", "_", name)
+    return re.sub(
+        r"[^A-Za-z0-9_.=-]+", "_", "-".join([study.name, *filter(None, parts)])
+    )
 
 
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:

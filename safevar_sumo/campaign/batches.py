@@ -216,8 +216,7 @@ def repeat_first_batches(study: Study, pool: Pool) -> None:
     of `repeat_first_batch`.
     """
     if user_code_names(study):
-        simulations = simulations_of_setting(system_of(study))
-        limit = pool.spare and pool.spare[1] // simulations
+        limit = pool.spare and pool.spare[1] // simulations_of_setting(system_of(study))
         pool.everywhere(repeat_first_batch, study, limit=limit)
 
 

@@ -149,8 +149,7 @@ def conflict(runs: SimulationRuns) -> tuple[FloatArray, FloatArray]:
     ttc = np.divide(
         trace.gap, closing_speed, out=np.zeros_like(trace.gap), where=is_counted
     )
-    at_arrival = trace.lateral + trace.lateral_speed * ttc
-    is_met = is_in_path | (np.abs(at_arrival) <= reach)
+    is_met = is_in_path | (np.abs(trace.lateral + trace.lateral_speed * ttc) <= reach)
     ttc = np.where(is_counted & is_met, ttc, np.inf)
 
     # Behind a leader, and wherever else the distance is the gap, it is TTC(t).

@@ -93,8 +93,7 @@ def _look_at(world: SumoWorld) -> None:
     """Keep the vehicles in the middle of the view."""
     fronts = world.vehicle_positions(VUT)
     low = fronts.min(axis=0) - AROUND
-    high = fronts.max(axis=0) + AROUND
-    world.api.gui.setBoundary(VIEW_NAME, *low, *high)
+    world.api.gui.setBoundary(VIEW_NAME, *low, *(fronts.max(axis=0) + AROUND))
 
 
 @contextmanager

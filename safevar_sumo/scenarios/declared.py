@@ -67,8 +67,7 @@ def with_ranges(study: Study) -> Study:
     tables = _with_declared(
         {**tables_of(study), "encounters": RANGES}, study.origin.places
     )
-    tests = tables.get("matrix", {}).get("tests", [])
-    places = [tables["scenario"], *tests]
+    places = [tables["scenario"], *tables.get("matrix", {}).get("tests", [])]
     axes = [axis for place in places for axis in place.get("over", {}).values()]
     if not any(isinstance(axis, dict) and "lower" in axis for axis in axes):
         return study

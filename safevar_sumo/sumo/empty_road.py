@@ -129,8 +129,10 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     beside = np.abs(trace.lateral[:end, 0]) - (trace.vehicle_width + obstacle_width) / 2
     stays_beside = (beside > 0).all() and beside[-1] >= beside[-2:][0]
     if gap[-1] <= 0 and stays_beside:
-        words = "meets nobody: whoever is there stays beside its way, and comes no nearer to it"
-        return EmptyRoadFault(Reason.LATE, words)
+        return EmptyRoadFault(
+            Reason.LATE,
+            "meets nobody: whoever is there stays beside its way, and comes no nearer to it",
+        )
     if gap[-1] <= 0 or (keeps_speed and is_alone):
         return None
 
@@ -149,5 +151,7 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
         f"with at most {trace.throttle[:end, 0].max():.2g} of the throttle and {brake.max():.2g} of"
         " the brake"
     )
-    words = f"never reaches the encounter (it gets {distance:.1f}{of_needed} m, {commanded})"
-    return EmptyRoadFault(Reason.STANDS, words)
+    return EmptyRoadFault(
+        Reason.STANDS,
+        f"never reaches the encounter (it gets {distance:.1f}{of_needed} m, {commanded})",
+    )

@@ -193,8 +193,7 @@ def evaluate_matrix(system: System, settings: FloatArray) -> Evaluations:
     at_points = [results[point.name] for point in system.points]
     numbers = worst_points(system, at_points)
     rows = numbers * len(settings) + np.arange(len(settings))
-    evaluations = Evaluations.concatenate(at_points).take(rows)
-    return replace(evaluations, worst_points=numbers)
+    return replace(Evaluations.concatenate(at_points).take(rows), worst_points=numbers)
 
 
 def settings_per_batch(system: System) -> int:

@@ -299,8 +299,9 @@ class TraciView:
             raise
         except (self._api.TraCIException, self._api.FatalTraCIError) as error:
             # The controller knows the ids of the traffic file.
-            message = re.sub(r"'([:!]?)\d+\.", r"'\1", str(error))
-            raise real_traci().exceptions.TraCIException(message) from None
+            raise real_traci().exceptions.TraCIException(
+                re.sub(r"'([:!]?)\d+\.", r"'\1", str(error))
+            ) from None
 
     def _command(self, domain: str, name: str, vehicle: str, *values: Value) -> Value:
         if vehicle != VUT:

@@ -62,10 +62,11 @@ def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> N
 def _prepared_original(
     vehicle: Vehicle, characteristics: CharacteristicSet
 ) -> Prepared:
-    values = {
-        member.name: np.full(1, float(member.original)) for member in characteristics
-    }
-    return vehicle.prepare(values, DRY_ROAD_FRICTION, STEP)
+    return vehicle.prepare(
+        {member.name: np.full(1, float(member.original)) for member in characteristics},
+        DRY_ROAD_FRICTION,
+        STEP,
+    )
 
 
 @lru_cache(maxsize=4)

@@ -151,8 +151,7 @@ class CommonDomain(NamedTuple):
     def ends_in_a(self) -> tuple[FloatArray, FloatArray]:
         """The lower and upper ends of A's settings that both domains hold, shape (n,)."""
         lower = np.maximum(self.lower[0], self.as_in_a(self.lower[1]))
-        upper = np.minimum(self.upper[0], self.as_in_a(self.upper[1]))
-        return lower, upper
+        return lower, np.minimum(self.upper[0], self.as_in_a(self.upper[1]))
 
     def as_in_b(self, settings: FloatArray) -> FloatArray:
         """A's settings as B's: the same changes of the other original vehicle."""

@@ -188,11 +188,10 @@ def _first_vehicles(problem: RepairProblem, subject: Subject) -> FloatArray:
     if not len(rows):
         kept = f"keeps {problem.unsafe.keep:g} m" if problem.unsafe.keep else "is safe"
         study = problem.study
-        text = (
-            f"{study.name!r}: the new vehicle {kept} in none of the tested encounters"
-        )
         raise InputError(
-            study.source, text, "a smaller --margin, or narrower ranges of the axes"
+            study.source,
+            f"{study.name!r}: the new vehicle {kept} in none of the tested encounters",
+            "a smaller --margin, or narrower ranges of the axes",
         )
     return rows
 

@@ -389,9 +389,8 @@ class RepairProblem:
 
     def worst_today(self, setting: FloatArray) -> Evaluations:
         """How the ADS of today ends with one setting, shape (n,)."""
-        values = self.values(self.today[np.newaxis])
         return self._evaluate(
-            values,
+            self.values(self.today[np.newaxis]),
             setting[np.newaxis],
             "the driving system of today",
             arrays=self.arrays,

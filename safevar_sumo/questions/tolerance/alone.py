@@ -119,8 +119,7 @@ def search_alone(
     """Limits of a star in which a search finds nothing, within known ones."""
     unsafe = star.lower[np.newaxis][:0]
     for _ in range(MOST_SEARCHES):
-        space = star.of_vehicles(limits.lower, limits.upper)
-        unsafe = search(space, unsafe[:0]).unsafe
+        unsafe = search(star.of_vehicles(limits.lower, limits.upper), unsafe[:0]).unsafe
         if not len(unsafe):
             return limits
         limits = limits_before(judge, star, limits, unsafe, parts)

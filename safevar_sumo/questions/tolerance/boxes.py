@@ -374,6 +374,5 @@ def _are_safe(boxes: Boxes, known: Known, tried: FloatArray) -> BoolArray:
 def _hold_nothing(boxes: Boxes, known: Known, tried: FloatArray) -> Iterator[bool]:
     """Whether each of B boxes holds no known failure."""
     extents = boxes.extents(known.cases)
-    largest = tried.max(axis=0, initial=0.0)
-    extents = extents[(extents <= largest).all(axis=(1, 2))]
+    extents = extents[(extents <= tried.max(axis=0, initial=0.0)).all(axis=(1, 2))]
     return (not (extents <= sides).all(axis=(1, 2)).any() for sides in tried)

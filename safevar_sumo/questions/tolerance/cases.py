@@ -89,8 +89,7 @@ class Space(NamedTuple):
         mixed = np.where(rng.random(first.shape) < 0.5, first, second)
         mutated = self._mutants(mixed, random, rng)
         moved = first + PULL * (second - first) + DIFFERENCE * (third - fourth)
-        is_odd = np.arange(number)[:, np.newaxis] % 2
-        cases = np.where(is_odd, moved, mutated)
+        cases = np.where(np.arange(number)[:, np.newaxis] % 2, moved, mutated)
 
         # A place has no meaning in another world.
         is_other = rng.random(number) < OTHER_WORLD

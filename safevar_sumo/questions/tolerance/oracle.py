@@ -156,8 +156,7 @@ class Oracle:
         robustness[~runs.valid & ~runs.infeasible] = np.nan
         robustness[~world.model.evaluator.region.feasible(settings)] = np.inf
         unsafe = np.flatnonzero(robustness < 0)
-        does_count = self._do_count(world, cases[unsafe])
-        robustness[unsafe[~does_count]] = np.inf
+        robustness[unsafe[~self._do_count(world, cases[unsafe])]] = np.inf
         return robustness
 
     def _do_count(self, world: CaseWorld, cases: FloatArray) -> BoolArray:
@@ -182,8 +181,7 @@ class Oracle:
         original = self._region.characteristics.original[n:]
 
         def draw_settings(count: int) -> FloatArray:
-            vehicles = draw(count)
-            return np.hstack([vehicles, np.tile(original, (count, 1))])
+            return np.hstack([draw(count), np.tile(original, (count, 1))])
 
         return self._region.draw_feasible(draw_settings, number)[:, :n]
 

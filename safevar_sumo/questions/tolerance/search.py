@@ -147,8 +147,7 @@ def alone_with_own_set(asked: Asked, limits: Alone) -> Alone:
         search = asked.search(0, effort.alone, rng, phases=False)
         limits = search_alone(oracle, star, limits, search, parts)
     cases = np.array([*limits.beyond.values()]).reshape(-1, asked.nothing.shape[1])
-    is_unsafe = oracle(cases) < 0
-    pairs = zip(limits.beyond.items(), is_unsafe, strict=True)
+    pairs = zip(limits.beyond.items(), oracle(cases) < 0, strict=True)
     return limits._replace(beyond=dict(pair for pair, fails in pairs if fails))
 
 
@@ -234,8 +233,7 @@ def _with_settled(
             return _passed(
                 limits._replace(proof=proof, proofs=proofs), sides, settled, fit
             )
-        known = learn(boxes, settled.known, unsafe, sides)
-        settled = settled._replace(known=known)
+        settled = settled._replace(known=learn(boxes, settled.known, unsafe, sides))
     return limits._replace(sides=None, known=settled.known, proof=None)
 
 
@@ -289,8 +287,7 @@ def _corner_search(asked: Asked, boxes: Boxes) -> CaseSearch:
             numbers = rng.integers(2**size, size=most)
         is_high = np.zeros((len(numbers), n), dtype=bool)
         is_high[:, is_open] = numbers[:, np.newaxis] >> np.arange(size) & 1
-        vehicles = np.where(is_high, upper, lower)
-        cases = product_of(vehicles, listed)
+        cases = product_of(np.where(is_high, upper, lower), listed)
         met = Counterexamples(known[:0], np.zeros(0)).after(cases, asked.oracle(cases))
         return met._replace(simulated=0)
 
@@ -349,8 +346,7 @@ def _beyond(asked: Asked, limits: FoundLimits) -> dict[Side, FloatArray]:
             # A slice of the wider box: this value at its end.
             space = boxes.cases_in(wider)
             lower, upper = space.lower.copy(), space.upper.copy()
-            end = (lower, upper)[side][column]
-            lower[column] = upper[column] = end
+            lower[column] = upper[column] = (lower, upper)[side][column]
             slice_ = space._replace(lower=lower, upper=upper)
             cases = search(slice_, known.at_places(boxes, wider)).unsafe
         if len(cases):

@@ -111,8 +111,7 @@ def answer_limits(
     told: Told, nearest: FloatArray | None, ranges: InRanges | None
 ) -> Answer:
     """The answer with limits alone and joint limits."""
-    table = _limits_table(told)
-    tables = {"limits": table}
+    tables = {"limits": _limits_table(told)}
     tried = len(told.asked.fits) + len(told.asked.left_out)
     if told.is_safe and tried > 1:
         title = "The limits in each parameter set of the vehicle model"

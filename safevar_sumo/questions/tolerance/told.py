@@ -192,7 +192,19 @@ class Told:
         stated = np.flatnonzero(~np.isnan(self.asked.given).all(axis=0)).tolist()
         if self.limits.broken or not self.is_safe:
             return stated
-        return [column for column in stated if self.outside(column) > 0]
+        return [column for column in stated if self._is_broken(column)]
+
+    def _is_broken(self, column: int) -> bool:
+        """Whether a specified limit is beyond what is safe alone. A rough search has wide gaps
+        between what is safe and what is not: there an unsafe vehicle must be within the limit.
+        """
+        if not self.is_rough:
+            return self.outside(column) > 0
+        lengths = np.abs(self.asked.given[:, column] - self.asked.original[column])
+        return any(
+            beyond[0][1] == column and self._change(beyond) <= lengths[beyond[0][0]]
+            for beyond in self.limits.alone.beyond.items()
+        )
 
     def value_in(self, fit: int) -> float:
         """The worst that the search found in a parameter set: a clearance [m], or a metric."""
