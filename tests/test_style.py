@@ -91,7 +91,10 @@ def test_tests_are_collected_without_the_extras() -> None:
 def test_the_rules_find_what_breaks_them() -> None:
     function = "def long():\n    '''One\n    two.'''\n\n    # Pass.\n    pass\n"
     assert elements_in(function) == elements_in("def long():\n    pass\n")
-    module = "class World: ...\nPair = tuple\nSIZE = 1\n_Own = int\ndef play(): ...\n"
-    assert [*public_names_in(module)] == ["World", "Pair", "play"]
+    assert [
+        *public_names_in(
+            "class World: ...\nPair = tuple\nSIZE = 1\n_Own = int\ndef play(): ...\n"
+        )
+    ] == ["World", "Pair", "play"]
     counts = counts_in(function + "left = [1 if one else 2 for one in (3, 4)]\n")
     assert [*counts.values()] == [3, 20, 1, 1, 2, 1]
