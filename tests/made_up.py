@@ -73,9 +73,11 @@ def made_up_runs(
     )
     crash = np.full(speed.shape[1], collision_speed)
     outcome = np.where(np.isnan(crash), Outcome.STOPPED.value, Outcome.COLLISION.value)
-    encounter = Encounter(gaps, gaps, speed, gaps > 0)
     return SimulationRuns(
-        trace=trace, encounter=encounter, outcome=outcome, collision_speed=crash
+        trace=trace,
+        encounter=Encounter(gaps, gaps, speed, gaps > 0),
+        outcome=outcome,
+        collision_speed=crash,
     )
 
 

@@ -136,9 +136,8 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         is_danger = is_in_way & (brakes | ((nearness > 0) & ~reaction.leader_brakes))
 
         # A new danger has lasted since its condition held, and not longer than it is perceived.
-        is_followed = is_same & memory.was_in_way
         perceived_time = np.where(
-            is_followed, step, memory.stray_time - self.perception_time
+            is_same & memory.was_in_way, step, memory.stray_time - self.perception_time
         )
         danger = Danger(
             is_danger,
@@ -183,9 +182,10 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         )
         strays_now = is_sighted & (deviation >= self.stray)
         drift = np.maximum(np.abs(observation.lateral_speed), LEAST_DIVISOR)
-        strayed = (deviation - self.stray) / drift
         new_stray_time = np.where(
-            strays_now, np.minimum(strayed, memory.reaction.step), -1.0
+            strays_now,
+            np.minimum((deviation - self.stray) / drift, memory.reaction.step),
+            -1.0,
         )
         old_time = memory.stray_time
         stray_time = np.where(

@@ -101,8 +101,7 @@ def evaluate(
         )
 
     # The evaluations are of no algorithm and run.
-    groups = [(("", 0), evaluations)]
-    frame = evaluations_frame(characteristics.names, groups).drop(
+    frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(
         columns=["algorithm", "run"]
     )
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)

@@ -316,8 +316,9 @@ def choose_batches(study: Study, selection: Selection) -> Batches:
     have_turns = (
         isinstance(system.ads, PerVehicleAds) or system.ads.max_vehicles is not None
     )
-    size = settings_per_batch(system)
-    return Batches(size, are_recorded and not have_turns, are_recorded)
+    return Batches(
+        settings_per_batch(system), are_recorded and not have_turns, are_recorded
+    )
 
 
 def compile_vehicle(study: Study, pool: Pool, progress: Progress) -> None:

@@ -110,10 +110,12 @@ def run_campaign(
     read: Iterable[str] = ()
     if not system.mover.is_exact:
         read = opened if is_new else read_manifest(directory).get("files", ())
-    manifest = manifest_now(study, system, read)
-    names = [*map(str, keys)]
     results = ResultsDirectory(
-        directory, study, manifest, system.measuring.scoring, names
+        directory,
+        study,
+        manifest_now(study, system, read),
+        system.measuring.scoring,
+        [*map(str, keys)],
     )
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
         warn(remark)

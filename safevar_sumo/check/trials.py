@@ -128,8 +128,15 @@ def try_simulations(
         seconds = seconds * vehicles / number
         number = vehicles
     settings = settings[:number]
-    all_points = len(assemble(study).points)
-    tell(Extent(number, vehicles or SIMULATED, len(system.points), all_points, seconds))
+    tell(
+        Extent(
+            number,
+            vehicles or SIMULATED,
+            len(system.points),
+            len(assemble(study).points),
+            seconds,
+        )
+    )
 
     # The study says that its simulator is not deterministic.
     if system.repeats > 1:

@@ -163,9 +163,10 @@ def first_paragraph(function: str) -> str:
     file = path.with_suffix(".py")
     if not file.exists():
         file = path / "__init__.py"
-    source = file.read_text(encoding="utf-8")
     docstring = re.search(
-        rf'^def {name}\(.*?"""(.*?)(?:\n\n|""")', source, re.DOTALL | re.MULTILINE
+        rf'^def {name}\(.*?"""(.*?)(?:\n\n|""")',
+        file.read_text(encoding="utf-8"),
+        re.DOTALL | re.MULTILINE,
     )
     assert docstring is not None
     return " ".join(docstring[1].split())

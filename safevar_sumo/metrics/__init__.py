@@ -15,7 +15,6 @@ from safevar_sumo.metrics.legal import (
     STOP_FROM_PEDAL,
     STOPPING_DISTANCE as STOPPING_DISTANCE,
 )
-from safevar_sumo.metrics.margin import margin_of as margin_of
 from safevar_sumo.metrics.measures import (
     AVE_DECE,
     DRAC,

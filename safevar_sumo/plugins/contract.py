@@ -253,10 +253,9 @@ class UserCode(NamedTuple):
         def checked(*arguments: Any) -> FloatArray:
             with np.errstate():
                 values = function(*map(read_only, arguments))
-            shape = (count(arguments[0]),)
-            return self.check_numbers(method, "values", values, shape, legal).astype(
-                float
-            )
+            return self.check_numbers(
+                method, "values", values, (count(arguments[0]),), legal
+            ).astype(float)
 
         return checked
 

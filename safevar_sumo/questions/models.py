@@ -11,14 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import Unsafe, margin_of
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
+DEFAULT_MARGIN = 0.3
+"""Distance to keep in a study that states no error of its model [m]."""
 SEARCHED_MARGIN = 0.1
 """Distance to keep where encounters are ranges [m]: where the original keeps just its
 margin, wear may use up the rest, and contact is no limit to release.
@@ -136,6 +139,15 @@ def keeping_distance(
     return replace(
         criterion, keep=SEARCHED_MARGIN if is_searched else margin_of(study, margin)
     )
+
+
+def margin_of(study: Study, margin: float | None) -> float:
+    """The distance to keep [m]: the stated one, else the study's error of its model, else
+    `DEFAULT_MARGIN`.
+    """
+    if margin is None:
+        return study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN)
+    return margin
 
 
 def check_margin(criterion: Unsafe, margin: float | None) -> None:

@@ -124,9 +124,13 @@ def braking(
         now = gap - (speed - leader) * k * STEP
         if now <= 0:
             break
-        across = lateral + lateral_speed * k * STEP
         one = seen(
-            k * STEP, speed, now, across, lateral_speed=lateral_speed, leader=leader
+            k * STEP,
+            speed,
+            now,
+            lateral + lateral_speed * k * STEP,
+            lateral_speed=lateral_speed,
+            leader=leader,
         )
         command, memory = driver.drive(one, memory)
         if command.brake[0] > 0.05 and np.isnan(

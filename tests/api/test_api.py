@@ -235,8 +235,11 @@ def test_load_reads_the_results_of_run(results: sv.Results) -> None:
     assert_frame_equal(again.solutions, results.solutions)
     assert tables_of(again.study) == tables_of(load_study("smoke"))
     assert len(again.evaluations) > 300
-    stored = pd.read_csv(results.directory / "solutions.csv")
-    assert_frame_equal(again.solutions, stored, check_dtype=False)
+    assert_frame_equal(
+        again.solutions,
+        pd.read_csv(results.directory / "solutions.csv"),
+        check_dtype=False,
+    )
 
 
 @SLOW

@@ -251,8 +251,10 @@ def shown(clock: list[float], width: int) -> list[str]:
 def test_on_a_terminal_all_fits_in_its_line(width: int, clock: list[float]) -> None:
     """Of 6000 simulations 5200 are left, at 10 a second."""
     lines = shown(clock, width)
-    last = [line for line in lines if "rain" in line][-1]
-    assert re.fullmatch(r"rain: 1 of 6 runs [━╸╺ ]+ 800 of 6,000 0:08:30 left", last)
+    assert re.fullmatch(
+        r"rain: 1 of 6 runs [━╸╺ ]+ 800 of 6,000 0:08:30 left",
+        [line for line in lines if "rain" in line][-1],
+    )
     assert max(map(len, lines)) <= width
 
 

@@ -395,8 +395,10 @@ def test_a_worker_with_another_file_ends_a_question(
     _, address = scheduler
     Path("models.py").write_text(MODELS)
     Path("wall.toml").write_text(STUDY)
-    process = worker(start, address, "--no-nanny")
-    until(lambda: "Registered to" in Path("worker-1.log").read_text(), process)
+    until(
+        lambda: "Registered to" in Path("worker-1.log").read_text(),
+        worker(start, address, "--no-nanny"),
+    )
     wrong = "safevar_sumo.campaign.batches"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(f"{wrong}.package_digest", lambda: "other")

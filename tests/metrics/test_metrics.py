@@ -155,8 +155,9 @@ def test_post_encroachment_time_is_that_of_the_second_one(
         "lateral_speed": lateral_speed * at,
         "obstacle_width": 1.2 * at,
     }
-    active = np.array([[True], [True], [False]])
-    run = made_up_runs(STEP, 10 * at, gap * at, **columns, active=active)
+    run = made_up_runs(
+        STEP, 10 * at, gap * at, **columns, active=np.array([[True], [True], [False]])
+    )
     run = dataclasses.replace(
         run, trace=dataclasses.replace(run.trace, vehicle_width=2.0)
     )

@@ -51,8 +51,9 @@ def test_a_search_between_the_tests_finds_what_no_test_shows(ahead: Study) -> No
     space = oracle.space(0, *ends, phases=False)
     vehicles = np.where(default_rng(0).random((512, len(vehicle))) < 0.5, *ends)
     assert oracle(product_of(vehicles, oracle.listed())).min() >= 0
-    nothing = space.lower[np.newaxis][:0]
-    met = search_cases(oracle, space, nothing, SearchPlan(5000), default_rng(1))
+    met = search_cases(
+        oracle, space, space.lower[np.newaxis][:0], SearchPlan(5000), default_rng(1)
+    )
     assert met.least < 0
     model, setting = oracle.setting(met.unsafe[0])
     speed = dict(zip(model.characteristics.names, setting, strict=True))["speed"]

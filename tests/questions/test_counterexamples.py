@@ -25,8 +25,10 @@ def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_ou
     def sliver(rows: FloatArray) -> BoolArray:
         return (rows[:, 0] >= 7.13) & (rows[:, 0] <= 7.1302) & (rows[:, 0] != 7.13)
 
-    model = made_up_model(2, sliver)
-    found = describe(model, {"a": np.array([7.13005, 5.0]), "b": np.array([7.5, 5.0])})
+    found = describe(
+        made_up_model(2, sliver),
+        {"a": np.array([7.13005, 5.0]), "b": np.array([7.5, 5.0])},
+    )
     assert [*found] == ["a"], "a setting that is safe is not described"
     assert sliver(found["a"].setting[np.newaxis])[0]
 

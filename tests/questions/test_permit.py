@@ -20,6 +20,7 @@ from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit import permit
+from safevar_sumo.questions.permit.answer import ROUGH_NEED
 from safevar_sumo.questions.permit.encounters import (
     EncounterRange,
     encounters_of,
@@ -229,6 +230,8 @@ def test_the_rough_answer_lets_no_car_drive_and_says_so_in_each_form(
     assert answer.numbers["rough"]
     assert "the study's own parameter set alone" in answer.verdict
     assert answer.numbers["drive"] == answer.numbers["attacked"] == 0
+    needing = permit(short, cars=cars, others="new", quick=True, need="34 km/h")
+    assert needing.failures == (ROUGH_NEED,)
     table = answer.table()
     assert set(table["verdict"]) == {"up to"}
     assert set(table["rough"]) == {True}
@@ -376,8 +379,9 @@ def reached(
     """How far cars, by default the original, are safe with the study's own parameter set."""
     span = span_of(study, None)
     own = model_of(study)
-    values = np.arange(span.low, span.high + 1)
-    search = PermitSearch(Models((own,), ()), span, values, budget)
+    search = PermitSearch(
+        Models((own,), ()), span, np.arange(span.low, span.high + 1), budget
+    )
     original = Cars.one(own.characteristics.vehicle.original)
     return search.reach([cars or original], [None])[0].least
 

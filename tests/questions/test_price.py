@@ -43,9 +43,8 @@ def test_a_question_keeps_to_the_number_of_simulations(
     rig: str, question: str, number: int
 ) -> None:
     others = [rig] if question == "compare" else []
-    pool = InlinePool()
     answer = getattr(sv, question)(
-        rig, *others, simulations=number, pool=pool, fresh=True
+        rig, *others, simulations=number, pool=InlinePool(), fresh=True
     )
     assert answer.numbers["rough"]
     assert answer.numbers["simulations"] <= number
@@ -321,8 +320,10 @@ def test_a_page_and_a_pack_share_one_number(
         Path("count").unlink()
         run(command, command, "--simulations", f"{number}", "--out", out, "--jobs", "1")
         assert number / 3 <= Path("count").stat().st_size <= number
-    page = Path("page.html").read_text()
-    stated = re.findall(r"(\w+) report (?:--samples 4000 )?--simulations (\d+)", page)
+    stated = re.findall(
+        r"(\w+) report (?:--samples 4000 )?--simulations (\d+)",
+        Path("page.html").read_text(),
+    )
     assert {name for name, _ in stated} == {"tolerance", "explain", "risk", "rules"}
     assert {3 * int(part) > 0.7 * number for _, part in stated} == {True}
     assert json_of("verify", "pack.zip", "--run-code")["numbers"]["passed"]

@@ -162,7 +162,7 @@ def test_a_beginning_is_rounded_to_the_unsafe_side() -> None:
     assert smallest.table["begins_at"].tolist() == [0.31]
     assert "a at 6.55 N m, 31 % of the way" in verdict
     assert "If all changes go 30 to 10 % of the way to the ends, none of 24" in verdict
-    assert "How sure this cause is, was simulated with a at 10 N m." in verdict
+    assert "The program tested with a at 10 N m how sure this cause is." in verdict
 
 
 def test_a_cause_begins_where_none_of_its_parts_is_unsafe() -> None:
@@ -272,8 +272,10 @@ def test_the_answer_leads_with_the_smallest_changes() -> None:
 
 def test_the_study_of_results_is_explained_as_without_results(slippery: Path) -> None:
     answer = sv.explain(slippery, of_study=True, simulations=600, jobs=1)
-    study = sv.load(slippery).study
-    assert answer.to_dict() == sv.explain(study, simulations=600, jobs=1).to_dict()
+    assert (
+        answer.to_dict()
+        == sv.explain(sv.load(slippery).study, simulations=600, jobs=1).to_dict()
+    )
 
 
 @SLOW

@@ -124,9 +124,11 @@ def test_a_second_library_reads_the_places_of_the_trace(
             np.array([getattr(place, axis) for place in places[samples]], dtype=float)
             for axis in "xyh"
         )
-        times = trajectory.shapes.time[samples]
         assert np.allclose(
-            times, comparison.runs.trace.time[samples], rtol=0, atol=1e-9
+            trajectory.shapes.time[samples],
+            comparison.runs.trace.time[samples],
+            rtol=0,
+            atol=1e-9,
         )
         front = 0.0 if track.is_person else box.center.x + box.boundingbox.length / 2
         assert np.abs(x + front * np.cos(heading) - track.x[samples, row]).max() < 0.01

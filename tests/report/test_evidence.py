@@ -326,8 +326,12 @@ def damaged(content: bytes, damage: dict[str, Any]) -> bytes:
             for one in (damage["old"], damage["new"])
         )
         for old, new in zip(olds, news, strict=True):
-            new_text = new * damage.get("times", 1)
-            text = re.sub(old, new_text, text, count=0 if "every" in damage else 1)
+            text = re.sub(
+                old,
+                new * damage.get("times", 1),
+                text,
+                count=0 if "every" in damage else 1,
+            )
     return text.encode("latin-1" if "\xff" in text else "utf-8")
 
 

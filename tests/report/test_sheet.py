@@ -325,8 +325,9 @@ def test_a_sheet_whose_speed_has_no_answer_says_so_and_calls_no_speed_unsafe() -
 def test_the_question_has_the_limits_of_the_sheet_and_stated_values_of_all_others() -> (
     None
 ):
-    all_measured = replace_in(STUDY, unmeasured={})
-    values = speed_values(reported(replace(answer_of(), study=all_measured)))
+    values = speed_values(
+        reported(replace(answer_of(), study=replace_in(STUDY, unmeasured={})))
+    )
     assert (values["margin"], values["others"]) == (0.3, "new")
     assert values["limits"] == (
         *(

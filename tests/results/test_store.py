@@ -78,9 +78,8 @@ def written(path: Path, study: Study) -> ResultsDirectory:
 
 def wide(study: Study) -> Evaluations:
     """One evaluation with as many characteristics as the study has."""
-    one = evaluations(1.0)
     return dataclasses.replace(
-        one, settings=np.ones((1, len(study.vehicle.characteristics)))
+        evaluations(1.0), settings=np.ones((1, len(study.vehicle.characteristics)))
     )
 
 
@@ -247,9 +246,10 @@ def test_the_order_of_a_table_counts_where_settings_or_points_are_arrays_in_it()
 def test_a_manifest_names_the_packages_that_its_study_uses(
     name: str, more: set[str]
 ) -> None:
-    algorithms = {"algorithms": ["pymoo:NSGA3"]}
     study = (
-        load_study("smoke", search=algorithms) if name == "pymoo" else load_study(name)
+        load_study("smoke", search={"algorithms": ["pymoo:NSGA3"]})
+        if name == "pymoo"
+        else load_study(name)
     )
     assert {*packages_of(study)} == {"safevar_sumo", "libsumo", "deap", "numpy", *more}
 

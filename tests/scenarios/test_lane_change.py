@@ -69,9 +69,12 @@ def test_the_competent_driver_answers_cut_ins_by_the_rule() -> None:
         **BODY,
     )
     beside = (3.5 - PATH) / scenario.lateral_speed
-    perceived = 0.375 / scenario.lateral_speed + 0.4
     expected = rule(
-        v / 3.6, scenario.gap, scenario.target_speed / 3.6, beside, perceived
+        v / 3.6,
+        scenario.gap,
+        scenario.target_speed / 3.6,
+        beside,
+        0.375 / scenario.lateral_speed + 0.4,
     )
     same, late = agreement(
         met_at_once(IDEAL, scenario, CompetentDriver(), N), expected, PATH

@@ -631,9 +631,11 @@ def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
         low, high = numbers["interval"]
         assert low < share < high
     for delay, holds in ((0.05, False), (0.02, None)):
-        limits = [f"delay <= {delay}"]
         answer = sv.tolerance(
-            "wall.toml", limits=limits, simulations=2000, pool=InlinePool()
+            "wall.toml",
+            limits=[f"delay <= {delay}"],
+            simulations=2000,
+            pool=InlinePool(),
         )
         assert answer.numbers["kept"] is holds
     run("study", "wall.toml", "--out", "results")

@@ -102,13 +102,12 @@ def standard_problem(
             for i in range(standard.variables)
         )
     )
-    scoring = StandardScoring(standard)
     return Problem(
         characteristics=unit,
         original=evaluated(unit, unit.original_settings, np.zeros(1)),
         evaluations=evaluations,
         population=population,
-        scoring=scoring,
+        scoring=StandardScoring(standard),
     )
 
 

@@ -84,10 +84,10 @@ def step(traci, vehicle_id):
 
 def system(name: str, script: str = SCRIPT, **tables: object) -> System:
     Path("my_controller.py").write_text(script)
-    study = load_study("native", **tables)
     return assemble(
         msgspec.structs.replace(
-            study, ads=ModelTable(model=f"my_controller:{name}", kind="traci")
+            load_study("native", **tables),
+            ads=ModelTable(model=f"my_controller:{name}", kind="traci"),
         )
     )
 

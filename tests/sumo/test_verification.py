@@ -123,9 +123,9 @@ def test_a_sample_has_unsafe_solutions_once_and_others_that_the_seed_draws(
     }
     assert [known[key] for key in keys] == sample.points.tolist()
     assert np.array_equal(sample.settings, chosen().settings)
-    other = with_search(study, seed=7)
     assert not np.array_equal(
-        sample.settings, choose_sample(other, original, runs).settings
+        sample.settings,
+        choose_sample(with_search(study, seed=7), original, runs).settings,
     )
 
 

@@ -244,8 +244,9 @@ def sensed_gaps(model: str, name: str) -> tuple[FloatArray, FloatArray]:
     state = vehicle.at_rest(prepared)
     gaps = []
     for k in range(240):
-        gap = np.full(5, 130.0 - 10 * k * STEP)
-        sensed, state = vehicle.sense(prepared, state, seen(k * STEP, 0.0, gap))
+        sensed, state = vehicle.sense(
+            prepared, state, seen(k * STEP, 0.0, np.full(5, 130.0 - 10 * k * STEP))
+        )
         gaps.append(sensed.gap)
     return population[:, SYSTEMS[model].characteristics.names.index(name)], np.stack(
         gaps

@@ -197,10 +197,8 @@ class Smallest(NamedTuple):
             again = f"{percentage(first['safe_again'])} % of the way"
             yield f"The unsafe range has a gap: at {again} the vehicle is safe again."
         if first["causes"] != first["boundary"] and pd.notna(first["robust_share"]):
-            yield (
-                "How sure this cause is, was simulated with"
-                f" {values_in_words(members, first['causes'])}."
-            )
+            tested = values_in_words(members, first["causes"])
+            yield f"The program tested with {tested} how sure this cause is."
         if first["unsafe_runs"] < 1:
             yield f"The vehicle is unsafe in {percentage(first['unsafe_runs'])} % of its runs."
         if pd.notna(first["holds"]):

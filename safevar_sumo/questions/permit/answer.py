@@ -50,6 +50,10 @@ ROUGH_LIST = (
     "Remark: the list is a rough answer (rough = yes), whose speeds prove nothing."
 )
 """What to know of a list that `--quick` wrote."""
+ROUGH_NEED = (
+    "a rough answer lets no car drive: ask without --quick, or for more simulations"
+)
+"""Why no gate passes on a rough answer."""
 SHOWN_WHOLE = 50
 """Number of cars up to which one screen shows all: there the list is the answer."""
 
@@ -108,6 +112,9 @@ class PermitAnswer:
         own = self.models.own.unsafe
         cannot = f"{number_of(too_slow, 'car')} {self._no_verb(too_slow)}"
         slower = f"{cannot} at {self.need or 0:g}{unit}"
+        failures: tuple[str, ...] = (slower,) if too_slow else ()
+        if self.is_rough and self.need is not None:
+            failures += (ROUGH_NEED,)
         return Answer(
             question="permit",
             study=self.study,
@@ -135,7 +142,7 @@ class PermitAnswer:
                 ),
             },
             folded=("sets",),
-            failures=(slower,) if too_slow else (),
+            failures=failures,
             listing=self._listing(cars, fleet),
         )
 

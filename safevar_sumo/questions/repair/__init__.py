@@ -20,7 +20,7 @@ import tomli_w
 
 from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import Unsafe, margin_of
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable, whole_file
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
@@ -29,7 +29,7 @@ from safevar_sumo.questions.cause_limits import find_cause_limits
 from safevar_sumo.questions.causes import find_minimal_causes
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.falsify import budget_of
-from safevar_sumo.questions.models import check_margin, models_of
+from safevar_sumo.questions.models import check_margin, margin_of, models_of
 from safevar_sumo.questions.options import Fits, LimitTexts, Margin
 from safevar_sumo.questions.repair.answer import REPAIRS, answer_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of

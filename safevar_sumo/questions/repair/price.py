@@ -74,7 +74,7 @@ def drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, 
         )
         speed = trace.speed[trace.active[:, row], row]
         deceleration = max(
-            deceleration, float(np.max(-np.diff(speed), initial=0.0) / trace.step)
+            deceleration, float(np.max(-np.diff(speed) / trace.step, initial=0.0))
         )
     return np.transpose(onsets), deceleration
 

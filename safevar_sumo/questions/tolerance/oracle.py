@@ -228,9 +228,7 @@ def product_of(vehicles: FloatArray, encounters: FloatArray) -> FloatArray:
 
 
 def worlds_of(model: Model, new_car: Unsafe, *, between: bool) -> list[CaseWorld]:
-    """The worlds of a parameter set: each test that moves, and all other points together. A test
-    moves only with a study that is not rated.
-    """
+    """The worlds of a parameter set: each test that moves, and all other points together."""
     moving = moving_tests(model, new_car) if between else []
     worlds = [CaseWorld(test.model.in_phases or test.model, test) for test in moving]
     names = {test.test.name for test in moving}
