@@ -13,11 +13,11 @@ from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.cases import SearchPlan, search_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance import tolerance
-from safevar_sumo.questions.tolerance.cases import SearchPlan, search_cases
 from safevar_sumo.questions.tolerance.oracle import Oracle, product_of
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points

@@ -8,6 +8,15 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
+from safevar_sumo.questions.cases import (
+    PARENTS,
+    CaseJudge,
+    CaseSearch,
+    Counterexamples,
+    SearchPlan,
+    Space,
+    search_cases,
+)
 from safevar_sumo.questions.tolerance.alone import (
     MOST_SEARCHES,
     Alone,
@@ -24,15 +33,6 @@ from safevar_sumo.questions.tolerance.boxes import (
     widened,
     with_fewest_changes,
     without,
-)
-from safevar_sumo.questions.tolerance.cases import (
-    PARENTS,
-    CaseJudge,
-    CaseSearch,
-    Counterexamples,
-    SearchPlan,
-    Space,
-    search_cases,
 )
 from safevar_sumo.records import FloatArray
 

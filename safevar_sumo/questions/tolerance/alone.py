@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.boundary import find_boundaries
-from safevar_sumo.questions.tolerance.cases import CaseJudge, CaseSearch, Space
+from safevar_sumo.questions.cases import CaseJudge, CaseSearch, Space
 from safevar_sumo.records import FloatArray
 
 MOST_SEARCHES = 20

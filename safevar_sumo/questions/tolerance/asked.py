@@ -14,16 +14,16 @@ from numpy.random import Generator
 from safevar_sumo.errors import InputError, about, check_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.box import MAX_CORNERS
-from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.tolerance.boxes import BoxEffort, Boxes
-from safevar_sumo.questions.tolerance.cases import (
+from safevar_sumo.questions.cases import (
     CaseSearch,
     Counterexamples,
     SearchPlan,
     Space,
     search_cases,
 )
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.tolerance.boxes import BoxEffort, Boxes
 from safevar_sumo.questions.tolerance.oracle import Oracle
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Limit, Study, limits_of

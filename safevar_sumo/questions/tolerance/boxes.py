@@ -16,7 +16,7 @@ import numpy as np
 from numpy.random import Generator
 
 from safevar_sumo.questions.boundary import find_boundaries
-from safevar_sumo.questions.tolerance.cases import CaseJudge, CaseSearch, Space
+from safevar_sumo.questions.cases import CaseJudge, CaseSearch, Space
 from safevar_sumo.records import BoolArray, FloatArray
 
 DEVIATIONS = tuple(0.35 * 0.6**number for number in range(6))

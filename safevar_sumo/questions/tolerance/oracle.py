@@ -13,8 +13,8 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.between import MovingTest, moving_tests
+from safevar_sumo.questions.cases import Space
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.tolerance.cases import Space
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import PHASE
 from safevar_sumo.sumo.simulators import simulations_of_setting

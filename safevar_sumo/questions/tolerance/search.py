@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.box import Judgement, Proof, prove
+from safevar_sumo.questions.cases import CaseSearch, Counterexamples, Space
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.alone import (
     Alone,
@@ -28,7 +29,6 @@ from safevar_sumo.questions.tolerance.boxes import (
     learn,
     settle,
 )
-from safevar_sumo.questions.tolerance.cases import CaseSearch, Counterexamples, Space
 from safevar_sumo.questions.tolerance.oracle import Exhausted, product_of
 from safevar_sumo.records import FloatArray
 

@@ -12,12 +12,12 @@ import numpy as np
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.cases import Counterexamples
 from safevar_sumo.questions.counterexamples import FURTHER_DIGITS, Failure, describe
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance.alone import Side
 from safevar_sumo.questions.tolerance.asked import Asked
-from safevar_sumo.questions.tolerance.cases import Counterexamples
 from safevar_sumo.questions.tolerance.search import FoundLimits
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
