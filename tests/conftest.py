@@ -17,7 +17,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import COMMANDS, command_function
 from safevar_sumo.plugins import ImportPath
-from safevar_sumo.questions import falsify
+from safevar_sumo.questions import cases
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
@@ -130,9 +130,9 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     """Claims are falsified with the fewest simulations that are enough to print them."""
-    monkeypatch.setattr(falsify, "USUAL_BUDGET", falsify.LEAST_SIMULATIONS)
+    monkeypatch.setattr(cases, "USUAL_BUDGET", cases.LEAST_SIMULATIONS)
     few = asked.USUAL._replace(
-        own=falsify.LEAST_SIMULATIONS, alone=falsify.LEAST_SIMULATIONS
+        own=cases.LEAST_SIMULATIONS, alone=cases.LEAST_SIMULATIONS
     )
     monkeypatch.setattr(asked, "USUAL", few)
 

@@ -34,7 +34,7 @@ import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.cli.program import commands
-from safevar_sumo.questions import falsify
+from safevar_sumo.questions import cases
 from safevar_sumo.questions.tolerance import asked
 from tests.manual import PROGRAM, ROOT, Block, blocks
 
@@ -130,8 +130,8 @@ def run_page(page: str, options_of_tests: bool) -> Iterator[tuple[Block, str]]:
             added = ""
             with pytest.MonkeyPatch.context() as patch:
                 if is_shortened and (options_of_tests or not is_shown):
-                    least = falsify.LEAST_SIMULATIONS
-                    patch.setattr(falsify, "USUAL_BUDGET", least)
+                    least = cases.LEAST_SIMULATIONS
+                    patch.setattr(cases, "USUAL_BUDGET", least)
                     few = asked.USUAL._replace(own=least, alone=least)
                     patch.setattr(asked, "USUAL", few)
                     added = block.comment.removeprefix("in tests").replace(":", "", 1)

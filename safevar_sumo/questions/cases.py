@@ -18,6 +18,11 @@ CaseJudge = Callable[[FloatArray], FloatArray]
 """What each of M cases leaves to the limit, shape (M,): below 0 it is unsafe; infinite where it
 does not count.
 """
+LEAST_SIMULATIONS = 1000
+"""Fewest simulations that search for a counterexample before a value is printed as one that holds.
+"""
+USUAL_BUDGET = 5000
+"""Simulations that search for a counterexample to a claim."""
 PARENTS = 32
 """The worst cases so far, from which the next ones come."""
 STEP, PULL, DIFFERENCE = 0.1, 0.5, 0.7

@@ -10,14 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import FloatArray, IntArray
 
-LEAST_SIMULATIONS = 1000
-"""Fewest simulations that search for a counterexample before a value is printed as one that holds.
-"""
-USUAL_BUDGET = 5000
-"""Simulations that search for a counterexample to a claim."""
 GENERATION, PARENTS = 512, 32
 """Settings of a generation; the worst ones so far, which are its parents."""
 STEP, PULL = 0.1, 0.5
@@ -60,11 +54,6 @@ class Falsification(NamedTuple):
             judge: self.settings[is_unsafe & (self.judges == judge)]
             for judge in np.unique(self.judges[is_unsafe]).tolist()
         }
-
-
-def budget_of(evaluator: Evaluator) -> int:
-    """Simulations that search for a counterexample to a claim, by how much is searched."""
-    return evaluator.scaled(USUAL_BUDGET)
 
 
 def falsify(

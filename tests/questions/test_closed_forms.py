@@ -49,8 +49,8 @@ SPEEDS = np.arange(10, 20.5, 0.5)
 @pytest.fixture
 def car(coarse: None, in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """Its study, with few simulations of every search."""
-    monkeypatch.setattr("safevar_sumo.questions.permit.LEAST_SIMULATIONS", 90)
-    monkeypatch.setattr("safevar_sumo.questions.permit.budget_of", lambda _: 90)
+    monkeypatch.setattr("safevar_sumo.questions.cases.LEAST_SIMULATIONS", 90)
+    monkeypatch.setattr("safevar_sumo.questions.cases.USUAL_BUDGET", 90)
     Path("cars.py").write_text(CARS)
     return STUDY.replace("models:Wall", "cars:Car")
 

@@ -16,7 +16,7 @@ from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
+from safevar_sumo.questions.cases import LEAST_SIMULATIONS
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit import permit

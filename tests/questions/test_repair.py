@@ -18,7 +18,7 @@ import safevar_sumo as sv
 from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions import falsify, repair as question
+from safevar_sumo.questions import cases, repair as question
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.repair import (
     full_braking,
@@ -146,7 +146,7 @@ grip = { at_least = 5 }
 @pytest.fixture
 def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for module, name, number in (
-        (falsify, "USUAL_BUDGET", 300),
+        (cases, "USUAL_BUDGET", 300),
         (validation, "MAX_UNSAFE_SHARE", 0.01),
         (question, "SOBOL_VEHICLES", 32),
     ):
@@ -191,7 +191,7 @@ def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
     """The gap of today decides the fastest of them; from there the worst promised sled needs a
     longer one.
     """
-    monkeypatch.setattr(falsify, "USUAL_BUDGET", 2000)
+    monkeypatch.setattr(cases, "USUAL_BUDGET", 2000)
     search = 'over.speed = { unit = "km/h", original = 40, lower = 30, upper = 72 }'
     planted.write_text(
         'encounters = "ranges"'

@@ -14,11 +14,11 @@ import numpy as np
 from safevar_sumo.errors import InputError, about
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable, whole_file
+from safevar_sumo.questions import cases
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, budget_of
 from safevar_sumo.questions.models import keeping_distance, models_of
 from safevar_sumo.questions.options import (
     CARS_FILE,
@@ -141,8 +141,9 @@ def permit(
     )
     models = models_of(evaluator, criterion, fits, with_unsafe_originals=True)
     # A claim about all cars within limits gets the search of one about joint limits.
-    budget = budget_of(evaluator) if limits else evaluator.scaled(LEAST_SIMULATIONS)
-    search = PermitSearch(models, span, values, 0 if quick else budget)
+    budget = cases.USUAL_BUDGET if limits else cases.LEAST_SIMULATIONS
+    budget = 0 if quick else evaluator.scaled(budget)
+    search = PermitSearch(models, span, values, budget)
     _check_driven(needed, search)
     within = _within(members, limits, study, fleet.settings[0])
     asked = [within] if limits else cars_of(members, fleet)

@@ -22,13 +22,13 @@ from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable, whole_file
+from safevar_sumo.questions import cases
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.cause_limits import find_cause_limits
 from safevar_sumo.questions.causes import find_minimal_causes
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import budget_of
 from safevar_sumo.questions.models import check_margin, margin_of, models_of
 from safevar_sumo.questions.options import Fits, LimitTexts, Margin
 from safevar_sumo.questions.repair.answer import REPAIRS, answer_of
@@ -128,7 +128,7 @@ def repair(
     unsafe_today = replace(criterion, keep=keep, contact=evaluator.system.contact)
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
-    budget = budget_of(evaluator)
+    budget = evaluator.scaled(cases.USUAL_BUDGET)
     # Less than usual is no rough answer: a change that was not attacked is no repair.
     usual = USUAL_ROUNDS * budget
     evaluator.begin({ROUNDS_STAGE: usual}, least=usual)

@@ -18,8 +18,8 @@ from safevar_sumo.errors import InputError, UserCodeError, about, unknown_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.cases import USUAL_BUDGET
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.falsify import USUAL_BUDGET
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.preventability import approach_parameters
 from safevar_sumo.questions.repair.full_braking import FullBraking, robustness_of

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from safevar_sumo.questions.box import Proof, proof_size
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS
+from safevar_sumo.questions.cases import LEAST_SIMULATIONS
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.repair.smallest import Search
 from safevar_sumo.questions.repair.validation import (

@@ -9,7 +9,8 @@ import numpy as np
 
 from safevar_sumo.questions.between import PLACES
 from safevar_sumo.questions.box import Judgement, Proof, prove
-from safevar_sumo.questions.falsify import LEAST_SIMULATIONS, falsify
+from safevar_sumo.questions.cases import LEAST_SIMULATIONS
+from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import at_worst_phases
 from safevar_sumo.questions.repair.problem import RepairProblem
