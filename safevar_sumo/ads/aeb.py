@@ -74,8 +74,8 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `response_time` rt; b is `braking_share` of the original vehicle's greatest deceleration. After
     braking it never accelerates again.
 
-    It warns its driver while gap / closing speed of an obstacle in its way is below `warning_time`,
-    and while it brakes. The simulated driver does not react to warnings.
+    The system warns its driver while it brakes, and while gap / closing speed of an obstacle in its
+    way is below `warning_time`. The simulated driver does not react to warnings.
 
     Parameters
     ----------

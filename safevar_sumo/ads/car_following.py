@@ -162,8 +162,8 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
 class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """SUMO's default model (Krauss 1998; `MSCFModel_Krauss`).
 
-    It never drives faster than a speed from which the original vehicle can stop behind the obstacle
-    after a reaction time.
+    The model never drives faster than a speed from which the original vehicle can stop behind the
+    obstacle after a reaction time.
 
     Parameters
     ----------

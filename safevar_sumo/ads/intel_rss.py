@@ -23,8 +23,8 @@ MOST = 1000.0
 
 class AdRss(ScalarAds):
     """Holds its speed until ad-rss-lib demands longitudinal braking, and then brakes fully as long
-    as it does. It does not press the accelerator again, and rolls out with 1 m/s^2 while somebody
-    is in its way.
+    as it does. The system does not press the accelerator again, and rolls out with 1 m/s^2
+    while somebody is in its way.
 
     The library applies the rule of responsibility-sensitive safety (Shalev-Shwartz, Shammah,
     Shashua 2017) to the situation "same direction, the ego vehicle behind". Needs the extra

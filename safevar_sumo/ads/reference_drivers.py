@@ -61,13 +61,13 @@ class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
 class R157(ReferenceDriver, frozen=True, kw_only=True):
     """An automated lane keeping system that does what UN R157, 5.2.5, demands, and no more.
 
-    To who enters its way, and to who stands or drives steadily in it, it reacts at a TTC below (v -
-    u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, with the speeds v and u of the vehicle and the obstacle,
-    and brakes with 6 m/s^2 at once (5.2.5.2, which means it for cars that cut in). Behind a leader
-    that brakes, 5.2.5.1 counts: no collision if the time gap was at least 1 s + v / (100 km/h) s
-    before, as far as the driver has seen the leader. Then it brakes in the same way as soon as the
-    leader does, which is enough; nearer the regulation demands nothing, and it does not react to
-    the leader's braking.
+    The system reacts to who enters its way, and to who stands or drives steadily in it, at a TTC
+    below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, with the speeds v and u of the vehicle and the
+    obstacle, and brakes with 6 m/s^2 at once (5.2.5.2, which means it for cars that cut in). Behind
+    a leader that brakes, 5.2.5.1 counts: no collision if the time gap was at least 1 s + v / (100
+    km/h) s before, as far as the system has seen the leader. With this time gap, the system avoids
+    a collision if it brakes as the leader does. At a smaller gap the regulation demands nothing,
+    and the system does not react to the leader's braking.
 
     Parameters
     ----------
@@ -178,8 +178,8 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     """The fuzzy safety model (Mattas et al. 2020, "Fuzzy Surrogate Safety Metrics"), in UN R157 as
     amended.
 
-    It brakes according to two metrics: PFS rises as the gap falls below the safe distance, CFS as a
-    collision nears.
+    The driver brakes according to two metrics: PFS rises as the gap falls below the safe distance,
+    CFS as a collision nears.
 
     Parameters
     ----------

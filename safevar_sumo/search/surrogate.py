@@ -25,10 +25,10 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
 
     The first settings, as many as a population, change from one to all characteristics. In each
     round, models learn from all settings that were simulated, and NSGA-II, with the parameters of
-    `nsga2`, searches their prediction: 1,500 settings in generations of 100. Of the new settings
-    that it finds, 10 and a tenth of the number of known ones are simulated: four in five are the
-    best by crowding distance, the others those whose prediction is the most uncertain. The result
-    is the non-dominated archive over all evaluations.
+    `nsga2`, searches their prediction: 1,500 settings in generations of 100. Some of the
+    new settings are simulated: 10, and a tenth of the number of known ones. Four in five of them
+    are the best by crowding distance, the others those with the most uncertain prediction. The
+    result is the non-dominated archive over all evaluations.
     """
 
     def search(
