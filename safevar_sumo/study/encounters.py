@@ -106,7 +106,7 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
 
     Where encounters are ranges, the original vehicle drives in the same encounter as each variant,
     and must keep at least `margin` [m] between bodies there: otherwise the encounter does not
-    count, as it shows nothing of the variant. Without a margin all of them count. A simulator of
+    count, as it shows nothing of the variant. Without a margin all encounters count. A simulator of
     the user's own that is not deterministic simulates each setting `repeats` times: the share of
     unsafe runs, the worst run, and means of metrics count.
     """
