@@ -103,11 +103,10 @@ def show_simulation(
     Parameters
     ----------
     solution
-        Simulate this solution of the results, such as nsga2:3:0. The words smallest (changes),
-        fewest (changes) and most-severe (collision) choose an unsafe solution, too.
+        Simulate this solution of the results, such as nsga2:3:0. A word chooses an unsafe
+        solution: smallest or fewest (changes), or most-severe (collision).
     set
-        Change a value, such as "tireFric=1.1" or "mass=+8%"; may be repeated. "tireFric=1..2:6"
-        simulates a series of 6 values.
+        Change a value, such as "tireFric=1.1" or "mass=+8%"; may be repeated.
     beyond
         Accept values outside the domains (allowed ranges), and vehicles that violate a constraint
         of the study. Default: an error.

@@ -109,7 +109,7 @@ def permit(
         Find the highest safe value of this speed, such as target_speed. Default: the speed of the
         vehicle.
     step
-        Difference between two tested speeds. The answer is a multiple of it.
+        Step between two tested speeds. The answer is a multiple of this step.
     margin
         Clearance to keep between bumpers, in metres. Default: the value of the study, else 0.3 m.
     unsafe

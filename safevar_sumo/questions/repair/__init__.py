@@ -89,8 +89,9 @@ def repair(
     Parameters
     ----------
     promise
-        Wear up to which vehicles must be safe, such as "treadDepth >= 3", or all; may be repeated.
-        Default: the wear under [repair.promise] of the study, else under [limits].
+        Limit of wear within which the repair must keep all vehicles safe, such as "treadDepth >=
+        3", or all; may be repeated. Default: the limits under [repair.promise] of the study, else
+        under [limits].
     margin
         Clearance that every vehicle must keep between bumpers, in metres. Default: the value of the
         study, else 0.3 m.
