@@ -56,14 +56,22 @@ class Space(NamedTuple):
         width = (self.upper - self.lower)[: self.size]
         return np.where(width > 0, width, np.inf)
 
-    def of_vehicles(self, lower: FloatArray, upper: FloatArray) -> Space:
+    def of_vehicles(
+        self,
+        lower: FloatArray,
+        upper: FloatArray,
+    ) -> Space:
         """The cases of other vehicles in the same worlds and places."""
         return self._replace(
             lower=np.concatenate([lower, self.lower[self.size :]]),
             upper=np.concatenate([upper, self.upper[self.size :]]),
         )
 
-    def draw(self, number: int, rng: Generator) -> FloatArray:
+    def draw(
+        self,
+        number: int,
+        rng: Generator,
+    ) -> FloatArray:
         """Random cases, with half of the vehicles' values at ends."""
         points = rng.random((number, len(self.lower)))
         at_ends = rng.random(points.shape) < 0.5
@@ -71,40 +79,54 @@ class Space(NamedTuple):
         points = np.where(at_ends, np.round(points), points)
         return self.hold(self.lower + points * (self.upper - self.lower), rng)
 
-    def hold(self, cases: FloatArray, rng: Generator) -> FloatArray:
+    def hold(
+        self,
+        cases: FloatArray,
+        rng: Generator,
+    ) -> FloatArray:
         """Cases moved into the space."""
         cases = np.clip(cases, self.lower, self.upper)
         if self.center is None:
             return cases
         vehicles = cases[:, : self.size]
         changes = np.abs(vehicles - self.center) / self.width
-        kept = np.argmax(changes * rng.random(changes.shape), axis=1)
-        is_kept = np.arange(self.size) == kept[:, np.newaxis]
-        cases[:, : self.size] = np.where(is_kept, vehicles, self.center)
+        columns = np.argmax(changes * rng.random(changes.shape), axis=1)
+        is_chosen = np.arange(self.size) == columns[:, np.newaxis]
+        cases[:, : self.size] = np.where(is_chosen, vehicles, self.center)
         return cases
 
-    def children(self, parents: FloatArray, number: int, rng: Generator) -> FloatArray:
+    def children(
+        self,
+        parents: FloatArray,
+        number: int,
+        rng: Generator,
+    ) -> FloatArray:
         """Half of them mix two parents, and change about one value; half move towards a worse
         parent, and by a difference of two others. The worst parents come first.
         """
-        first, second, third, fourth = parents[
-            rng.integers(len(parents), size=(4, number))
-        ]
+        rows = rng.integers(len(parents), size=(4, number))
+        mothers, fathers, plus, minus = parents[rows]
         random = self.draw(number, rng)
-        mixed = np.where(rng.random(first.shape) < 0.5, first, second)
-        mutated = self._mutants(mixed, random, rng)
-        moved = first + PULL * (second - first) + DIFFERENCE * (third - fourth)
-        cases = np.where(np.arange(number)[:, np.newaxis] % 2, moved, mutated)
+        mixtures = np.where(rng.random(mothers.shape) < 0.5, mothers, fathers)
+        mutants = self._mutants(mixtures, random, rng)
+        moves = PULL * (fathers - mothers)
+        differences = DIFFERENCE * (plus - minus)
+        neighbours = mothers + moves + differences
+        is_odd = np.arange(number)[:, np.newaxis] % 2
+        cases = np.where(is_odd, neighbours, mutants)
 
         # A place has no meaning in another world.
-        is_other = rng.random(number) < OTHER_WORLD
-        cases[:, self.size] = np.where(
-            is_other, random[:, self.size], first[:, self.size]
-        )
+        column = self.size
+        is_elsewhere = rng.random(number) < OTHER_WORLD
+        worlds = np.where(is_elsewhere, random[:, column], mothers[:, column])
+        cases[:, column] = worlds
         return self.hold(cases, rng)
 
     def _mutants(
-        self, cases: FloatArray, random: FloatArray, rng: Generator
+        self,
+        cases: FloatArray,
+        random: FloatArray,
+        rng: Generator,
     ) -> FloatArray:
         """Cases of which about one value is random, a step towards that, or an end."""
         ends = np.where(rng.random(cases.shape) < 0.5, self.lower, self.upper)
@@ -145,7 +167,11 @@ class Counterexamples(NamedTuple):
         """What the worst case leaves; infinite without one that counts."""
         return float(self.robustness.min(initial=np.inf))
 
-    def after(self, cases: FloatArray, robustness: FloatArray) -> Counterexamples:
+    def after(
+        self,
+        cases: FloatArray,
+        robustness: FloatArray,
+    ) -> Counterexamples:
         """With the worst of further cases."""
         counts = np.isfinite(robustness)
         every_case = np.concatenate([self.cases, cases[counts]])
@@ -162,23 +188,27 @@ CaseSearch = Callable[[Space, FloatArray], Counterexamples]
 
 
 def search_cases(
-    judge: CaseJudge, space: Space, known: FloatArray, plan: SearchPlan, rng: Generator
+    judge: CaseJudge,
+    space: Space,
+    start: FloatArray,
+    plan: SearchPlan,
+    rng: Generator,
 ) -> Counterexamples:
     """Search a space for the cases that leave least, from known ones on, in generations; it ends
-    soon after one is unsafe.
+    soon after a case is unsafe.
     """
     size = plan.generation
-    more = plan.more
-    met = Counterexamples(known[:0], np.zeros(0))
-    cases = np.concatenate([space.hold(known, rng), space.draw(size, rng)])
-    while met.simulated < plan.budget and more >= 0:
-        cases = cases[: plan.budget - met.simulated]
-        met = met.after(cases, judge(cases))
-        more -= len(met.unsafe) > 0
-        parents = met.cases[:PARENTS]
+    generations = plan.more
+    results = Counterexamples(start[:0], np.zeros(0))
+    cases = np.concatenate([space.hold(start, rng), space.draw(size, rng)])
+    while results.simulated < plan.budget and generations >= 0:
+        cases = cases[: plan.budget - results.simulated]
+        results = results.after(cases, judge(cases))
+        generations -= len(results.unsafe) > 0
+        parents = results.cases[:PARENTS]
         cases = (
             space.children(parents, size, rng)
             if len(parents)
             else space.draw(size, rng)
         )
-    return met
+    return results

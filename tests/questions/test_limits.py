@@ -25,14 +25,14 @@ from safevar_sumo.questions.tolerance.alone import (
 )
 from safevar_sumo.questions.tolerance.boxes import (
     Boxes,
-    Known,
+    Failures,
+    cut,
     find_largest_box,
     learn,
+    reduce_changes,
     settle,
-    shrunk,
-    widened,
-    with_fewest_changes,
-    without,
+    shrink,
+    widen,
 )
 from safevar_sumo.records import FloatArray
 
@@ -131,15 +131,15 @@ def unsafe_in(boxes: Boxes, sides: Sides, judge: CaseJudge) -> int:
 def largest(boxes: Boxes, known: FloatArray | None = None, seed: int = 0) -> Sides:
     n = boxes.space.size
     rng = default_rng(seed)
-    start = Known(nothing(n) if known is None else known, nothing(n))
+    start = Failures(nothing(n) if known is None else known, nothing(n))
     quick, thorough = (
         search_of(boxes.judge, 1024, seed),
         search_of(boxes.judge, 5000, seed + 1),
     )
     settled = find_largest_box(boxes, start, quick, thorough, rng)
     assert settled.sides is not None
-    assert settled.attacked >= 5000
-    assert settled.least >= 0
+    assert settled.attack.simulated >= 5000
+    assert settled.attack.least >= 0
     return settled.sides
 
 
@@ -172,12 +172,12 @@ def test_no_box_where_what_is_given_fails() -> None:
     boxes = boxes_of(2, unsafe_where(lambda cases: cases[:, 0] > 7), {(1, 0): 4.0})
     settled = settle(
         boxes,
-        Known(nothing(2), nothing(2)),
+        Failures(nothing(2), nothing(2)),
         boxes.longest,
         [search_of(boxes.judge, 2000)],
     )
     assert settled.sides is None
-    assert settled.known.boxes == 1, "nothing can cut this off"
+    assert settled.failures.boxes == 1, "nothing can cut this off"
 
 
 def test_limits_alone_end_before_the_first_island() -> None:
@@ -309,9 +309,9 @@ def test_no_box_without_failures_is_larger_than_the_cut() -> None:
     """Of all that move one limit in for each failure."""
     failures = default_rng(1).uniform(0, 10, (7, 2))
     boxes = boxes_of(2, linear)
-    known = Known(cases_of(*failures.tolist()), nothing(2))
-    cut = without(boxes, boxes.longest, known, 0.0)
-    assert not len(known.inside(boxes, cut))
+    known = Failures(cases_of(*failures.tolist()), nothing(2))
+    box = cut(boxes, boxes.longest, known, 0.0)
+    assert not len(known.inside(boxes, box))
     volumes = []
     for columns in product((0, 1), repeat=7):
         sides = boxes.longest.copy()
@@ -319,17 +319,17 @@ def test_no_box_without_failures_is_larger_than_the_cut() -> None:
             side = np.argmax(failure[:, column])
             sides[side, column] = min(sides[side, column], failure[side, column])
         volumes.append(boxes.log_volume(sides))
-    assert boxes.log_volume(cut) == pytest.approx(max(volumes), abs=1e-6)
+    assert boxes.log_volume(box) == pytest.approx(max(volumes), abs=1e-6)
 
 
 def test_a_cut_keeps_off_failures_by_its_clearance_and_cuts_no_given_side() -> None:
-    known = Known(cases_of([9.0, 9.5], [9.5, 8.0]), nothing(2))
+    known = Failures(cases_of([9.0, 9.5], [9.5, 8.0]), nothing(2))
     boxes = boxes_of(2, linear)
-    near, far = (without(boxes, boxes.longest, known, moves) for moves in (0.5, 5.0))
+    near, far = (cut(boxes, boxes.longest, known, moves) for moves in (0.5, 5.0))
     assert near[1].tolist() == [pytest.approx(3.9), 5.0], "one limit cuts both off"
     assert far[1].tolist() == [pytest.approx(3.0), 5.0]
     given = boxes_of(2, linear, {(1, 0): 5.0})
-    assert without(given, given.longest, known, 0.5)[1].tolist() == [
+    assert cut(given, given.longest, known, 0.5)[1].tolist() == [
         5.0,
         pytest.approx(2.9),
     ]
@@ -341,9 +341,9 @@ def test_causes_are_as_few_changes_as_possible_and_places_where_the_box_was_unsa
     judge = unsafe_where(lambda cases: (cases[:, 0] > 7) & (cases[:, 1] < 3))
     boxes = boxes_of(3, judge)
     unsafe = cases_of([9, 1, 8], [8, 2, 5])
-    causes = with_fewest_changes(judge, boxes.original, unsafe)
+    causes = reduce_changes(judge, boxes.original, unsafe)
     assert causes[:, :3].tolist() == [[9, 1, 5], [8, 2, 5]]
-    known = learn(boxes, Known(nothing(3), nothing(3)), unsafe, boxes.longest)
+    known = learn(boxes, Failures(nothing(3), nothing(3)), unsafe, boxes.longest)
     assert known.boxes == 1
     assert (judge(known.cases) < 0).all()
     assert known.cases[:, 0].min() == pytest.approx(7, abs=0.02), (
@@ -356,15 +356,16 @@ def test_causes_are_as_few_changes_as_possible_and_places_where_the_box_was_unsa
 def test_a_box_grows_up_to_a_wall_and_shrinks_from_what_is_beyond() -> None:
     judge = unsafe_where(lambda cases: (cases[:, 0] > 7) & (cases[:, 1] > 4))
     boxes = boxes_of(2, judge)
-    known = Known(nothing(2), cases_of([1.0, 0.0]))
-    inner = shrunk(boxes, known, boxes.longest)
+    known = Failures(nothing(2), cases_of([1.0, 0.0]))
+    inner = shrink(boxes, known, boxes.longest)
     assert inner[1, 0] == pytest.approx(2, abs=0.02)
-    sides = widened(boxes, known, inner, default_rng(0))
+    sides = widen(boxes, known, inner, default_rng(0))
     assert sides[1, 0] == pytest.approx(2, abs=0.1)
     assert sides[1, 0] <= 2
     assert sides[:, 1].tolist() == [5, 5]
     assert (
-        shrunk(boxes, Known(nothing(2), nothing(2)), inner).tolist() == inner.tolist()
+        shrink(boxes, Failures(nothing(2), nothing(2)), inner).tolist()
+        == inner.tolist()
     )
 
 

@@ -15,6 +15,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
+from safevar_sumo.questions.cases import Counterexamples
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import limit_criterion, models_of
@@ -163,22 +164,22 @@ def tolerance(
     of_whole = original if up_to is None else _original_of(whole)
     reference = of_whole if of_whole.valid[0] else original
     criterion = limit_criterion(whole, subject, unsafe, margin, reference)
-    asked = LimitsQuestion(
+    request = LimitsQuestion(
         subject, whole, criterion, unsafe, margin, columns, specified, fits, at_tests
     )
 
     # Limits up to a value lie within those up to each smaller one.
-    outer = None
+    wider = None
     for cut in map(whole.for_study, smaller):
-        if not asked.is_unsafe(_original_of(cut)):
-            outer = find_limits(_asked_of(asked, cut), outer)
-    is_safe = not asked.is_unsafe(original)
-    last = _asked_of(asked if is_safe else asked._replace(fits=0), evaluator)
-    found = find_limits(last, outer) if is_safe else no_limits(last)
+        if not request.is_unsafe(_original_of(cut)):
+            wider = find_limits(_asked_of(request, cut), wider)
+    is_safe = not request.is_unsafe(original)
+    task = _asked_of(request if is_safe else request._replace(fits=0), evaluator)
+    results = find_limits(task, wider) if is_safe else no_limits(task)
     is_few = evaluator.left is not None
-    told = Told(
-        asked=last,
-        limits=found,
+    facts = Told(
+        task=task,
+        limits=results,
         unsafe=criterion,
         original=original,
         columns=columns,
@@ -189,11 +190,13 @@ def tolerance(
         tests_left_out=names_left_out(whole.study, study),
     )
     ranges = (
-        _in_ranges(asked, evaluator, found) if is_safe and not told.is_rough else None
+        _in_ranges(request, evaluator, results)
+        if is_safe and not facts.is_rough
+        else None
     )
-    has_nearest = told.broken and is_safe and not is_few
-    nearest = nearest_limits(last, found) if has_nearest else None
-    return answer_limits(told, nearest, ranges)
+    has_nearest = facts.broken and is_safe and not is_few
+    nearest = nearest_limits(task, results) if has_nearest else None
+    return answer_limits(facts, nearest, ranges)
 
 
 def _original_of(evaluator: Evaluator) -> Evaluations:
@@ -220,34 +223,38 @@ def _usual_settings(
     return phases
 
 
-def _asked_of(asked: LimitsQuestion, evaluator: Evaluator) -> Asked:
+def _asked_of(request: LimitsQuestion, evaluator: Evaluator) -> Asked:
     """The limits that are sought in a part of the study."""
-    models = models_of(evaluator, asked.unsafe, asked.fits)
+    models = models_of(evaluator, request.unsafe, request.fits)
     sought = asked_of(
-        models, asked.unsafe, asked.columns, asked.limits, at_tests=asked.at_tests
+        models,
+        request.unsafe,
+        request.columns,
+        request.limits,
+        at_tests=request.at_tests,
     )
-    return sought._replace(avoided=_unsafe_solutions(asked, evaluator))
+    return sought._replace(avoided=_unsafe_solutions(request, evaluator))
 
 
-def _unsafe_solutions(asked: LimitsQuestion, evaluator: Evaluator) -> FloatArray:
+def _unsafe_solutions(request: LimitsQuestion, evaluator: Evaluator) -> FloatArray:
     """The vehicles of unsafe solutions of results that change no others than what varies, shape (K,
     n).
     """
     members = evaluator.characteristics
-    subject, vehicle = asked.subject, members.vehicle
+    subject, vehicle = request.subject, members.vehicle
     if isinstance(subject, Study):
         return np.zeros((0, len(vehicle)))
-    frame = subject.solutions[asked.unsafe.rows(subject.solutions)]
+    frame = subject.solutions[request.unsafe.rows(subject.solutions)]
     settings = frame[list(members.names)].to_numpy(dtype=float)
     is_original = settings[:, : len(vehicle)] == vehicle.original
-    varies = np.isin(range(len(vehicle)), asked.columns)
+    varies = np.isin(range(len(vehicle)), request.columns)
     settings = np.unique(settings[is_original[:, ~varies].all(axis=1)], axis=0)
-    if evaluator is not asked.whole and len(settings):
+    if evaluator is not request.whole and len(settings):
         # They are unsafe in the whole study; those in encounters above the value do not count.
         is_inside = (settings >= members.lower) & (settings <= members.upper)
         settings = settings[is_inside.all(axis=1)]
         runs = evaluator.evaluate(settings, "unsafe solutions")
-        settings = settings[runs.valid & asked.unsafe.of(runs)]
+        settings = settings[runs.valid & request.unsafe.of(runs)]
     return np.asarray(settings[:, : len(vehicle)])
 
 
@@ -271,7 +278,7 @@ def _check_drawable(evaluator: Evaluator) -> None:
 
 
 def _in_ranges(
-    asked: LimitsQuestion, evaluator: Evaluator, limits: FoundLimits
+    request: LimitsQuestion, evaluator: Evaluator, limits: FoundLimits
 ) -> InRanges | None:
     """What a search for counterexamples to the limits finds in the ranges that a study states
     beside its tests; to the specified ones without joint limits.
@@ -280,22 +287,21 @@ def _in_ranges(
     sides = limits.specified if limits.sides is None else limits.sides
     if study is None or not sides.any():
         return None
-    other = evaluator.for_study(study)
+    wider = evaluator.for_study(study)
     try:
-        original = other.evaluate_original()
+        original = wider.evaluate_original()
     except InputError as error:
         warn(f"the limits are not tried in the ranges of the study: {error.problem}")
         return None
-    unsafe = limit_criterion(other, study, asked.stated, asked.margin, original)
-    there = _asked_of(asked._replace(unsafe=unsafe, subject=study, whole=other), other)
-    rngs = [Stream.WIDER_SCOPE.generator(other.seed, fit) for fit in there.fits]
-    space = there.boxes(there.domain).cases_in(sides)
+    unsafe = limit_criterion(wider, study, request.stated, request.margin, original)
+    task = _asked_of(request._replace(unsafe=unsafe, subject=study, whole=wider), wider)
+    space = task.boxes(task.domain).cases_in(sides)
+    attacks = dict[int, Counterexamples]()
     with evaluator.phases.stage(RANGES_STAGE):
-        attacks = [
-            there.search(fit, there.budget(fit), rng)(space, there.nothing)
-            for fit, rng in zip(there.fits, rngs, strict=True)
-        ]
-    return InRanges(there, unsafe, attacks)
+        for fit in task.fits:
+            search = task.search(Stream.WIDER_SCOPE, fit)
+            attacks[fit] = search(space, task.nothing)
+    return InRanges(task, unsafe, attacks)
 
 
 def study_in_ranges(study: Study) -> Study | None:

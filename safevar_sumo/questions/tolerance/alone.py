@@ -32,15 +32,19 @@ class Alone(NamedTuple):
     upper: FloatArray
     beyond: Mapping[Side, FloatArray] = {}
 
-    def without(self, cases: FloatArray, center: FloatArray) -> Alone:
+    def without(
+        self,
+        cases: FloatArray,
+        center: FloatArray,
+    ) -> Alone:
         """Limits that leave no room on the sides where some cases are."""
-        lower, upper = self.lower.copy(), self.upper.copy()
         vehicles = cases[:, : len(center)]
         is_below = (vehicles < center).any(axis=0)
         is_above = (vehicles > center).any(axis=0)
-        lower[is_below] = center[is_below]
-        upper[is_above] = center[is_above]
-        return self._replace(lower=lower, upper=upper)
+        return self._replace(
+            lower=np.where(is_below, center, self.lower),
+            upper=np.where(is_above, center, self.upper),
+        )
 
 
 def scan_alone(
@@ -57,29 +61,33 @@ def scan_alone(
     center = _center_of(star)
 
     # Each line leads from the original to an end, in one encounter.
-    starts = np.hstack([np.tile(center, (len(encounters), 1)), encounters])
-    lines = []
-    for column in range(star.size):
-        for end in (limits.lower, limits.upper):
-            if end[column] != center[column]:
-                line = starts.copy()
-                line[:, column] = end[column]
-                lines.append(line)
-    if not lines:
-        return limits
-    last = np.concatenate(lines)
-    first = np.tile(starts, (len(lines), 1))
-    shares = np.arange(1, values + 1)[:, np.newaxis, np.newaxis] / values
-    on_lines = first + shares * (last - first)
-    on_lines[-1] = last
-    robustness = judge(on_lines.reshape(-1, last.shape[1]))
-    is_unsafe = robustness.reshape(on_lines.shape[:2]) < 0
+    ends = np.stack([limits.lower, limits.upper], axis=1)
+    columns, sides = np.nonzero(ends != center[:, np.newaxis])
+    number = len(encounters)
+    originals = np.hstack([np.tile(center, (number, 1)), encounters])
+    starts = np.tile(originals, (len(columns), 1))
+    lasts = starts.copy()
+    rows = np.arange(len(lasts))
+    lasts[rows, columns.repeat(number)] = ends[columns, sides].repeat(number)
 
-    # The first unsafe value of each line; the one before it is safe.
-    fails = np.flatnonzero(is_unsafe.any(axis=0))
-    number = np.argmax(is_unsafe, axis=0)[fails]
-    unsafe = on_lines[number, fails]
-    return limits_before(judge, star, limits, unsafe, parts, number / (number + 1))
+    # The first unsafe value of each line; the value before it is safe.
+    lines = find_boundaries(
+        starts,
+        lasts,
+        lambda cases: judge(cases) < 0,
+        [values],
+    )
+    fails = np.flatnonzero((judge(lasts) < 0) | (lines.unsafe_shares < 1))
+    passed = np.rint(lines.safe_shares[fails] * values)
+    lowest = passed / (passed + 1)
+    return limits_before(
+        judge,
+        star,
+        limits,
+        lines.unsafe[fails],
+        parts,
+        lowest,
+    )
 
 
 def limits_before(
@@ -95,17 +103,22 @@ def limits_before(
     starts = unsafe.copy()
     starts[:, : star.size] = center
     lines = find_boundaries(
-        starts, unsafe, lambda cases: judge(cases) < 0, parts, lowest
+        starts,
+        unsafe,
+        lambda cases: judge(cases) < 0,
+        parts,
+        lowest,
     )
-    lower, upper, beyond = limits.lower.copy(), limits.upper.copy(), {**limits.beyond}
+    ends = np.stack([limits.lower, limits.upper])
+    beyond = {**limits.beyond}
     for safe, failure in zip(lines.safe, lines.unsafe, strict=True):
         (column,) = np.flatnonzero(failure[: star.size] != center).tolist()
-        value = safe[column]
-        is_above = failure[column] > center[column]
-        end = upper if is_above else lower
-        if value < end[column] if is_above else value > end[column]:
-            end[column] = value
-            beyond[int(is_above), column] = failure
+        side = int(failure[column] > center[column])
+        sign = 2 * side - 1
+        if sign * safe[column] < sign * ends[side, column]:
+            ends[side, column] = safe[column]
+            beyond[side, column] = failure
+    lower, upper = ends
     return Alone(lower, upper, beyond)
 
 
@@ -117,12 +130,20 @@ def search_alone(
     parts: Sequence[int],
 ) -> Alone:
     """Limits of a star in which a search finds nothing, within known ones."""
-    unsafe = star.lower[np.newaxis][:0]
+    start = star.lower[np.newaxis][:0]
+    unsafe = start
     for _ in range(MOST_SEARCHES):
-        unsafe = search(star.of_vehicles(limits.lower, limits.upper), unsafe[:0]).unsafe
+        space = star.of_vehicles(limits.lower, limits.upper)
+        unsafe = search(space, start).unsafe
         if not len(unsafe):
             return limits
-        limits = limits_before(judge, star, limits, unsafe, parts)
+        limits = limits_before(
+            judge,
+            star,
+            limits,
+            unsafe,
+            parts,
+        )
     return limits.without(unsafe, _center_of(star))
 
 

@@ -6,10 +6,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.random import Generator
 
 from safevar_sumo.errors import InputError, about, check_name
 from safevar_sumo.metrics import Unsafe
@@ -23,6 +23,7 @@ from safevar_sumo.questions.cases import (
 )
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.boxes import BoxEffort, Boxes
 from safevar_sumo.questions.tolerance.oracle import Oracle
 from safevar_sumo.records import FloatArray
@@ -148,22 +149,37 @@ class Asked(NamedTuple):
         return self.star.lower[np.newaxis][:0]
 
     def search(
-        self, fit: int, budget: int, rng: Generator, *, phases: bool = True
+        self,
+        stream: Stream,
+        fit: int,
+        budget: int | None = None,
+        *,
+        phases: bool = True,
     ) -> CaseSearch:
-        """A search for unsafe cases with a parameter set."""
-        oracle, plan = self.oracle, self.effort.plan(budget)
-
-        def search(space: Space, known: FloatArray) -> Counterexamples:
-            n = space.size
-            there = oracle.space(fit, space.lower[:n], space.upper[:n], phases=phases)
-            there = there._replace(center=space.center)
-            return search_cases(oracle, there, known, plan, rng)
-
+        """A search for unsafe cases with a parameter set, by default for a counterexample to a
+        box.
+        """
+        if budget is None:
+            budget = self.effort.other if fit else self.effort.own
+        (search,) = self.searches(stream, fit, [budget], phases=phases)
         return search
 
-    def budget(self, fit: int) -> int:
-        """The cases that search for a counterexample to a box with a parameter set."""
-        return self.effort.other if fit else self.effort.own
+    def searches(
+        self, stream: Stream, fit: int, budgets: Sequence[int], *, phases: bool
+    ) -> list[CaseSearch]:
+        """Searches with some numbers of cases, which draw from the same stream in turn."""
+        oracle = self.oracle
+        rng = stream.generator(self.seed, fit)
+
+        def search(
+            plan: SearchPlan, space: Space, start: FloatArray
+        ) -> Counterexamples:
+            n = space.size
+            cases = oracle.space(fit, space.lower[:n], space.upper[:n], phases=phases)
+            cases = cases._replace(center=space.center)
+            return search_cases(oracle, cases, start, plan, rng)
+
+        return [partial(search, self.effort.plan(budget)) for budget in budgets]
 
     def boxes(self, longest: FloatArray) -> Boxes:
         """Boxes with the specified limits, whose other sides are at most so long."""

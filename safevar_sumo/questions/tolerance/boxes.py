@@ -99,8 +99,12 @@ class Boxes(NamedTuple):
     @property
     def width(self) -> FloatArray:
         """The widths of the domains; 0 where there is only one value."""
-        width = self.space.width
-        return np.where(np.isinf(width), 0.0, width)
+        space = self.space
+        return (space.upper - space.lower)[: space.size]
+
+    def are_unsafe(self, cases: FloatArray) -> BoolArray:
+        """Which cases are unsafe."""
+        return self.judge(cases) < 0
 
     @property
     def fixed(self) -> FloatArray:
@@ -118,13 +122,11 @@ class Boxes(NamedTuple):
     def log_volume(self, sides: FloatArray) -> FloatArray:
         """The logarithm of the volume of boxes, shape (..., 2, n), as a share of the domain's."""
         is_open = self.width > 0
-        shares = np.divide(
-            sides.sum(axis=-2),
-            self.width,
-            out=np.ones_like(sides[..., 0, :]),
-            where=is_open,
-        )
-        return np.asarray(np.log(np.maximum(shares, ROUNDING)).sum(axis=-1))
+        lengths = sides.sum(axis=-2)
+        shares = np.ones_like(lengths)
+        np.divide(lengths, self.width, out=shares, where=is_open)
+        logarithms = np.log(np.maximum(shares, ROUNDING))
+        return np.asarray(logarithms.sum(axis=-1))
 
     def extents(self, cases: FloatArray) -> FloatArray:
         """The sides that a box needs to hold each of K cases, shape (K, 2, n)."""
@@ -132,24 +134,35 @@ class Boxes(NamedTuple):
         of_sides = np.stack([-changes, changes], axis=1)
         return np.maximum(of_sides - ROUNDING * self.width, 0.0)
 
-    def shares(self, cases: FloatArray, sides: FloatArray) -> FloatArray:
+    def shares(
+        self,
+        cases: FloatArray,
+        sides: FloatArray,
+    ) -> FloatArray:
         """Where cases lie in a box: their changes as shares of its sides."""
         n = self.space.size
         changes = cases[:, :n] - self.original
         side = np.where(changes > 0, sides[1], sides[0])
-        shares = np.divide(changes, side, out=np.zeros_like(changes), where=side > 0)
+        shares = np.zeros_like(changes)
+        np.divide(changes, side, out=shares, where=side > 0)
         return np.hstack([shares, cases[:, n:]])
 
-    def cases_at(self, places: FloatArray, sides: FloatArray) -> FloatArray:
+    def cases_at(
+        self,
+        places: FloatArray,
+        sides: FloatArray,
+    ) -> FloatArray:
         """The cases at C places of B boxes, shape (B, C, n + 1 + k)."""
         n = self.space.size
         shares = places[:, :n]
+        encounters = places[:, n:]
         ends = np.where(shares > 0, sides[:, 1:], sides[:, :1])
-        rest = np.broadcast_to(places[:, n:], (len(sides), *places[:, n:].shape))
-        return np.concatenate([self.original + shares * ends, rest], axis=2)
+        shape = (len(sides), *encounters.shape)
+        repeated = np.broadcast_to(encounters, shape)
+        return np.concatenate([self.original + shares * ends, repeated], axis=2)
 
 
-class Known(NamedTuple):
+class Failures(NamedTuple):
     """What is known to fail: unsafe cases with as few changes as possible, the places of boxes
     where such cases were, and the number of these boxes.
     """
@@ -158,29 +171,48 @@ class Known(NamedTuple):
     places: FloatArray
     boxes: int = 0
 
-    def at_places(self, boxes: Boxes, sides: FloatArray) -> FloatArray:
+    def at_places(
+        self,
+        boxes: Boxes,
+        sides: FloatArray,
+    ) -> FloatArray:
         """The cases at the places of a box where failures were."""
-        return np.asarray(boxes.cases_at(self.places, sides[np.newaxis])[0])
+        (cases,) = boxes.cases_at(self.places, sides[np.newaxis])
+        return np.asarray(cases)
 
-    def inside(self, boxes: Boxes, sides: FloatArray) -> FloatArray:
+    def inside(
+        self,
+        boxes: Boxes,
+        sides: FloatArray,
+    ) -> FloatArray:
         """The cases that a box holds."""
         is_inside = (boxes.extents(self.cases) <= sides).all(axis=(1, 2))
         return np.asarray(self.cases[is_inside])
 
 
-class Settled(NamedTuple):
-    """The sides of a box in which no search finds anything, None without one; what is known then;
-    how many cases the searches met, and the least that these leave.
-    """
+class Attack(NamedTuple):
+    """The number of cases that searched limits, and the least that these leave."""
 
-    sides: FloatArray | None
-    known: Known
-    attacked: int = 0
+    simulated: int = 0
     least: float = math.inf
 
 
+class Settled(NamedTuple):
+    """The sides of a box in which no search finds anything, None without one; what is known to
+    fail then; and the searches.
+    """
+
+    sides: FloatArray | None
+    failures: Failures
+    attack: Attack = Attack()
+
+
 def find_largest_box(
-    boxes: Boxes, known: Known, quick: CaseSearch, thorough: CaseSearch, rng: Generator
+    boxes: Boxes,
+    failures: Failures,
+    quick: CaseSearch,
+    thorough: CaseSearch,
+    rng: Generator,
 ) -> Settled:
     """The largest box in which a thorough search finds nothing; a quick one teaches where failures
     are.
@@ -188,60 +220,81 @@ def find_largest_box(
     effort = boxes.effort
     sides = boxes.longest
     for _ in range(effort.explored):
-        start = without(boxes, sides, known, effort.retreat)
-        sides = widened(boxes, known, shrunk(boxes, known, start), rng)
-        unsafe = quick(boxes.cases_in(sides), known.at_places(boxes, sides)).unsafe
+        start = cut(boxes, sides, failures, effort.retreat)
+        core = shrink(boxes, failures, start)
+        sides = widen(boxes, failures, core, rng)
+        places = failures.at_places(boxes, sides)
+        unsafe = quick(boxes.cases_in(sides), places).unsafe
         if not len(unsafe):
             break
-        known = learn(boxes, known, unsafe, sides)
-    best = settle(boxes, known, sides, [thorough])
+        failures = learn(boxes, failures, unsafe, sides)
+    best = settle(boxes, failures, sides, [thorough])
     for _ in range(effort.growths):
         if best.sides is None:
             break
-        best = _grown(boxes, best, thorough, rng)
+        best = _grow(
+            boxes,
+            best,
+            best.sides,
+            thorough,
+            rng,
+        )
     return best
 
 
-def _grown(boxes: Boxes, best: Settled, search: CaseSearch, rng: Generator) -> Settled:
-    """A box that passed, or a larger one from it that passes, without what is known then."""
-    assert best.sides is not None
-    wider = widened(boxes, best.known, best.sides, rng)
-    grown = settle(boxes, best.known, wider, [search])
-    cut = boxes.printed(without(boxes, best.sides, grown.known, 0.0))
-    if grown.sides is None or boxes.log_volume(grown.sides) <= boxes.log_volume(cut):
-        return best._replace(sides=cut, known=grown.known)
-    return grown
+def _grow(
+    boxes: Boxes,
+    best: Settled,
+    sides: FloatArray,
+    search: CaseSearch,
+    rng: Generator,
+) -> Settled:
+    """The best box so far, or a larger one from its sides that passes, without what is known to
+    fail then.
+    """
+    wider = widen(boxes, best.failures, sides, rng)
+    grown = settle(boxes, best.failures, wider, [search])
+    smaller = boxes.printed(cut(boxes, sides, grown.failures, 0.0))
+    if grown.sides is not None:
+        gain = boxes.log_volume(grown.sides) - boxes.log_volume(smaller)
+        if gain > 0:
+            return grown
+    return best._replace(sides=smaller, failures=grown.failures)
 
 
 def settle(
-    boxes: Boxes, known: Known, sides: FloatArray, searches: Sequence[CaseSearch]
+    boxes: Boxes,
+    failures: Failures,
+    sides: FloatArray,
+    searches: Sequence[CaseSearch],
 ) -> Settled:
     """A box within another one in which no search finds anything."""
     for number in range(MOST_CUTS):
-        if len(known.inside(boxes, boxes.fixed)):
+        if len(failures.inside(boxes, boxes.fixed)):
             break
-        sides = boxes.printed(
-            without(boxes, sides, known, boxes.effort.retreat * number)
-        )
-        space, places = boxes.cases_in(sides), known.at_places(boxes, sides)
-        attacked, least, unsafe = 0, math.inf, places[:0]
+        clearance = boxes.effort.retreat * number
+        sides = boxes.printed(cut(boxes, sides, failures, clearance))
+        space = boxes.cases_in(sides)
+        places = failures.at_places(boxes, sides)
+        simulated = 0
+        least = math.inf
         for search in searches:
-            met = search(space, places)
-            attacked, least, unsafe = (
-                attacked + met.simulated,
-                min(least, met.least),
-                met.unsafe,
-            )
-            if len(unsafe):
+            result = search(space, places)
+            simulated += result.simulated
+            least = min(least, result.least)
+            if len(result.unsafe):
+                failures = learn(boxes, failures, result.unsafe, sides)
                 break
-        if not len(unsafe):
-            return Settled(sides, known, attacked, least)
-        known = learn(boxes, known, unsafe, sides)
-    return Settled(None, known)
+        else:
+            return Settled(sides, failures, Attack(simulated, least))
+    return Settled(None, failures)
 
 
-def without(
-    boxes: Boxes, sides: FloatArray, known: Known, clearance: float
+def cut(
+    boxes: Boxes,
+    sides: FloatArray,
+    failures: Failures,
+    clearance: float,
 ) -> FloatArray:
     """The largest sides within some sides that hold none of the known cases that a free side can
     cut off, by branch and bound. Limits keep off each failure by a `clearance`, in moves.
@@ -249,73 +302,82 @@ def without(
     Each failure is cut off by one side. The largest box that waits comes first, so that the first
     one without failures is the largest; after `MOST_BRANCHES` only the best cut is followed.
     """
-    extents = boxes.extents(known.cases)
-    distance = np.minimum(
-        clearance * LEAST_MOVE * boxes.width, boxes.effort.farthest * extents
-    )
+    extents = boxes.extents(failures.cases)
+    farthest = boxes.effort.farthest * extents
+    distance = np.minimum(clearance * LEAST_MOVE * boxes.width, farthest)
     # A cut excludes its own failure also after rounding, so that this ends.
     ends = np.maximum(extents - distance - ROUNDING * boxes.width, 0.0)
     is_choice = boxes.is_free & (extents > 0)
     extents[~is_choice.any(axis=(1, 2))] = np.inf
     numbers = count()
-    waiting = [(0.0, next(numbers), sides)]
+    queue = [(0.0, next(numbers), sides)]
     for branch in count():
-        sides = heappop(waiting)[-1]
-        inside = np.flatnonzero((extents <= sides).all(axis=(1, 2)))
-        if not len(inside):
+        sides = heappop(queue)[-1]
+        is_inside = (extents <= sides).all(axis=(1, 2))
+        if not is_inside.any():
             return sides
 
         # The failure whose best cut costs most is cut off first.
+        rows = np.flatnonzero(is_inside)
         lengths = np.maximum(sides.sum(axis=0), ROUNDING)
-        kept = (lengths - sides + ends[inside]) / lengths
-        kept = np.where(is_choice[inside], kept, 0.0)
-        hardest = inside[np.argmin(kept.max(axis=(1, 2)))]
+        shares = (lengths - sides + ends[rows]) / lengths
+        shares = np.where(is_choice[rows], shares, 0.0)
+        row = rows[np.argmin(shares.max(axis=(1, 2)))]
         if branch > MOST_BRANCHES:
-            waiting = []
-        for side, column in np.argwhere(is_choice[hardest]):
+            queue = []
+        for side, column in np.argwhere(is_choice[row]):
             smaller = sides.copy()
-            smaller[side, column] = ends[hardest, side, column]
-            heappush(
-                waiting, (-float(boxes.log_volume(smaller)), next(numbers), smaller)
-            )
+            smaller[side, column] = ends[row, side, column]
+            loss = -float(boxes.log_volume(smaller))
+            heappush(queue, (loss, next(numbers), smaller))
     raise AssertionError("the first box without failures is the largest")
 
 
-def learn(boxes: Boxes, known: Known, unsafe: FloatArray, sides: FloatArray) -> Known:
+def learn(
+    boxes: Boxes,
+    failures: Failures,
+    unsafe: FloatArray,
+    sides: FloatArray,
+) -> Failures:
     """What is known with the unsafe cases of a box: as few of their changes as possible."""
-    spread = unsafe[:: math.ceil(len(unsafe) / boxes.effort.learnt)]
-    causes = with_fewest_changes(boxes.judge, boxes.original, spread)
+    step = math.ceil(len(unsafe) / boxes.effort.learnt)
+    causes = reduce_changes(boxes.judge, boxes.original, unsafe[::step])
     starts = causes.copy()
     starts[:, : boxes.space.size] = boxes.original
-    lines = find_boundaries(
-        starts, causes, lambda cases: boxes.judge(cases) < 0, boxes.effort.parts
-    )
+    parts = boxes.effort.parts
+    lines = find_boundaries(starts, causes, boxes.are_unsafe, parts)
 
     # A place for each combination of changes in each world: that of the worst case.
     n = boxes.space.size
     directions = np.sign(causes[:, :n] - boxes.original)
     kinds = np.column_stack([directions, np.floor(causes[:, n])])
     rows = np.sort(np.unique(kinds, axis=0, return_index=True)[1])
-    places = np.concatenate([boxes.shares(causes[rows], sides), known.places])
-    cases = np.concatenate([lines.unsafe, known.cases])
-    return Known(cases, places[: boxes.effort.places], known.boxes + 1)
+    places = np.concatenate([boxes.shares(causes[rows], sides), failures.places])
+    cases = np.concatenate([lines.unsafe, failures.cases])
+    return Failures(cases, places[: boxes.effort.places], failures.boxes + 1)
 
 
-def with_fewest_changes(
-    judge: CaseJudge, original: FloatArray, unsafe: FloatArray
+def reduce_changes(
+    judge: CaseJudge,
+    original: FloatArray,
+    unsafe: FloatArray,
 ) -> FloatArray:
-    """Unsafe cases with as few changes as possible, undone one after another."""
+    """Unsafe cases with as few changes as possible, undone in turn."""
     causes = unsafe.copy()
     for column, value in enumerate(original):
-        undone = causes.copy()
-        undone[:, column] = value
+        candidates = causes.copy()
+        candidates[:, column] = value
         rows = np.flatnonzero(causes[:, column] != value)
-        rows = rows[judge(undone[rows]) < 0]
-        causes[rows] = undone[rows]
+        rows = rows[judge(candidates[rows]) < 0]
+        causes[rows] = candidates[rows]
     return causes
 
 
-def shrunk(boxes: Boxes, known: Known, sides: FloatArray) -> FloatArray:
+def shrink(
+    boxes: Boxes,
+    failures: Failures,
+    sides: FloatArray,
+) -> FloatArray:
     """A box whose free sides are the largest share of those of another one with which it is safe
     at known places.
     """
@@ -324,55 +386,74 @@ def shrunk(boxes: Boxes, known: Known, sides: FloatArray) -> FloatArray:
         return np.where(boxes.is_free, shares[..., np.newaxis] * sides, boxes.longest)
 
     def are_unsafe(shares: FloatArray) -> BoolArray:
-        tried = at_share(shares)
-        holds_nothing = np.array([*_hold_nothing(boxes, known, tried)])
-        return ~(holds_nothing & _are_safe(boxes, known, tried))
+        candidates = at_share(shares)
+        is_empty = np.array([*_are_empty(boxes, failures, candidates)])
+        return ~(is_empty & _are_safe(boxes, failures, candidates))
 
-    whole = np.ones((1, 1))
-    if not are_unsafe(whole)[0]:
+    full = np.ones((1, 1))
+    if not are_unsafe(full)[0]:
         return sides
-    lines = find_boundaries(np.zeros((1, 1)), whole, are_unsafe, boxes.effort.parts)
+    parts = boxes.effort.parts
+    lines = find_boundaries(np.zeros((1, 1)), full, are_unsafe, parts)
     return np.asarray(at_share(lines.safe)[0])
 
 
-def widened(
-    boxes: Boxes, known: Known, sides: FloatArray, rng: Generator
+def widen(
+    boxes: Boxes,
+    failures: Failures,
+    sides: FloatArray,
+    rng: Generator,
 ) -> FloatArray:
     """A box that is safe at known places, as large as a random search makes it."""
-    number = max(boxes.effort.batch // max(len(known.places), 1), 1)
+    number = max(boxes.effort.batch // max(len(failures.places), 1), 1)
     for deviation in DEVIATIONS:
-        tried = _proposals(boxes, sides, deviation, rng)
-        chosen = islice(compress(tried, _hold_nothing(boxes, known, tried)), number)
-        tried = np.array([*chosen]).reshape(-1, *sides.shape)
-        safe = tried[_are_safe(boxes, known, tried)]
+        proposals = _propose(boxes, sides, deviation, rng)
+        is_empty = _are_empty(boxes, failures, proposals)
+        chosen = [*islice(compress(proposals, is_empty), number)]
+        candidates = np.array(chosen).reshape(-1, *sides.shape)
+        safe = candidates[_are_safe(boxes, failures, candidates)]
         sides = max(safe, key=boxes.log_volume, default=sides)
     return sides
 
 
-def _proposals(
-    boxes: Boxes, sides: FloatArray, deviation: float, rng: Generator
+def _propose(
+    boxes: Boxes,
+    sides: FloatArray,
+    deviation: float,
+    rng: Generator,
 ) -> FloatArray:
-    """Boxes of which a random share of the sides is moved by random steps, larger than one box."""
+    """Boxes of which a random share of the sides is moved by random steps, larger than a box."""
     shape = (PROPOSALS, *sides.shape)
     is_moved = rng.random(shape) < rng.random((PROPOSALS, 1, 1))
     steps = rng.normal(0.0, deviation, shape) * is_moved * boxes.width
-    moved = np.clip(sides + steps, 0.0, boxes.longest)
-    moved = np.where(rng.random(shape) < WHOLE, boxes.longest, moved)
-    tried = np.where(boxes.is_free, moved, boxes.longest)
-    return np.asarray(
-        tried[boxes.log_volume(tried) > boxes.log_volume(sides) + LEAST_GAIN]
-    )
+    candidates = np.clip(sides + steps, 0.0, boxes.longest)
+    is_fixed = (rng.random(shape) < WHOLE) | ~boxes.is_free
+    candidates = np.where(is_fixed, boxes.longest, candidates)
+    least = boxes.log_volume(sides) + LEAST_GAIN
+    return np.asarray(candidates[boxes.log_volume(candidates) > least])
 
 
-def _are_safe(boxes: Boxes, known: Known, tried: FloatArray) -> BoolArray:
+def _are_safe(
+    boxes: Boxes,
+    failures: Failures,
+    candidates: FloatArray,
+) -> BoolArray:
     """Which of B boxes are safe at known places, shape (B,)."""
-    cases = boxes.cases_at(known.places, tried)
+    cases = boxes.cases_at(failures.places, candidates)
     robustness = boxes.judge(cases.reshape(-1, cases.shape[2]))
-    return np.asarray((robustness.reshape(cases.shape[:2]) >= 0).all(axis=1))
+    is_safe = robustness.reshape(cases.shape[:2]) >= 0
+    return np.asarray(is_safe.all(axis=1))
 
 
-def _hold_nothing(boxes: Boxes, known: Known, tried: FloatArray) -> Iterator[bool]:
+def _are_empty(
+    boxes: Boxes,
+    failures: Failures,
+    candidates: FloatArray,
+) -> Iterator[bool]:
     """Whether each of B boxes holds no known failure."""
-    extents = boxes.extents(known.cases)
-    extents = extents[(extents <= tried.max(axis=0, initial=0.0)).all(axis=(1, 2))]
-    return (not (extents <= sides).all(axis=(1, 2)).any() for sides in tried)
+    extents = boxes.extents(failures.cases)
+    hull = candidates.max(axis=0, initial=0.0)
+    extents = extents[(extents <= hull).all(axis=(1, 2))]
+    for sides in candidates:
+        is_inside = (extents <= sides).all(axis=(1, 2))
+        yield not is_inside.any()

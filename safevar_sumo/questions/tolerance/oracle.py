@@ -44,33 +44,39 @@ class CaseWorld(NamedTuple):
         """The number of places of a case: the phase, then each other axis."""
         return 1 + len(self.model.characteristics.scenario) - self.has_phase
 
-    def settings(self, vehicles: FloatArray, places: FloatArray) -> FloatArray:
+    def settings(
+        self,
+        vehicles: FloatArray,
+        places: FloatArray,
+    ) -> FloatArray:
         """Vehicles, shape (M, n), at places, shape (M, k), as they are printed."""
         members = self.model.characteristics
         axes = members.scenario
-        phases, shares = places[:, :1], places[:, 1 : self.places]
+        shares = places[:, 1 : self.places]
         if self.has_phase:
-            shares = np.hstack([shares, phases])
-        values = axes.lower + shares * (axes.upper - axes.lower)
-        return members.with_printed_encounters(np.hstack([vehicles, values]))
+            shares = np.hstack([shares, places[:, :1]])
+        encounters = axes.lower + shares * (axes.upper - axes.lower)
+        return members.with_printed_encounters(np.hstack([vehicles, encounters]))
 
     def listed(self) -> FloatArray:
         """The places of its listed encounters, shape (E, k), at phase 0; of ranges, those at which
         the original vehicle leaves least.
         """
         axes = self.model.characteristics.scenario
-        if self.test is not None:
-            lists = self.test.test.axes
-            values = [[0.0] if name == PHASE else lists[name].at for name in axes.names]
-            rows = np.array([*product(*values)]).reshape(-1, len(axes))
-        else:
+        if self.test is None:
             evaluator = self.model.evaluator
-            of_vehicle = evaluator.characteristics.of_vehicle
-            rows = np.vstack(
-                [axes.original, evaluator.critical_encounters[:, ~of_vehicle]]
-            )
+            count = len(evaluator.characteristics.vehicle)
+            hardest = evaluator.critical_encounters[:, count:]
+            rows = np.vstack([axes.original, hardest])
+        else:
+            values = [
+                [0.0] if name == PHASE else self.test.test.axes[name].at
+                for name in axes.names
+            ]
+            rows = np.array([*product(*values)]).reshape(-1, len(axes))
         shares = (rows - axes.lower) / (axes.upper - axes.lower)
-        return np.hstack([np.zeros((len(shares), 1)), shares[:, : self.places - 1]])
+        phases = np.zeros((len(shares), 1))
+        return np.hstack([phases, shares[:, : self.places - 1]])
 
 
 class Oracle:
@@ -91,23 +97,31 @@ class Oracle:
     """
 
     def __init__(
-        self, models: Sequence[Model], new_car: Unsafe, *, between: bool
+        self,
+        models: Sequence[Model],
+        new_car: Unsafe,
+        *,
+        between: bool,
     ) -> None:
-        self.worlds = [
-            world
-            for model in models
-            for world in worlds_of(model, new_car, between=between)
-        ]
+        self.worlds = list[CaseWorld]()
+        for model in models:
+            self.worlds += worlds_of(
+                model,
+                new_car,
+                between=between,
+            )
         self.fits = [world.model.fit for world in self.worlds]
-        self.vehicle = models[0].characteristics.vehicle
         self.places = max(world.places for world in self.worlds)
         self.own = models[0]
+        self.vehicle = self.own.characteristics.vehicle
         evaluator = self.own.evaluator
         self.phases = evaluator.phases
         self._region = evaluator.region
         self._account = evaluator.account
-        systems = [world.model.evaluator.system for world in self.worlds]
-        self._simulations = max(map(simulations_of_setting, systems))
+        self._simulations = max(
+            simulations_of_setting(world.model.evaluator.system)
+            for world in self.worlds
+        )
         self._tries_originals = any(
             world.model.new_car is not None for world in self.worlds
         )
@@ -122,14 +136,20 @@ class Oracle:
         """What each of M cases leaves, shape (M,): below 0 it is unsafe, infinite where it does not
         count, or could not be simulated.
         """
-        return np.nan_to_num(
-            self.measure(cases), nan=np.inf, posinf=np.inf, neginf=-np.inf
+        robustness = self.measure(cases)
+        return np.where(
+            np.isnan(robustness),
+            np.inf,
+            robustness,
         )
 
     def with_failed(self, cases: FloatArray) -> FloatArray:
         """What each of M cases leaves; minus infinity where it could not be simulated."""
-        return np.nan_to_num(
-            self.measure(cases), nan=-np.inf, posinf=np.inf, neginf=-np.inf
+        robustness = self.measure(cases)
+        return np.where(
+            np.isnan(robustness),
+            -np.inf,
+            robustness,
         )
 
     def measure(self, cases: FloatArray) -> FloatArray:
@@ -137,51 +157,73 @@ class Oracle:
         # Simulations of the original vehicle may follow.
         if (1 + self._tries_originals) * len(cases) > self.available:
             raise Exhausted(
-                "simulations", "too few are left for the limits", "a larger number"
+                "simulations",
+                "too few are left for the limits",
+                "a larger number",
             )
-        n = len(self.vehicle)
         robustness = np.full(len(cases), np.inf)
-        numbers = np.floor(cases[:, n]).astype(int)
-        for number in np.unique(numbers).tolist():
-            rows = np.flatnonzero(numbers == number)
-            robustness[rows] = self._measure_in(self.worlds[number], cases[rows])
+        numbers = np.floor(cases[:, len(self.vehicle)])
+        for number in np.unique(numbers):
+            is_there = numbers == number
+            world = self.worlds[int(number)]
+            robustness[is_there] = self._measure_in(world, cases[is_there])
         return robustness
 
-    def _measure_in(self, world: CaseWorld, cases: FloatArray) -> FloatArray:
-        """What cases of one world leave."""
+    def _measure_in(
+        self,
+        world: CaseWorld,
+        cases: FloatArray,
+    ) -> FloatArray:
+        """What cases of a world leave."""
         n = len(self.vehicle)
+        model = world.model
         settings = world.settings(cases[:, :n], cases[:, n + 1 :])
-        runs = world.model.evaluate(settings, STAGE)
-        robustness = world.model.robustness_by(runs)
-        robustness[~runs.valid & ~runs.infeasible] = np.nan
-        robustness[~world.model.evaluator.region.feasible(settings)] = np.inf
+        runs = model.evaluate(settings, STAGE)
+        robustness = model.robustness_by(runs)
+        robustness[~(runs.valid | runs.infeasible)] = np.nan
+        robustness[~model.evaluator.region.feasible(settings)] = np.inf
         unsafe = np.flatnonzero(robustness < 0)
-        robustness[unsafe[~self._do_count(world, cases[unsafe])]] = np.inf
+        does_count = self._do_count(world, cases[unsafe])
+        robustness[unsafe[~does_count]] = np.inf
         return robustness
 
-    def _do_count(self, world: CaseWorld, cases: FloatArray) -> BoolArray:
+    def _do_count(
+        self,
+        world: CaseWorld,
+        cases: FloatArray,
+    ) -> BoolArray:
         """Which cases of a world are encounters that count: in which the original is safe, too."""
         new_car = world.model.new_car
         if new_car is None or not len(cases):
             return np.ones(len(cases), dtype=bool)
         n = len(self.vehicle)
         keys = [case.tobytes() for case in cases[:, n:]]
-        new = {key: row for row, key in enumerate(keys) if key not in self._counts}
-        if new:
-            places = cases[[*new.values()], n + 1 :]
-            originals = np.tile(self.vehicle.original, (len(new), 1))
+        rows = {key: row for row, key in enumerate(keys) if key not in self._counts}
+        if rows:
+            places = cases[[*rows.values()], n + 1 :]
+            originals = np.tile(self.vehicle.original, (len(rows), 1))
             runs = world.model.evaluate(world.settings(originals, places), STAGE)
             does_count = runs.valid & ~new_car.of(runs)
-            self._counts |= dict(zip(new, does_count.tolist(), strict=True))
+            self._counts |= dict(
+                zip(
+                    rows,
+                    does_count.tolist(),
+                    strict=True,
+                )
+            )
         return np.array([self._counts[key] for key in keys])
 
-    def feasible(self, draw: Callable[[int], FloatArray], number: int) -> FloatArray:
+    def feasible(
+        self,
+        draw: Callable[[int], FloatArray],
+        number: int,
+    ) -> FloatArray:
         """So many drawn vehicles that satisfy the study's constraints."""
         n = len(self.vehicle)
-        original = self._region.characteristics.original[n:]
+        encounter = self._region.characteristics.original[n:]
 
         def draw_settings(count: int) -> FloatArray:
-            return np.hstack([draw(count), np.tile(original, (count, 1))])
+            return np.hstack([draw(count), np.tile(encounter, (count, 1))])
 
         return self._region.draw_feasible(draw_settings, number)[:, :n]
 
@@ -189,28 +231,43 @@ class Oracle:
         """The model of a case, and its setting there."""
         n = len(self.vehicle)
         world = self.worlds[int(case[n])]
-        (setting,) = world.settings(case[np.newaxis, :n], case[np.newaxis, n + 1 :])
+        rows = case[np.newaxis]
+        (setting,) = world.settings(rows[:, :n], rows[:, n + 1 :])
         return world.model._replace(new_car=None), setting
 
     def space(
-        self, fit: int, lower: FloatArray, upper: FloatArray, *, phases: bool = True
+        self,
+        fit: int,
+        lower: FloatArray,
+        upper: FloatArray,
+        *,
+        phases: bool = True,
     ) -> Space:
         """The cases of vehicles between two ends with a parameter set, at all phases or phase 0."""
-        numbers = [number for number, own in enumerate(self.fits) if own == fit]
-        first = [numbers[0], *np.zeros(self.places)]
-        past_last = np.nextafter(numbers[-1] + 1, 0)
-        last = [past_last, float(phases), *np.ones(self.places - 1)]
-        return Space(np.append(lower, first), np.append(upper, last), len(lower))
+        numbers = np.flatnonzero(np.equal(self.fits, fit))
+        first = np.zeros(1 + self.places)
+        first[0] = numbers[0]
+        last = np.ones(1 + self.places)
+        last[0] = np.nextafter(numbers[-1] + 1, 0)
+        last[1] = phases
+        return Space(
+            np.append(lower, first),
+            np.append(upper, last),
+            len(lower),
+        )
 
     def listed(self) -> FloatArray:
         """The listed encounters with the study's own parameter set: worlds and places, shape (E,
         1 + k).
         """
-        rows = []
-        for number, world in enumerate(self.worlds):
-            for place in world.listed() if world.model.fit == 0 else ():
-                rows.append([number, *place, *[0.0] * (self.places - len(place))])
-        return np.array(rows)
+        tables = []
+        for number in np.flatnonzero(np.equal(self.fits, 0)).tolist():
+            places = self.worlds[number].listed()
+            encounters = np.zeros((len(places), 1 + self.places))
+            encounters[:, 0] = number
+            encounters[:, 1 : 1 + places.shape[1]] = places
+            tables.append(encounters)
+        return np.vstack(tables)
 
     def hardest(self, number: float) -> FloatArray:
         """So many of the listed encounters: those in which the original vehicle leaves least."""
@@ -223,11 +280,20 @@ class Oracle:
 
 def product_of(vehicles: FloatArray, encounters: FloatArray) -> FloatArray:
     """Each vehicle in each encounter."""
-    repeated = np.repeat(vehicles, len(encounters), axis=0)
+    repeated = np.repeat(
+        vehicles,
+        len(encounters),
+        axis=0,
+    )
     return np.hstack([repeated, np.tile(encounters, (len(vehicles), 1))])
 
 
-def worlds_of(model: Model, new_car: Unsafe, *, between: bool) -> list[CaseWorld]:
+def worlds_of(
+    model: Model,
+    new_car: Unsafe,
+    *,
+    between: bool,
+) -> list[CaseWorld]:
     """The worlds of a parameter set: each test that moves, and all other points together."""
     moving = moving_tests(model, new_car) if between else []
     worlds = [CaseWorld(test.model.in_phases or test.model, test) for test in moving]

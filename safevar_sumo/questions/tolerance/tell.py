@@ -7,22 +7,27 @@ import pandas as pd
 
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.bars import bars_of, draw_bars
+from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import Failure, describe, limit_text
+from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tables import Column, Columns, Rows, tabulate
-from safevar_sumo.questions.tolerance.told import InRanges, Told
-from safevar_sumo.questions.tolerance.words import (
+from safevar_sumo.questions.tolerance.oracle import Oracle
+from safevar_sumo.questions.tolerance.told import (
+    InRanges,
+    Told,
     broken_in_words,
     refusal_in_words,
     tested_sentences,
     verdict_sentences,
+    worst_of,
 )
 from safevar_sumo.questions.words import (
     constraints_in_words,
     counted_in_words,
     join_phrases,
 )
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.records import FloatArray, JsonObject, finite_or_none
 from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.vehicles import Characteristic
 
@@ -108,91 +113,84 @@ ROUGH = (
 
 
 def answer_limits(
-    told: Told, nearest: FloatArray | None, ranges: InRanges | None
+    facts: Told, nearest: FloatArray | None, ranges: InRanges | None
 ) -> Answer:
     """The answer with limits alone and joint limits."""
-    tables = {"limits": _limits_table(told)}
-    tried = len(told.asked.fits) + len(told.asked.left_out)
-    if told.is_safe and tried > 1:
+    tables = {"limits": _limits_table(facts)}
+    tried = len(facts.task.fits) + len(facts.task.left_out)
+    if facts.is_safe and tried > 1:
         title = "The limits in each parameter set of the vehicle model"
-        tables["fits"] = tabulate(title, FITS, _fit_rows(told))
-    near = _nearest_rows(told, nearest)
+        tables["fits"] = tabulate(title, FITS, _fit_rows(facts))
+    near = _nearest_rows(facts, nearest)
     if near:
         tables["nearest"] = tabulate("Limits that would do", NEAREST, near)
-    in_ranges = [] if ranges is None else [_row_in_ranges(told, ranges)]
+    in_ranges = [] if ranges is None else [_row_in_ranges(facts, ranges)]
     if in_ranges:
         title = "The same limits in the ranges of the study"
         tables["ranges"] = tabulate(title, IN_RANGES, in_ranges)
-    sentences = verdict_sentences(told, near, in_ranges)
-    counted = counted_in_words(told.study), constraints_in_words(told.study)
+    sentences = verdict_sentences(facts, near, in_ranges)
+    counted = counted_in_words(facts.study), constraints_in_words(facts.study)
     return Answer(
         question="tolerance",
-        study=told.study,
+        study=facts.study,
         verdict=" ".join(sentences),
-        tested=" ".join([*tested_sentences(told), *counted[0], *counted[1]]),
-        numbers=_numbers(told),
+        tested=" ".join([*tested_sentences(facts), *counted[0], *counted[1]]),
+        numbers=_numbers(facts),
         tables=tables,
-        failures=_failures(told),
+        failures=_failures(facts),
         draw=draw_bars,
     )
 
 
-def _numbers(told: Told) -> JsonObject:
+def _numbers(facts: Told) -> JsonObject:
     """The numbers of an answer; those about joint limits are undefined without such limits."""
-    found, proof = told.limits, told.limits.proof
     numbers: JsonObject = dict.fromkeys(NUMBERS)
     numbers |= {
-        "unsafe": str(told.unsafe),
-        "margin": told.unsafe.keep,
-        "kept": told.kept,
+        "unsafe": str(facts.unsafe),
+        "margin": facts.unsafe.keep,
+        "kept": facts.kept,
+        "rough": facts.is_rough,
+        "scope": facts.scope,
+        "boxes": int(facts.box is not None),
     }
-    numbers |= {
-        "rough": told.is_rough,
-        "scope": told.scope,
-        "boxes": int(told.box is not None),
-    }
-    if told.up_to is not None:
-        numbers["up_to"] = float(told.up_to.partition("=")[2])
-    if not told.is_safe:
+    if facts.up_to is not None:
+        numbers["up_to"] = float(facts.up_to.partition("=")[2])
+    if not facts.is_safe:
         return numbers
-    tried = len(told.asked.fits)
-    numbers |= {
-        "box": told.box is not None,
-        "fits": tried - len(found.broken),
-        "fits_tried": tried,
-    }
-    if told.box is not None:
-        attacked = sum(attack.simulated for attack in found.attacks.values())
-        numbers |= {"attacked": attacked, "least_attacked": told.least}
-    if proof is not None:
-        numbers |= {"samples": proof.samples, "failures": proof.failures}
-        numbers |= {"at_most": proof.at_most, "not_simulated": proof.not_simulated}
+    fits = len(facts.task.fits)
+    numbers["box"] = facts.box is not None
+    numbers["fits"] = fits - len(facts.limits.broken)
+    numbers["fits_tried"] = fits
+    if facts.box is not None:
+        numbers["attacked"] = facts.attacked
+        numbers["least_attacked"] = facts.least
+    if facts.limits.proof is not None:
+        numbers |= facts.limits.proof._asdict()
     return numbers
 
 
-def _failures(told: Told) -> tuple[str, ...]:
+def _failures(facts: Told) -> tuple[str, ...]:
     """Why a gate must not pass."""
-    if not told.is_safe:
-        return (refusal_in_words(told),)
-    if told.broken:
-        return tuple(f"limit of {text}" for text in broken_in_words(told))
-    is_stated = not np.isnan(told.asked.given).all()
-    return (ROUGH,) if told.is_rough and is_stated else ()
+    if not facts.is_safe:
+        return (refusal_in_words(facts),)
+    if facts.broken:
+        return tuple(f"limit of {text}" for text in broken_in_words(facts))
+    return (ROUGH,) if facts.is_rough and facts.stated else ()
 
 
-def _limits_table(told: Told) -> pd.DataFrame:
+def _limits_table(facts: Told) -> pd.DataFrame:
     """The row of each characteristic that varies; the screen shows those that are limited."""
-    rows = [_limits_row(told, column) for column in told.columns]
+    rows = [_limits_row(facts, column) for column in facts.columns]
     # Joint limits lead, without those of each alone.
     end = LIMITS["alone_low"]
     assert isinstance(end, Column)
-    shown = {**LIMITS, "alone_low": end._replace(is_detail=told.box is not None)}
+    shown = {**LIMITS, "alone_low": end._replace(is_detail=facts.box is not None)}
     texts = [text for row in rows if (text := row["fails_first"])]
     words = {text: text.removeprefix("the car ") for text in texts}
     table = tabulate(
         LIMITS_TITLE, shown, [[*row.values()] for row in rows], words=words
     )
-    members = [told.members[column] for column in told.columns]
+    members = [facts.members[column] for column in facts.columns]
     domains = [(item.lower, item.upper) for item in members]
     joint = table[["together_low", "together_high"]].to_numpy(float)
     is_open = (joint == np.array(domains)).all(axis=1)
@@ -202,66 +200,66 @@ def _limits_table(told: Told) -> pd.DataFrame:
     return table
 
 
-def _limits_row(told: Told, column: int) -> JsonObject:
+def _limits_row(facts: Told, column: int) -> JsonObject:
     """A row of `LIMITS`."""
-    item = told.members[column]
+    item = facts.members[column]
     row: JsonObject = {
         **dict.fromkeys(LIMITS),
         "characteristic": item.name,
         "unit": item.unit,
     }
     row["original"] = item.original
-    row["alone_low"], row["alone_high"] = told.alone(column)
-    row["specified_low"], row["specified_high"] = told.given(column)
-    if told.box is not None:
-        row["together_low"] = float(told.box.lower[column])
-        row["together_high"] = float(told.box.upper[column])
-    if told.given(column) != (None, None):
-        is_kept = column not in told.broken
-        row["kept"] = None if is_kept and told.is_rough else is_kept
-    failure = told.failures.get(column)
+    row["alone_low"], row["alone_high"] = facts.alone(column)
+    row["specified_low"], row["specified_high"] = facts.given(column)
+    if facts.box is not None:
+        row["together_low"] = float(facts.box.lower[column])
+        row["together_high"] = float(facts.box.upper[column])
+    if facts.given(column) != (None, None):
+        is_kept = column not in facts.broken
+        row["kept"] = None if is_kept and facts.is_rough else is_kept
+    failure = facts.failures.get(column)
     if failure is not None:
         row["fails_first"] = failure.words
-        row["fails_at"] = _values_of(told, failure)
+        row["fails_at"] = _values_of(facts.own, failure)
         row["simulate"] = failure.command
-    if told.is_safe:
-        row["sentence"] = _sentence(told, column)
+    if facts.is_safe:
+        row["sentence"] = _sentence(facts, column)
     return row
 
 
-def _values_of(told: Told, failure: Failure) -> JsonObject:
+def _values_of(own: Model, failure: Failure) -> JsonObject:
     """The vehicle that fails, with its encounter where encounters are ranges."""
-    names = told.own.characteristics.names
+    names = own.characteristics.names
     return dict(zip(names, failure.setting.tolist(), strict=False))
 
 
-def _sentence(told: Told, column: int) -> str:
+def _sentence(facts: Told, column: int) -> str:
     """A sentence for a maintenance manual: all of these may be obeyed together."""
-    item, box = told.members[column], told.box
+    item = facts.members[column]
+    box = facts.box
     name = item.short_name[:1].upper() + item.short_name[1:]
+    scope = f"Scope: {facts.scope}."
     if box is None:
         return f"{name}: no joint limits were found."
     ends = float(box.lower[column]), float(box.upper[column])
     if ends[0] == ends[1]:
         value = limit_text_of(item, ends[0])
-        return (
-            f"{name}: {value}, as in the original vehicle; no room was found for it. Scope:"
-            f" {told.scope}."
-        )
-    domain = item.lower, item.upper
-    demands = [
-        f"{word} {limit_text_of(item, end)}"
-        for word, end, last in zip(("at least", "at most"), ends, domain, strict=True)
-        if end != last
-    ]
+        state = "as in the original vehicle; no room was found for it"
+        return f"{name}: {value}, {state}. {scope}"
+    demands = list[str]()
+    if ends[0] != item.lower:
+        demands.append(f"at least {limit_text_of(item, ends[0])}")
+    if ends[1] != item.upper:
+        demands.append(f"at most {limit_text_of(item, ends[1])}")
     if not demands:
         span = f"from {item.lower:.10g} to {limit_text_of(item, item.upper)}"
-        return f"{name}: any value {span}. Scope: {told.scope}."
-    beyond = ""
-    failure = told.failures.get(column)
-    if failure is not None:
-        beyond = f" {_vehicle_in_words(told, column, failure)}, {failure.words}."
-    return f"{name}: {' and '.join(demands)}.{beyond} Scope: {told.scope}."
+        return f"{name}: any value {span}. {scope}"
+    sentence = f"{name}: {' and '.join(demands)}."
+    failure = facts.failures.get(column)
+    if failure is None:
+        return f"{sentence} {scope}"
+    vehicle = _vehicle_in_words(facts, box, column, failure)
+    return f"{sentence} {vehicle}, {failure.words}. {scope}"
 
 
 def limit_text_of(item: Characteristic, value: float) -> str:
@@ -269,99 +267,82 @@ def limit_text_of(item: Characteristic, value: float) -> str:
     return f"{value:.10g}{item.suffix}"
 
 
-def _vehicle_in_words(told: Told, column: int, failure: Failure) -> str:
+def _vehicle_in_words(facts: Told, box: Box, column: int, failure: Failure) -> str:
     """The vehicle that fails just beyond a limit: `At 0.81, with all others at their limits`, and
     which of the others are elsewhere.
     """
-    box = told.box
-    assert box is not None
-    elsewhere = list[str]()
-    for other, item in enumerate(told.members):
-        value = float(failure.setting[other])
+    others = list[str]()
+    for number, item in enumerate(facts.members):
+        value = float(failure.setting[number])
         # Others are at their limit, if they have one, and as in the original, if they have none.
-        ends = ((box.lower[other], item.lower), (box.upper[other], item.upper))
-        limits = {float(end) for end, last in ends if end != last} or {item.original}
+        ends = {float(box.lower[number]), float(box.upper[number])}
+        limits = ends - {item.lower, item.upper} or {item.original}
         is_said = len(limits) == 1 and np.isclose(value, [*limits])[0]
-        if other != column and not is_said:
-            elsewhere.append(f"{item.name} {limit_text(item, value)}")
-    others = "with all others at their limits"
-    if elsewhere:
-        others = f"with {join_phrases(elsewhere)} and all others at their limits"
+        if number != column and not is_said:
+            others.append(f"{item.name} {limit_text(item, value)}")
+    places = "all others at their limits"
+    if others:
+        places = f"{join_phrases(others)} and {places}"
     value = float(failure.setting[column])
-    return f"At {limit_text(told.members[column], value)}, {others}"
+    return f"At {limit_text(facts.members[column], value)}, with {places}"
 
 
-def _fit_rows(told: Told) -> Rows:
+def _fit_rows(facts: Told) -> Rows:
     """A row of `FITS` for each parameter set."""
-    attacks, broken = told.limits.attacks, told.limits.broken
-    states = {fit: "not kept" if fit in broken else "kept" for fit in told.asked.fits}
-    states |= {model.fit: "left out" for model in told.asked.left_out}
-    least = {fit: told.value_in(fit) for fit in attacks} if told.box is not None else {}
-    return [
-        (fit, state, least.get(fit, np.nan)) for fit, state in sorted(states.items())
-    ]
+    broken = facts.limits.broken
+    states = {fit: "not kept" if fit in broken else "kept" for fit in facts.task.fits}
+    states |= {model.fit: "left out" for model in facts.task.left_out}
+    least = dict.fromkeys(states, np.nan)
+    if facts.box is not None:
+        least |= {fit: facts.value_in(fit) for fit in facts.limits.attacks}
+    return [(fit, states[fit], least[fit]) for fit in sorted(states)]
 
 
-def _nearest_rows(told: Told, nearest: FloatArray | None) -> Rows:
+def _nearest_rows(facts: Told, nearest: FloatArray | None) -> Rows:
     """A row of `NEAREST` for each end of a specified limit."""
+    rows = list[tuple[object, ...]]()
     if nearest is None:
-        return []
-    rows = []
-    for column in told.columns:
-        item = told.members[column]
-        for given, value in zip(
-            told.given(column), nearest[:, column].tolist(), strict=True
-        ):
-            if given is not None:
-                found = None if np.isnan(value) else value
-                rows.append((item.name, item.unit, given, found))
+        return rows
+    for column in facts.stated:
+        item = facts.members[column]
+        for side, limit in enumerate(facts.given(column)):
+            value = finite_or_none(nearest[side, column])
+            if limit is not None:
+                rows.append((item.name, item.unit, limit, value))
     return rows
 
 
-def _row_in_ranges(told: Told, ranges: InRanges) -> tuple[object, ...]:
+def _row_in_ranges(facts: Told, ranges: InRanges) -> tuple[object, ...]:
     """The row of `IN_RANGES`; of several failures that at the lowest speed."""
-    own = ranges.asked.oracle.own
-    scope = scope_of(own.evaluator.study)
-    simulated = sum(attack.simulated for attack in ranges.attacks)
-    least = min(attack.least for attack in ranges.attacks)
-    unsafe = [case for attack in ranges.attacks for case in attack.unsafe]
-    if not np.isfinite(least):
-        verdict = f"none of {simulated:,} simulations met an encounter that counts."
-        return (scope, True, verdict, None, None)
-    if not unsafe:
-        keeps = ranges.unsafe.value_in_words(ranges.unsafe.value(least))
-        searched = f"{simulated:,} simulations that search for a counterexample"
-        return (
-            scope,
-            True,
-            f"the limits hold: the worst of {searched} {keeps}.",
-            None,
-            None,
-        )
-    axes = own.characteristics.scenario.names
-    axis = own.characteristics.names.index(
-        SPEED_DIMENSION if SPEED_DIMENSION in axes else axes[0]
-    )
-    settings = [ranges.asked.oracle.setting(case) for case in unsafe]
-    model, setting = min(settings, key=lambda pair: float(pair[1][axis]))
-    limits = told.box or told.box_of(told.limits.specified)
+    own = ranges.task.oracle.own
+    attacks = ranges.attacks.values()
+    simulations = f"{sum(attack.simulated for attack in attacks):,} simulations"
+    unsafe = np.concatenate([attack.unsafe for attack in attacks])
+    least = worst_of(ranges.unsafe, ranges.attacks)
+    vehicle: tuple[object, ...] = (None, None)
+    if len(unsafe):
+        verdict = "they do not hold: a car within them is unsafe."
+        failure = _slowest_failure(facts, ranges.task.oracle, unsafe)
+        if failure is not None:
+            verdict = f"they do not hold: {failure.words}."
+            vehicle = _values_of(own, failure), failure.command
+    elif least is None:
+        verdict = f"none of {simulations} met an encounter that counts."
+    else:
+        keeps = ranges.unsafe.value_in_words(least)
+        search = f"{simulations} that search for a counterexample"
+        verdict = f"the limits hold: the worst of {search} {keeps}."
+    return (scope_of(own.evaluator.study), not len(unsafe), verdict, *vehicle)
+
+
+def _slowest_failure(facts: Told, oracle: Oracle, unsafe: FloatArray) -> Failure | None:
+    """How the unsafe case at the lowest speed fails; without speeds, at the lowest first value."""
+    members = oracle.own.characteristics
+    axes = members.scenario.names
+    axis = SPEED_DIMENSION if SPEED_DIMENSION in axes else axes[0]
+    column = members.names.index(axis)
+    settings = [oracle.setting(case) for case in unsafe]
+    model, setting = min(settings, key=lambda pair: float(pair[1][column]))
+    limits = facts.box or facts.box_of(facts.limits.specified)
     within = limits.in_encounters_of(model.evaluator.region)
-    failure = describe(model, {"": setting}, within).get("")
-    if failure is None:
-        return (
-            scope,
-            False,
-            "they do not hold: a car within them is unsafe.",
-            None,
-            None,
-        )
-    values = dict(
-        zip(own.characteristics.names, failure.setting.tolist(), strict=False)
-    )
-    return (
-        scope,
-        False,
-        f"they do not hold: {failure.words}.",
-        values,
-        failure.command,
-    )
+    return describe(model, {"": setting}, within).get("")
