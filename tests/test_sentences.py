@@ -18,7 +18,7 @@ from tests.size import sources_of
 SOURCES = sources_of("safevar_sumo")
 BROKEN = {
     *("api/study.py", "questions/explain/words.py", "questions/words.py"),
-    *("questions/tolerance/tell.py", "questions/tolerance/words.py"),
+    *("questions/tolerance/tell.py", "questions/tolerance/told.py"),
 }
 """Modules with sentences that may still break rules."""
 

@@ -128,15 +128,11 @@ def unsafe_in(boxes: Boxes, sides: Sides, judge: CaseJudge) -> int:
     return int((judge(space.lower + points * (space.upper - space.lower)) < 0).sum())
 
 
-def largest(boxes: Boxes, known: FloatArray | None = None, seed: int = 0) -> Sides:
+def largest(boxes: Boxes) -> Sides:
     n = boxes.space.size
-    rng = default_rng(seed)
-    start = Failures(nothing(n) if known is None else known, nothing(n))
-    quick, thorough = (
-        search_of(boxes.judge, 1024, seed),
-        search_of(boxes.judge, 5000, seed + 1),
-    )
-    settled = find_largest_box(boxes, start, quick, thorough, rng)
+    start = Failures(nothing(n), nothing(n))
+    quick, thorough = search_of(boxes.judge, 1024, 0), search_of(boxes.judge, 5000, 1)
+    settled = find_largest_box(boxes, start, quick, thorough, default_rng(0))
     assert settled.sides is not None
     assert settled.attack.simulated >= 5000
     assert settled.attack.least >= 0
@@ -367,9 +363,3 @@ def test_a_box_grows_up_to_a_wall_and_shrinks_from_what_is_beyond() -> None:
         shrink(boxes, Failures(nothing(2), nothing(2)), inner).tolist()
         == inner.tolist()
     )
-
-
-def test_a_box_avoids_what_it_must_not_hold() -> None:
-    boxes = boxes_of(2, unsafe_where(lambda cases: cases[:, 0] > 99))
-    sides = largest(boxes, cases_of([9.0, 8.0]))
-    assert sides[1].tolist() == [pytest.approx(4, abs=0.3), 5] or sides[1, 1] < 3
