@@ -102,7 +102,7 @@ def test_all_cars_within_limits_drive_as_fast_as_the_worst_of_them(car: str) -> 
     Path("car.toml").write_text(car.replace("[vehicle.", SPEED))
     answer = sv.permit("car.toml", limits=["decel >= 5", "delay <= 0.25"], **OPTIONS)
     (row,) = answer.tables["cars"].to_dict("records")
-    assert row["up_to"] == permitted(5.0, 0.25)
+    assert (row["up_to"], row["repair_first"]) == (permitted(5.0, 0.25), None)
     assert "decel 8 -> 5 m/s^2 (-37.5 %) and delay 0 -> 0.25 s" in row["because"]
 
 

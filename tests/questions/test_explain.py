@@ -30,10 +30,8 @@ from safevar_sumo.questions.causes import (
 )
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain, failures
-from safevar_sumo.questions.explain.robustness import MIN_ROBUST_SHARE
 from safevar_sumo.questions.explain.tables import (
     CAUSE_COLUMNS,
-    MAX_DISTINCT,
     printed_limits,
 )
 from safevar_sumo.questions.tables import cell_text, columns_of
@@ -91,17 +89,6 @@ def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> N
             assert cause["size"] == len(cause["changes"])
             assert 0 <= cause["holds"] <= cause["fits"] == FITS
             assert cause["avoided_by"] == row["avoided_by"]
-
-
-@pytest.mark.slow
-def test_the_most_frequent_robust_cause_leads(explained: Answer) -> None:
-    """Or the most robust one; its share is that of its kind."""
-    causes = explained.tables["causes"]
-    robust = causes[causes["robust_share"] >= MIN_ROBUST_SHARE]
-    column = "robust_share" if robust.empty else "share"
-    assert causes[column].iloc[0] == (causes if robust.empty else robust)[column].max()
-    shares = explained.tables["distinct_causes"]["share"]
-    assert causes["share"].isin(shares).all() or len(shares) == MAX_DISTINCT
 
 
 @SLOW

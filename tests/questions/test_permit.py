@@ -201,27 +201,6 @@ def test_a_car_is_answered_alike_in_any_list_and_with_any_jobs(
 
 
 @SLOW
-def test_all_cars_within_limits(short: Study) -> None:
-    limits = ("brakeTorque >= 0.7", "payload <= 525", "treadDepth >= 3")
-    answer = permit(short, limits=limits, others="new", fits=2, out="out.csv")
-    (row,) = answer.table().to_dict("records")
-    assert [*pd.read_csv("out.csv")][:2] == ["car", "up_to"], "no value of a car"
-    assert row["repair_first"] is None
-    assert row["up_to"] <= 37, "a worn car of another test"
-    members = assemble(short).characteristics.vehicle
-    names = ("treadDepth", "payload", "brakeTorque")
-    corners = product([3, 8], [75, 525], [0.7, 1])
-    cars = [
-        members.setting(dict(zip(names, corner, strict=True))) for corner in corners
-    ]
-    speeds = np.arange(34.0, row["up_to"] + 0.1, 0.5)
-    for fit in range(2):
-        assert not are_unsafe(
-            short, fit, np.array(cars), speeds, PLACES, keep=0.1
-        ).any()
-
-
-@SLOW
 def test_the_rough_answer_lets_no_car_drive_and_says_so_in_each_form(
     short: Study,
 ) -> None:

@@ -143,26 +143,6 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
 
 
 @SLOW
-def test_no_phase_is_unsafe_where_the_worst_is_not() -> None:
-    evaluator = Evaluator(ahead(), InlinePool())
-    model = Model(0, evaluator, Unsafe(below=0.0))
-    members = evaluator.characteristics
-    settings = np.tile(members.original, (40, 1))
-    settings[:, members.names.index("brakeTorque")] = np.linspace(0.92, 0.96, 40)
-    claim = model.in_phases
-    assert claim is not None
-    _, worst = at_worst_phases(
-        claim, partial(claim.robustness, stage="phases"), settings
-    )
-    many = np.repeat(np.linspace(0, 1, 200, endpoint=False), len(settings))
-    rows = np.column_stack([np.tile(settings, (200, 1)), many])
-    scanned = claim.robustness(rows, "scan").reshape(200, -1)
-    is_unsafe = scanned.min(axis=0) < 0
-    assert (is_unsafe & (scanned[0] >= 0)).any()
-    assert ((worst < 0) == is_unsafe).all()
-
-
-@SLOW
 def test_a_car_may_not_drive_where_it_fails_at_another_phase() -> None:
     car = ["--set", "brakeTorque=0.93", "--others", "new", "--margin", "0.3"]
     (row,) = json_of("permit", "autoware_july", *car)["tables"]["cars"]["rows"]

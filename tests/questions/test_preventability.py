@@ -19,7 +19,6 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import PointComparison, compare_at_points
 from safevar_sumo.questions.explain.robustness import robust_shares
 from safevar_sumo.questions.explain.words import avoided_in_words
-from safevar_sumo.questions.part import at_point
 from safevar_sumo.questions.preventability import (
     TITLES,
     assess_collisions,
@@ -32,7 +31,7 @@ from safevar_sumo.study import ModelTable, ScenarioTable
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import SLOW, InlinePool
-from tests.made_up import drawn, made_up_runs, original_of
+from tests.made_up import made_up_runs, original_of
 from tests.questions.conftest import box, made_up_evaluator
 
 COLLISION = Unsafe()
@@ -303,18 +302,3 @@ def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> Non
     assert plain is not None
     assert runs.trace.gap[plain, 0] == pytest.approx(15.0)
     assert unbraked is None
-
-
-@SLOW
-def test_the_drivers_of_lanes_are_judged_where_a_car_cuts_in() -> None:
-    study = at_point(load_study("alks", encounters="ranges"), "cut_in")
-    evaluator = Evaluator(study, InlinePool(), verified=0)
-    collisions = evaluator.evaluate(drawn(assemble(study), 24, 3), "settings")
-    collisions = collisions.take(collisions.collided)
-    verdicts = assess_collisions(evaluator, collisions)
-    rows = drivers_frame(verdicts, len(collisions)).set_index("driver")
-    assert {"competent_driver", "rss", "fuzzy_safety", "r157"} < {*rows.index}
-    assert (
-        (rows["avoided"] + rows["no_longer"] + rows["no_verdict"]) == len(collisions)
-    ).all()
-    assert rows["no_verdict"]["full_braking"] == rows["no_verdict"].min()

@@ -34,24 +34,6 @@ def keeps(decel: float, delay: float, clearance: float = 0.0) -> bool:
     return CLEARANCE - 15 * delay - 15**2 / 2 / decel >= clearance
 
 
-@SLOW
-@pytest.mark.parametrize(
-    "question", ["risk", "rules", "explain", "tolerance", "compare"]
-)
-@pytest.mark.parametrize("number", [150, 700])
-def test_a_question_keeps_to_the_number_of_simulations(
-    rig: str, question: str, number: int
-) -> None:
-    others = [rig] if question == "compare" else []
-    answer = getattr(sv, question)(
-        rig, *others, simulations=number, pool=InlinePool(), fresh=True
-    )
-    assert answer.numbers["rough"]
-    assert answer.numbers["simulations"] <= number
-    assert f"--simulations {number}" in answer.verdict
-    assert f"--simulations {number}" in answer.command
-
-
 def test_joint_limits_of_few_simulations_are_safe_by_the_formula(rig: str) -> None:
     answer = sv.tolerance(rig, simulations=400, pool=InlinePool())
     limits = answer.tables["limits"].set_index("characteristic")

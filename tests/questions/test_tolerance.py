@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy
-from hypothesis import assume, given, settings, strategies as st
 
 from safevar_sumo import tolerance
 from safevar_sumo.errors import InputError
@@ -54,24 +53,6 @@ def answer_of(
 ) -> Answer:
     study = made_up_study(n)
     return tolerance(study, pool=Plant(study, region, degrees, failing), **options)
-
-
-@SLOW
-@settings(max_examples=20)
-@given(ends=st.lists(st.floats(0, 10), min_size=2, max_size=2).map(sorted))
-def test_any_interval_is_found_that_is_as_wide_as_two_values_are_apart(
-    ends: list[float],
-) -> None:
-    low, high = ends
-    assume(high - low > 0.05 and not low <= 5 <= high)
-    answer = answer_of(
-        1, lambda rows: (rows[:, 0] >= low) & (rows[:, 0] <= high), unsafe="collision"
-    )
-    (row,) = answer.tables["limits"].to_dict("records")
-    expected = (0.0, low) if low > 5 else (high, 10.0)
-    assert (row["alone_low"], row["alone_high"]) == pytest.approx(expected, abs=0.11)
-    assert not low <= row["alone_low"] <= high
-    assert not low <= row["alone_high"] <= high
 
 
 @SLOW

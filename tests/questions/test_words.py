@@ -2,54 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import math
 
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.questions.case import load_cases
-from safevar_sumo.questions.words import undecidable_in_words
+from safevar_sumo.questions.words import (
+    MAX_POINTS_NAMED,
+    percentage,
+    points_in_words,
+    share_in_words,
+    two_decimals,
+    undecidable_in_words,
+)
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import SLOW, json_of, searched
-
-STUDY = """
-extends = "sun"
-name = "tiny"
-title = "Which words are read?"
-[repair.promise]
-tireFric = { at_least = 3.0 }
-[search]
-algorithms = ["nsga2"]
-population = 10
-evaluations = 100
-runs = 1
-"""
-FEW = ("--characteristics", "tireFric,maxBrakeTorque", "--fits", "0")
-
-
-@SLOW
-def test_half_of_the_originals_is_said_by_every_question(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also by one that asks another question first: nothing collides among the solutions of a short
-    search.
-    """
-    (tmp_path / "tiny.toml").write_text(
-        STUDY.replace("evaluations = 100", "evaluations = 60")
-    )
-    searched(load_study(str(tmp_path / "tiny.toml")), tmp_path / "results")
-    monkeypatch.chdir(tmp_path)
-    assert load_cases(["results"])[0].unsafe.is_half
-    for typed in (
-        ("explain", "results", "--quick", "--top", "1"),
-        ("risk", "results", "--samples", "64"),
-        ("rules", "results", "--samples", "64"),
-        ("tolerance", "results", "--quick", *FEW),
-    ):
-        answer = json_of(*typed)
-        assert answer["numbers"]["unsafe"].startswith("safety_degree < "), typed
-        assert "half of the original's" in answer["verdict"], typed
-        assert "--unsafe collision counts collisions alone." in answer["verdict"], typed
 
 
 @pytest.mark.parametrize(
@@ -67,3 +33,30 @@ def test_a_limit_nearer_to_the_original_than_its_measurement_is_not_decidable(
     assert "relative brake torque (measured to within 0.05)" in undecidable_in_words(
         [brakes]
     )
+
+
+def test_a_share_is_all_or_none_only_if_it_is_exactly_that() -> None:
+    shares = (0.0, 0.004, 0.006, 0.99, 0.995, 1.0)
+    words = ["none", "hardly any", "1 %", "99 %", "nearly all", "all"]
+    assert [*map(share_in_words, shares)] == words
+    shares = (0.00043, 0.0994, 0.0995, 0.37)
+    assert [*map(percentage, shares)] == ["0.043", "9.9", "10", "37"]
+    values = (None, math.nan, -0.004, 1.006)
+    assert [*map(two_decimals, values)] == ["-", "-", "0.00", "1.01"]
+
+
+@pytest.mark.parametrize(
+    ("failing", "count", "said"),
+    [
+        (0, 1, "no test case"),
+        (0, 2, "none of the 2 test cases"),
+        (1, 1, "1 of 1 test cases: a"),
+        (MAX_POINTS_NAMED, 9, "6 of 9 test cases: a; b; c; d; e; f"),
+        (MAX_POINTS_NAMED + 1, 9, "7 of 9 test cases: a; b; c; d; e; f and 1 more"),
+    ],
+)
+def test_a_sentence_names_the_first_failing_test_cases(
+    failing: int, count: int, said: str
+) -> None:
+    sentence = points_in_words("It", [*"abcdefghi"[:failing]], count)
+    assert sentence == f"It fails {said}."

@@ -17,7 +17,6 @@ from calibration import fit
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.model_spread import (
     compute_model_spreads,
-    prediction_band,
     value_of,
     with_values,
 )
@@ -181,41 +180,6 @@ def test_the_models_error_covers_nine_tenths_of_the_rows_of_each_file(
     assert fit.model_error(study, [far]) == pytest.approx(23, abs=1e-6)
     assert fit.model_error(study, [data, far]) == pytest.approx(23, abs=1e-6)
     assert fit.model_error(study, [data]) == 0
-
-
-def test_a_band_holds_nine_tenths_of_the_sets_and_of_the_repeats() -> None:
-    lower, upper = prediction_band(
-        np.column_stack([np.linspace(0, 1, 101), np.full(101, np.nan)]), 0.1
-    )
-    assert (lower[0], upper[0]) == pytest.approx((0.05 - 0.1645, 0.95 + 0.1645))
-    assert np.isnan([lower[1], upper[1]]).all()
-
-
-def test_the_models_error_makes_the_band_wider_with_the_distance_from_the_original_vehicle() -> (
-    None
-):
-    """Three quarters of one domain and half of another: sqrt(13/16) domains away, by Pythagoras.
-    The original counts as 0.3 away.
-    """
-    sets = {"spread": {GAP: [OWN, OWN]}, "repeatability": {"safety_degree": 1e-9}}
-    bare, study = (
-        load_study("sun", **sets, model_error=error)
-        for error in ({}, {"safety_degree": 0.4})
-    )
-    ch = assemble(study).characteristics
-    settings = np.stack([ch.original, ch.original])
-    for name, share in (("tireFric", -0.75), ("dampRateZeroT_CE", -0.5)):
-        i = list(ch.names).index(name)
-        settings[1, i] += share * (ch.upper[i] - ch.lower[i])
-    for here, wide, more in zip(
-        compute_model_spreads(bare, settings),
-        compute_model_spreads(study, settings),
-        (0.4 * 0.3, 0.4 * 0.8125**0.5),
-        strict=True,
-    ):
-        assert (wide.lower, wide.upper) == pytest.approx(
-            (here.lower - more, here.upper + more), abs=1e-9
-        )
 
 
 def test_the_sets_are_simulated_one_by_one() -> None:

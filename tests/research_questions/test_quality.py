@@ -338,48 +338,6 @@ def test_tables_have_the_columns_that_their_command_declares() -> None:
             assert all(isinstance(number, int) for number in numbers), name
 
 
-@SLOW
-def test_the_tests_of_each_question_are_corrected_as_a_family() -> None:
-    """Runs that are all apart: Holm multiplies the smallest p-value of RQ1, 2 / 2^n, by its 8
-    tests, and that of RQ2, 2 / C(2n, n), by its 7: 11 and 7 runs are needed where 8 and 5 would be
-    without the correction.
-    """
-    for runs, enough in (
-        (6, (False, False)),
-        (7, (False, True)),
-        (10, (False, True)),
-        (11, (True, True)),
-    ):
-        metrics = {"tet": (2.5, 2.0), "tit": (2.5, 2.0), "ave_dece": (9.0, 8.0)}
-        case = made_up(
-            *(
-                row(name, run=run, sd=degree + run / 1000)
-                | {metric: values[i] + run / 1000 for metric, values in metrics.items()}
-                for i, (name, degree) in enumerate((("nsga2", 0.5), ("rs", 1.5)))
-                for run in range(runs)
-            )
-        )
-        answer = answer_questions([case], names=("rq1-runs", "rq2-runs"))
-        for name, tests, smallest, is_enough in (
-            ("rq1-runs", 8, 2 / 2**runs, enough[0]),
-            ("rq2-runs", 7, 2 / math.comb(2 * runs, runs), enough[1]),
-        ):
-            table, remarks = answer.only(name).tables.values()
-            assert len(table) == tests
-            if runs <= 8:  # from then on, U's p-value of tied runs is approximate
-                assert table["p_holm"].min() == pytest.approx(min(tests * smallest, 1))
-            assert (table["enough_runs"].all(), table["significant"].any()) == (
-                is_enough,
-                is_enough,
-            )
-            text = " ".join(remarks["remark"])
-            assert (
-                f"Holm's method corrects the p-values of the {tests} tests of {name[:3].upper()}"
-                in text
-            )
-            assert ("a test needs at least" in text) is not is_enough
-
-
 def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
     """As at the end of a study: seven runs are too few for RQ1, five are enough for RQ2, whatever
     the number of solutions.
@@ -406,14 +364,3 @@ def test_pooled_solutions_of_too_few_runs_do_not_stand_out_either() -> None:
     assert imported.tables["rq1"]["significant"].any(), (
         "the runs of imported solutions are unknown"
     )
-
-
-@SLOW
-def test_readers_see_a_long_table_crosswise_and_every_table_within_100_columns() -> (
-    None
-):
-    text = answer_about("two").render("text", "rq3.2")
-    assert re.search(r"setting +┃ *characteristic +┃ *1 ┃ *2 ┃ *3 ┃ *any ", text)
-    assert re.search(r"made-up +│ *mass +│", text)
-    lines = answer_about("two").render("text", details=True).splitlines()
-    assert max(len(line) for line in lines if line[0] in "┏┃┡│└") == 100
