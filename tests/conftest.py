@@ -5,8 +5,11 @@ that compute in this process.
 from __future__ import annotations
 
 import os
+import pickle
+import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +68,11 @@ def _own_cache_and_pools_of_this_process(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[None]:
     """Each session of tests builds its own networks, once for all of its processes; commands start
-    no worker processes and keep no simulations, by which a test would check itself.
+    no worker processes and keep no simulations, by which a test would check itself. A text of a
+    study, which hundreds of tests read, is parsed once.
     """
+    parse = tomllib.loads
+    parsed = cache(lambda text: pickle.dumps(parse(text)))
     session = tmp_path_factory.getbasetemp()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(
@@ -78,6 +84,7 @@ def _own_cache_and_pools_of_this_process(
         )
         patch.setenv("SAFEVAR_CACHE", "off")
         patch.setattr(local, "ProcessWorker", inline_worker)
+        patch.setattr(tomllib, "loads", lambda text: pickle.loads(parsed(text)))
         yield
 
 

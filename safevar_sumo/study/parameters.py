@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Any, get_args, get_type_hints
 
 import msgspec
@@ -17,6 +18,9 @@ decisions of the driving system.
 """
 PHASE_DECIMALS = 4
 """Decimals of a phase that is simulated and printed: unsafe windows of 0.1 % of a step occur."""
+
+_hints_of = lru_cache(get_type_hints)
+"""The types of a class's fields, which Python compiles anew each time."""
 
 
 class FreeParameter(Table, frozen=True, kw_only=True):
@@ -52,7 +56,7 @@ def free_parameters(model: type) -> dict[str, FreeParameter]:
     if not (issubclass(model, msgspec.Struct) or dataclasses.is_dataclass(model)):
         return {}
     parameters = {}
-    for name, kind in get_type_hints(model, include_extras=True).items():
+    for name, kind in _hints_of(model, include_extras=True).items():
         for meta in _metas_in(kind):
             extra = meta.extra or {}
             if "free" in extra:
@@ -72,6 +76,5 @@ def _metas_in(kind: Any) -> Iterator[Meta]:
     for mark in getattr(kind, "__metadata__", ()):
         if isinstance(mark, Meta):
             yield mark
-    if not isinstance(kind, str):
-        for member in get_args(kind):
-            yield from _metas_in(member)
+    for member in get_args(kind):
+        yield from _metas_in(member)

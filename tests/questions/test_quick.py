@@ -41,15 +41,6 @@ def test_a_rough_tolerance_calls_no_limit_kept() -> None:
     assert "calls no limit kept" in done.stderr
 
 
-@SLOW
-def test_a_rough_tolerance_says_which_limit_fails() -> None:
-    answer = sv.tolerance(
-        "smoke", limits=("mass <= 2700",), unsafe="below=2.7", quick=True
-    )
-    assert answer.numbers["kept"] is False
-    assert "Do not release" in answer.verdict
-
-
 MANY = """
 extends = "wear"
 name = "many"

@@ -278,14 +278,6 @@ def test_the_study_of_results_is_explained_as_without_results(slippery: Path) ->
     )
 
 
-@SLOW
-def test_of_a_searched_scenario_each_combination_meets_critical_encounters() -> None:
-    answer = sv.explain("sun", ranges=True, fits=0, quick=True, pool=InlinePool())
-    assert (
-        "Scope: the original encounter and the 16 encounters in which" in answer.verdict
-    )
-
-
 def test_the_verdict_claims_no_more_than_was_simulated() -> None:
     """Two changes collide and, without them, three others."""
 
