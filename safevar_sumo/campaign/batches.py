@@ -32,7 +32,7 @@ from safevar_sumo.campaign.evaluation import (
     system_of,
     verify_settings,
 )
-from safevar_sumo.campaign.identity import files_of, manifest_now, refuse_changed_inputs
+from safevar_sumo.campaign.inputs import files_of, manifest_now, refuse_changed_inputs
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.campaign.share import MAX_SKIPPED
 from safevar_sumo.campaign.user_checks import check_code

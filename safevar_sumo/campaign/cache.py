@@ -33,7 +33,7 @@ import portalocker
 from diskcache.core import MODE_BINARY, MODE_RAW
 
 from safevar_sumo.campaign.evaluation import Selection, system_of
-from safevar_sumo.campaign.identity import manifest_now
+from safevar_sumo.campaign.inputs import manifest_now
 from safevar_sumo.errors import warn
 from safevar_sumo.plugins import digests, file_by_name, files_in
 from safevar_sumo.records import Evaluations, FloatArray

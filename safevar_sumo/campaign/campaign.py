@@ -21,7 +21,7 @@ from safevar_sumo.campaign.evaluation import (
     evaluate_settings,
     verify_settings,
 )
-from safevar_sumo.campaign.identity import manifest_now
+from safevar_sumo.campaign.inputs import manifest_now
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.campaign.runs import (
     MAX_REPEATED,

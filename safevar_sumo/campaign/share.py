@@ -20,7 +20,7 @@ from safevar_sumo.campaign.evaluation import (
     repeat_first_batch,
     system_of,
 )
-from safevar_sumo.campaign.identity import refuse_changed_inputs
+from safevar_sumo.campaign.inputs import refuse_changed_inputs
 from safevar_sumo.campaign.runs import (
     Run,
     RunKey,

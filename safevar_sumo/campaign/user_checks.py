@@ -18,7 +18,7 @@ from safevar_sumo.campaign.evaluation import (
     reproduction_command,
     system_of,
 )
-from safevar_sumo.campaign.identity import manifest_now
+from safevar_sumo.campaign.inputs import manifest_now
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import UserCodeError
 from safevar_sumo.plugins import record_opened, unload_user_modules

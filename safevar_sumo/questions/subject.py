@@ -234,7 +234,7 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
     InputError
         If an input has changed and `as_it_is_now` is false; the message names the changes.
     """
-    from safevar_sumo.campaign.identity import manifest_now
+    from safevar_sumo.campaign.inputs import manifest_now
     from safevar_sumo.sumo.system import assemble
 
     # Inputs of the results that have changed since.

@@ -22,7 +22,7 @@ import pandas as pd
 from safevar_sumo.api.evaluation import evaluate_with_workers
 from safevar_sumo.api.running import run
 from safevar_sumo.campaign import all_runs
-from safevar_sumo.campaign.identity import PLATFORM
+from safevar_sumo.campaign.inputs import PLATFORM
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.metrics import PUBLISHED_SCORING, Unsafe

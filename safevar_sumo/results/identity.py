@@ -47,7 +47,7 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
     ----------
     identity
         Inputs of the results besides the study file, by `IDENTITY`; see
-        `safevar_sumo.campaign.identity.manifest_now`. Its `versions` are those of a simulator of
+        `safevar_sumo.campaign.inputs.manifest_now`. Its `versions` are those of a simulator of
         the user's own.
     """
     versions = {name: version(name) for name in packages_of(study)}

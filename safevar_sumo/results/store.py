@@ -62,7 +62,7 @@ class ResultsDirectory:
     study
         The study as it is run.
     manifest
-        The study's manifest; see `safevar_sumo.campaign.identity.manifest_now`.
+        The study's manifest; see `safevar_sumo.campaign.inputs.manifest_now`.
     scoring
         Metrics and objectives.
     run_names

@@ -17,7 +17,7 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign.identity import PLATFORM
+from safevar_sumo.campaign.inputs import PLATFORM
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import CHOICES, RESULTS, load_runs
 from safevar_sumo.study import Study

@@ -22,7 +22,7 @@ from numpy.testing import assert_array_equal
 
 import safevar_sumo as sv
 from safevar_sumo.campaign.cache import Cache, keep_simulations
-from safevar_sumo.campaign.identity import manifest_now
+from safevar_sumo.campaign.inputs import manifest_now
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.plugins.process import this_process

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.campaign.identity import manifest_now
+from safevar_sumo.campaign.inputs import manifest_now
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.part import study_up_to

@@ -19,7 +19,7 @@ import pytest
 from safevar_sumo import output
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign.evaluation import Task
-from safevar_sumo.campaign.identity import files_of
+from safevar_sumo.campaign.inputs import files_of
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.plugins.process import record_opened
 from safevar_sumo.records import Evaluations, FloatArray

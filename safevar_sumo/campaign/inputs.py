@@ -1,6 +1,4 @@
-"""The identity of a study: all inputs of its results besides the study itself, among them the
-digests of files.
-"""
+"""The inputs of results besides the study itself, such as versions and digests of files."""
 
 from __future__ import annotations
 
