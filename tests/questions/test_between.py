@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
@@ -16,14 +15,15 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.cases import SearchPlan, search_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
+from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance import tolerance
-from safevar_sumo.questions.tolerance.oracle import Oracle, product_of
-from safevar_sumo.study import Study
+from safevar_sumo.questions.tolerance.oracle import Exhausted, Oracle, product_of
+from safevar_sumo.study import Constraint, Study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, json_of
-from tests.questions.conftest import model_of
+from tests.questions.conftest import Plant, made_up_study, model_of
 
 AHEAD = """
 extends = "wear"
@@ -61,6 +61,58 @@ def test_a_search_between_the_tests_finds_what_no_test_shows(ahead: Study) -> No
     assert speed == round(speed, 2)
 
 
+def test_cases_lie_in_worlds_with_a_phase_and_a_place_on_each_axis(
+    ahead: Study,
+) -> None:
+    """One test at 50 and 60 km/h, in two parameter sets."""
+    own = model_of(ahead, keep=0.3)
+    oracle = Oracle([own, own._replace(fit=3)], own.unsafe, between=True)
+    vehicle = oracle.vehicle
+    n = len(vehicle)
+    space = oracle.space(3, vehicle.lower, vehicle.upper)
+    assert space.lower.tolist() == [*vehicle.lower, 1, 0, 0]
+    assert space.upper.tolist() == [*vehicle.upper, np.nextafter(2, 0), 1, 1]
+    at_start = oracle.space(0, vehicle.lower, vehicle.upper, phases=False)
+    assert at_start.upper[n:].tolist() == [np.nextafter(1, 0), 0, 1]
+    assert oracle.listed().tolist() == [[0, 0, 0], [0, 0, 1]]
+    assert oracle.hardest(1).tolist() == [[0, 0, 0]], "at 50 km/h"
+    assert len(oracle.hardest(2)) == 2
+    model, setting = oracle.setting(np.r_[vehicle.original, 1.9, 0.25, 0.4])
+    assert model.fit == 3
+    values = dict(zip(model.characteristics.names, setting.tolist(), strict=True))
+    assert (values["speed"], values["phase"]) == (54, 0.25)
+    assert setting[:n].tolist() == vehicle.original.tolist()
+
+
+def test_what_cannot_be_simulated_or_is_infeasible_leaves_everything() -> None:
+    """a above 9 fails, a below 1 violates a constraint, and b above 7 collides."""
+    study = replace(
+        made_up_study(2), constraints=(Constraint(sum={"a": 1.0}, at_least=1.0),)
+    )
+    plant = Plant(
+        study,
+        lambda rows: rows[:, 1] > 7,
+        lambda rows: rows[:, 1],
+        lambda rows: rows[:, 0] > 9,
+    )
+    evaluator = Evaluator(study, plant)
+    evaluator.account.most = 10
+    oracle = Oracle([Model(0, evaluator, Unsafe(keep=0.5))], Unsafe(), between=False)
+    (encounter,) = oracle.listed()
+    vehicles = np.array([[9.5, 8.0], [0.5, 8.0], [5.0, 8.0], [5.0, 0.25], [5.0, 3.0]])
+    cases = product_of(vehicles, encounter[np.newaxis])
+    assert oracle(cases).tolist() == [np.inf, np.inf, -1.5, -0.25, 2.5]
+    assert oracle.available == 10 - 4, "those that satisfy the constraint"
+    assert oracle.with_failed(cases[:3]).tolist() == [-np.inf, np.inf, -1.5]
+    assert np.isnan(oracle.measure(cases[:1])).all()
+    assert oracle.available == 3
+    with pytest.raises(Exhausted):
+        oracle(cases[:4])
+    assert len(oracle(cases[2:5])) == 3, "as many as are left"
+    drawn = oracle.feasible(lambda count: vehicles[np.arange(count) % 2], 8)
+    assert {*drawn[:, 0].tolist()} == {9.5}
+
+
 def test_an_encounter_between_counts_only_where_the_original_is_safe(
     ahead: Study,
 ) -> None:
@@ -93,47 +145,24 @@ def test_a_scope_names_a_range_only_where_it_was_driven(
 
 
 @SLOW
-@pytest.mark.parametrize("name", ["ahead.toml", "rain"])
 @pytest.mark.usefixtures("few_simulations")
-def test_more_parameter_sets_never_widen_limits_which_hold_between_the_tests(
-    ahead: Study, name: str
-) -> None:
-    names = (
-        "treadDepth,sensorLatency"
-        if name == "ahead.toml"
-        else "tireFric,maxBrakeTorque"
-    )
-    options = ("--characteristics", names)
-    rows = [
-        json_of("tolerance", name, *options, "--fits", fits)["tables"]["limits"]["rows"]
-        for fits in (("0", "2", "3") if name == "ahead.toml" else ("0", "2", "6", "12"))
-    ]
-    for fewer, more in pairwise(rows):
-        for before, after in zip(fewer, more, strict=True):
-            for kind in ("alone", "together"):
-                assert before[f"{kind}_low"] <= after[f"{kind}_low"]
-                assert before[f"{kind}_high"] >= after[f"{kind}_high"]
-    if name == "ahead.toml":
-        check_at_whole_speeds(ahead, rows[-1], 3)
-
-
-def check_at_whole_speeds(study: Study, rows: list[dict[str, Any]], fits: int) -> None:
-    """Corners and random cars at whole speeds: what the original survives with a parameter set, all
-    of them survive with it.
+def test_limits_hold_at_whole_speeds_between_the_tests(ahead: Study) -> None:
+    """Corners and random cars: what the original survives with a parameter set, all of them survive
+    with it.
     """
-    members = assemble(study).characteristics
+    options = "--characteristics", "treadDepth,sensorLatency", "--fits", "3"
+    limits = json_of("tolerance", "ahead.toml", *options)["tables"]["limits"]
+    members = assemble(ahead).characteristics
     ends = np.array([members.original, members.original])
-    for row in rows:
-        ends[:, members.names.index(row["characteristic"])] = (
-            row["together_low"],
-            row["together_high"],
-        )
+    for row in limits["rows"]:
+        column = members.names.index(row["characteristic"])
+        ends[:, column] = row["together_low"], row["together_high"]
     points = default_rng(5).random((300, len(members)))
     points[:100] = np.round(points[:100])
     cars = np.vstack([members.original, ends[0] + points * (ends[1] - ends[0])])
-    (test,) = study.matrix.tests
+    (test,) = ahead.matrix.tests
     speeds = {"speed": [float(speed) for speed in range(50, 61)]}
-    for number, of_set in enumerate(studies_of_sets(study)[:fits]):
+    for number, of_set in enumerate(studies_of_sets(ahead)[:3]):
         denser = of_set.with_tests([msgspec.structs.replace(test, over=speeds)])
         for result in simulate_all_points(assemble(denser), cars):
             least = 0.0 if number else 0.3

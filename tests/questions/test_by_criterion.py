@@ -192,14 +192,3 @@ def test_a_clearance_is_between_bumpers_where_the_degree_is_between_middles() ->
     assert evaluator.checked(Unsafe.parse("safety_degree < 0.5")).of(runs).tolist() == [
         False
     ]
-
-
-@SLOW
-def test_a_stated_clearance_breaks_a_limit_as_the_margin_does() -> None:
-    asked = {"limits": ("decel >= 4.7",), "characteristics": ("decel",), "quick": True}
-    for criterion in ({"unsafe": "below=0.3"}, {"margin": 0.3}):
-        answer = sv.tolerance("native", **asked, **criterion)
-        assert answer.verdict.partition("Do not release: ")[2].startswith(
-            "decel 4.7 m/s^2: "
-        )
-        assert "less than 0.3 m from a standing vehicle" in answer.verdict

@@ -14,7 +14,6 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.questions import price
 from safevar_sumo.questions.price import Account, round_down
 from safevar_sumo.questions.progress import Phases
-from safevar_sumo.questions.tolerance.tell import ROUGH
 from safevar_sumo.terminal import show_no_progress
 from tests.in_process import SLOW, InlinePool, json_of, refused, run
 from tests.scenarios.test_simulated import MODELS, STUDY
@@ -47,16 +46,6 @@ def test_joint_limits_of_few_simulations_are_safe_by_the_formula(rig: str) -> No
     assert answer.numbers["kept"] is None
 
 
-def test_few_simulations_say_nothing_of_parts_that_were_not_asked_about(
-    rig: str,
-) -> None:
-    answer = sv.tolerance(
-        rig, characteristics=["decel"], simulations=100, pool=InlinePool()
-    )
-    assert "decel can make the vehicle unsafe on its own." in answer.verdict
-    assert "delay" not in answer.verdict
-
-
 def test_few_simulations_state_no_limits_that_leave_a_part_no_room(rig: str) -> None:
     """The new vehicle keeps just this clearance, so that no delay is safe beside its braking."""
     unsafe = f"below={CLEARANCE - 15**2 / 2 / 8}"
@@ -65,14 +54,6 @@ def test_few_simulations_state_no_limits_that_leave_a_part_no_room(rig: str) -> 
         "no joint limits of use, because no safe change of delay was found"
         in answer.verdict
     )
-    assert (
-        answer.tables["limits"][["together_low", "together_high"]].isna().all(axis=None)
-    )
-
-
-def test_no_joint_limits_are_stated_that_nothing_was_tried_in(rig: str) -> None:
-    answer = sv.tolerance(rig, simulations=35, pool=InlinePool())
-    assert "did not suffice" in answer.verdict
     assert (
         answer.tables["limits"][["together_low", "together_high"]].isna().all(axis=None)
     )
@@ -176,23 +157,6 @@ def test_many_more_simulations_search_more_and_not_roughly() -> None:
         account = Account(Phases(show_no_progress), asked=asked)
         account.open(100, None)
         assert (account.most, account.effort) == (None, effort)
-
-
-def test_limits_that_are_given_are_not_kept_by_few_simulations(rig: str) -> None:
-    """They are the limits of the others, or a vehicle within them is unsafe."""
-    pool = InlinePool()
-    answer = sv.tolerance(rig, limits=["decel >= 5"], simulations=500, pool=pool)
-    limits = answer.tables["limits"].set_index("characteristic")
-    assert limits.loc["decel", ["together_low", "together_high"]].tolist() == [5, 9]
-    assert keeps(5, limits.loc["delay", "together_high"], 0.3)
-    assert not keeps(5, limits.loc["delay", "together_high"] + 0.1, 0.3)
-    assert answer.numbers["kept"] is None
-    assert answer.failures == (ROUGH,)
-    answer = sv.tolerance(rig, limits=["decel >= 3.2"], simulations=500, pool=pool)
-    assert answer.numbers["kept"] is False
-    assert len(answer.failures) == 1
-    assert answer.failures[0].startswith("limit of decel 3.2")
-    assert "Do not release: decel 3.2" in answer.verdict
 
 
 COUNTED = """

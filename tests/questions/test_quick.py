@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -41,28 +39,7 @@ def test_a_rough_tolerance_calls_no_limit_kept() -> None:
     assert "calls no limit kept" in done.stderr
 
 
-MANY = """
-extends = "wear"
-name = "many"
-title = "Many test cases"
-[[matrix.tests]]
-name = "along"
-model = "along"
-over.speed = [20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35, 36, 37, 38, 39, 40]
-over.impact_location = [25, 26, 27, 28, 29, 30, 31, 32, 33, 34, 35, 36, 37, 38, 39, 40, 41, 42,
-  43, 44, 45, 46, 47, 48, 49, 50, 51, 52, 53, 54, 55, 56]
-"""
-
-
-@SLOW
-def test_a_rough_answer_about_many_test_cases_searches_a_little(in_tmp: Path) -> None:
-    Path("many.toml").write_text(MANY)
-    answer = sv.tolerance("many.toml", quick=True, characteristics=("brakeTorque",))
-    assert answer.numbers["samples"]
-
-
 WORN = {"one": {"brakeTorque": 0.7}, "two": {"brakeTorque": 0.9}}
-PROMISE = {"promise": ("brakeTorque >= 0.95",), "change": ("margin",)}
 
 
 @SLOW
@@ -78,26 +55,6 @@ def test_a_rough_list_says_its_price_and_drives_the_own_parameter_set_alone(
         r"about [\d,]+ simulations, about 0:\d\d:\d\d; cars that fail early take fewer"
     )
     assert re.fullmatch(price, capfd.readouterr().err.strip())
-
-
-@SLOW
-@pytest.mark.parametrize(
-    ("ask", "options"),
-    [
-        (sv.explain, {}),
-        (sv.tolerance, {"characteristics": ("brakeTorque",)}),
-        (sv.repair, PROMISE),
-    ],
-)
-def test_rough_answers_simulate_the_own_parameter_set_alone(
-    ask: Callable[..., Any], options: Mapping[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        model_spread, "with_values", lambda *_: pytest.fail("another set")
-    )
-    answer = ask("wear", quick=True, pool=InlinePool(), **options)
-    assert answer.verdict.startswith("Rough answer (--quick")
-    assert answer.numbers["rough"]
 
 
 @SLOW

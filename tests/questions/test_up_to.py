@@ -4,27 +4,18 @@ between those of others.
 
 from __future__ import annotations
 
-from itertools import pairwise
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from safevar_sumo import tolerance
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.models import SEARCHED_MARGIN
 from safevar_sumo.questions.part import names_left_out, study_up_to
-from safevar_sumo.questions.tolerance import _unsafe_solutions, tell
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import SLOW
-from tests.questions.conftest import Plant
 
 AHEAD = """
 extends = "wear"
@@ -40,17 +31,6 @@ name = "fast"
 model = "along"
 parameters = { vut_length = 4.7, vut_width = 1.85 }
 over = { speed = [50, 60] }
-"""
-TINY = """
-extends = "rain"
-name = "tiny"
-title = "Which vehicle, at which gap?"
-encounters = "ranges"
-[scenario]
-margin = 0.4
-[scenario.over]
-distance = { unit = "m", original = 12.129, lower = 8, upper = 18, meaning = "gap at the start" }
-walking_speed = false
 """
 ROUGH: dict[str, Any] = {"quick": True, "jobs": 1}
 
@@ -109,66 +89,3 @@ def test_limits_up_to_a_value_between_two_tests_hold_there_and_lie_between_their
     settings[:, cut.characteristics.names.index("brakeTorque")] = least[1], least[0]
     is_kept = drive_and_score(cut, settings).f_safe >= between.numbers["margin"]
     assert is_kept.tolist() == [True, False]
-
-
-def test_solutions_of_results_in_encounters_above_the_value_do_not_limit() -> None:
-    """In the study that is cut, a brake torque below 0.7 collides; all three did in the results."""
-    study = study_up_to(load_study("wear", encounters="ranges"), "speed=40")
-    plant = Plant(study, lambda rows: rows[:, 1] < 0.7)
-    members = CharacteristicSet.of(study)
-    evaluator: Any = SimpleNamespace(
-        characteristics=members, evaluate=lambda rows, _: plant.evaluate(rows)
-    )
-    settings = np.tile(members.original, (3, 1))
-    settings[:, members.names.index("brakeTorque")] = 0.6, 0.6, 0.8
-    settings[:, members.names.index("speed")] = 30, 50, 30
-    frame = pd.DataFrame(settings, columns=[*members.names])
-    frame = frame.assign(outcome="collision", safety_degree=-1.0)
-    subject: Any = SimpleNamespace(solutions=frame)
-    columns = [*range(len(members.vehicle))]
-    options: dict[str, Any] = {
-        "subject": subject,
-        "unsafe": Unsafe(),
-        "columns": columns,
-    }
-    known = _unsafe_solutions(SimpleNamespace(**options, whole=None), evaluator)  # type: ignore[arg-type]
-    assert known.tolist() == [settings[0, : len(columns)].tolist()]
-    whole = _unsafe_solutions(SimpleNamespace(**options, whole=evaluator), evaluator)  # type: ignore[arg-type]
-    assert len(whole) == 3, "those of results about the whole study all count"
-
-
-@SLOW
-def test_limits_up_to_a_larger_value_are_never_wider(ahead: Study) -> None:
-    """With a search of its own for each value, 0.279 s were the limit up to 30 km/h and 0.294 s up
-    to 40.
-    """
-    options = {**ROUGH, "characteristics": ("brakeTorque,sensorLatency",)}
-    answers = [
-        tolerance(ahead, up_to=f"speed={value}", **options) for value in (30, 40, 50)
-    ]
-    for slower, faster in pairwise(answers):
-        for name, sign in (("low", 1), ("high", -1)):
-            for kind in ("alone", "together"):
-                ends = [one.values(f"limits.{kind}_{name}") for one in (slower, faster)]
-                assert (sign * np.array(ends[0]) <= sign * np.array(ends[1])).all(), (
-                    kind,
-                    name,
-                )
-
-
-@SLOW
-def test_a_vehicle_that_is_said_to_fail_fails_and_a_rough_answer_keeps_nothing(
-    in_tmp: Path,
-) -> None:
-    """In a study that searches its scenario."""
-    (in_tmp / "tiny.toml").write_text(TINY)
-    study = load_study("tiny.toml")
-    options = {**ROUGH, "characteristics": ("tireFric",)}
-    own_set = {**options, "quick": False, "fits": 0}
-    fails_at = tolerance(study, **own_set).tables["limits"]["fails_at"][0]
-    system = assemble(study)
-    setting = np.array([[fails_at[name] for name in system.characteristics.names]])
-    assert drive_and_score(system, setting).f_safe[0] < SEARCHED_MARGIN
-    answer = tolerance(study, **options, limits=("tireFric >= 3.4",))
-    assert answer.numbers["kept"] is None
-    assert answer.failures == (tell.ROUGH,)
