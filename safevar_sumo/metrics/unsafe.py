@@ -81,6 +81,9 @@ class Unsafe:
     """Whether a collision alone, or less distance than `keep`, is unsafe."""
     verbs = "collides", "collide"
     """What an unsafe vehicle does, and what several do, in short."""
+    event = "a collision"
+    effects = "causes a collision", "cause a collision"
+    """What changes lead to; what one of them does, and what several do."""
     option = "--margin"
     """The option by which a user asks for less."""
     is_of_impacts = False
@@ -155,9 +158,7 @@ class Unsafe:
         return ""
 
     def smaller_demand(self, original: Evaluations) -> str:
-        """What to do where the original does not meet the criterion; "" if it collides, and a
-        collision is what counts.
-        """
+        """What to do where the original vehicle is unsafe; "" if it collides, and that counts."""
         if self.is_collision and (not self.keep or original.collided[0]):
             return ""
         return f"Ask again with a weaker criterion ({self.option})."
@@ -330,6 +331,8 @@ class UnsafeStated(Unsafe):
 
     is_collision = False
     verbs = "is unsafe", "are unsafe"
+    event = "an unsafe vehicle"
+    effects = "makes the vehicle unsafe", "make the vehicle unsafe"
     option = "--unsafe"
 
 

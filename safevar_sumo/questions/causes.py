@@ -25,9 +25,9 @@ from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 from safevar_sumo.terminal import print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
-SUBSETS = "subsets of the changes"
-BOUNDARIES = "boundaries"
-OTHER_SETS = "other parameter sets"
+SUBSETS = "look for the necessary changes"
+BOUNDARIES = "look for smaller changes"
+OTHER_SETS = "check other parameter sets"
 """Stages of progress."""
 MAX_SUBSETS = 20_000
 """Maximum number of subsets simulated in one call, which bounds the memory; and, unless another
@@ -59,23 +59,20 @@ def find_minimal_causes(
     The empty subset counts too: if the original vehicle is unsafe, no change is needed.
     """
     # What each setting changes; encounters stay as they are.
-    characteristics = evaluator.characteristics
-    names = characteristics.names
-    is_changed = characteristics.changed(settings) & characteristics.of_vehicle
+    members = evaluator.characteristics
+    is_changed = members.changed(settings) & members.of_vehicle
     changed = [np.flatnonzero(flags).tolist() for flags in is_changed]
-    of_scenario = np.flatnonzero(~characteristics.of_vehicle).tolist()
-    originals = characteristics.with_original_vehicle(settings)
-    causes: list[list[Cause]] = [[] for _ in settings]
-    found: list[list[set[int]]] = [[] for _ in settings]
+    originals = members.with_original_vehicle(settings)
+    causes = [dict[frozenset[int], Cause]() for _ in settings]
     complete = largest_complete([*map(len, changed)], limit)
 
     # Subsets by size, those of all settings together, without those that contain a cause.
-    expected = sum(_subset_counts([*map(len, changed)], complete))
+    expected = _count_subsets([*map(len, changed)], complete)
     with evaluator.phases.stage(SUBSETS, expected):
         for size in range(max(map(len, changed), default=0) + 1):
             number = sum(
                 comb(len(columns), size)
-                for columns, of_row in zip(changed, found, strict=True)
+                for columns, of_row in zip(changed, causes, strict=True)
                 if not of_row
             )
             if (
@@ -86,7 +83,7 @@ def find_minimal_causes(
                 break
             subsets = (
                 (row, list(columns))
-                for row, of_row in enumerate(found)
+                for row, of_row in enumerate(causes)
                 if size <= complete or not of_row
                 for columns in combinations(changed[row], size)
                 if not any(cause.issubset(columns) for cause in of_row)
@@ -102,18 +99,14 @@ def find_minimal_causes(
                 for index in np.flatnonzero(of_runs).tolist():
                     row, columns = chunk[index]
                     values = settings[row].tolist()
-                    cause = Cause(
-                        changes={names[column]: values[column] for column in columns},
-                        outcome=str(evaluations.outcome[index]),
-                        safety_degree=float(evaluations.f_safe[index]),
-                        encounter={
-                            names[column]: values[column] for column in of_scenario
-                        },
-                        unsafe_runs=float(of_runs[index]),
+                    causes[row][frozenset(columns)] = Cause(
+                        {members.names[column]: values[column] for column in columns},
+                        str(evaluations.outcome[index]),
+                        float(evaluations.f_safe[index]),
+                        members.scenario.named(settings[row, ~members.of_vehicle]),
+                        float(of_runs[index]),
                     )
-                    causes[row].append(cause)
-                    found[row].append({*columns})
-    return causes
+    return [[*of_row.values()] for of_row in causes]
 
 
 def largest_complete(numbers: Sequence[int], limit: int) -> int:
@@ -121,9 +114,7 @@ def largest_complete(numbers: Sequence[int], limit: int) -> int:
     about `limit` settings altogether; at least 1.
     """
     sizes = range(2, max(numbers, default=1) + 1)
-    affordable = takewhile(
-        lambda size: sum(_subset_counts(numbers, size)) <= limit, sizes
-    )
+    affordable = takewhile(lambda size: _count_subsets(numbers, size) <= limit, sizes)
     return max(affordable, default=1)
 
 
@@ -151,14 +142,9 @@ def are_causes(
     )
 
 
-def _subset_counts(numbers: Sequence[int], most: int | None = None) -> list[int]:
-    """How many subsets of at most so many of each number of changes there are; of all of them."""
-    return [
-        sum(
-            comb(number, size) for size in range((number if most is None else most) + 1)
-        )
-        for number in numbers
-    ]
+def _count_subsets(numbers: Sequence[int], largest: int) -> int:
+    """How many subsets of at most `largest` of each number of changes there are."""
+    return sum(comb(number, size) for number in numbers for size in range(largest + 1))
 
 
 def select_affordable_rows(
@@ -168,8 +154,7 @@ def select_affordable_rows(
     takes at most about `max_evaluations`; where few simulations are allowed, at least one if its
     single changes may be simulated.
     """
-    changes = evaluator.characteristics.number_changed(settings).astype(int).tolist()
-    costs = np.array(_subset_counts(changes), dtype=float)
+    costs = 2.0 ** evaluator.characteristics.number_changed(settings)
     if costs.sum() <= max_evaluations:
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.seed).permutation(len(settings))
@@ -221,15 +206,15 @@ def count_needed(
         in_some += is_in_cause.any(axis=0)
 
     # Of a sample the intervals are those of all failures.
-    intervals = [(count / number, count / number) for count in needed.tolist()]
-    if len(changed) < failures:  # a sample
-        intervals = [clopper_pearson(int(count), number) for count in needed]
+    intervals = np.repeat(needed[:, np.newaxis] / number, 2, axis=1)
+    if len(changed) < failures:
+        intervals = np.array([clopper_pearson(int(count), number) for count in needed])
     shares = {
         "characteristic": names,
         "changed": changed.sum(axis=0) / number,
         "needed": needed / number,
-        "needed_low": [low for low, _ in intervals],
-        "needed_high": [high for _, high in intervals],
+        "needed_low": intervals[:, 0],
+        "needed_high": intervals[:, 1],
         "in_some": in_some / number,
     }
     frame = pd.DataFrame(shares).head(len(names) if len(changed) else 0)
@@ -291,10 +276,10 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     )
     examined = failures.sort_values(order, kind="stable").groupby(keys).head(limit)
     settings = examined[[*names, F_NUM_DIFF.name]].drop_duplicates()
-    price = sum(_subset_counts(settings.pop(F_NUM_DIFF.name).astype(int).tolist()))
+    price = int((2.0 ** settings.pop(F_NUM_DIFF.name)).sum())
     print_text(
         Console(stderr=True),
-        f"{case.name}: the minimal causes take at most {price:,} simulations.",
+        f"Finding the minimal causes of {case.name} takes at most {price:,} simulations.",
     )
 
     # Kinds of causes: which characteristics change, and in which direction.
@@ -329,9 +314,8 @@ def settings_of(
     """The original vehicle with the changes of each of M causes only, in its encounter; shape (M,
     n).
     """
-    of_causes = [cause.changes | cause.encounter for cause in causes]
-    values = [
-        [values.get(item.name, item.original) for item in characteristics]
-        for values in of_causes
+    settings = [
+        characteristics.setting(cause.changes | cause.encounter, beyond=True)
+        for cause in causes
     ]
-    return np.array(values).reshape(-1, len(characteristics))
+    return np.array(settings).reshape(-1, len(characteristics))

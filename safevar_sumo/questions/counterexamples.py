@@ -45,20 +45,67 @@ unsafe.
 """
 OF_ENCOUNTER = ("test", "weather")
 """Keys of a point's parameters that are no numbers of its scenario."""
-STAGE = "what fails first"
+LEAST_IMPACT = 1.0
+"""A slower impact, as at the limit itself, says nothing [km/h]."""
+STAGE = "find what fails first"
+
+
+class Place(NamedTuple):
+    """Where a vehicle fails, as it is printed: the test, its speed, other values of the encounter,
+    each `""` without any, and the number of the parameter set.
+    """
+
+    test: str
+    speed: str
+    values: str
+    fit: int
+
+    @property
+    def words(self) -> str:
+        """Such as `test CPNA, driven at 40 km/h, impact location 25 %; parameter set 9`; empty
+        where there is but one.
+        """
+        test = f"test {self.test}" if self.test else ""
+        speed = f"driven at {self.speed}" if self.speed else ""
+        encounter = ", ".join(filter(None, (test, speed, self.values)))
+        fit = f"parameter set {self.fit}" if self.fit else ""
+        return "; ".join(filter(None, (encounter, fit)))
 
 
 class Failure(NamedTuple):
-    """An unsafe vehicle, shape (n,), with the values that are printed, how it fails, in words with
-    the encounter, the parameters of the point of the matrix where it does, its breach of the
-    criterion alone, and the command that simulates it.
+    """An unsafe vehicle.
+
+    Attributes
+    ----------
+    setting
+        Its values as they are printed, shape (n,).
+    event
+        How it fails, such as `hits a pedestrian`.
+    impact
+        With which impact, such as `impact at 12 km/h`; `""` without one.
+    place
+        Where it fails.
+    point
+        The parameters of this point of the matrix.
+    breach
+        Its breach of the criterion alone.
+    command
+        The command that simulates it.
     """
 
     setting: FloatArray
-    words: str
+    event: str
+    impact: str
+    place: Place
     point: JsonObject
     breach: str
     command: str
+
+    @property
+    def words(self) -> str:
+        """Such as `the vehicle hits a pedestrian (impact at 12 km/h; test CPNA)`."""
+        details = "; ".join(filter(None, (self.impact, self.place.words)))
+        return f"the vehicle {self.event}{f' ({details})' if details else ''}"
 
 
 def describe(
@@ -86,13 +133,10 @@ def describe(
                 for name, setting in waiting.items()
             ]
         )
-        found = failures_at(model, rows)
-        failures |= {
-            name: found[row] for row, name in enumerate(waiting) if row in found
-        }
-        waiting = {
-            name: setting for name, setting in waiting.items() if name not in failures
-        }
+        names = [*waiting]
+        for row, failure in failures_at(model, rows).items():
+            failures[names[row]] = failure
+            del waiting[names[row]]
     return failures
 
 
@@ -188,22 +232,25 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     is_unsafe = model.evaluator.region.feasible(settings) & (
         model.robustness_by(runs) < 0
     )
-    fit = f" (parameter set {model.fit})" if model.fit else ""
     failures = dict[int, Failure]()
     for row in np.flatnonzero(is_unsafe).tolist():
         point = points[runs.points[row]]
         values = members.scenario.named(settings[row, ~members.of_vehicle])
         scenario = encounter(point, values).scenario
-        how = _failure_in_words(
-            scenario, model.unsafe, bool(runs.collided[row]), float(runs.f_safe[row])
-        )
         breach = model.unsafe.breach_in_words(runs.take(np.array([row])))
-        if model.unsafe.is_of_impacts and runs.collided[row]:
-            how = f"the car {breach}"
-        where = where_in_words(points, point, scenario, values)
+        collided = bool(runs.collided[row])
+        event = _event_in_words(scenario, model.unsafe, collided)
+        impact = ""
+        speed = -KMH_PER_MS * float(runs.f_safe[row])
+        if collided and model.unsafe.is_of_impacts:
+            event = breach
+        elif collided and speed >= LEAST_IMPACT:
+            impact = f"impact at {float(f'{speed:.2g}'):g} km/h"
         failures[row] = Failure(
             settings[row],
-            f"{how}{where}{fit}",
+            event,
+            impact,
+            place_of(points, point, scenario, values, model.fit),
             dict(point.parameters),
             breach,
             _command(model, settings[row], point, values),
@@ -230,33 +277,30 @@ def _command(
     return " ".join(word for word in words if word)
 
 
-def where_in_words(
-    points: Sequence[Point], point: Point, scenario: Scenario, values: NamedValues
-) -> str:
-    """The encounter of a failure, such as ` in the test CPNA at 40 km/h with impact location 25 %`,
-    from one of the points of a matrix, the values of searched parameters, and the scenario with
-    them; empty where there is but one.
+def place_of(
+    points: Sequence[Point],
+    point: Point,
+    scenario: Scenario,
+    values: NamedValues,
+    fit: int = 0,
+) -> Place:
+    """Where a failure is: at one of the points of a matrix, with values of searched parameters, the
+    scenario with them, and the number of the parameter set. No sentence has the phase, which is in
+    the command.
     """
-    own = dict(point.parameters)
-    numbers = {
-        **{name: value for name, value in own.items() if name not in OF_ENCOUNTER},
-        **values,
-    }
-    if not numbers.get(PHASE, 1):
-        del numbers[PHASE]
+    numbers = dict(point.parameters) | values
+    test = numbers.pop("test", "")
+    # The weather has a name of its own, if there is more than one.
+    for name in ("weather", PHASE):
+        numbers.pop(name, None)
+    if len({one.weather.name for one in points}) > 1:
+        numbers["weather"] = point.weather.name
     texts = texts_of(point, numbers)
     speed = texts.pop(SPEED_DIMENSION, "")
     if not speed and scenario.test_speed is not None:
         speed = f"{KMH_PER_MS * scenario.test_speed:.4g} km/h"
-    test = own.get("test", "")
-    at = f" at {speed}" if speed else ""
-    rest = [f"{name.replace('_', ' ')} {text}" for name, text in texts.items()]
-    if len({each.weather.name for each in points}) > 1:
-        rest.append(f"weather {point.weather.name.replace('_', ' ')}")
-    beside = f" with {join_phrases(rest)}" if rest else ""
-    if test:
-        return f" in the test {test}{at}{beside}"
-    return f" in an encounter{at}{beside}" if at or beside else ""
+    place = ", ".join(f"{name} {text}" for name, text in texts.items())
+    return Place(test, speed, place.replace("_", " "), fit)
 
 
 def texts_of(point: Point, values: JsonObject) -> dict[str, str]:
@@ -271,22 +315,12 @@ def texts_of(point: Point, values: JsonObject) -> dict[str, str]:
     }
 
 
-def _failure_in_words(
-    scenario: Scenario, unsafe: Unsafe, collided: bool, degree: float
-) -> str:
-    """A failure at a safety degree, such as `the car hits a pedestrian at 12 km/h`."""
-    if unsafe.bound is not None and not collided:
-        return f"the car has {unsafe.bound}"
+def _event_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool) -> str:
+    """A failure, such as `hits a pedestrian`."""
     if collided:
-        impact_speed = (
-            -KMH_PER_MS * degree
-        )  # nearly 0 at the limit itself: then it says nothing
-        impact = (
-            "" if impact_speed < 1 else f" at {float(f'{impact_speed:.2g}'):g} km/h"
-        )
-        return f"the car hits {scenario.obstacle()}{impact}"
+        return f"hits {scenario.obstacle()}"
+    if unsafe.bound is not None:
+        return f"has {unsafe.bound}"
     measured = FROM_CENTRES if unsafe.contact and unsafe.degree else ""
-    return (
-        f"the car keeps less than {unsafe.degree or unsafe.distance:.3g} m{measured} from"
-        f" {scenario.obstacle()}"
-    )
+    least = f"{unsafe.degree or unsafe.distance:.3g} m{measured}"
+    return f"keeps less than {least} from {scenario.obstacle()}"

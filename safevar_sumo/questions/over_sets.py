@@ -19,7 +19,7 @@ from safevar_sumo.questions.words import percentage
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject, NamedValues
 from safevar_sumo.study import Study
 
-STAGE = "other parameter sets"
+STAGE = "check other parameter sets"
 """Phase of progress."""
 INTERVALS = "by_set_intervals"
 """The number of an answer that has the intervals."""

@@ -87,7 +87,7 @@ def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:
     # A point for each setting.
     frame = answer.tables["settings"]
     figure, ((axis,),) = new_figure(
-        f"Unsafe: {answer.numbers['unsafe']}", 1, 1, (4.6, 4.0)
+        f"Unsafe means: {answer.numbers['unsafe']}", 1, 1, (4.6, 4.0)
     )
     for where, colour in {
         "neither": GREY,
@@ -111,5 +111,5 @@ def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:
         escape_dollars(f"safety degree in {name} [m, below 0: -m/s]") for name in titles
     ]
     axis.set(xlabel=labels[0], ylabel=labels[1])
-    axis.legend(title="unsafe in", fontsize=FONT_SIZE - 1)
+    axis.legend(title="unsafe in version", fontsize=FONT_SIZE - 1)
     return figure

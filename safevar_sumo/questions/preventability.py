@@ -25,7 +25,7 @@ from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System
 
-REFERENCE_DRIVERS = "reference drivers in the same vehicle"
+REFERENCE_DRIVERS = "let other drivers drive"
 """The stage of progress."""
 MAX_SAMPLE = 6_666
 """Maximum number of collisions that are simulated: of more a random sample is."""
@@ -42,11 +42,28 @@ COLUMNS: Columns = {
         " possible moment; where a car ahead brakes, or takes or leaves the lane, rss"
         " (responsibility-sensitive safety), fuzzy_safety and r157 (UN R157, 5.2.5)"
     ),
-    "avoided": "collisions that he avoids",
-    "no_longer": "collisions that he avoids in the original vehicle, but not in this one",
-    "no_verdict": "collisions at points where he collides in the original vehicle, too: no verdict",
+    "avoided": Column(
+        "", "collisions that this driver avoids", head="collisions avoided"
+    ),
+    "no_longer": Column(
+        "",
+        "collisions that this driver avoids in the original vehicle, but not in the changed one",
+        head="avoided only in the original vehicle",
+    ),
+    "no_verdict": Column(
+        "",
+        "collisions in test cases where this driver collides even in the original vehicle; these"
+        " collisions do not count in the share",
+        head="not decided",
+    ),
     **with_interval(
-        "share", Column("-", "share that he avoids of those with a verdict", ".2f")
+        "share",
+        Column(
+            "-",
+            "share of the decided collisions that this driver avoids",
+            ".2f",
+            head="share avoided",
+        ),
     ),
     "no_verdict_points": Column("", "points without a verdict", is_shown=False),
 }

@@ -44,16 +44,17 @@ SCOPE = "Scope: "
 NOTES = (
     *(
         SCOPE,
+        "Valid for: ",
         "Remark: ",
         "Changed: ",
         "Criterion: ",
         "Not simulated: ",
-        "Counted as unsafe: ",
+        "Unsafe means: ",
     ),
     "Safe means: ",
     *(
-        "Only encounters count",
-        "Only vehicles that satisfy",
+        "An encounter counts only",
+        "A vehicle counts only",
         "Left out",
         "If all changes go",
     ),

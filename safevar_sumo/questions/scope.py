@@ -45,42 +45,34 @@ def moving_axes(
 
 
 def scope_of(study: Study, *, between: bool = True) -> str:
-    """What a claim about a study covers, as a phrase for a manual: `crossing (CPFA) at 10 to 40
-    km/h; weather wet (friction 0.71, water 1 mm), by day`.
+    """What a claim about a study covers, as a phrase for a manual: `the test CPFA (scenario
+    crossing) at 10 to 40 km/h; weather wet (71 % of the grip of a dry road, 1 mm of water), by
+    day`.
 
     Without `between`, nothing was simulated between the values of a matrix, which are then listed.
     """
-    # What drives in each test.
-    points = assemble(study).points
-    drives = [
-        (
-            _model_in_words((test and test.model) or study.scenario.model),
-            test.name if test else "",
-            _parameters_in_words(study, test, own, between),
-        )
-        for test, own in points_of_tests(study, points)
-    ]
-
     # Tests with the same scenario and parameters share a phrase.
-    phrases = []
-    for model, parameters in dict.fromkeys(
-        (model, parameters) for model, _, parameters in drives
-    ):
-        names = [
-            name
-            for other, name, same in drives
-            if (other, same) == (model, parameters) and name
-        ]
-        tests = f" ({join_phrases(names)})" if names else ""
-        phrases.append(f"{model}{tests}{f' {parameters}' if parameters else ''}")
-    if not points[0].scenario.mover.has("weather"):
-        return "; ".join(phrases)
-    weathers = dict.fromkeys(_weather_in_words(point.weather) for point in points)
-    return f"{'; '.join(phrases)}; {' or '.join(weathers)}"
+    points = assemble(study).points
+    groups = dict[tuple[str, str], list[str]]()
+    for test, of_test in points_of_tests(study, points):
+        model = (test and test.model) or study.scenario.model
+        key = model, _parameters_in_words(study, test, of_test, between)
+        groups.setdefault(key, []).extend([test.name] if test else [])
+    phrases = [_tests_in_words(names, *key) for key, names in groups.items()]
+    if points[0].scenario.mover.has("weather"):
+        weathers = dict.fromkeys(_weather_in_words(point.weather) for point in points)
+        phrases.append(" or ".join(weathers))
+    return "; ".join(phrases)
 
 
-def _model_in_words(model: str) -> str:
-    return model.rpartition(":")[2].replace("_", " ")
+def _tests_in_words(names: Sequence[str], model: str, parameters: str) -> str:
+    """Tests with the same scenario and parameters; the scenario alone without tests."""
+    scenario = f"scenario {model.rpartition(':')[2].replace('_', ' ')}"
+    tests = f"the {scenario}"
+    if names:
+        noun = "tests" if len(names) > 1 else "test"
+        tests = f"the {noun} {join_phrases(names)} ({scenario})"
+    return f"{tests} {parameters}".strip()
 
 
 def _parameters_in_words(
@@ -90,30 +82,25 @@ def _parameters_in_words(
     scenario.
     """
     # Axes that are listed, and those of which any value may occur.
-    over = study.lists_of(test)
     moving = moving_axes(study, test, points) if between else {}
-    phrases = {}
-    for name, values in over.items():
+    texts = {}
+    for name, values in study.lists_of(test).items():
         unit = unit_text(unit_of(points[0].scenario, name))
-        phrases[name] = f"{_values_in_words(values, name in moving)}{unit}"
+        texts[name] = f"{_values_in_words(values, name in moving)}{unit}"
     for name, domain in study.ranges_of(test).items():
-        phrases[name] = f"{domain.lower:g} to {domain.upper:g}{unit_text(domain.unit)}"
+        texts[name] = f"{domain.lower:g} to {domain.upper:g}{unit_text(domain.unit)}"
 
-    # Speeds of tests that state none, first.
-    speeds = sorted(
-        {
-            point.scenario.test_speed
-            for point in points
-            if point.scenario.test_speed is not None
-        }
-    )
-    if SPEED_DIMENSION not in phrases and speeds:
-        driven = dict.fromkeys(f"{KMH_PER_MS * speed:.4g}" for speed in speeds)
-        phrases = {SPEED_DIMENSION: f"{join_phrases(driven)} km/h", **phrases}
-    return ", ".join(
-        f"at {text}" if name == SPEED_DIMENSION else f"{name.replace('_', ' ')} {text}"
-        for name, text in phrases.items()
-    )
+    # Speeds first, also of tests that state none.
+    speed = texts.pop(SPEED_DIMENSION, "")
+    stated = (point.scenario.test_speed for point in points)
+    speeds = sorted({value for value in stated if value is not None})
+    if speeds and not speed:
+        driven = dict.fromkeys(f"{KMH_PER_MS * value:.4g}" for value in speeds)
+        speed = f"{join_phrases(driven)} km/h"
+    phrases = [f"{name.replace('_', ' ')} {text}" for name, text in texts.items()]
+    if speed:
+        phrases.insert(0, f"at {speed}")
+    return ", ".join(phrases)
 
 
 def _values_in_words(values: Sequence[float | str], is_range: bool) -> str:
@@ -125,19 +112,19 @@ def _values_in_words(values: Sequence[float | str], is_range: bool) -> str:
 
 
 def _weather_in_words(weather: Weather) -> str:
-    """The weather with its effects, and the light: `weather wet (friction 0.71, water 1 mm), by
-    day`, `weather clear (grip of a dry road), by day`.
-    """
-    is_dry = weather.road_friction == 1 and not weather.water
-    effects = [
-        "grip of a dry road" if is_dry else f"friction {weather.road_friction:g}"
-    ]
-    effects += [f"water {weather.water:g} mm"] if weather.water else []
-    effects += [f"visibility {weather.visibility:g}"] if weather.visibility != 1 else []
-    effects += (
-        [f"recognition {weather.recognition_delay:g} s later"]
-        if weather.recognition_delay
-        else []
-    )
+    """The weather with its effects, and the light: `weather clear (grip of a dry road), by day`."""
+    effects = ["grip of a dry road"]
+    if weather.road_friction != 1 or weather.water:
+        effects = [f"{100 * weather.road_friction:g} % of the grip of a dry road"]
+    if weather.water:
+        effects.append(f"{weather.water:g} mm of water")
+    if weather.visibility != 1:
+        effects.append(
+            f"sensors detect at {100 * weather.visibility:g} % of their range"
+        )
+    if weather.recognition_delay:
+        effects.append(
+            f"sensors recognise a person {weather.recognition_delay:g} s later"
+        )
     name = weather.name.replace("_", " ")
     return f"weather {name} ({', '.join(effects)}), by {weather.light}"

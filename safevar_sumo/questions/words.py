@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from shlex import quote
 
 from safevar_sumo.questions.sampling import CONFIDENCE
+from safevar_sumo.questions.sentence import Sentence
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -16,36 +17,35 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 OUTCOME_VERBS = {
     Outcome.STOPPED: "stops",
     Outcome.PASSED: "passes",
-    Outcome.TIMEOUT: "is still under way at the end",
+    Outcome.TIMEOUT: "is still driving when the simulation ends",
     Outcome.NEVER_MOVED: "never moves",
     Outcome.SIMULATOR_ERROR: "could not be simulated",
-    Outcome.INVALID_TEST: "ends as an invalid test",
-    Outcome.INFEASIBLE: "violates a constraint",
+    Outcome.INVALID_TEST: "drives an invalid test, which counts neither as failure nor as success",
+    Outcome.INFEASIBLE: "violates a constraint of the study",
 }
 """How a run ended, as the verb of a sentence; a collision is described with its speed instead."""
 
 
+UNSAFE_MEANS = Sentence("note", "Unsafe means: {description}.")
 EXACT = ".15g"
 """How values are printed with which a vehicle was simulated: all their digits."""
 LOST_SHARE = 0.05
 """A value is printed with all its digits where rounding would change more of it."""
 
 
-def ending_in_words(outcome: str, safety_degree: float | None, contact: float) -> str:
-    """How a run ended, such as `collides at 3.21 m/s` or `stops with a safety degree of 0.87 m`.
+def ending_in_words(outcome: str, safety_degree: float, contact: float) -> str:
+    """How a run ended, such as `collides at 3.21 m/s` or `stops, with a safety degree (smallest
+    distance) of 0.87 m`.
 
     The safety degree is in m, or -m/s on a collision; bodies touch at a safety degree of `contact`.
     """
-    verb = (
-        "collides"
-        if outcome == Outcome.COLLISION
-        else OUTCOME_VERBS.get(Outcome(outcome), outcome)
-    )
-    if safety_degree is None or math.isnan(safety_degree):
-        return verb
     if outcome == Outcome.COLLISION:
-        return f"{verb} at {abs(safety_degree):.2f} m/s"
-    return f"{verb} with a safety degree of {distance_in_words(safety_degree, contact)}"
+        return f"collides at {abs(safety_degree):.2f} m/s"
+    verb = OUTCOME_VERBS[Outcome(outcome)]
+    if math.isnan(safety_degree):
+        return verb
+    distance = distance_in_words(safety_degree, contact)
+    return f"{verb}, with a safety degree (smallest distance) of {distance}"
 
 
 def collision_in_words(closing_speed: float, own_speed: float, digits: int = 2) -> str:
@@ -53,8 +53,9 @@ def collision_in_words(closing_speed: float, own_speed: float, digits: int = 2) 
     another one, as the struck body moves along the lane.
     """
     closing, own = (f"{speed:.{digits}f}" for speed in (closing_speed, own_speed))
-    beside = "" if closing == own else f" (closing speed; its own is {own} m/s)"
-    return f"collides at {closing} m/s{beside}"
+    if closing == own:
+        return f"collides at {closing} m/s"
+    return f"collides at a closing speed of {closing} m/s (own speed {own} m/s)"
 
 
 def change_texts(
@@ -64,8 +65,8 @@ def change_texts(
     are_printed: bool = False,
 ) -> list[str]:
     """The values that differ from the original values, in the order of the study, such as `mass
-    2404 -> 2600 kg (+8.2 %)`, without a share of an original that is 0. Values that `are_printed`
-    have their digits already.
+    from 2404 to 2600 kg (+8.2 %)`, without a share of an original that is 0. Values that
+    `are_printed` have their digits already.
     """
     texts = []
     for item in characteristics:
@@ -82,16 +83,27 @@ def change_texts(
             error = abs(float(rounded) - value)
             is_lost = float(rounded) == original or error > LOST_SHARE * abs(value)
             text = f"{value:{EXACT}}" if are_printed or is_lost else rounded
-            texts.append(f"{item.name} {original:g} -> {text}{item.suffix}{share}")
+            texts.append(
+                f"{item.short_name} from {original:g} to {text}{item.suffix}{share}"
+            )
     return texts
 
 
-def undecidable_in_words(items: Iterable[Characteristic]) -> str:
-    """That limits of characteristics are too near to the original, in a sentence."""
-    return (
-        f"Not decidable in a workshop, as the limit is nearer to the original vehicle than it is"
-        f" measured: {precise_in_words(items)}."
+def undecidable_in_words(items: Sequence[Characteristic]) -> str:
+    """That a workshop cannot check limits of characteristics, which are too near to the original,
+    and what to do.
+    """
+    sentences = [
+        f"A workshop cannot check the limit of {item.short_name}: the allowed change is smaller"
+        f" than the measuring error ({item.error:g}{item.suffix})."
+        for item in items
+    ]
+    names = join_phrases(item.short_name for item in items)
+    sentences.append(
+        f"Ask the manufacturer's service to measure {names}, or treat each such part as one that"
+        " must be as new."
     )
+    return " ".join(sentences)
 
 
 def precise_in_words(items: Iterable[Characteristic]) -> str:
@@ -106,23 +118,30 @@ def precise_in_words(items: Iterable[Characteristic]) -> str:
     return join_phrases(phrases) if phrases else ""
 
 
+def place_in_words(
+    characteristics: CharacteristicSet,
+    values: Mapping[str, float],
+    *,
+    are_printed: bool = False,
+) -> str:
+    """The searched parameters of the scenario, such as `speed 59.5 km/h`; empty without any."""
+    phrases = []
+    for item in characteristics.scenario:
+        value = values[item.name]
+        text = f"{value:{EXACT}}" if are_printed else item.text(value)
+        phrases.append(f"{item.short_name} {text}{item.suffix}")
+    return join_phrases(phrases) if phrases else ""
+
+
 def encounter_in_words(
     characteristics: CharacteristicSet,
     values: Mapping[str, float],
     *,
     are_printed: bool = False,
 ) -> str:
-    """The searched parameters of the scenario, such as ` in an encounter with speed 59.5 km/h`;
-    empty without any.
-    """
-    texts = {
-        item: f"{values[item.name]:{EXACT}}"
-        if are_printed
-        else item.text(values[item.name])
-        for item in characteristics.scenario
-    }
-    phrases = [f"{item.short_name} {text}{item.suffix}" for item, text in texts.items()]
-    return f" in an encounter with {join_phrases(phrases)}" if phrases else ""
+    """The place in a sentence, such as ` in an encounter with speed 59.5 km/h`."""
+    place = place_in_words(characteristics, values, are_printed=are_printed)
+    return f" in an encounter with {place}" if place else ""
 
 
 def replay_command(subject: str, point: str = "") -> str:
@@ -133,10 +152,18 @@ def replay_command(subject: str, point: str = "") -> str:
     return f"{PROGRAM_COMMAND} simulate {quote(subject)}{where}"
 
 
-def join_phrases(phrases: Iterable[str]) -> str:
+def join_phrases(phrases: Iterable[str], conjunction: str = "and") -> str:
     """Phrases of a sentence as a list: `a, b and c`."""
     *beginning, last = phrases
-    return f"{', '.join(beginning)} and {last}" if beginning else last
+    return f"{', '.join(beginning)} {conjunction} {last}" if beginning else last
+
+
+def count_in_words(count: float, total: int) -> str:
+    """How many of a number: `none of the 24`, `1 of the 24`, `all 24`."""
+    if count == total > 1:
+        return f"all {total:,}"
+    number = f"{count:,.1f}".removesuffix(".0") if count else "none"
+    return f"{number} of the {total:,}"
 
 
 def number_of(count: int, noun: str) -> str:
@@ -151,32 +178,21 @@ MAX_POINTS_NAMED = 6
 def points_in_words(
     vehicle: str, failing_points: Sequence[str], point_count: int
 ) -> str:
-    """A sentence such as `The original vehicle fails 2 of 72 test cases: CPNA, speed 40,
+    """A sentence such as `The original vehicle fails in 2 of 72 test cases: CPNA, speed 40,
     impact_location 25; CPLA, speed 60, clear.`
     """
-    if not failing_points:
+    number = len(failing_points)
+    if not number:
         tests = (
             f"none of the {point_count} test cases"
             if point_count > 1
             else "no test case"
         )
-        return f"{vehicle} fails {tests}."
-    rest = len(failing_points) - MAX_POINTS_NAMED
-    names = "; ".join(failing_points[:MAX_POINTS_NAMED]) + (
-        f" and {rest} more" if rest > 0 else ""
-    )
-    return (
-        f"{vehicle} fails {len(failing_points)} of {point_count} test cases: {names}."
-    )
-
-
-def share_in_words(share: float) -> str:
-    """A share in whole per cent, such as `14 %`; `all` and `none` only if it is exactly that."""
-    if share in (0, 1):
-        return "all" if share else "none"
-    if share >= 0.995:
-        return "nearly all"
-    return "hardly any" if share < 0.005 else f"{100 * share:.0f} %"
+        return f"{vehicle} fails in {tests}."
+    names = "; ".join(failing_points[:MAX_POINTS_NAMED])
+    if number > MAX_POINTS_NAMED:
+        names += f" and {number - MAX_POINTS_NAMED} more"
+    return f"{vehicle} fails in {number} of {point_count} test cases: {names}."
 
 
 def percentage(share: float) -> str:
@@ -203,10 +219,12 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
     """
     if not study.ranges:
         return []
-    names = join_phrases(study.ranges)
-    own = f"Each vehicle drives in its own encounter ({names})."
-    left = [] if left_out is None else [f"{number_of(left_out, 'encounter')} left out."]
-    return [own, *demanded_in_words(study), *left]
+    own = (
+        "Each vehicle meets an encounter of its own, with its own values of"
+        f" {join_phrases(study.ranges)}."
+    )
+    left = f"{left_out:,} encounters do not count and were left out."
+    return [own, *demanded_in_words(study), *([left] if left_out else [])]
 
 
 def with_scope(study: Study, left_out: int, *sentences: str) -> str:
@@ -219,8 +237,10 @@ def demanded_in_words(study: Study) -> list[str]:
     """What the original vehicle must keep in a searched encounter, in a sentence; empty for any
     other study.
     """
-    margin = f"at least {study.scenario.margin or 0:g} m of clearance (scenario.margin)"
-    sentence = f"Only encounters count in which the original vehicle keeps {margin}."
+    sentence = (
+        "An encounter counts only if the original vehicle keeps at least"
+        f" {study.scenario.margin or 0:g} m of clearance in it (scenario.margin)."
+    )
     return [sentence] if study.ranges else []
 
 
@@ -231,8 +251,5 @@ def constraints_in_words(study: Study) -> list[str]:
         f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}"
         for constraint in study.shared_constraints
     )
-    return (
-        [f"Only vehicles that satisfy the study's constraints count: {conditions}."]
-        if conditions
-        else []
-    )
+    sentence = f"A vehicle counts only if it satisfies the constraints of the study: {conditions}."
+    return [sentence] if conditions else []

@@ -298,9 +298,10 @@ def _tests_in_words(phrase: str) -> str:
     """A phrase of a scope as what happens in Euro NCAP's tests: `an adult crosses from the far
     side; this vehicle drives at 10 to 40 km/h`.
     """
-    # The phrase has the scenario, the names of its tests in brackets, and their speeds.
-    tests, _, speeds = phrase.partition(" (")[2].partition(")")
-    names = re.split(", | and ", tests)
+    # The phrase has the names of tests, their scenario in brackets, and their speeds.
+    tests, _, scenario = phrase.partition(" (scenario ")
+    speeds = scenario.partition(")")[2]
+    names = re.split(", | and ", re.sub("^the tests? ", "", tests))
     if not TESTS.keys() >= set(names):
         return phrase
     words = join_phrases(TESTS[name].words for name in names)

@@ -149,7 +149,7 @@ def test_a_collision_with_a_moving_car_has_its_closing_speed_and_the_cars_own() 
     one = sv.simulate(study, {"tireFric": 1.0})
     closing, own = -one.metrics["safety_degree"], one.collision_speed
     assert own == pytest.approx(closing + 20 / 3.6, abs=1e-6)
-    speeds = f"{closing:.2f} m/s (closing speed; its own is {own:.2f} m/s)"
+    speeds = f"a closing speed of {closing:.2f} m/s (own speed {own:.2f} m/s)"
     assert one.verdict == f"collides at {speeds}"
 
 

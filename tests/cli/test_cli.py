@@ -152,7 +152,7 @@ def test_a_matrix_says_of_how_many_test_cases_a_degree_is_the_least() -> None:
     points = json.loads(simulate("wear", "--json").stdout)["tables"]["points"]["rows"]
     worst = min(points, key=lambda row: row["safety_degree"])
     least = f"{worst['safety_degree']:.2f} m, the least of {len(points)} test cases"
-    assert f"{least} ({worst['point']}). The original vehicle fails none" in lead
+    assert f"{least} ({worst['point']}). The original vehicle fails in none" in lead
     assert "simulated" not in simulate("wear").stdout
 
 

@@ -147,7 +147,9 @@ def test_one_screen_says_how_many_sentences_it_leaves_out_and_none_of_what_is_va
     None
 ):
     sentences = [f"Sentence {number} is here." for number in range(5)]
-    valid = "Only vehicles that satisfy the study's constraints count: a below b."
+    valid = (
+        "A vehicle counts only if it satisfies the constraints of the study: a below b."
+    )
     tested = f"All corners. How they were chosen. {valid}"
     text = replace(ANSWER, verdict=" ".join(sentences), tested=tested).render("text")
     assert "More: --details (2 more sentences" in text
@@ -419,7 +421,10 @@ def test_a_change_has_no_share_of_an_original_that_is_0() -> None:
     texts = change_texts(
         CharacteristicSet.of(load_study("sun", encounters="ranges")), changes
     )
-    assert texts == ["mass 2404 -> 2644 kg (+10.0 %)", "recognition_delay 0 -> 0.100 s"]
+    assert texts == [
+        "vehicle mass from 2404 to 2644 kg (+10.0 %)",
+        "additional time that the sensors need in this weather from 0 to 0.100 s",
+    ]
 
 
 def test_a_change_over_decades_or_next_to_the_original_is_no_other_value() -> None:
@@ -428,7 +433,7 @@ def test_a_change_over_decades_or_next_to_the_original_is_no_other_value() -> No
         items.members[items.names.index("mass")], original=1e-9, lower=0, upper=0.1
     )
     texts = (change_texts([mass], {"mass": value}) for value in (3.2e-6, 0.051, 1.1e-9))
-    assert [text.split(" -> ")[1].split()[0] for [text] in texts] == [
+    assert [text.split(" to ")[1].split()[0] for [text] in texts] == [
         "3.2e-06",
         "0.051",
         "1.1e-09",

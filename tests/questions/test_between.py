@@ -127,8 +127,16 @@ def test_an_encounter_between_counts_only_where_the_original_is_safe(
 @pytest.mark.parametrize(
     ("over", "between", "said"),
     [
-        ("speed = [10, 20, 30, 40]", True, "(A) at 10 to 40 km/h"),
-        ("speed = [10, 20, 30, 40]", False, "(A) at 10, 20, 30 and 40 km/h"),
+        (
+            "speed = [10, 20, 30, 40]",
+            True,
+            "the test A (scenario crossing) at 10 to 40 km/h",
+        ),
+        (
+            "speed = [10, 20, 30, 40]",
+            False,
+            "A (scenario crossing) at 10, 20, 30 and 40 km/h",
+        ),
         ('target = ["adult", "child"]', True, "target adult and child"),
     ],
 )
@@ -185,7 +193,7 @@ def test_a_set_in_which_the_original_is_unsafe_is_named_with_its_test(
         characteristics=("treadDepth",),
     )
     assert (
-        "With the original vehicle itself the car hits a pedestrian ahead"
+        "With the original vehicle itself the vehicle hits a pedestrian ahead"
         in answer.verdict
     )
-    assert "(parameter set 1): there no limit is claimed." in answer.verdict
+    assert "; parameter set 1): there no limit is claimed." in answer.verdict

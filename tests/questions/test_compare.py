@@ -18,6 +18,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.compare.coverage import missing_in_words, missing_parts
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.research_questions.statistics import compare_samples
+from safevar_sumo.questions.sentence import Sentence
 from safevar_sumo.questions.tables import cell_text
 from safevar_sumo.questions.tolerance import asked
 from tests.in_process import SLOW, InlinePool, json_of, refused, run, searched
@@ -103,12 +104,12 @@ OTHERS = {
     "a margin that leaves encounters out": (
         "sun",
         {"encounters": "ranges", "scenario": {"margin": 2.0}},
-        ["the encounters in which its original keeps less than 2 m"],
+        ["the encounters in which its original vehicle keeps less than 2 m"],
     ),
     "a constraint": (
         "sun",
         {"constraints": [{"sum": {"mass": 1.0}, "at_most": 2500.0}]},
-        ["what its constraint on mass excludes"],
+        ["the vehicles that its constraint on mass excludes"],
     ),
 }
 
@@ -134,9 +135,11 @@ def test_a_sentence_names_four_missing_parts() -> None:
         open_evaluator(load_study("wear"), POOL) as a,
         open_evaluator(load_study("wear", **ONE_TEST), POOL) as b,
     ):
-        (sentence,) = missing_in_words((a, b), "AB")
-    assert sentence.startswith("B lacks the test case (CPFA, speed 10, wet), ")
-    assert sentence.endswith(", the test CPNA and 2 more.")
+        (sentence,) = missing_in_words(a, b, {"a": "A", "b": "B"})
+    assert sentence.text.startswith(
+        "Version B lacks the test case (CPFA, speed 10, wet), "
+    )
+    assert sentence.text.endswith(", the test CPNA and 2 more, which A has.")
 
 
 @SLOW
@@ -182,24 +185,24 @@ VERSIONS = {
     "later": (
         {"ads": {"model": "late:Late"}},
         "do not release",
-        r"but brakes less often without need\. later lacks 12 parameter sets\. later"
-        r" collides at ([\d.]+) m/s with its original"
-        r" vehicle in the test CPFA at 40 km/h, where that of wear does not",
+        r"although it brakes less often without need\. Version later lacks 12 parameter sets, which"
+        r" wear has\. The original vehicle of later collides at ([\d.]+) m/s \(test CPFA, driven at"
+        r" 40 km/h\)\. The original vehicle of wear does not",
     ),
     "needless": (
         {"ads": {"parameters": {"braking_share": 0.1}}},
         "decide",
-        r"brakes needlessly in \d+ of \d+ benign scenes, wear in \d+\. needless is safe in",
+        r"needlessly in \d+ of \d+ benign scenes .*, and version wear in \d+\. \d+ of the",
     ),
     "slower": (
         {"vehicle": {"characteristics": {"sensorLatency": {"original": 0.15}}}},
         "do not release",
-        "has limits of single characteristics that shrink",
+        "The limits of single characteristics are narrower in slower",
     ),
     "hasty": (
         {"ads": {"parameters": {"response_time": 0.2}}},
         "do not release",
-        r"is less safe than wear. hasty is unsafe in \d+ of",
+        r"is less safe than wear. \d+ of the \d+ changed vehicles that are safe in wear are",
     ),
 }
 
@@ -327,10 +330,7 @@ def test_a_report_of_two_results_compares_them(
 def test_what_a_person_has_to_decide_passes_no_gate_and_counts_have_no_exponent(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    decided = (
-        {"decision": "decide", "better_in": 1, "worse_in": 1},
-        "DECIDE: B is both.",
-    )
+    decided = "DECIDE", [Sentence("answer", "DECIDE: B is both.")]
     monkeypatch.setattr("safevar_sumo.questions.compare._decide", lambda *_: decided)
     run("compare", "smoke", "smoke", "--samples", "8", "--jobs", "1", expect=4)
     assert cell_text(1259.0, ".3g") == "1,259"

@@ -204,20 +204,21 @@ def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
         if item.name in leading["boundary"]:
             value = leading["boundary"][item.name]
             assert (
-                float(re.search(rf"{item.short_name} at ([\d.]+)", verdict)[1]) == value
+                float(re.search(rf"{item.short_name} at ([\d.]*\d)", verdict)[1])
+                == value
             )  # type: ignore[index]
     share = f"{100 * leading['robust_share']:.0f} % of vehicles with slightly different values"
     assert re.search(
-        r"^With .* the vehicle collides\. Of 256 vehicles .*\. The cause d.* exact values: "
-        rf".*{share} are unsafe, too\.",
+        r"^One change is enough for a collision: .* \d+ failures .* 256 vehicles .*\."
+        rf" The cause is [^:]*: (only )?{share} are unsafe",
         verdict,
     )
-    assert f"The cause holds in {leading['holds']} of {FITS} parameter sets" in verdict
+    assert f"cause was found in {leading['holds']} of {FITS} parameter sets" in verdict
     assert leading["solution"] not in verdict
     numbers = explained.numbers
     assert (
-        f"Of {numbers['settings']} different solutions of the search,"
-        f" {numbers['failures']} collide." in verdict
+        f"{numbers['failures']} of the {numbers['settings']} different vehicles that the search"
+        " returned (its solutions) collide." in verdict
     )
     assert (
         explained.tables["drivers"].set_index("driver")["avoided"]["competent_driver"]
@@ -487,10 +488,10 @@ def test_of_an_unsafe_original_no_change_is_a_cause(
     )
     degree = f"{answer.numbers['original_degree']:.3g}"
     said = (
-        f"The original vehicle itself has a safety degree of {degree} m, below 99 m: no change is"
-        " necessary. Ask again with a weaker criterion"
+        f"The original vehicle is already unsafe: it has a safety degree of {degree} m, below 99 m."
+        " A failure needs no change of the vehicle. Ask again with a weaker criterion"
     )
-    assert answer.verdict.startswith(f"{said} (--unsafe). Of 4 vehicles")
+    assert answer.verdict.startswith(f"{said} (--unsafe). All 4 vehicles")
     assert [
         len(answer.tables[name])
         for name in ("causes", "characteristics", "distinct_causes")

@@ -41,24 +41,22 @@ evaluations = 80
 runs = 1
 """
 LEFT_OUT = (
-    r"in its own encounter \(distance\)\. Only encounters count in which the original vehicle keeps"
-    r" at least 0\.4 m of clearance \(scenario\.margin\)\. {} encounters? left out\."
+    r"own values of distance\. An encounter counts only if the original vehicle keeps at least 0\.4"
+    r" m of clearance in it \(scenario\.margin\)\. {} encounters do not count and were left out\."
 )
 DEMANDED = (
-    r"Only encounters count in which the original vehicle keeps at least 0\.4 m of clearance"
+    r"An encounter counts only if the original vehicle keeps at least 0\.4 m of clearance in it"
     r" \(scenario\.margin\)\."
 )
 COUNTED = LEFT_OUT.format(r"[\d,]+")
-CAUSE = (
-    "collides in an encounter in which the original vehicle is safe. The encounter has"
-)
+CAUSE = "The original vehicle is safe in the same encounter, which has"
 QUESTIONS = {
     "risk tiny.toml --samples 300": f"{DEMANDED}.*left out",
     "risk results --samples 300": COUNTED,
     "rules tiny.toml --samples 300": COUNTED,
     "explain tiny.toml --quick": (
         rf"encounters in which the original vehicle is least safe\..* {DEMANDED}"
-        r" [\d,]+ encounters? left out\."
+        r" [\d,]+ encounters do not count and were left out\."
     ),
     "explain results --quick --top 2": CAUSE,
     "tables results": (
@@ -295,4 +293,4 @@ def test_the_page_replays_causes_in_their_encounters() -> None:
     replays = re.findall(r"<summary>(Only [^<]*)</summary>", page)
     assert replays
     assert all("in its encounter: collides" in one for one in replays), replays
-    assert "Each vehicle drives in its own encounter (distance)" in page
+    assert "meets an encounter of its own, with its own values of distance" in page

@@ -55,9 +55,12 @@ def test_limits_are_attacked_in_the_ranges_of_their_study_by_a_car_that_can_be_s
     [
         (
             "CPNA, speed 40, impact_location 25, wet",
-            "crossing (CPNA) at 40 km/h, impact location",
+            "the test CPNA (scenario crossing) at 40 km/h, impact location",
         ),
-        ("CPLA, speed 60, wet", "along (CPLA) at 60 km/h; weather wet"),
+        (
+            "CPLA, speed 60, wet",
+            "the test CPLA (scenario along) at 60 km/h; weather wet",
+        ),
     ],
 )
 def test_limits_at_one_point_of_a_matrix_claim_nothing_beyond_it(

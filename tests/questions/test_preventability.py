@@ -18,7 +18,7 @@ from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.failures import PointComparison, compare_at_points
 from safevar_sumo.questions.explain.robustness import robust_shares
-from safevar_sumo.questions.explain.words import avoided_in_words
+from safevar_sumo.questions.explain.tell import avoidance
 from safevar_sumo.questions.preventability import (
     TITLES,
     assess_collisions,
@@ -26,6 +26,7 @@ from safevar_sumo.questions.preventability import (
     avoided_by,
     drivers_frame,
 )
+from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import ModelTable, ScenarioTable
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -101,12 +102,12 @@ def verdicts(
 
 def test_what_drivers_avoid_is_counted_among_the_collisions_with_a_verdict() -> None:
     many = verdicts([1.0] + [0.0] * 42 + [np.nan] * 1336, [1.0] * 1061 + [0.0] * 318)
-    assert avoided_in_words(many) == (
+    assert Verdict(avoidance(many)) == (
         "A competent driver (as in UN R157) in the same vehicle would have avoided 1 of 43"
-        " collisions with a verdict (1,379 examined). Full braking at the first possible moment"
-        " would have avoided 1,061 of 1,379 examined collisions."
+        " collisions with a verdict (1,379 were examined). Full braking at the first possible"
+        " moment would have avoided 1,061 of 1,379 examined collisions."
     )
-    assert avoided_in_words(verdicts([np.nan], [np.nan])) == ""
+    assert not [*avoidance(verdicts([np.nan], [np.nan]))]
 
 
 def test_who_has_no_verdict_is_counted_with_the_points() -> None:
@@ -230,14 +231,16 @@ def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
 ) -> None:
     endings, unsafe_points = failure
     at = next(
-        point for point in system.points if endings.startswith(f"At {point.name}: ")
+        point
+        for point in system.points
+        if endings.startswith(f"In the test case {point.name}, ")
     )
     assert at.name in unsafe_points
     original = drive_and_score(system.at(at), original_of(system)).f_safe[0]
     assert (
-        endings == f"At {at.name}: the original stops with a safety degree of"
-        f" {original:.2f} m; this one"
-        " collides at "
+        endings
+        == f"In the test case {at.name}, the original vehicle stops, with a safety degree"
+        f" (smallest distance) of {original:.2f} m. The failed vehicle collides at "
         f"{-drive_and_score(system, weak).f_safe[0]:.2f} m/s."
     )
 

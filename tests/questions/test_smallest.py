@@ -18,8 +18,10 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.combinations import enumerate_causes, staircase
 from safevar_sumo.questions.explain.smallest import Smallest
+from safevar_sumo.questions.explain.tell import smallest_sentences
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.over_sets import VEHICLES
+from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -124,7 +126,7 @@ def smallest_of(
     evaluator = made_up_evaluator(n, region)
     evaluator.account.most = most
     smallest = Smallest.of(evaluator, COLLISION, 0)
-    return smallest, " ".join(filter(None, smallest.sentences(evaluator, COLLISION)))
+    return smallest, Verdict(smallest_sentences(smallest, evaluator, COLLISION))
 
 
 def way(settings: FloatArray) -> FloatArray:
@@ -152,7 +154,8 @@ def test_one_change_at_half_its_way_leads_where_all_ends_are_safe() -> None:
     )
     assert "None of the 4 changes of a single characteristic to an end" in verdict
     assert (
-        "If all changes go 50 % of the way to the ends, 1 change is enough" in verdict
+        "If all changes go 50 % of the way to the ends of their domains, 1 change is"
+        in verdict
     )
 
 
@@ -161,8 +164,13 @@ def test_a_beginning_is_rounded_to_the_unsafe_side() -> None:
     smallest, verdict = smallest_of(2, lambda rows: way(rows)[:, 0] > 0.3007)
     assert smallest.table["begins_at"].tolist() == [0.31]
     assert "a at 6.55 N m, 31 % of the way" in verdict
-    assert "If all changes go 30 to 10 % of the way to the ends, none of 24" in verdict
-    assert "The program tested with a at 10 N m how sure this cause is." in verdict
+    assert (
+        "go 30 to 10 % of the way to the ends of their domains, none of 24" in verdict
+    )
+    assert (
+        "(similar vehicles, other parameter sets) used these values: a at 10 N m."
+        in verdict
+    )
 
 
 def test_a_cause_begins_where_none_of_its_parts_is_unsafe() -> None:
@@ -217,10 +225,10 @@ def test_combinations_that_contain_a_cause_and_cures_are_counted() -> None:
     assert [smallest.numbers[name] for name in names] == counts
     assert smallest.numbers["containing_tried"] == counts[0]
     assert (
-        "26 further combinations of two to four changes contain a smaller cause"
+        "26 further combinations contain a smaller cause (fewer changes that are enough)"
         in verdict
     )
-    assert "9 of the 26 simulated ones are safe" in verdict
+    assert "prevents the failure in 9 of the 26 simulated combinations" in verdict
 
 
 @pytest.mark.parametrize(
@@ -288,14 +296,8 @@ def test_the_verdict_claims_no_more_than_was_simulated() -> None:
         )
 
     _, sentences = smallest_of(4, region)
-    assert (
-        "1 of the 24 combinations of two changes causes a collision: a and b."
-        in sentences
-    )
-    assert (
-        "1 of the 28 combinations of three changes causes a collision: b, c and d."
-        in sentences
-    )
+    assert "1 of the 24 combinations of two changes causes a collision." in sentences
+    assert "1 of the 28 combinations of three changes causes a collision." in sentences
     assert (
         "none of 480 simulated combinations (up to four changes) causes a collision"
         in sentences
@@ -320,8 +322,8 @@ def test_with_repeats_a_cause_has_the_share_of_its_unsafe_runs() -> None:
     evaluator = Evaluator(study, Repeated(study, lambda rows: rows[:, 0] > 9))
     smallest = Smallest.of(evaluator, COLLISION, 0)
     assert smallest.table["unsafe_runs"].tolist() == [0.25]
-    sentences = [*smallest.sentences(evaluator, COLLISION)]
-    assert "The vehicle is unsafe in 25 % of its runs." in sentences
+    sentences = Verdict(smallest_sentences(smallest, evaluator, COLLISION))
+    assert "The vehicle is unsafe in 25 % of its repeated runs." in sentences
 
 
 @SLOW

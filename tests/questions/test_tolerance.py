@@ -309,15 +309,15 @@ def test_a_box_stays_within_that_of_a_smaller_unsafe_region() -> None:
 @pytest.mark.parametrize(
     ("limit", "said"),
     [
-        ("a <= 6.8", "Do not release: a 6.8 N m: the car hits"),
+        ("a <= 6.8", "Do not release: a 6.8 N m: the vehicle hits"),
         (
             "a <= 6.812",
             (
-                "Do not release: a 6.812 N m: the car hits a crossing pedestrian at 3.6 km/h"
-                " (outside by 0.312 N m)"
+                "Do not release: a 6.812 N m: the vehicle hits a crossing pedestrian (impact at"
+                " 3.6 km/h) (outside by 0.312 N m)"
             ),
         ),
-        ("a <= 8", "Do not release: a 6.6 N m: the car hits"),
+        ("a <= 8", "Do not release: a 6.6 N m: the vehicle hits"),
         (
             "a <= 6",
             (

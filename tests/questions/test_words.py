@@ -9,9 +9,9 @@ import pytest
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.words import (
     MAX_POINTS_NAMED,
+    count_in_words,
     percentage,
     points_in_words,
-    share_in_words,
     two_decimals,
     undecidable_in_words,
 )
@@ -26,15 +26,15 @@ def test_a_limit_nearer_to_the_original_than_its_measurement_is_not_decidable() 
     ends = (0.9, 1.0), (0.96, 1.0), (0.5, 1.0), (1.0, 1.0)
     is_decidable = [True, False, True, True]
     assert [brakes.is_decidable(*both) for both in ends] == is_decidable
-    assert "relative brake torque (measured to within 0.05)" in undecidable_in_words(
-        [brakes]
-    )
+    assert "the measuring error (0.05)" in undecidable_in_words([brakes])
 
 
-def test_a_share_is_all_or_none_only_if_it_is_exactly_that() -> None:
-    shares = (0.0, 0.004, 0.006, 0.99, 0.995, 1.0)
-    words = ["none", "hardly any", "1 %", "99 %", "nearly all", "all"]
-    assert [*map(share_in_words, shares)] == words
+def test_a_count_is_all_or_none_only_if_it_is_exactly_that() -> None:
+    counts = [count_in_words(number, 24) for number in (0, 2.5, 24)]
+    assert counts == ["none of the 24", "2.5 of the 24", "all 24"]
+
+
+def test_a_share_has_the_digits_that_decide() -> None:
     shares = (0.00043, 0.0994, 0.0995, 0.37)
     assert [*map(percentage, shares)] == ["0.043", "9.9", "10", "37"]
     values = (None, math.nan, -0.004, 1.006)
@@ -55,4 +55,4 @@ def test_a_sentence_names_the_first_failing_test_cases(
     failing: int, count: int, said: str
 ) -> None:
     sentence = points_in_words("It", [*"abcdefghi"[:failing]], count)
-    assert sentence == f"It fails {said}."
+    assert sentence == f"It fails in {said}."

@@ -188,7 +188,7 @@ def test_settings_that_answers_name_are_replayed_once_for_each_set_of_changes(
     assert names == ["Only tireFric", "Only mass, tireFric"]
     assert played[0]["title"].startswith("Fewest changes: ")
     assert played[1 + len(study.choices)]["changes"][0].startswith(
-        "tireFric 3.5 -> 1.20 "
+        "tyre friction from 3.5 to 1.20 "
     ), "the first of them"
 
 

@@ -60,8 +60,9 @@ def answer_of(
         "kept": True,
         "rough": False,
         "scope": (
-            "crossing (CPFA and CPNCO) at 10 to 40 km/h; lead vehicle stopped at 50 km/h; stop"
-            " (full) at 80 km/h; weather wet (friction 0.71, water 1 mm), by day"
+            "the tests CPFA and CPNCO (scenario crossing) at 10 to 40 km/h; the scenario lead"
+            " vehicle stopped at 50 km/h; the test full (scenario stop) at 80 km/h; weather wet (71"
+            " % of the grip of a dry road, 1 mm of water), by day"
         ),
         "box": True,
         "fits": 1,
@@ -166,15 +167,15 @@ def test_a_foreman_reads_for_each_part_what_to_measure_the_limit_and_what_to_do(
         "The workshop enters every value except those marked “operator”,",
         "Tests and speedsan adult crosses from the far side and a child crosses from the"
         " near side, hidden by parked cars; this vehicle drives at 10 to 40 km/h;"
-        "lead vehicle stopped at 50 km/h;stop (full) at 80 km/h",
-        "Weather and lightweather wet (friction 0.71, water 1 mm), by day",
+        "the scenario lead vehicle stopped at 50 km/h;the test full (scenario stop) at 80 km/h",
+        "Weather and lightweather wet (71 % of the grip of a dry road, 1 mm of water), by day",
         "Original vehicleThe original vehicle keeps at least 0.3 m of clearance in all of these",
         "Vehicle checked: licence plate VIN odometer km",
         "The signature does not cover an item without a value. Date: Name and signature:",
         "Simulated vehicleworn (A car with two axles",
         "; study wear",
         "Driving systemaeb (Holds its speed; brakes in part, then fully,",
-        "Scope of the limitscrossing (CPFA and CPNCO) at 10 to 40 km/h;",
+        "Scope of the limitsthe tests CPFA and CPNCO (scenario crossing) at 10 to 40 km/h;",
         "Tested rangestread depth 1.6 to 8 mm; relative brake torque 0.5 to 1; brake",
         "sensors 15 to 80 mVersionslibsumo 1.28",
         f"{sha256(answer.render('json').encode()).hexdigest()[:16]} (first digits of: {COMMAND}",
@@ -405,5 +406,5 @@ def test_limits_that_a_workshop_cannot_decide_have_no_sheet_to_sign() -> None:
         for name, *rest in LIMITS
     ]
     sheet = sheet_with(answer_of(rows=vague[:-1]))
-    assert "Do not use this sheet. Not decidable in a workshop" in sheet
+    assert "Do not use this sheet. A workshop cannot check the limit" in sheet
     assert "signature" not in sheet

@@ -107,7 +107,7 @@ def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_
     told = run("simulate", "r152", "--set", "sensorRange=15", "--point", FAST).stdout
     assert f"has an impact at {speed / KMH:.3g} km/h where 35 is allowed" in told
     assert (
-        "fails none of the 13 test cases"
+        "fails in none of the 13 test cases"
         in run("simulate", "r152", "--set", "sensorRange=15").stdout
     )
 
@@ -115,8 +115,8 @@ def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_
 def test_a_point_fails_by_the_criterion_of_its_study() -> None:
     """The limits page: 62 % of the brake torque keep 6.43 m/s^2, 61 % do not."""
     for share, told in (
-        ("0.61", "fails 1 of 1 test cases: type 0"),
-        ("0.62", "fails no test case"),
+        ("0.61", "fails in 1 of 1 test cases: type 0"),
+        ("0.62", "fails in no test case"),
     ):
         assert told in run("simulate", "r13h", "--set", f"brakeTorque={share}").stdout
 

@@ -20,6 +20,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
+from safevar_sumo.questions.compare import words
 from safevar_sumo.questions.compare.coverage import missing_in_words
 from safevar_sumo.questions.compare.differences import (
     BOTH,
@@ -64,10 +65,11 @@ from safevar_sumo.questions.research_questions.statistics import (
     fewest_runs,
     signed_rank_test,
 )
+from safevar_sumo.questions.sentence import Sentence, Verdict
 from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tolerance.asked import usual_alone
 from safevar_sumo.questions.tolerance.oracle import STAGE
-from safevar_sumo.questions.words import counted_in_words, join_phrases
+from safevar_sumo.questions.words import UNSAFE_MEANS, counted_in_words, join_phrases
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import limits_of
 
@@ -157,48 +159,55 @@ def compare(
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings, valid)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
-    titles = (
-        ("A", "B")
-        if study.name == second.study.name
-        else (study.name, second.study.name)
+    names = (study.name, second.study.name)
+    titles = dict(
+        zip(SIDES, ("A", "B") if names[0] == names[1] else names, strict=True)
     )
 
     # What differs: settings, limits, the original vehicles, safety degrees.
     alone = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
-    of_originals, of_new_cars = compare_originals(
-        evaluators, originals, criteria, titles[0]
-    )
+    of_originals, of_new_cars = compare_originals(evaluators, originals, criteria)
     differences = [
         *of_new_cars,
-        *compare_counts(counts, titles[0]),
-        *compare_limits(alone),
+        *compare_counts(counts),
+        *compare_limits(alone, evaluator.characteristics),
         *compare_values(tested.p, tested.a12),
     ]
-    decided, why = _decide(
-        differences, titles, of_originals, missing_in_words(evaluators, titles)
-    )
+    lacks = [*missing_in_words(*evaluators, titles)]
+    decision, why = _decide(differences, titles, of_originals, lacks)
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
-        **decided,
-        **_numbers(criteria[0], counts, tested, alone["change"], pairs, outside),
+        "decision": decision.lower(),
+        "better_in": sum(one.is_better for one in differences),
+        "worse_in": sum(not one.is_better for one in differences),
+        "unsafe": str(criteria[0]),
+        "margin": criteria[0].keep,
+        "settings": sum(counts.values()),
+        **counts,
+        "p": tested.p,
+        "a12": tested.a12,
+        "limits_grown": int(alone["change"].isin([GROWN, BOTH]).sum()),
+        "limits_shrunk": int(alone["change"].isin([SHRUNK, BOTH]).sum()),
+        "outside": outside,
+        "not_simulated": int((~pairs.are_valid).sum()) - pairs.number_infeasible,
         **of_originals,
     }
     summary = summary_of(numbers, tested.pairs, titles)
     table = _table(common, settings)
-    sentences = [
-        *(
-            [second.no_verdict]
-            if second.no_verdict not in ("", evaluator.no_verdict)
-            else []
-        ),
-        why,
-        *_basis_in_words(criteria[0], common, limits),
-        *counted_in_words(study, pairs.number_infeasible),
-    ]
+    reason = second.no_verdict if second.no_verdict != evaluator.no_verdict else ""
+    notes = [criteria[0].remark, *counted_in_words(study, pairs.number_infeasible)]
+    verdict = Verdict(
+        [
+            Sentence("answer", reason),
+            *why,
+            *_basis(criteria[0], common, limits, titles),
+            *(Sentence("note", note) for note in notes),
+        ]
+    )
     return Answer(
         question="compare",
         study=study,
-        verdict=" ".join(sentences),
+        verdict=verdict,
         tested=_test_in_words(tested, titles),
         numbers=numbers,
         tables={
@@ -208,32 +217,9 @@ def compare(
             "settings": table,
         },
         folded=("settings",),
-        failures=(why,) if why.startswith(DO_NOT_RELEASE) else (),
-        draw=partial(draw_pairs, titles=titles),
+        failures=(Verdict(why),) if decision == DO_NOT_RELEASE else (),
+        draw=partial(draw_pairs, titles=[*titles.values()]),
     )
-
-
-def _numbers(
-    criterion: Unsafe,
-    counts: Mapping[str, int],
-    tested: _PairedTest,
-    changes_of_limits: pd.Series[str],
-    pairs: Pairs,
-    outside: int,
-) -> JsonObject:
-    """What was compared."""
-    return {
-        "unsafe": str(criterion),
-        "margin": criterion.keep,
-        "settings": sum(counts.values()),
-        **counts,
-        "p": tested.p,
-        "a12": tested.a12,
-        "limits_grown": int(changes_of_limits.isin([GROWN, BOTH]).sum()),
-        "limits_shrunk": int(changes_of_limits.isin([SHRUNK, BOTH]).sum()),
-        "outside": outside,
-        "not_simulated": int((~pairs.are_valid).sum()) - pairs.number_infeasible,
-    }
 
 
 def _criteria(
@@ -313,7 +299,9 @@ def _table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
         settings["unsafe_in"].map([*UNSAFE_IN].index).sort_values(kind="stable").index
     )
     return tabulate(
-        "The same settings in both systems", columns, settings.loc[order, [*columns]]
+        "The same changed vehicles in both versions",
+        columns,
+        settings.loc[order, [*columns]],
     )
 
 
@@ -336,7 +324,7 @@ def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
     pairs = frame[frame["source"] == SAMPLE].groupby(LINE)[[*SIDES]].mean()
     names = [f"line {int(line)}" for line in pairs.index]
-    unit = "straight lines through the domain"
+    unit = "each pair has the same vehicles on a straight line through the domain"
     if "run" in frame:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
         if len(means) >= fewest_runs("RQ1"):
@@ -345,103 +333,87 @@ def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
                 f"{name}-{int(run):02d} of {side.upper()}"
                 for side, name, run in pairs.index
             ]
-            unit = "runs"
+            unit = "each pair has the solutions of a run"
     # The p-value of pairs, and the probability that A's value is greater: above 0.5 A is better.
     sides = pairs.to_numpy(dtype=float).T
     p = signed_rank_test(*sides).p_value
     a12 = compare_samples(*sides).effect_size
     rows = pairs.reset_index(drop=True).assign(pair=names)
-    table = tabulate("Pairs that are tested: mean safety degree", PAIR_COLUMNS, rows)
+    table = tabulate(
+        "Pairs of the statistical test: mean safety degree", PAIR_COLUMNS, rows
+    )
     return _PairedTest(p, a12, table, unit)
 
 
 def _decide(
     differences: Sequence[Difference],
-    titles: Sequence[str],
+    titles: Mapping[str, str],
     of_originals: JsonObject,
-    lacks: Sequence[str],
-) -> tuple[JsonObject, str]:
+    lacks: Sequence[Sentence],
+) -> tuple[str, list[Sentence]]:
     """Whether to release B, and why: with a new collision never, and not if it is worse in safety
     and better in needless braking at most. What is better in some and worse in other things is for
     a person to decide; so is every change whose needless braking was not measured. Where one side
     `lacks` what the other is simulated in, only a new collision decides.
     """
-    a, b = titles
     in_order = sorted(differences, key=lambda one: -one.weight)
-    worse, better = (
-        [one for one in in_order if one.is_better is sign] for sign in (False, True)
-    )
-    worst, best = (
-        max([one.weight for one in some], default=COMFORT) for some in (worse, better)
-    )
+    worse = [one for one in in_order if not one.is_better]
+    better = [one for one in in_order if one.is_better]
+    worst = max((one.weight for one in worse), default=COMFORT)
+    best = max((one.weight for one in better), default=COMFORT)
     brakes_elsewhere = of_originals["metres_earlier"] or of_originals["metres_later"]
     is_unknown = not of_originals["benign_scenes"] and (better or brakes_elsewhere)
     decision = DECIDE
     if lacks and worst < COLLISION:
-        what = f"and {a} were not simulated in the same encounters"
+        template = words.LACKING
     elif worst == COLLISION or worst > best:
         decision = DO_NOT_RELEASE
-        but = (
-            ", but brakes less often without need" if better and best == COMFORT else ""
-        )
-        what = f"is less safe than {a}{but}"
-    elif worse and better:
-        what = f"is better than {a} in some things and worse in others"
+        is_smoother = better and best == COMFORT
+        template = words.LESS_SAFE_BUT_SMOOTHER if is_smoother else words.LESS_SAFE
     elif worse:
-        what = f"is as safe as {a}, but brakes more often without need"
+        template = words.MIXED if better else words.LESS_SMOOTH
     elif is_unknown:
-        safe = "safer than" if better else "as safe as"
-        what = f"is {safe} {a}, but may brake more often without need, which was not measured"
+        template = words.BRAKING_UNKNOWN
     else:
         decision = RELEASE
-        what = f"is better than {a}, and worse in nothing that was measured"
-        if not better:
-            what = f"does not differ from {a} in anything that was measured"
+        template = words.BETTER if better else words.ALIKE
+    safe = "safer than" if better else "as safe as"
     shown = [*worse[: MAX_REASONS - bool(better)], *better][:MAX_REASONS]
-    phrases = dict.fromkeys(difference.phrase for difference in shown)
-    sentences = [
-        f"{decision}: {b} {what}.",
-        *lacks,
-        *(f"{b} {phrase}." for phrase in phrases),
-    ]
-    numbers = {
-        "decision": decision.lower(),
-        "better_in": len(better),
-        "worse_in": len(worse),
-    }
-    return numbers, " ".join(sentences)
+    reasons = [one.template.fill(**one.values, **titles) for one in shown]
+    sentences = [template.fill(safe=safe, **titles), *lacks]
+    return decision, [*sentences, *dict.fromkeys(reasons)]
 
 
-def _test_in_words(tested: _PairedTest, titles: Sequence[str]) -> str:
+def _test_in_words(tested: _PairedTest, titles: Mapping[str, str]) -> str:
     if np.isnan(tested.p):
-        return "The results have no pair of values to test."
-    return (
-        f"A signed-rank test of the safety degree over {len(tested.pairs)} {tested.unit} gives"
-        f" p = {tested.p:.2g}. The value of {titles[0]} is the larger one with a probability of"
-        f" {tested.a12:.2f} (A12)."
-    )
+        return words.NO_TEST.text
+    return words.TEST.fill(
+        number=len(tested.pairs),
+        pairs=tested.unit,
+        p=tested.p,
+        a12=tested.a12,
+        **titles,
+    ).text
 
 
-def _basis_in_words(
-    unsafe: Unsafe, common: CommonDomain, limits: Sequence[str]
-) -> Iterator[str]:
+def _basis(
+    unsafe: Unsafe,
+    common: CommonDomain,
+    limits: Sequence[str],
+    titles: Mapping[str, str],
+) -> Iterator[Sentence]:
     """What counts as unsafe, within which limits, and around which originals."""
     if not unsafe.is_collision or unsafe.keep:
-        yield f"Unsafe means: {unsafe.description}."
-    if unsafe.remark:
-        yield unsafe.remark
+        yield UNSAFE_MEANS.fill(description=unsafe.description)
     if limits:
-        yield f"All vehicles that were compared are within {join_phrases(limits)}."
+        yield words.WITHIN.fill(limits=join_phrases(limits))
 
     # Original values that differ.
-    members = [side.characteristics.members for side in common.evaluators]
-    texts = [
-        f"{item.name} {item.original:g} and {members[1][column].original:g}{item.suffix}"
-        for column, item in enumerate(members[0])
-        if common.shift[column]
+    a, b = (side.characteristics.members for side in common.evaluators)
+    values = [
+        f"{a[column].short_name} {a[column].original:g} and"
+        f" {b[column].original:g}{a[column].suffix}"
+        for column in np.flatnonzero(common.shift)
     ]
-    if texts:
-        yield (
-            f"The original vehicles differ ({join_phrases(texts)}), so the same changes of each"
-            " original are compared."
-        )
+    if values:
+        yield words.ORIGINALS_DIFFER.fill(values=join_phrases(values), **titles)

@@ -6,12 +6,14 @@ A version whose failing tests were deleted looks safer, although nothing shows t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
+from safevar_sumo.questions.compare.words import LACKS
 from safevar_sumo.questions.counterexamples import OF_ENCOUNTER
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.scope import points_of_tests
+from safevar_sumo.questions.sentence import Sentence
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.scenarios import Point
 from safevar_sumo.study import Study, Weather
@@ -62,20 +64,16 @@ def missing_parts(side: Evaluator, other: Evaluator) -> list[str]:
 
 
 def missing_in_words(
-    sides: tuple[Evaluator, Evaluator], titles: Sequence[str]
-) -> list[str]:
-    """What each of two systems lacks, as sentences: `earlier lacks the test CCRs.`"""
-    a, b = sides
-    sentences = []
-    for title, parts in zip(
-        titles, (missing_parts(a, b), missing_parts(b, a)), strict=True
-    ):
-        shown = parts[:MAX_PARTS_NAMED]
+    a: Evaluator, b: Evaluator, titles: Mapping[str, str]
+) -> Iterator[Sentence]:
+    """What each of two systems lacks: `Version b lacks the test CCRs, which a has.`"""
+    for side, other, names in ((a, b, "ab"), (b, a, "ba")):
+        parts = missing_parts(side, other)
         if len(parts) > MAX_PARTS_NAMED:
-            shown.append(f"{len(parts) - MAX_PARTS_NAMED} more")
-        if shown:
-            sentences.append(f"{title} lacks {join_phrases(shown)}.")
-    return sentences
+            parts[MAX_PARTS_NAMED:] = [f"{len(parts) - MAX_PARTS_NAMED} more"]
+        if parts:
+            version, another = map(titles.__getitem__, names)
+            yield LACKS.fill(version=version, parts=join_phrases(parts), other=another)
 
 
 def _missing_cases(side: Evaluator, other: Evaluator) -> Iterator[str]:
@@ -120,11 +118,11 @@ def _excluded(study: Study, other: Study) -> Iterator[str]:
             and own.ends[1] <= high
             for own in other.constraints
         ):
-            yield f"what its constraint on {one.quantity} excludes"
+            yield f"the vehicles that its constraint on {one.quantity} excludes"
     margin = study.scenario.margin
     others = other.scenario.margin
     if study.ranges and margin is not None and (others is None or margin > others):
-        yield f"the encounters in which its original keeps less than {margin:g} m"
+        yield f"the encounters in which its original vehicle keeps less than {margin:g} m"
 
 
 def _missing_sets(study: Study, other: Study) -> Iterator[str]:

@@ -4,7 +4,7 @@ brakes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,9 +13,10 @@ import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Column, Columns, tabulate, with_interval
+from safevar_sumo.questions.compare import words
 from safevar_sumo.questions.compare.coverage import TestCase, cases_of
 from safevar_sumo.questions.compare.settings import within
-from safevar_sumo.questions.counterexamples import where_in_words
+from safevar_sumo.questions.counterexamples import place_of
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.pairs import SIDES
@@ -26,14 +27,16 @@ from safevar_sumo.questions.repair.price import (
 )
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
+from safevar_sumo.questions.sentence import Sentence
 from safevar_sumo.questions.tolerance.alone import Alone
 from safevar_sumo.questions.tolerance.asked import Asked, asked_of
 from safevar_sumo.questions.tolerance.search import alone_with_own_set
-from safevar_sumo.questions.words import join_phrases, number_of
+from safevar_sumo.questions.words import count_in_words, join_phrases
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import Point
 from safevar_sumo.study import Limit
 from safevar_sumo.sumo.matrix import simulate_all_points
+from safevar_sumo.vehicles import CharacteristicSet
 
 LIMIT_COLUMNS: Columns = {
     "characteristic": "characteristic of the vehicle",
@@ -61,10 +64,6 @@ UNDEFINED = (np.nan, np.nan)
 """The ends of no interval."""
 MAX_LIMITS_NAMED = 3
 """Maximum number of limits that a sentence names."""
-OF_OWN_FIT = "with the study's own parameter set"
-"""In which parameter set of the vehicle model the limits hold."""
-
-
 COMFORT, SAFETY, COLLISION = range(3)
 """Weights of differences: needless braking, what concerns safety, and new collisions of the
 original vehicle.
@@ -72,69 +71,66 @@ original vehicle.
 
 
 class Difference(NamedTuple):
-    """What B does in comparison with A: a phrase, whether it is better, and how much it weighs."""
+    """What B does in comparison with A, by a template and what fills it beside the names of both;
+    whether it is better, and how much it weighs.
+    """
 
-    phrase: str
+    template: Sentence
+    values: JsonObject
     is_better: bool
     weight: int = SAFETY
 
 
 def summary_of(
-    numbers: JsonObject, pairs: pd.DataFrame, titles: Sequence[str]
+    numbers: JsonObject, pairs: pd.DataFrame, titles: Mapping[str, str]
 ) -> pd.DataFrame:
     """The table of what is compared: the new car, changed cars, needless braking, and limits."""
     both = numbers["both"]
     values: JsonObject = {
-        "original vehicle: safety degree": [
+        "safety degree of the original vehicle [m, or -m/s after a collision]": [
             numbers[f"{side}_degree"] for side in SIDES
         ],
-        f"unsafe of {numbers['settings']} changed vehicles": [
+        f"unsafe vehicles of {numbers['settings']} changed vehicles": [
             numbers[f"only_{side}_unsafe"] + both for side in SIDES
         ],
-        "changed vehicles: mean safety degree": pairs[[*SIDES]].mean(),
-        f"needless braking in {numbers['benign_scenes']} benign scenes": [
+        "mean safety degree of the changed vehicles": pairs[[*SIDES]].mean(),
+        f"scenes with needless braking, of {numbers['benign_scenes']} benign scenes": [
             numbers[f"{side}_needless_braking"] for side in SIDES
         ],
-        "characteristics whose limit alone is closer": [
+        "characteristics with the narrower limit": [
             numbers["limits_grown"],
             numbers["limits_shrunk"],
         ],
     }
     rows = [(what, *of_sides) for what, of_sides in values.items()]
-    heads = zip(SIDES, titles, strict=True)
     columns = SUMMARY_COLUMNS | {
-        side: SUMMARY_COLUMNS[side]._replace(head=title) for side, title in heads
+        side: SUMMARY_COLUMNS[side]._replace(head=title)
+        for side, title in titles.items()
     }
     return tabulate("What was compared", columns, rows)
 
 
-def compare_counts(counts: Mapping[str, int], a: str) -> list[Difference]:
+def compare_counts(counts: Mapping[str, int]) -> Iterator[Difference]:
     """The settings that are unsafe in one system only."""
-    only_a = counts["only_a_unsafe"]
-    only_b = counts["only_b_unsafe"]
-    unsafe_in_a = f"{number_of(only_a + counts['both'], 'setting')} that are"
-    safe_in_a = f"{number_of(only_b + counts['neither'], 'setting')} that are"
-    found = [
-        Difference(
-            f"is safe in {only_a} of {unsafe_in_a} unsafe in {a}", is_better=True
-        ),
-        Difference(
-            f"is unsafe in {only_b} of {safe_in_a} safe in {a}", is_better=False
-        ),
-    ]
-    return [one for one, count in zip(found, (only_a, only_b), strict=True) if count]
+    for template, only, rest, is_better in (
+        (words.SAFE_NOW, "only_a_unsafe", "both", True),
+        (words.UNSAFE_NOW, "only_b_unsafe", "neither", False),
+    ):
+        number = counts[only]
+        values = {
+            "count": count_in_words(number, number + counts[rest]),
+            "are": "is" if number == 1 else "are",
+        }
+        if number:
+            yield Difference(template, values, is_better)
 
 
-def compare_values(p: float, a12: float) -> list[Difference]:
+def compare_values(p: float, a12: float) -> Iterator[Difference]:
     """A significant difference of the safety degree over all pairs; p is NaN without pairs."""
-    if not p < ALPHA:
-        return []
     is_better = a12 < 0.5
-    return [
-        Difference(
-            f"has a {'higher' if is_better else 'lower'} safety degree", is_better
-        )
-    ]
+    if p < ALPHA:
+        higher = "higher" if is_better else "lower"
+        yield Difference(words.DEGREE, {"higher": higher}, is_better)
 
 
 def limits_of_both(
@@ -164,9 +160,10 @@ def limits_of_both(
         ends_in_a = (a.original, *(in_a or UNDEFINED))
         ends_in_b = (b.original, *(in_b or UNDEFINED))
         rows.append((a.name, a.unit, *ends_in_a, *ends_in_b, _change_of(in_a, in_b)))
-    where = " at the points of the tests alone" if at_tests else ""
+    where = ", at the listed test cases" if at_tests else ""
     return tabulate(
-        f"Limits of each characteristic alone {OF_OWN_FIT}{where}, rounded to the safe side",
+        "Limits of each characteristic alone (parameter set 0 of the vehicle model"
+        f"{where}), rounded to the safe side",
         LIMIT_COLUMNS,
         rows,
     )
@@ -205,28 +202,29 @@ def _change_of(a: Interval | None, b: Interval | None) -> str:
     )
 
 
-def compare_limits(limits: pd.DataFrame) -> list[Difference]:
-    """The limits that grow, shrink or move and exist in both systems, in words."""
-    found = list[Difference]()
+def compare_limits(
+    limits: pd.DataFrame, members: CharacteristicSet
+) -> Iterator[Difference]:
+    """The limits that grow, shrink or move and exist in both systems."""
     exist = limits[limits[["a_low", "b_low"]].notna().all(axis=1)]
-    for change, verb, signs in (
-        (GROWN, "grow", (True,)),
-        (SHRUNK, "shrink", (False,)),
-        (BOTH, "move", (True, False)),
+    for change, wider, signs in (
+        (GROWN, "wider", (True,)),
+        (SHRUNK, "narrower", (False,)),
+        (BOTH, "narrower on one side and wider on the other", (True, False)),
     ):
-        names = exist["characteristic"][exist["change"] == change].tolist()
+        changed = {*exist["characteristic"][exist["change"] == change]}
+        names = [item.short_name for item in members if item.name in changed]
         if len(names) > MAX_LIMITS_NAMED:
             names[MAX_LIMITS_NAMED:] = [f"{len(names) - MAX_LIMITS_NAMED} more"]
-        phrase = f"has limits of single characteristics that {verb} ({join_phrases(names or [''])})"
-        found += [Difference(phrase, is_better) for is_better in signs if names]
-    return found
+        for is_better in signs if names else ():
+            values = {"wider": wider, "names": join_phrases(names)}
+            yield Difference(words.LIMITS, values, is_better)
 
 
 def compare_originals(
     evaluators: Sequence[Evaluator],
     originals: Sequence[Evaluations],
     criteria: Sequence[Unsafe],
-    a: str,
 ) -> tuple[JsonObject, list[Difference]]:
     """How both original vehicles end, how often they brake needlessly, and how much earlier B's
     brakes: the numbers, and what they say.
@@ -241,21 +239,21 @@ def compare_originals(
     numbers = {**ends, **braking, **_metres_earlier(*evaluators)}
 
     # What differs, and in whose favour.
-    found = _new_collisions(evaluators, a)
+    differences = [*_new_collisions(evaluators)]
     if in_a != in_b:
-        of_b, of_a = ("unsafe", "safe") if in_b else ("safe", "unsafe")
-        phrase = f"is {of_b} even with the original vehicle, which is {of_a} in {a}"
-        found.append(Difference(phrase, is_better=in_a))
+        template = words.ORIGINAL_UNSAFE if in_b else words.ORIGINAL_SAFE
+        differences.append(Difference(template, {}, is_better=in_a))
     before, after, scenes = braking.values()
     if before != after:
-        phrase = (
-            f"brakes needlessly in {after} of {scenes} benign scenes, {a} in {before}"
+        values = {"before": before, "after": after, "scenes": scenes}
+        is_better = after < before
+        differences.append(
+            Difference(words.NEEDLESS_BRAKING, values, is_better, COMFORT)
         )
-        found.append(Difference(phrase, after < before, COMFORT))
-    return numbers, found
+    return numbers, differences
 
 
-def _new_collisions(evaluators: Sequence[Evaluator], a: str) -> list[Difference]:
+def _new_collisions(evaluators: Sequence[Evaluator]) -> Iterator[Difference]:
     """The fastest collision of B's original vehicle in a test case in which A's does not collide,
     if there is one. Test cases that A lacks show nothing about a change.
     """
@@ -270,21 +268,14 @@ def _new_collisions(evaluators: Sequence[Evaluator], a: str) -> list[Difference]
         for case, point, speed in of_b
         if case in cases_of_a and case not in cases_of_collisions
     ]
-    if not new:
-        return []
-    speed, point = max(new, key=lambda pair: pair[0])
-    where = where_in_words(evaluators[1].system.points, point, point.scenario, {})
-    more = (
-        f" ({len(new)} test cases are like this; this one is the fastest)"
-        if len(new) > 1
-        else ""
-    )
-    collision = f"collides at {speed:.2f} m/s with its original vehicle{where}"
-    return [
-        Difference(
-            f"{collision}, where that of {a} does not collide{more}", False, COLLISION
-        )
-    ]
+    if new:
+        speed, point = max(new, key=lambda pair: pair[0])
+        points = evaluators[1].system.points
+        place = place_of(points, point, point.scenario, {}).words
+        template = words.NEW_COLLISIONS if len(new) > 1 else words.NEW_COLLISION
+        where = f" ({place})" if place else ""
+        values = {"speed": speed, "place": where, "number": len(new)}
+        yield Difference(template, values, is_better=False, weight=COLLISION)
 
 
 def _collisions_of_original(side: Evaluator) -> list[tuple[TestCase, Point, float]]:

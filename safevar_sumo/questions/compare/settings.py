@@ -23,7 +23,7 @@ from safevar_sumo.study import Limit, Study
 from safevar_sumo.study.characteristics import Domain, check_limits
 from safevar_sumo.study.encounters import Axes, AxisTable
 
-BOTH_STAGE = "settings in both systems"
+BOTH_STAGE = "simulate both versions"
 """The phase of progress."""
 MAX_FACTOR = 512
 """Largest number of settings that are drawn for each one that satisfies the constraints of both
@@ -198,15 +198,20 @@ def in_order_of(a: Study, b: Study) -> Study:
     InputError
         If B has other characteristics or searched parameters, or other units.
     """
+    place = {name: number for number, name in enumerate(a.ranges)}
+
+    def in_order(axes: dict[str, AxisTable]) -> Axes:
+        """Axes that may have any value stand in the order of their names, the last."""
+        names = sorted(axes, key=lambda name: place.get(name, -1))
+        return {name: axes[name] for name in names}
+
     # The units of both must be the same.
     units_a = {(name, row.unit) for name, row in a.domains.items()}
     units_b = {(name, row.unit) for name, row in b.domains.items()}
     if units_a == units_b:
         characteristics = {name: b.domains[name] for name in a.vehicle.characteristics}
-        return replace(
-            _in_order(b, [*a.ranges]),
-            vehicle=replace(b.vehicle, characteristics=characteristics),
-        )
+        vehicle = replace(b.vehicle, characteristics=characteristics)
+        return replace(b.mapped(in_order), vehicle=vehicle)
 
     def in_words(units: set[tuple[str, str]]) -> str:
         return ", ".join(f"{name} [{unit}]" for name, unit in sorted(units)) or "none"
@@ -217,19 +222,6 @@ def in_order_of(a: Study, b: Study) -> Study:
         f"of {b.name!r} alone: {in_words(units_b - units_a)}",
         "studies with the same characteristics and searched parameters in the same units",
     )
-
-
-def _in_order(study: Study, names: Sequence[str]) -> Study:
-    """A study whose axes that may have any value stand in the order of their names, the last."""
-    place = {name: number for number, name in enumerate(names)}
-
-    def ordered(axes: dict[str, AxisTable]) -> Axes:
-        return {
-            name: axes[name]
-            for name in sorted(axes, key=lambda name: place.get(name, -1))
-        }
-
-    return study.mapped(ordered)
 
 
 def pairs_of(

@@ -45,7 +45,11 @@ from safevar_sumo.questions.explain.tables import (
     failures_frame,
     statistics_tables,
 )
-from safevar_sumo.questions.explain.words import others_in_words, verdict_on_failures
+from safevar_sumo.questions.explain.tell import (
+    failure_sentences,
+    other_sentences,
+    smallest_sentences,
+)
 from safevar_sumo.questions.options import Range
 from safevar_sumo.questions.over_sets import INTERVALS, planned_over_sets
 from safevar_sumo.questions.preventability import (
@@ -57,6 +61,7 @@ from safevar_sumo.questions.preventability import (
     has_reference_drivers,
 )
 from safevar_sumo.questions.price import LEAST_SETTINGS
+from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
@@ -183,14 +188,18 @@ def explain(
     # Tables, numbers and the verdict.
     solutions = failures_frame(population, evaluator, reasons)
     distinct = count_distinct_causes(evaluator.characteristics, of_sample)
-    of_failures = (population, evaluator, fits, solutions, of_chosen, distinct)
+    if of_study:
+        leading_tables = smallest_tables(smallest)
+    else:
+        causes_of_chosen = causes_table(
+            population, evaluator, fits, solutions, of_chosen, distinct
+        )
+        leading_tables = {"causes": causes_of_chosen}
     tables = {
-        **(
-            smallest_tables(smallest)
-            if of_study
-            else {"causes": causes_table(*of_failures)}
+        **leading_tables,
+        "solutions": tabulate(
+            "The failures that were examined one by one", SOLUTION_COLUMNS, solutions
         ),
-        "solutions": tabulate("The failures explained", SOLUTION_COLUMNS, solutions),
         **statistics_tables(needed, len(sample), verdicts, collisions, distinct),
     }
     numbers = {
@@ -198,14 +207,14 @@ def explain(
         **_collision_numbers(verdicts, collisions if has_drivers else None),
         **(smallest.numbers if smallest is not None else {}),
     }
-    verdict = verdict_on_failures(evaluator, population, tables["causes"])
+    leading = failure_sentences(evaluator, population, tables["causes"], len(sample))
     if smallest is not None:
-        verdict = smallest.sentences(evaluator, population.unsafe)
-    sentences = [*verdict, *others_in_words(study, population, complete, verdicts)]
+        leading = smallest_sentences(smallest, evaluator, population.unsafe)
+    others = other_sentences(study, population, complete, verdicts)
     return Answer(
         question="explain",
         study=study,
-        verdict=" ".join(filter(None, sentences)),
+        verdict=Verdict([*leading, *others]),
         numbers=numbers,
         tables=tables,
         draw=draw_staircase if smallest is not None else draw_needed,
@@ -239,6 +248,8 @@ def _counts(
     runs = population.evaluations
     original = population.original
     over_sets = population.over_sets
+    failures = population.unsafe.number(runs)
+    share = failures / max(len(runs), 1)
     left_out = 0
     if (
         isinstance(subject, Case)
@@ -249,10 +260,10 @@ def _counts(
     return {
         "unsafe": str(population.unsafe),
         "settings": len(runs),
-        "failures": population.unsafe.number(runs),
+        "failures": failures,
         "other_outcomes": population.otherwise,
         "left_out": left_out,
-        "by_set": None if over_sets is None else over_sets.of_all(population.share),
+        "by_set": None if over_sets is None else over_sets.of_all(share),
         INTERVALS: None if over_sets is None else over_sets.numbers[INTERVALS],
         "original_outcome": str(original.outcome[0]),
         "original_degree": float(original.f_safe[0]),
@@ -290,13 +301,13 @@ def draw_needed(answer: Answer) -> Figure:
     ]  # bars are drawn from the bottom up
     size = (6.4, 1.4 + 0.3 * max(len(frame), 4))
     figure, ((axis,),) = new_figure(
-        f"{answer.study.name}: changed and necessary", 1, 1, size
+        f"{answer.study.name}: which changed characteristics are necessary", 1, 1, size
     )
     names = [escape_dollars(name) for name in frame["characteristic"]]
     for column, label, colour, height in (
-        ("changed", "changed", GREY, 0.8),
-        ("in_some", "in some minimal cause", SKY_BLUE, 0.5),
-        ("needed", "necessary: in every minimal cause", BLUE, 0.24),
+        ("changed", "changed by the search", GREY, 0.8),
+        ("in_some", "part of some minimal cause", SKY_BLUE, 0.5),
+        ("needed", "necessary (part of every minimal cause)", BLUE, 0.24),
     ):
         axis.barh(names, 100 * frame[column], height=height, color=colour, label=label)
     axis.set_xlim(0, 100)

@@ -39,7 +39,7 @@ class Beginning(NamedTuple):
     boundary
         The values there.
     safe_again
-        The smallest larger share at which these changes are safe; infinite if none was found.
+        The smallest larger share at which these changes are safe; NaN if none was found.
     """
 
     cause: Cause
@@ -97,7 +97,7 @@ def _begin(
     prices = np.cumsum([steps + 2 ** len(cause.changes) for cause, _ in placed])
     number = int(np.count_nonzero(prices <= evaluator.at_most(int(prices[-1]), 2)))
     beginnings = [
-        Beginning(cause, share if share < 1 else np.nan, cause.changes, np.inf)
+        Beginning(cause, share if share < 1 else np.nan, cause.changes, np.nan)
         for cause, share in placed
     ]
     if not number:
@@ -147,6 +147,6 @@ def _begin(
         boundary = {name: float(f"{named[name]:.12g}") for name in cause.changes}
         again = shares[at + 1 :][is_safe[row, at + 1 :]]
         beginnings[row] = Beginning(
-            cause, float(shares[at]), boundary, min(again, default=np.inf)
+            cause, float(shares[at]), boundary, min(again, default=np.nan)
         )
     return beginnings, smaller

@@ -20,7 +20,7 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
-COMBINATIONS = "combinations of changes"
+COMBINATIONS = "try combinations of changes"
 """The stage of progress."""
 SHARES = tuple(percent / 100 for percent in range(100, 0, -10))
 """Shares of the way to the ends of the domain at which the fewest changes are sought."""
@@ -233,10 +233,7 @@ def _robustness(
             changes={names[column]: value for column, value in sorted(combination)},
             outcome=str(outcome),
             safety_degree=float(degree),
-            encounter={
-                item.name: members.named(setting)[item.name]
-                for item in members.scenario
-            },
+            encounter=members.scenario.named(setting[~members.of_vehicle]),
             unsafe_runs=float(of_runs),
         )
         for combination, outcome, degree, setting, of_runs in zip(

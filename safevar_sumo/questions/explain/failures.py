@@ -5,6 +5,7 @@ drawn from a study's whole domain; and how each of them ends beside the original
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import compress, islice
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from safevar_sumo.questions.causes import (
     select_affordable_rows,
 )
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain import words
 from safevar_sumo.questions.over_sets import VEHICLES, SharesOverSets
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import ending_in_words
@@ -34,17 +36,17 @@ from safevar_sumo.sumo.system import System
 
 Reasons = dict[int, str]
 """The rows of the chosen failures, with the reasons for their choice."""
-TO_EXPLAIN = "settings to explain"
+TO_EXPLAIN = "simulate the vehicles"
 """A stage of progress."""
 REASONS = {
     "fewest": "fewest changes",
-    "most_severe": "most severe",
+    "most_severe": "highest collision speed",
     "smallest": "smallest changes",
 }
 """Reasons for choosing a failure, by the name of the choice in `CHOICES`."""
 REQUESTED = "requested"
 """The reason for explaining a solution that the user names."""
-DISTINCT_CAUSE = "a cause of its own"
+DISTINCT_CAUSE = "simplest failure with another cause"
 """The reason for choosing the simplest failure with a cause that no other chosen failure has."""
 SAMPLED_SETTINGS = 4096
 """Number of settings drawn from the whole domain if there are no results."""
@@ -87,11 +89,6 @@ class Population(NamedTuple):
     otherwise: int
     left_out: int
     over_sets: SharesOverSets | None
-
-    @property
-    def share(self) -> float:
-        """The share of the rows that is unsafe."""
-        return self.unsafe.number(self.evaluations) / max(len(self.evaluations), 1)
 
 
 def gather_failures(
@@ -211,58 +208,46 @@ def choose_failures(
     failure for each of `REASONS`, and the simplest failure with each minimal cause that these do
     not have.
     """
-    rows = population.rows
-
-    # Named failures are explained all.
-    settings = population.evaluations.settings
-    limit //= len(
-        evaluator.system.points
-    )  # an evaluation simulates a setting at every point
-    if population.is_named:
-        found = find_minimal_causes(evaluator, settings[rows], population.unsafe, limit)
-        reasons = dict.fromkeys(rows, REQUESTED)
-        causes = dict(zip(rows, found, strict=True))
-        return Chosen(reasons, rows, causes, _complete(population, rows, limit))
-
-    # Causes of a sample, and of failures that matter.
-    sample = [
-        rows[index]
-        for index in select_affordable_rows(settings[rows], evaluator, limit)
-    ]
-    reasons = dict(list(_failures_that_matter(population).items())[:top])
-    analysed = sorted({*sample, *reasons})
-    found = find_minimal_causes(
-        evaluator, settings[analysed], population.unsafe, 2 * limit
-    )
-    causes = dict(zip(analysed, found, strict=True))
+    # An evaluation simulates a setting at every point.
+    limit //= len(evaluator.system.points)
     runs = population.evaluations
+    rows = population.rows
+    if population.is_named:
+        sample = rows
+        reasons = dict.fromkeys(rows, REQUESTED)
+    else:
+        places = select_affordable_rows(runs.settings[rows], evaluator, limit)
+        sample = [rows[place] for place in places]
+        reasons = dict(islice(_failures_that_matter(population).items(), top))
+        limit *= 2
+
+    # Causes of the sample, and of failures that matter.
+    analysed = sorted({*sample, *reasons})
+    settings = runs.settings[analysed]
+    groups = find_minimal_causes(evaluator, settings, population.unsafe, limit)
+    causes = dict(zip(analysed, groups, strict=True))
+    numbers = runs.f_num_diff[analysed].astype(int).tolist()
+    complete = largest_complete(numbers, limit)
+    is_cut = complete < max(numbers, default=0)
+    chosen = Chosen(reasons, sample, causes, complete if is_cut else None)
+    if population.is_named:
+        return chosen
 
     # For each distinct cause that is missing, the simplest failure that has it.
-    keys = {
-        row: {
-            directions(evaluator.characteristics, cause.changes)
-            for cause in causes[row]
-        }
-        for row in causes
+    members = evaluator.characteristics
+    kinds = {
+        row: {directions(members, cause.changes) for cause in group}
+        for row, group in causes.items()
     }
-    for key in count_distinct_causes(
-        evaluator.characteristics, [causes[row] for row in sample]
-    )["cause"]:
-        if len(reasons) < top and not any(key in keys[row] for row in reasons):
-            of_this_cause = [row for row in sample if key in keys[row]]
+    of_sample = [causes[row] for row in sample]
+    for kind in count_distinct_causes(members, of_sample)["cause"]:
+        if len(reasons) < top and not any(kind in kinds[row] for row in reasons):
             simplest = min(
-                of_this_cause,
+                (row for row in sample if kind in kinds[row]),
                 key=lambda row: (runs.f_num_diff[row], runs.f_diff[row], row),
             )
             reasons[simplest] = DISTINCT_CAUSE
-    return Chosen(reasons, sample, causes, _complete(population, analysed, 2 * limit))
-
-
-def _complete(population: Population, rows: list[int], limit: int) -> int | None:
-    """The number of changes up to which all minimal causes of some rows are found; None if all."""
-    numbers = population.evaluations.f_num_diff[rows].astype(int).tolist()
-    complete = largest_complete(numbers, limit)
-    return complete if complete < max(numbers, default=0) else None
+    return chosen
 
 
 def _failures_that_matter(population: Population) -> Reasons:
@@ -284,16 +269,6 @@ sentence; and the names of the points of a test matrix at which it is unsafe, in
 """
 
 
-def _endings_in_words(system: System, point: str, both: Evaluations) -> str:
-    """How the runs of the original vehicle and of another vehicle end at a point."""
-    contact = system.contact
-    pairs = zip(both.outcome.tolist(), both.f_safe.tolist(), strict=True)
-    original, changed = (
-        ending_in_words(outcome, degree, contact) for outcome, degree in pairs
-    )
-    return f"{f'At {point}: the' if point else 'The'} original {original}; this one {changed}."
-
-
 def compare_at_points(
     system: System, settings: FloatArray, unsafe: Unsafe
 ) -> list[PointComparison]:
@@ -308,16 +283,17 @@ def compare_at_points(
     # In words, at the worst point.
     comparisons = []
     for original, vehicle in enumerate(range(len(settings), len(worst))):
-        names = (
-            result.point.name
-            for result, fails in zip(results, is_unsafe[:, vehicle], strict=True)
-            if fails
+        result = results[worst[vehicle]]
+        both = result.evaluations.take([original, vehicle])
+        runs = zip(both.outcome.tolist(), both.f_safe.tolist(), strict=True)
+        endings = [ending_in_words(*run, system.contact) for run in runs]
+        sentence = words.AT_POINT.fill(
+            point=result.point.name or "of the study",
+            original=endings[0],
+            changed=endings[1],
         )
-        at_worst = results[worst[vehicle]]
-        sentence = _endings_in_words(
-            system, at_worst.point.name, at_worst.evaluations.take([original, vehicle])
-        )
-        comparisons.append(
-            (sentence, tuple(filter(None, names)))
-        )  # without a matrix, the only point has no name
+        # Without a matrix, the only point has no name.
+        failures = compress(system.points, is_unsafe[:, vehicle])
+        names = filter(None, (point.name for point in failures))
+        comparisons.append((sentence.text, tuple(names)))
     return comparisons

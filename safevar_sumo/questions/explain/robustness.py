@@ -11,7 +11,7 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
-NEIGHBOURS = "neighbours"
+NEIGHBOURS = "check similar vehicles"
 """The stage of progress."""
 NEIGHBOUR_COUNT = 64
 """Number of neighbours of a setting that are simulated with each time step."""
@@ -81,17 +81,3 @@ def robust_shares(
             failing = (unsafe_shares * is_valid).sum(axis=1)
             shares.append(failing / np.maximum(is_valid.sum(axis=1), 1))
     return np.transpose(shares)
-
-
-def robustness_in_words(share: float) -> str:
-    """How robust a failure is, by the share of its unsafe neighbours: `The cause does not depend
-    on exact values: 84 % of vehicles with slightly different values are unsafe, too.`; empty if
-    unknown.
-    """
-    if np.isnan(share):
-        return ""
-    which = "all" if share == 1 else f"{100 * share:.0f} % of"
-    phrase = f"{which} vehicles with slightly different values are unsafe, too"
-    if share >= MIN_ROBUST_SHARE:
-        return f"The cause does not depend on exact values: {phrase}."
-    return f"The cause depends on exact values: only {phrase}."

@@ -56,7 +56,7 @@ CAUSE_COLUMNS: Columns = {
     "solution": Column("", "handle of the failure", is_detail=True),
     "changes": Column(
         "",
-        "a smallest set of the failure's changes that is unsafe by itself",
+        "smallest set of changes of this failure that is unsafe without the other changes",
         ".5g",
         is_shown=False,
     ),
@@ -65,26 +65,31 @@ CAUSE_COLUMNS: Columns = {
     ),
     "boundary": Column(
         "",
-        "smallest values of these changes that are still unsafe (rounded to the unsafe side, and"
-        " simulated)",
+        "smallest values of these changes that are still unsafe; rounded to the unsafe side and"
+        " simulated as printed",
         EXACT,
-        head="cause",
+        head="changes, with the values at which the failure begins",
     ),
     "single_boundary": Column(
         "",
-        "for each change, the value if this change alone is made smaller; rounded and simulated",
+        "smallest unsafe value of each change while the other changes stay; rounded and simulated"
+        " as printed",
         EXACT,
         is_shown=False,
     ),
     "fraction": Column(
         "-",
-        "factor by which all changes are scaled at the boundary",
+        "factor by which all changes of the cause are multiplied at their smallest unsafe values",
         ".3f",
         is_shown=False,
     ),
-    "end": Column("", "what happens just below the boundary", is_shown=False),
+    "end": Column("", "what happens with slightly smaller changes", is_shown=False),
     "size": Column("", "number of changes", is_shown=False),
-    "elsewhere": "whether these changes are unsafe in the original encounter, too",
+    "elsewhere": Column(
+        "",
+        "whether these changes are unsafe in the original encounter, too",
+        head="unsafe in the original encounter, too",
+    ),
     "outcome": Column("", "outcome with these changes only", is_shown=False),
     "safety_degree": Column(
         "m",
@@ -95,23 +100,27 @@ CAUSE_COLUMNS: Columns = {
         "-",
         "share of the failures that have such a cause",
         ".2f",
-        head="share of failures",
+        head="share of failures with this cause",
     ),
     "robust_share": Column(
         "-",
-        "share of vehicles with nearly the values of the cause alone that are unsafe",
+        "share of the vehicles with slightly different values of the cause that are unsafe",
         ".2f",
+        head="unsafe share of similar vehicles",
     ),
     "unsafe_runs": RUNS,
     "holds": Column(
         "",
         "number of parameter sets of the vehicle model with which these changes are a cause",
-        head="holds in parameter sets",
+        head="parameter sets in which these changes are a cause",
     ),
-    "fits": "number of parameter sets that were tried",
+    "fits": Column(
+        "", "number of parameter sets that were tried", head="parameter sets tried"
+    ),
     "avoided_by": Column(
         "",
-        "weakest reference driver who avoids the failure, in the same vehicle",
+        "weakest of the other drivers who avoids the failure in the same vehicle; nobody: no driver"
+        " avoids it",
         is_shown=False,
     ),
 }
@@ -119,10 +128,12 @@ OF_ENCOUNTER = ("encounter", "elsewhere")
 """Columns of a study whose encounters are ranges."""
 SOLUTION_COLUMNS: Columns = {
     "solution": "handle of the failure",
-    "reason": "why this failure was chosen",
+    "reason": Column(
+        "", "why this failure was chosen", head="why this failure was examined"
+    ),
     "outcome": Column("", "outcome", is_shown=False),
     "safety_degree": Column("m", "safety degree; in -m/s on a collision", ".2f"),
-    "changed": "number of changes",
+    "changed": Column("", "number of changes", head="characteristics changed"),
     "largest_change": Column(
         "-",
         "largest change of a characteristic (share of the original value)",
@@ -130,8 +141,9 @@ SOLUTION_COLUMNS: Columns = {
     ),
     "unsafe_neighbours": Column(
         "-",
-        "share of vehicles with nearly the values of the whole failure that are unsafe",
+        "share of the vehicles with slightly different values of the whole failure that are unsafe",
         ".2f",
+        head="unsafe share of similar vehicles",
     ),
     "ends": Column(
         "",
@@ -140,20 +152,32 @@ SOLUTION_COLUMNS: Columns = {
     ),
     "points": Column("", "points at which it is unsafe", is_shown=False),
     "avoided_by": (
-        "weakest reference driver who avoids it in the same vehicle; nobody: unavoidable"
+        "weakest of the other drivers who avoids the failure in the same vehicle; nobody: no driver"
+        " avoids it"
     ),
 }
 CHARACTERISTIC_COLUMNS: Columns = {
     "characteristic": "characteristic of the vehicle",
-    "changed": Column("-", "share of the failures that change it", ".2f"),
+    "changed": Column(
+        "-",
+        "share of the failures that change it",
+        ".2f",
+        head="changed in (share of failures)",
+    ),
     **with_interval(
         "needed",
         Column(
-            "-", "share of the failures for which it is in every minimal cause", ".2f"
+            "-",
+            "share of the failures for which it is in every minimal cause",
+            ".2f",
+            head="necessary in (share of failures)",
         ),
     ),
     "in_some": Column(
-        "-", "share of the failures for which it is in some minimal cause", ".2f"
+        "-",
+        "share of the failures for which it is in some minimal cause",
+        ".2f",
+        head="part of some cause in (share of failures)",
     ),
 }
 """The interval is Clopper and Pearson's, 95 %, if only a sample of the failures was analysed, else
@@ -261,7 +285,10 @@ def causes_table(
         name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted
     }
     table = tabulate(
-        "Minimal causes, all other characteristics as in the original", columns, frame
+        "Minimal causes: smallest sets of changes that are unsafe (all other characteristics as in"
+        " the original vehicle)",
+        columns,
+        frame,
     )
     table.attrs["lead_rows"] = np.flatnonzero(
         ~frame["boundary"].astype(str).duplicated()
@@ -342,18 +369,20 @@ def statistics_tables(
     """The tables of characteristics, of drivers and of distinct causes."""
     return {
         "characteristics": tabulate(
-            f"Characteristics changed, and necessary, in {number_of(failures, 'failure')}",
+            "How often each characteristic is changed, and how often it is necessary, in"
+            f" {number_of(failures, 'failure')}",
             CHARACTERISTIC_COLUMNS,
             # Of one failure every share is 0 or 1.
             needed if failures > 1 else needed.head(0),
         ),
         "drivers": tabulate(
-            f"Other drivers in the same vehicle: {number_of(len(verdicts), 'collision')} again",
+            "What other drivers would have avoided in the same vehicle:"
+            f" {number_of(len(verdicts), 'collision')} simulated again",
             DRIVER_COLUMNS,
             drivers_frame(verdicts, collisions),
         ),
         "distinct_causes": tabulate(
-            f"The most frequent of {number_of(len(distinct), 'distinct cause')}",
+            f"The most frequent of {number_of(len(distinct), 'different cause')}",
             DISTINCT_COLUMNS,
             distinct.assign(cause=distinct["cause"].map(", ".join)).head(MAX_DISTINCT),
         ),

@@ -1,157 +1,174 @@
-"""What `explain` says of failures: the values of a cause and how sure it is, who avoids them, and
-what counts.
+"""What `explain` can say.
+
+`{unsafe}` is a collision, or an unsafe vehicle by another criterion; `{collide}` and `{causes}` are
+verbs for as many as the sentence counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from safevar_sumo.questions.sentence import Sentence
 
-import numpy as np
-import pandas as pd
-
-from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.counterexamples import values_in_words
-from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.failures import Population
-from safevar_sumo.questions.explain.robustness import (
-    LEAST_NEIGHBOURS,
-    robustness_in_words,
+# Of a study: the smallest changes.
+AT_ENDS = (
+    Sentence(
+        "answer",
+        "One change is enough for {unsafe}: {changes}, an end of its domain (its range of values).",
+    ),
+    Sentence(
+        "answer",
+        "{number} changes together are enough for {unsafe}: {changes}, each at an end of its domain"
+        " (its range of values).",
+    ),
 )
-from safevar_sumo.questions.preventability import FULL, LETTER
-from safevar_sumo.questions.variation import sampled_in_words
-from safevar_sumo.questions.words import (
-    constraints_in_words,
-    counted_in_words,
-    encounter_in_words,
-    ending_in_words,
-    number_of,
-    share_in_words,
+"""Of one change, and of several."""
+ON_THE_WAY = (
+    Sentence(
+        "answer",
+        "One change is enough for {unsafe}: {changes}, {share} % of the way from the original value"
+        " to an end of its domain (its range of values).",
+    ),
+    Sentence(
+        "answer",
+        "{number} changes together are enough for {unsafe}: {changes}, each {share} % of the way"
+        " from its original value to an end of its domain (its range of values).",
+    ),
 )
-from safevar_sumo.records import NamedValues
-from safevar_sumo.study import Study
+"""Of one change, and of several."""
+OTHERS = Sentence("answer", "The table has {causes} with as few changes.")
+NOTHING_FOUND = Sentence(
+    "answer",
+    "The search found no cause of {unsafe} with {up_to}, each at an end of its domain (its range of"
+    " values).",
+)
+TOO_FEW = Sentence(
+    "answer",
+    "No cause was found, because too few simulations were allowed. Allow more simulations"
+    " (--simulations).",
+)
+UNSAFE_IN_ENCOUNTER = Sentence(
+    "answer",
+    "The original vehicle is already unsafe in this encounter, without any change.",
+)
 
-AVOIDING = {
-    LETTER: "A competent driver (as in UN R157) in the same vehicle",
-    FULL: "Full braking at the first possible moment",
-}
-"""Who might have avoided a collision."""
-BEYOND = 256
-"""Number of vehicles beyond the values of a cause that are simulated."""
+# Of results: what is enough for their failures.
+ALREADY_UNSAFE = Sentence(
+    "answer",
+    "The original vehicle is already unsafe: it {breach}. A failure needs no change of the"
+    " vehicle.",
+)
+NONE_UNSAFE = Sentence(
+    "answer",
+    "No cause was found, because none of the examined vehicles is unsafe.",
+)
+ENDING = Sentence("evidence", "The original vehicle {ending}.")
+CHANGES = (
+    Sentence(
+        "answer",
+        "One change is enough for {unsafe}: {changes}. All other characteristics are as in the"
+        " original vehicle.",
+    ),
+    Sentence(
+        "answer",
+        "{number} changes together are enough for {unsafe}: {changes}. All other characteristics"
+        " are as in the original vehicle.",
+    ),
+)
+"""Of one change, and of several."""
+ENCOUNTER = Sentence(
+    "answer",
+    "The original vehicle is safe in the same encounter, which has {values}.",
+)
+SHARE = Sentence(
+    "evidence",
+    "{count} failures whose causes were searched {have} such a cause: the same characteristics,"
+    " changed in the same direction.",
+)
+BEYOND = Sentence(
+    "evidence",
+    "{count} vehicles that were tested with larger changes of the same kind {collide}.",
+)
 
+# How sure a cause is.
+GAP = Sentence(
+    "evidence",
+    "The unsafe range has a gap: at {share} % of the way the vehicle is safe again.",
+)
+CHECKED_WITH = Sentence(
+    "evidence",
+    "The checks of this cause (similar vehicles, other parameter sets) used these values:"
+    " {changes}.",
+)
+RUNS = Sentence("evidence", "The vehicle is unsafe in {share} % of its repeated runs.")
+SETS = Sentence(
+    "evidence",
+    "The same cause was found in {holds} of {fits} parameter sets of the vehicle model (alternative"
+    " calibrations).",
+)
+ROBUST = Sentence(
+    "evidence",
+    "The cause is robust: {share} vehicles with slightly different values are unsafe, too.",
+)
+BORDERLINE = Sentence(
+    "evidence",
+    "The cause is borderline: only {share} vehicles with slightly different values are unsafe.",
+)
 
-def verdict_on_failures(
-    evaluator: Evaluator, population: Population, causes: pd.DataFrame
-) -> Iterator[str]:
-    """How little is enough, and how sure that is."""
-    unsafe = population.unsafe
-    contact = evaluator.system.contact
-    runs = population.evaluations
+# What was simulated of a study.
+OF_SIZE = Sentence("evidence", "{count} {combinations} {causes}.")
+OF_PART = Sentence(
+    "evidence",
+    "{count} simulated {combinations} {causes} ({existing:,} such combinations exist).",
+)
+STEP = Sentence(
+    "note",
+    "If all changes go {shares} % of the way to the ends of their domains, {changes} enough for"
+    " {unsafe}.",
+)
+STEP_WITHOUT = Sentence(
+    "note",
+    "If all changes go {shares} % of the way to the ends of their domains, none of {tried:,}"
+    " simulated combinations ({up_to}) {causes}.",
+)
+CONTAINING = Sentence(
+    "condition",
+    "{combinations} {contain} a smaller cause (fewer changes that are enough).",
+)
+CURES = Sentence(
+    "condition",
+    "Another change prevents the failure in {count} simulated combinations with a smaller cause.",
+)
+IN_NONE = Sentence("condition", "No cause with {up_to} includes {names}.")
+SCOPE = Sentence(
+    "note",
+    "Valid for: the original encounter and the {number} encounters in which the original vehicle is"
+    " least safe.",
+)
 
-    # Nothing has to change if the original is unsafe.
-    if not evaluator.study.ranges and unsafe.of(population.original)[0]:
-        words = unsafe.breach_in_words(population.original)
-        yield f"The original vehicle itself {words}: no change is necessary."
-        yield unsafe.smaller_demand(population.original)
-        return
+# How many vehicles fail, and who would have avoided it.
+NUMBER_OF_SAMPLE = Sentence(
+    "evidence", "{count} vehicles that were {sampled} {collide}."
+)
+NUMBER_OF_SOLUTIONS = Sentence(
+    "evidence",
+    "{count} different vehicles that the search returned (its solutions) {collide}.",
+)
+COMPETENT_DRIVER = Sentence(
+    "evidence",
+    "A competent driver (as in UN R157) in the same vehicle would have avoided {avoided:,} of"
+    " {collisions}.",
+)
+FULL_BRAKING = Sentence(
+    "evidence",
+    "Full braking at the first possible moment would have avoided {avoided:,} of {collisions}.",
+)
+COMPLETE = Sentence(
+    "condition",
+    "For the examined failures, all minimal causes (smallest unsafe sets of changes) with up to"
+    " {changes} were found.",
+)
 
-    # Without a cause, how the worst setting and the original end.
-    if causes.empty:
-        nearest = runs.take(np.argsort(runs.f_safe, kind="stable")[:1])
-        for who, run in (
-            ("worst vehicle", nearest),
-            ("original vehicle", population.original),
-        ):
-            if len(run):
-                ending = ending_in_words(
-                    str(run.outcome[0]), float(run.f_safe[0]), contact
-                )
-                yield f"The {who} {ending}."
-        return
-    leading = causes.iloc[0]
-    if not leading["changes"]:
-        yield "The original vehicle itself is unsafe in this encounter: no change is necessary."
-        return
-
-    # Its values, its encounter, and how sure the cause is.
-    members = evaluator.characteristics
-    boundary = leading["boundary"]
-    encounter = encounter_in_words(
-        members, leading.get("encounter", {}), are_printed=True
-    )
-    where = (
-        " in an encounter in which the original vehicle is safe" if encounter else ""
-    )
-    yield f"With {values_in_words(members, boundary)} the vehicle {unsafe.verbs[0]}{where}."
-    yield f"The encounter has {encounter.partition(' with ')[2]}." if encounter else ""
-    yield _beyond_in_words(evaluator, unsafe, boundary, leading.get("encounter", {}))
-    yield robustness_in_words(leading["robust_share"])
-    if pd.notna(leading["holds"]):
-        holding = f"{leading['holds']} of {leading['fits']}"
-        yield f"The cause holds in {holding} parameter sets of the vehicle model."
-
-
-def _beyond_in_words(
-    evaluator: Evaluator, unsafe: Unsafe, cause: NamedValues, encounter: NamedValues
-) -> str:
-    """The share of vehicles beyond all values of a cause, all else as in the original, that are
-    unsafe, in a sentence; empty if there are none, or too few may be simulated.
-    """
-    members = evaluator.characteristics
-    number = evaluator.at_most(BEYOND, 4)
-    at_cause = members.setting(cause | encounter, beyond=True)
-    ends = np.where(at_cause > members.original, members.upper, members.lower)
-    is_open = np.isin(members.names, [*cause]) & (ends != at_cause)
-    if number < LEAST_NEIGHBOURS or not is_open.any():
-        return ""
-    shares = np.random.default_rng(evaluator.seed).random((number, len(members)))
-    vehicles = at_cause + np.where(is_open, shares * (ends - at_cause), 0)
-    runs = evaluator.evaluate(vehicles, "vehicles beyond the values of a cause")
-    share = share_in_words(unsafe.number(runs) / number)
-    whose = "these values" if len(cause) > 1 else "this value"
-    number_of_them = (
-        f"Of {number} vehicles beyond {whose}, all else as in the original,"
-    )
-    return f"{number_of_them} {share} {unsafe.verbs[1]}."
-
-
-def others_in_words(
-    study: Study, population: Population, complete: int | None, verdicts: pd.DataFrame
-) -> Iterator[str]:
-    """Up to which size causes are complete, who avoids the failures, and which settings count."""
-    if complete:
-        yield f"All minimal causes of up to {number_of(complete, 'change')} are found."
-    yield avoided_in_words(verdicts)
-    over_sets = population.over_sets
-    drawn = f"vehicles {sampled_in_words(study)}"
-    yield _number_in_words(
-        population, drawn if over_sets else "different solutions of the search"
-    )
-    if over_sets:
-        yield over_sets.in_words().strip()
-        yield from counted_in_words(study, population.left_out)
-    yield from constraints_in_words(study)
-
-
-def avoided_in_words(verdicts: pd.DataFrame) -> str:
-    """What a competent driver, and full braking, would have avoided of the collisions on which each
-    has a verdict.
-    """
-    sentences = []
-    examined = f"{len(verdicts):,} examined"
-    for name, who in AVOIDING.items():
-        number = int(verdicts[name].count())
-        which = f"{number:,} examined collisions"
-        if number < len(verdicts):
-            which = f"{number:,} collisions with a verdict ({examined})"
-        if number:
-            avoided = f"{int(verdicts[name].sum()):,} of {which}"
-            sentences.append(f"{who} would have avoided {avoided}.")
-    return " ".join(sentences)
-
-
-def _number_in_words(population: Population, kind: str) -> str:
-    """How many settings are unsafe."""
-    unsafe = population.unsafe
-    runs = population.evaluations
-    number = unsafe.number(runs)
-    return f"Of {len(runs):,} {kind}, {unsafe.number_in_words(number)}. {unsafe.remark}".strip()
+# In a table: how a failure ends.
+AT_POINT = Sentence(
+    "evidence",
+    "In the test case {point}, the original vehicle {original}. The failed vehicle {changed}.",
+)

@@ -33,7 +33,7 @@ from safevar_sumo.questions.words import (
     bound_in_words,
     join_phrases,
     number_of,
-    share_in_words,
+    percentage,
     undecidable_in_words,
 )
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
@@ -469,10 +469,10 @@ def _alone_in_words(facts: Told) -> Iterator[str]:
 def tested_sentences(facts: Told) -> Iterator[str]:
     """How joint limits were tested; nothing without such limits."""
     if facts.study.ranges and facts.is_safe:
-        share = share_in_words(facts.own.evaluator.share_left_out)
+        share = percentage(facts.own.evaluator.share_left_out)
         yield (
-            f"Of the encounters over the domain {share} do not count, because the original vehicle"
-            f" itself keeps less than {facts.study.scenario.margin or 0:g} m in them."
+            f"{share} % of the encounters do not count, because the original vehicle keeps less"
+            f" than {facts.study.scenario.margin or 0:g} m of clearance in them."
         )
     if facts.box is None:
         return

@@ -1,0 +1,303 @@
+"""What is told about causes: which templates, and what fills them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.counterexamples import values_in_words
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain import words
+from safevar_sumo.questions.explain.combinations import Enumeration
+from safevar_sumo.questions.explain.failures import Population
+from safevar_sumo.questions.explain.robustness import LEAST_NEIGHBOURS, MIN_ROBUST_SHARE
+from safevar_sumo.questions.explain.smallest import Smallest
+from safevar_sumo.questions.preventability import FULL, LETTER
+from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.variation import sampled_in_words
+from safevar_sumo.questions.words import (
+    UNSAFE_MEANS,
+    constraints_in_words,
+    count_in_words,
+    counted_in_words,
+    ending_in_words,
+    join_phrases,
+    number_of,
+    percentage,
+    place_in_words,
+)
+from safevar_sumo.records import NamedValues
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
+
+BEYOND = 256
+"""Number of vehicles beyond the values of a cause that are simulated."""
+NUMBERS = [
+    "none",
+    "one",
+    "two",
+    "three",
+    "four",
+    "five",
+    "six",
+    "seven",
+    "eight",
+    "nine",
+    "ten",
+]
+AVOIDING = {LETTER: words.COMPETENT_DRIVER, FULL: words.FULL_BRAKING}
+"""Who might have avoided a collision."""
+
+
+def smallest_sentences(
+    smallest: Smallest, evaluator: Evaluator, unsafe: Unsafe
+) -> Iterator[Sentence]:
+    """The smallest changes of a study, how sure they are, and what was simulated."""
+    members = evaluator.characteristics
+    yield from _leading_of_study(smallest, members, unsafe)
+    for size, number in smallest.at_ends.existing.items():
+        if number:
+            yield _of_size(smallest.at_ends, unsafe, size)
+    yield from _steps(smallest.steps[1:], unsafe)
+    yield from _containing(smallest)
+    yield from _in_none(smallest.at_ends, members)
+    if encounters := len(evaluator.critical_encounters):
+        yield words.SCOPE.fill(number=encounters)
+
+
+def _leading_of_study(
+    smallest: Smallest, members: CharacteristicSet, unsafe: Unsafe
+) -> Iterator[Sentence]:
+    """The fewest changes that begin nearest to the original, and how sure they are."""
+    table = smallest.table
+    if not smallest.at_ends.tried:
+        yield words.TOO_FEW
+        return
+    if table.empty:
+        largest = max(smallest.at_ends.simulated)
+        yield words.NOTHING_FOUND.fill(unsafe=unsafe.event, up_to=_up_to(largest))
+        return
+    fewest = table[table["size"] == table["size"].min()]
+    in_order = fewest.sort_values("begins_at", kind="stable")
+    leading = in_order.to_dict("records")[0]
+    if not leading["size"]:
+        yield words.UNSAFE_IN_ENCOUNTER
+        return
+    share = leading["begins_at"]
+    templates = words.ON_THE_WAY if share < 1 else words.AT_ENDS
+    yield _enough(templates, members, unsafe, leading["boundary"], share)
+    if others := len(fewest) - 1:
+        yield words.OTHERS.fill(causes=number_of(others, "further cause"))
+
+    # How sure they are.
+    if pd.notna(leading["safe_again"]):
+        yield words.GAP.fill(share=percentage(leading["safe_again"]))
+    is_checked = pd.notna(leading["robust_share"])
+    if is_checked and leading["causes"] != leading["boundary"]:
+        changes = values_in_words(members, leading["causes"])
+        yield words.CHECKED_WITH.fill(changes=changes)
+    if leading["unsafe_runs"] < 1:
+        yield words.RUNS.fill(share=percentage(leading["unsafe_runs"]))
+    yield from _sureness(leading)
+
+
+def _enough(
+    templates: Sequence[Sentence],
+    members: CharacteristicSet,
+    unsafe: Unsafe,
+    changes: NamedValues,
+    share: float = 1.0,
+) -> Sentence:
+    """That changes are enough, by the template of one or of several."""
+    return templates[len(changes) > 1].fill(
+        unsafe=unsafe.event,
+        number=_count(len(changes)),
+        changes=values_in_words(members, changes),
+        share=f"{100 * share:.12g}",
+    )
+
+
+def _of_size(at_ends: Enumeration, unsafe: Unsafe, size: int) -> Sentence:
+    """How many combinations of a size are unsafe."""
+    number = sum(len(cause.changes) == size for cause in at_ends.causes)
+    existing = at_ends.existing[size]
+    simulated = at_ends.simulated[size]
+    template = words.OF_SIZE if simulated == existing else words.OF_PART
+    combinations = f"combinations of {_count(size)} changes"
+    if size == 1:
+        combinations = "changes of a single characteristic to an end of its domain"
+    return template.fill(
+        count=count_in_words(number, simulated),
+        combinations=combinations,
+        causes=unsafe.effects[number > 1],
+        existing=existing,
+    )
+
+
+def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Iterator[Sentence]:
+    """The fewest changes at each share of the way that was simulated beside the ends."""
+    by_size = groupby(steps, lambda step: (step.size, max(step.simulated)))
+    for (size, largest), group in by_size:
+        alike = [*group]
+        ends = dict.fromkeys(f"{100 * alike[place].share:.0f}" for place in (0, -1))
+        shares = " to ".join(ends)
+        if size:
+            changes = "1 change is" if size == 1 else f"{_count(size)} changes are"
+            yield words.STEP.fill(shares=shares, changes=changes, unsafe=unsafe.event)
+            continue
+        up_to = _up_to(largest)
+        if alike[0].is_cut:
+            up_to += ", because more exceed the search"
+        yield words.STEP_WITHOUT.fill(
+            shares=shares,
+            tried=sum(step.tried for step in alike),
+            up_to=up_to,
+            causes=unsafe.effects[0],
+        )
+
+
+def _containing(smallest: Smallest) -> Iterator[Sentence]:
+    """How many combinations contain a smaller cause, and how many of these are safe."""
+    total, simulated, cures = smallest.containing
+    if total:
+        combinations = number_of(total, "further combination")
+        contain = "contains" if total == 1 else "contain"
+        yield words.CONTAINING.fill(combinations=combinations, contain=contain)
+    if simulated:
+        yield words.CURES.fill(count=count_in_words(cures, simulated))
+
+
+def _in_none(at_ends: Enumeration, members: CharacteristicSet) -> Iterator[Sentence]:
+    """Which characteristics no cause has, up to the size of which all were simulated."""
+    size = at_ends.complete_up_to
+    changed = {name for cause in at_ends.causes for name in cause.changes}
+    names = [item.short_name for item in members.vehicle if item.name not in changed]
+    if names and changed and size:
+        yield words.IN_NONE.fill(up_to=_up_to(size), names=join_phrases(names, "or"))
+
+
+def failure_sentences(
+    evaluator: Evaluator, population: Population, causes: pd.DataFrame, analysed: int
+) -> Iterator[Sentence]:
+    """What is enough for the failures in results, of which so many were analysed, and how sure that
+    is.
+    """
+    unsafe = population.unsafe
+    original = population.original
+    if not evaluator.study.ranges and unsafe.of(original)[0]:
+        breach = unsafe.breach_in_words(original)
+        yield words.ALREADY_UNSAFE.fill(breach=breach)
+        yield Sentence("answer", unsafe.smaller_demand(original))
+        return
+    if causes.empty and unsafe.number(population.evaluations):
+        yield words.TOO_FEW
+        return
+    if causes.empty:
+        degree = float(original.f_safe[0])
+        contact = evaluator.system.contact
+        ending = ending_in_words(str(original.outcome[0]), degree, contact)
+        yield words.NONE_UNSAFE
+        yield words.ENDING.fill(ending=ending)
+        return
+    leading = causes.to_dict("records")[0]
+    if not leading["changes"]:
+        yield words.UNSAFE_IN_ENCOUNTER
+        return
+
+    # The values of the cause that leads, its encounter, and how sure it is.
+    members = evaluator.characteristics
+    boundary = leading["boundary"]
+    yield _enough(words.CHANGES, members, unsafe, boundary)
+    place = leading.get("encounter", {})
+    if values := place_in_words(members, place, are_printed=True):
+        yield words.ENCOUNTER.fill(values=values)
+    if analysed > 1 and pd.notna(leading["share"]):
+        number = round(leading["share"] * analysed)
+        count = count_in_words(number, analysed)
+        yield words.SHARE.fill(count=count, have="has" if number <= 1 else "have")
+    yield from _beyond(evaluator, unsafe, boundary, place)
+    yield from _sureness(leading)
+
+
+def _beyond(
+    evaluator: Evaluator, unsafe: Unsafe, cause: NamedValues, encounter: NamedValues
+) -> Iterator[Sentence]:
+    """How many vehicles beyond all values of a cause, all else as in the original, are unsafe;
+    nothing if there are none, or too few may be simulated.
+    """
+    members = evaluator.characteristics
+    number = evaluator.at_most(BEYOND, 4)
+    at_cause = members.setting(cause | encounter, beyond=True)
+    ends = np.where(at_cause > members.original, members.upper, members.lower)
+    is_open = np.isin(members.names, [*cause]) & (ends != at_cause)
+    if number < LEAST_NEIGHBOURS or not is_open.any():
+        return
+    shares = np.random.default_rng(evaluator.seed).random((number, len(members)))
+    vehicles = at_cause + np.where(is_open, shares * (ends - at_cause), 0)
+    runs = evaluator.evaluate(vehicles, "check vehicles beyond the cause")
+    failures = unsafe.number(runs)
+    yield words.BEYOND.fill(
+        count=count_in_words(failures, number), collide=unsafe.verbs[failures > 1]
+    )
+
+
+def _sureness(row: Mapping[Any, Any]) -> Iterator[Sentence]:
+    """How robust the cause of a row is, and in how many parameter sets it is one, if known."""
+    share = row["robust_share"]
+    if not np.isnan(share):
+        template = words.ROBUST if share >= MIN_ROBUST_SHARE else words.BORDERLINE
+        yield template.fill(share="all" if share == 1 else f"{100 * share:.0f} % of")
+    if pd.notna(row["holds"]):
+        yield words.SETS.fill(holds=row["holds"], fits=row["fits"])
+
+
+def other_sentences(
+    study: Study, population: Population, complete: int | None, verdicts: pd.DataFrame
+) -> Iterator[Sentence]:
+    """Up to which size causes are complete, who avoids the failures, and what counts."""
+    unsafe = population.unsafe
+    if complete:
+        yield words.COMPLETE.fill(changes=number_of(complete, "change"))
+    yield from avoidance(verdicts)
+    number = unsafe.number(population.evaluations)
+    over_sets = population.over_sets
+    template = words.NUMBER_OF_SAMPLE if over_sets else words.NUMBER_OF_SOLUTIONS
+    yield template.fill(
+        count=count_in_words(number, len(population.evaluations)),
+        sampled=sampled_in_words(study),
+        collide=unsafe.verbs[number > 1],
+    )
+    if not unsafe.is_collision:
+        yield UNSAFE_MEANS.fill(description=unsafe.description)
+    notes = [unsafe.remark, *constraints_in_words(study)]
+    if over_sets:
+        yield Sentence("condition", over_sets.in_words().strip())
+        notes += counted_in_words(study, population.left_out)
+    yield from (Sentence("note", note) for note in notes)
+
+
+def avoidance(verdicts: pd.DataFrame) -> Iterator[Sentence]:
+    """What a competent driver, and full braking, would have avoided of the collisions on which each
+    has a verdict.
+    """
+    for name, template in AVOIDING.items():
+        number = int(verdicts[name].count())
+        collisions = f"{number:,} examined collisions"
+        if number < len(verdicts):
+            collisions = f"{number:,} collisions with a verdict ({len(verdicts):,} were examined)"
+        if number:
+            avoided = int(verdicts[name].sum())
+            yield template.fill(avoided=avoided, collisions=collisions)
+
+
+def _count(number: int) -> str:
+    return NUMBERS[number] if number < len(NUMBERS) else f"{number:,}"
+
+
+def _up_to(size: int) -> str:
+    return "one change" if size <= 1 else f"up to {_count(size)} changes"
