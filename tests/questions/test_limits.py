@@ -353,7 +353,7 @@ def test_a_scan_meets_each_value_in_each_encounter_and_a_limit_ends_in_the_worst
     assert limits.upper.tolist() == [6, 5]
     scanned = np.concatenate(cases[:2])
     assert len(scanned) == 3 * 2 * 10, "three sides may move"
-    assert {*scanned[:, 0].tolist()} == {*np.arange(0, 10.5, 0.5).tolist()}
+    assert {*np.diff(np.unique(scanned[:, 0]))} == {0.5}
     assert [len(rows) for rows in cases[2:]] == [3, 3]
     failure = limits.beyond[1, 0]
     assert failure.tolist() == [6.125, 5, 0, 0, 0]
@@ -371,7 +371,6 @@ def test_what_a_search_keeps_is_the_worst_that_counts() -> None:
     every = met.after(cases, values - 39.5)
     assert len(every.cases) == len(every.unsafe) == 40, "all unsafe ones"
     assert every.least == -39.5
-    assert every.simulated == 82
 
 
 def test_a_box_settles_a_step_further_inwards_after_each_failure() -> None:

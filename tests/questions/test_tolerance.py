@@ -23,7 +23,9 @@ from safevar_sumo.questions.tolerance.asked import (
     effort_of,
     usual_alone,
 )
+from safevar_sumo.questions.tolerance.boxes import Attack
 from safevar_sumo.questions.tolerance.search import find_limits
+from safevar_sumo.questions.tolerance.told import worst_of
 from safevar_sumo.questions.words import bound_in_words
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
@@ -241,12 +243,17 @@ def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> N
     assert limits.alone.upper.tolist() == [10, 10, 5]
 
 
+def test_the_worst_clearance_is_what_is_left_beside_the_margin_of_its_set() -> None:
+    attacks = {0: Attack(1, 0.2), 2: Attack(1, 0.4), 3: Attack(1)}
+    assert worst_of(Unsafe(keep=0.3), attacks) == 0.4
+
+
 def test_few_simulations_are_shared_between_limits_alone_and_the_box() -> None:
     evaluator = made_up_evaluator(4, nowhere)
     effort = effort_of(evaluator, 3000, 4)
-    on_lines = 2 * 4 * effort.encounters * (effort.values + sum(effort.box.parts))
-    assert 0.1 * 3000 < on_lines <= 0.15 * 3000
     assert (effort.values, effort.alone, effort.own) == (8, 0, 300)
+    on_lines = effort.encounters * (effort.values + sum(effort.box.parts))
+    assert 300 < 8 * on_lines <= 0.15 * 3000
     assert (effort.corners, effort.confirmations, effort.share) == (0, 2, 1)
     assert effort.box.retreat == pytest.approx(0.5 + 200 / 3000)
     fewer = effort_of(evaluator, 200, 4)

@@ -29,7 +29,6 @@ from safevar_sumo.questions.words import (
 )
 from safevar_sumo.records import FloatArray, JsonObject, finite_or_none
 from safevar_sumo.scenarios import SPEED_DIMENSION
-from safevar_sumo.vehicles import Characteristic
 
 NUMBERS = (
     *("unsafe", "margin", "kept", "rough", "scope", "up_to", "box", "boxes"),
@@ -243,16 +242,16 @@ def _sentence(facts: Told, column: int) -> str:
         return f"{name}: no joint limits were found."
     ends = float(box.lower[column]), float(box.upper[column])
     if ends[0] == ends[1]:
-        value = limit_text_of(item, ends[0])
+        value = limit_text(item, ends[0])
         state = "as in the original vehicle; no room was found for it"
         return f"{name}: {value}, {state}. {scope}"
     demands = list[str]()
     if ends[0] != item.lower:
-        demands.append(f"at least {limit_text_of(item, ends[0])}")
+        demands.append(f"at least {limit_text(item, ends[0])}")
     if ends[1] != item.upper:
-        demands.append(f"at most {limit_text_of(item, ends[1])}")
+        demands.append(f"at most {limit_text(item, ends[1])}")
     if not demands:
-        span = f"from {item.lower:.10g} to {limit_text_of(item, item.upper)}"
+        span = f"from {item.lower:.10g} to {limit_text(item, item.upper)}"
         return f"{name}: any value {span}. {scope}"
     sentence = f"{name}: {' and '.join(demands)}."
     failure = facts.failures.get(column)
@@ -260,11 +259,6 @@ def _sentence(facts: Told, column: int) -> str:
         return f"{sentence} {scope}"
     vehicle = _vehicle_in_words(facts, box, column, failure)
     return f"{sentence} {vehicle}, {failure.words}. {scope}"
-
-
-def limit_text_of(item: Characteristic, value: float) -> str:
-    """A limit in a sentence."""
-    return f"{value:.10g}{item.suffix}"
 
 
 def _vehicle_in_words(facts: Told, box: Box, column: int, failure: Failure) -> str:

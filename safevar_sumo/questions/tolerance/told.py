@@ -217,9 +217,10 @@ class Told:
             return self.outside(column) > 0
         lengths = np.abs(self.task.given[:, column] - self.task.original[column])
         beyond = self.limits.alone.beyond
-        sides = [side for side in ((0, column), (1, column)) if side in beyond]
         return any(
-            self._change(side, beyond[side]) <= lengths[side[0]] for side in sides
+            self._change(side, case) <= lengths[side[0]]
+            for side, case in beyond.items()
+            if side[1] == column
         )
 
     def value_in(self, fit: int) -> float:
