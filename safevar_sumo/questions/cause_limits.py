@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import StrEnum
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -100,21 +101,26 @@ def find_cause_limits(
         )
 
     # The limits of each cause, from its lines.
-    limits_of_causes = list[Limits]()
-    first = 0
-    for cause, flags, number in zip(causes, is_changed, line_counts, strict=True):
-        together, *alone = limits[first : first + number, flags].tolist()
-        single = [values[place] for place, values in enumerate(alone)]
-        limits_of_causes.append(
-            Limits(
-                boundary=dict(zip(cause.changes, together, strict=True)),
-                single_boundary=dict(zip(cause.changes, single, strict=True)),
-                fraction=float(shares[first]) if cause.changes else 0.0,
-                end=states[first],
-            )
+    first_lines = np.cumsum([0, *line_counts])
+    return [
+        Limits(
+            boundary=dict(
+                zip(cause.changes, limits[first, flags].tolist(), strict=True)
+            ),
+            single_boundary=dict(
+                zip(
+                    cause.changes,
+                    np.diagonal(limits[first + 1 : stop, flags]).tolist(),
+                    strict=True,
+                )
+            ),
+            fraction=float(shares[first]) if cause.changes else 0.0,
+            end=states[first],
         )
-        first += number
-    return limits_of_causes
+        for cause, flags, (first, stop) in zip(
+            causes, is_changed, pairwise(first_lines), strict=True
+        )
+    ]
 
 
 def _first_unsafe_shares(

@@ -316,7 +316,7 @@ class Scenario:
 
     def obstacle(self) -> str:
         """What the vehicle hits in a collision, in words."""
-        return OBSTACLES.get(self.pre_crash, "what is in its way")
+        return OBSTACLES.get(self.pre_crash, "the obstacle")
 
 
 NamedScenarios = Iterable[tuple[str, Scenario]]

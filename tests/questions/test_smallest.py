@@ -149,7 +149,7 @@ def test_one_change_at_half_its_way_leads_where_all_ends_are_safe() -> None:
         "One change is enough for a collision: a at 7.3 N m, 46 % of the way"
     )
     assert (
-        "The unsafe range has a gap: at 55 % of the way the vehicle is safe again."
+        "has a gap: at 55 % of the way to the ends, the vehicle is safe again."
         in verdict
     )
     assert "None of the 4 changes of a single characteristic to an end" in verdict
@@ -225,7 +225,7 @@ def test_combinations_that_contain_a_cause_and_cures_are_counted() -> None:
     assert [smallest.numbers[name] for name in names] == counts
     assert smallest.numbers["containing_tried"] == counts[0]
     assert (
-        "26 further combinations contain a smaller cause (fewer changes that are enough)"
+        "The counts of combinations leave out 26 combinations with a smaller cause"
         in verdict
     )
     assert "prevents the failure in 9 of the 26 simulated combinations" in verdict

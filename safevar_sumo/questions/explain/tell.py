@@ -165,9 +165,7 @@ def _containing(smallest: Smallest) -> Iterator[Sentence]:
     """How many combinations contain a smaller cause, and how many of these are safe."""
     total, simulated, cures = smallest.containing
     if total:
-        combinations = number_of(total, "further combination")
-        contain = "contains" if total == 1 else "contain"
-        yield words.CONTAINING.fill(combinations=combinations, contain=contain)
+        yield words.CONTAINING.fill(combinations=number_of(total, "combination"))
     if simulated:
         yield words.CURES.fill(count=count_in_words(cures, simulated))
 
@@ -241,8 +239,13 @@ def _beyond(
     vehicles = at_cause + np.where(is_open, shares * (ends - at_cause), 0)
     runs = evaluator.evaluate(vehicles, "check vehicles beyond the cause")
     failures = unsafe.number(runs)
+    larger = "larger changes of the same characteristics"
+    if len(cause) == 1:
+        larger = "a larger change of the same characteristic"
     yield words.BEYOND.fill(
-        count=count_in_words(failures, number), collide=unsafe.verbs[failures > 1]
+        count=count_in_words(failures, number),
+        larger=larger,
+        collide=unsafe.verbs[failures > 1],
     )
 
 

@@ -80,18 +80,17 @@ ENCOUNTER = Sentence(
 )
 SHARE = Sentence(
     "evidence",
-    "{count} failures whose causes were searched {have} such a cause: the same characteristics,"
-    " changed in the same direction.",
+    "{count} failures whose causes were searched {have} the same cause (the same characteristics,"
+    " changed in the same direction).",
 )
 BEYOND = Sentence(
-    "evidence",
-    "{count} vehicles that were tested with larger changes of the same kind {collide}.",
+    "evidence", "{count} vehicles that were tested with {larger} {collide}."
 )
 
 # How sure a cause is.
 GAP = Sentence(
     "evidence",
-    "The unsafe range has a gap: at {share} % of the way the vehicle is safe again.",
+    "The unsafe range has a gap: at {share} % of the way to the ends, the vehicle is safe again.",
 )
 CHECKED_WITH = Sentence(
     "evidence",
@@ -131,7 +130,8 @@ STEP_WITHOUT = Sentence(
 )
 CONTAINING = Sentence(
     "condition",
-    "{combinations} {contain} a smaller cause (fewer changes that are enough).",
+    "The counts of combinations leave out {combinations} with a smaller cause (fewer changes that"
+    " are enough).",
 )
 CURES = Sentence(
     "condition",
