@@ -210,4 +210,6 @@ def did_you_mean(name: object, names: Iterable[str]) -> str:
 def one_of(names: Iterable[str]) -> str:
     """The text `one of`, with all legal names, for an error message; `none` without any."""
     listed = ", ".join(sorted(names))
-    return f"one of {listed}" if listed else "none"
+    if listed:
+        return f"one of {listed}"
+    return "none"

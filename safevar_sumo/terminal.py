@@ -106,7 +106,9 @@ def printable_text(text: object, style: str = "") -> Text:
 def _printable_letter(letter: str) -> str:
     if letter.isprintable():
         return letter
-    return " " if letter.isspace() else "?"
+    if letter.isspace():
+        return " "
+    return "?"
 
 
 def print_text(console: Console, text: str) -> None:
@@ -125,7 +127,7 @@ class Parts:
 
     def __init__(self, show: Progress, expected: Iterable[int] = ()) -> None:
         self._show = show
-        self._expected = [*expected]
+        self._expected = list(expected)
         self._before = self._whole = 0
         """Number of simulations of the parts before this one, and of this one."""
 
@@ -139,7 +141,8 @@ class Parts:
             # What costs more than its simulations, such as workers that start, is spread over them.
             self._whole = max(total, expected)
             number = self._whole * number // max(total, 1)
-            phase = f"{name}: {phase}" if name else phase
+            if name:
+                phase = f"{name}: {phase}"
             self._show(phase, self._before + number, self._before + self._whole + later)
 
         return show_part

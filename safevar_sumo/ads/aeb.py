@@ -117,7 +117,7 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
         zeros = np.zeros(n)
-        nobody = np.zeros(n, dtype=bool)
+        nobody = np.zeros(n, bool)
         return _Memory(
             nominal,
             step,

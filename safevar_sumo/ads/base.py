@@ -178,18 +178,18 @@ class PerVehicleAds(Ads):
         values = np.empty((len(observation), n))
         for row, value in enumerate(observation):
             values[row] = value
-        observations = [*map(Observation._make, values.T.tolist())]
+        observations = list(map(Observation._make, values.T.tolist()))
         pedals = [(0.0, 0.0)] * n
         # A vehicle whose run has ended may have left what its driver expects.
-        rows = open_rows(np.ones(n, dtype=bool)).tolist()
+        rows = open_rows(np.ones(n, bool)).tolist()
         with np.errstate():
             for i in rows:
                 command = self._code.call("drive", memory[i].drive, observations[i])
                 pedals[i] = self._checked_pedals(command)
-        return Command(*np.array(pedals, dtype=float).reshape(n, 2).T.copy()), memory
+        return Command(*np.array(pedals, float).reshape(n, 2).T.copy()), memory
 
     def warns(self, memory: list[ScalarAds]) -> BoolArray:
-        return np.array([bool(driver.warns) for driver in memory], dtype=bool)
+        return np.array([bool(driver.warns) for driver in memory], bool)
 
     def _checked_pedals(self, command: Any) -> tuple[float, float]:
         if type(command) is tuple and len(command) == 2:

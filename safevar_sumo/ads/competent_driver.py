@@ -108,7 +108,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     def start(self, n: int, nominal: Nominal, step: float) -> _Perceiving:
         reaction = ReferenceDriver.start(self, n, nominal, step)
         never = np.full(n, -1.0)
-        nobody = np.zeros(n, dtype=bool)
+        nobody = np.zeros(n, bool)
         return _Perceiving(reaction, np.full(n, np.inf), nobody, never, never, nobody)
 
     def drive(

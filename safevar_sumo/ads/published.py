@@ -102,7 +102,7 @@ class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         return _ApolloMemory(
             nominal,
             step,
-            has_begun_to_stop=np.zeros(n, dtype=bool),
+            has_begun_to_stop=np.zeros(n, bool),
             needed_after_lag=zeros,
             commanded_acceleration=zeros,
             creeping_time=zeros,
@@ -290,7 +290,7 @@ class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields
     def start(self, n: int, nominal: Nominal, step: float) -> _RailsMemory:
         idle = Command(np.zeros(n), np.zeros(n))
         return _RailsMemory(
-            np.zeros(n, dtype=bool),
+            np.zeros(n, bool),
             (idle,) * round(self.latency / step),
             DelayLine.by(self.recognition_delay, step),
             DelayLine.by(self.hesitation, step),

@@ -150,7 +150,7 @@ class ReferenceDriver(
 
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
         zeros = np.zeros(n)
-        never = np.zeros(n, dtype=bool)
+        never = np.zeros(n, bool)
         return Reaction(
             nominal=nominal,
             step=step,

@@ -82,7 +82,7 @@ def with_tau(ads: Ads, tau: FloatArray | None) -> Ads:
     if tau is None or not ads.tau_parameter:
         return ads
     if not isinstance(ads, VariedAds):
-        return VariedAds(ads, (ads.tau_parameter,), tau[:, np.newaxis])
+        return VariedAds(ads, (ads.tau_parameter,), tau[:, None])
     values = np.tile(ads._values, (len(tau) // len(ads._values), 1))
     return VariedAds(
         ads._ads, (*ads._names, ads.tau_parameter), np.column_stack([values, tau])

@@ -150,13 +150,11 @@ def _read_settings(
                     "settings", f"column {name!r} is no characteristic", name, names
                 )
                 _check_numbers(name, settings[name])
-            values = settings.reindex(columns=names).to_numpy(
-                dtype=float, na_value=np.nan
-            )
+            values = settings.reindex(columns=names).to_numpy(float, na_value=np.nan)
             array = np.where(np.isnan(values), characteristics.original, values)
             index = settings.index
         else:
-            array = np.array(settings, dtype=float)
+            array = np.array(settings, float)
             if array.ndim != 2 or array.shape[1] != len(names):
                 expected = (
                     f"{SETTINGS_FORMAT}; here n = {len(names)}: {', '.join(names)}"

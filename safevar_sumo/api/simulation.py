@@ -337,9 +337,8 @@ def simulate(
         If SUMO fails.
     """
     loaded_study, system = load_and_assemble(study)
-    names = () if changes is None else [*changes]
     with about("changes"):
-        loaded_study, system = with_set_axes(loaded_study, system, names)
+        loaded_study, system = with_set_axes(loaded_study, system, changes or ())
     setting = changed_setting(system, changes, filtered, beyond)
     return simulate_with_original(
         loaded_study, where_met(system, setting), setting, filtered=filtered
@@ -379,9 +378,7 @@ def changed_setting(
         )
         if not beyond:
             simulated = system.characteristics.filter(setting) if filtered else setting
-            system.region.check(
-                simulated[np.newaxis], otherwise=", or any with beyond=True"
-            )
+            system.region.check(simulated[None], otherwise=", or any with beyond=True")
         return setting
 
 
@@ -400,7 +397,7 @@ def simulate_with_original(
     settings = np.stack([original] if is_original else [original, setting])
     point = worst_point(system, setting)
     at_point = system.at(point)
-    observations = list[Observation]()
+    observations = []
     runs = drive_all(
         replace(at_point, in_sumo=True),
         settings,

@@ -223,7 +223,9 @@ def _found(
     answer = summarise(results)
     reason = why_no_verdict(system)
     (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
-    criterion = "" if unsafe is None else f" --unsafe {quote(str(unsafe))}"
+    criterion = ""
+    if unsafe is not None:
+        criterion = f" --unsafe {quote(str(unsafe))}"
     directory = quote(str(results.directory))
     questions = f"explain {study}", f"explain {directory}", f"tolerance {directory}"
     advice = ", ".join(
@@ -373,7 +375,7 @@ def summarise(results: Results) -> Answer:
     tables = {"algorithms": table}
 
     # Tests that none of so few runs can pass are folded, with a remark.
-    untested = list[str]()
+    untested = []
     with suppress(UnanswerableError):
         tables |= answer_questions([case], names=RUN_TESTS).tables
         untested = [name for name in RUN_TESTS if not tables[name]["enough_runs"].any()]

@@ -125,8 +125,10 @@ def evaluate_all(
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     batches = choose_batches(study, selection)
     cache = cache_of(study, opened)
-    evaluated = list[Evaluations]()
-    portions = math.ceil(len(distinct_settings) / batches.portion) if cache else 1
+    evaluated = []
+    portions = 1
+    if cache:
+        portions = math.ceil(len(distinct_settings) / batches.portion)
     for portion in np.array_split(distinct_settings, portions):
         key = b""
         if cache:
@@ -203,7 +205,7 @@ def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:
     if cache := cache_of(study, opened):
         key = hashlib.sha256(b"original" + cache.key_of(study, opened)).digest()
         cached = evaluations_in(cache.get(key))
-        if cached is not None and [*differences(cached.results, original.results)]:
+        if cached is not None and list(differences(cached.results, original.results)):
             warn(
                 "does not continue: the simulator drives the original vehicle otherwise now"
             )
@@ -297,7 +299,9 @@ class Batches(NamedTuple):
     @property
     def portion(self) -> int:
         """Number of settings that are simulated before their results are kept."""
-        return PORTION if self.share_steps else SMALL_PORTION
+        if self.share_steps:
+            return PORTION
+        return SMALL_PORTION
 
     def number(self, settings: int, pool: Pool) -> int:
         """The number of batches for so many settings."""

@@ -239,7 +239,9 @@ class CommandCache:
             return
         if self._is_fresh:
             shutil.rmtree(self._own_folder, ignore_errors=True)
-        begin = self._own_folder.stat().st_mtime if self._own_folder.is_dir() else None
+        begin = None
+        if self._own_folder.is_dir():
+            begin = self._own_folder.stat().st_mtime
         self._own = Cache(self._own_folder, is_counted=True)
         if begin is not None and (number := self._own.number_kept()):
             at = time.strftime("%H:%M", time.localtime(begin))

@@ -115,7 +115,7 @@ def run_campaign(
         study,
         manifest_now(study, system, read),
         system.measuring.scoring,
-        [*map(str, keys)],
+        list(map(str, keys)),
     )
     for remark in results.extent_remarks(set(map(str, all_runs(study)))):
         warn(remark)
@@ -126,7 +126,9 @@ def run_campaign(
     task = Task(study=study, in_sumo=system.in_sumo, batch_size=size)
 
     evaluations = len(keys) * study.search.evaluations
-    repeated = min(evaluations, MAX_REPEATED) if engine_used == RECORDED else 0
+    repeated = 0
+    if engine_used == RECORDED:
+        repeated = min(evaluations, MAX_REPEATED)
     parts = Parts(progress, [evaluations, SUMO_COST * repeated])
     show_search = parts.begin()
     show_journals = journal_progress(study, keys, directory, show_search)
@@ -144,7 +146,9 @@ def run_campaign(
     hands = deal(keys, pool.workers, task.batch_size, study.search.population)
     about = directory.absolute(), results.manifest, original, retry_failed
     shares = [(task, Share(dealt, *about)) for dealt in hands]
-    runs = [*chain.from_iterable(carry_out(carry_share, shares, pool, show_journals))]
+    runs = list(
+        chain.from_iterable(carry_out(carry_share, shares, pool, show_journals))
+    )
 
     # A part of the runs writes no solutions, which would look like those of the whole study.
     runs.sort(key=lambda run: run.key)

@@ -124,7 +124,9 @@ def carry_out(
         task, *arguments = jobs[error.job]
         names = user_code_names(task.study)
         argument = next(iter(arguments), None)
-        work = "the check of user code" if argument is None else str(argument)
+        work = "the check of user code"
+        if argument is not None:
+            work = str(argument)
         if isinstance(argument, np.ndarray):
             work = f"{len(argument)} settings"
         problem = f"two workers were lost at the same work, {work}: {error}"

@@ -48,7 +48,9 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
                     f"scenario.model = {study.scenario.model!r}: LIBRARIES has {name!r}",
                     "names of installed distributions",
                 ) from None
-    used_by = {"libraries": sorted(libraries)} if libraries else {}
+    used_by = {}
+    if libraries:
+        used_by = {"libraries": sorted(libraries)}
     return manifest_of(study, {**identity, "versions": versions, **used_by})
 
 
@@ -69,7 +71,7 @@ def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
     """
     places = study.origin.places
     networks = {point.scenario.network for point in system.points} - {""}
-    opened = [open_network(network) for network in sorted(networks)]
+    opened = list(map(open_network, sorted(networks)))
     network_files = {
         network.path(name) for network in opened for name, _ in network.digests
     }

@@ -115,7 +115,7 @@ class Pool:
         waiting = deque(range(len(jobs)))
         idle = deque(range(self.workers))
         ended = SimpleQueue[Future[Any]]()
-        under_way = dict[Future[Any], tuple[int, int]]()
+        under_way = {}
         while len(results) < len(jobs):
             while waiting and idle:
                 place = idle.popleft()
@@ -152,13 +152,13 @@ class Pool:
         folders = (
             self.attempts.iterdir() if self.attempts and self.attempts.exists() else ()
         )
-        return sum(len([*folder.iterdir()]) > MAX_DEATHS for folder in folders)
+        return sum(len(list(folder.iterdir())) > MAX_DEATHS for folder in folders)
 
     def everywhere(
         self, function: Callable[..., Any], *arguments: Any, limit: int | None = None
     ) -> None:
         """Carry out a function in each worker that has started and lives, or in so many of them."""
-        places = [*self._started][:limit]
+        places = list(self._started)[:limit]
         futures = [self._begin(place, function, arguments) for place in places]
         for future in futures:
             future.result()
@@ -182,11 +182,9 @@ class Pool:
 
 def available_cores() -> int:
     """Cores that this process may use."""
-    return (
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count() or 1
-    )
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @contextmanager

@@ -239,7 +239,7 @@ class Run:
                 if setting.tobytes() not in self._row_of:
                     self._missing.setdefault(setting.tobytes(), position)
         return np.asarray(
-            self._request[np.array([*self._missing.values()], dtype=int) - self._asked]
+            self._request[np.array(list(self._missing.values()), int) - self._asked]
         )
 
     def receive(self, evaluations: Evaluations) -> None:

@@ -110,7 +110,7 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
                 owners, settings = zip(*(requests[row] for row in rows), strict=True)
                 evaluations = evaluate_settings(task, np.stack(settings))
                 for run, rows_of_run in groupby(range(len(rows)), owners.__getitem__):
-                    run.receive(evaluations.take([*rows_of_run]))
+                    run.receive(evaluations.take(list(rows_of_run)))
                 if task.study.search.failed == "skip":
                     _refuse_failures(task.study, runs)
         refuse_changed_inputs(task.study, system_of(task.study), share.manifest)

@@ -92,7 +92,7 @@ class _Command(click.Command):
                 lines.append((title, ", ".join(flags)))
         records = (option.get_help_record(ctx) for option in options.values())
         with formatter.section("Options"):
-            formatter.write_dl([*filter(None, records)], col_max=16)
+            formatter.write_dl(list(filter(None, records)), col_max=16)
 
         if lines:
             with formatter.section(
@@ -163,7 +163,7 @@ def _give_answer(
         The name is that of a number in --json.
     """
     # What the answer will not have is refused before it is computed.
-    conditions = [_parse(text) for text in fail_if]
+    conditions = list(map(_parse, fail_if))
     if declared:
         _check_names(declared, values, [key for key, _, _ in conditions], table)
     if plot is not None:
@@ -198,7 +198,9 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
     options = [
         option for option in options_of(function) if option.name not in LIBRARY_ONLY
     ]
-    constants = {"progress": True} if "progress" in signature.parameters else {}
+    constants = {}
+    if "progress" in signature.parameters:
+        constants = {"progress": True}
 
     def call(**values: Any) -> Any:
         subjects: list[Any] = []
@@ -215,7 +217,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         click.echo(call(**values))
 
     flags = [_flag(option) for option in options if option.name != "table"]
-    callback: Callable[..., None] = print_text
+    callback = print_text
     if "Answer" in str(signature.return_annotation):
         flags += map(_flag, options_of(_give_answer))
         callback = partial(_give_answer, call, contents_of(function))
@@ -249,7 +251,7 @@ def _exit_on_failures(
     """End with an exit code if a limit is not kept, a condition holds, a check has findings, or a
     person has to decide; the verdict's reasons are not said again.
     """
-    failures = [*answer.failures]
+    failures = list(answer.failures)
     for condition in conditions:
         failures += _fulfilments(answer, *condition)
     for sentence in failures:
@@ -273,7 +275,7 @@ def names_in_study(values: Mapping[str, Any]) -> list[str]:
     study = study_in(
         study_or_case(values["source"], as_it_is_now=values["as_it_is_now"])
     )
-    return [*assemble(study).measuring.measures]
+    return list(assemble(study).measuring.measures)
 
 
 @contextmanager

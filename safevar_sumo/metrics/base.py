@@ -199,7 +199,7 @@ class Scoring(
         are ranges.
         """
         if self.safe_original is None or ORIGINAL_DEGREE not in frame:
-            return np.ones(len(frame), dtype=bool)
+            return np.ones(len(frame), bool)
         return np.asarray(frame[ORIGINAL_DEGREE] >= self.safe_original)
 
     def values(self, evaluations: Evaluations) -> FloatArray:

@@ -112,7 +112,7 @@ def mean_fully_developed_deceleration(
     """
     trace = runs.trace
     squares = trace.speed * trace.speed
-    end_squares = np.square(MFDD_SHARES)[:, np.newaxis] * squares[0]
+    end_squares = np.square(MFDD_SHARES)[:, None] * squares[0]
     columns = zip(end_squares.T, squares.T, trace.position.T, strict=True)
     places = np.array(
         [np.interp(-levels, -square, way) for levels, square, way in columns]
@@ -135,7 +135,7 @@ def impact_speed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Relative speed at contact along the vehicle's lane [m/s], at least `LEAST_CLOSING_SPEED`;
     shape (N,), NaN without a collision.
     """
-    return np.asarray(np.maximum(runs.relative_speed, LEAST_CLOSING_SPEED))
+    return np.maximum(runs.relative_speed, LEAST_CLOSING_SPEED)
 
 
 IMPACT_SPEED = Measure(

@@ -206,9 +206,7 @@ class Unsafe:
         of the collision. Of repeats the worst counts.
         """
         rounds = self._rounds(evaluations)
-        return np.asarray(
-            np.min([self._robustness(repeat) for repeat in rounds], axis=0)
-        )
+        return np.asarray(np.min(list(map(self._robustness, rounds)), axis=0))
 
     def _robustness(self, evaluations: Evaluations) -> FloatArray:
         robustness = self._excess(evaluations)

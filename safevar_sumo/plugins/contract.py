@@ -328,7 +328,7 @@ def checked_class(code: UserCode, base: type) -> type:
 
     def checked_method(name: str, returned: Returned) -> Callable[..., UserValue]:
         def method(self: Any, *arguments: Any) -> UserValue:
-            passed = [*arguments]
+            passed = list(arguments)
             if returned.like is not None:
                 passed[returned.like] = read_only(arguments[returned.like])
             with np.errstate():

@@ -179,7 +179,9 @@ class Lookup:
         if member.code is not None:
             return dict(self._with_paths(parameters, key))
         file = parameters.get("file")
-        path = {"file": self.files.get(file, file)} if isinstance(file, str) else {}
+        path = {}
+        if isinstance(file, str):
+            path = {"file": self.files.get(file, file)}
         return {**parameters, **path}
 
     def _with_paths(self, value: Any, key: str) -> Any:

@@ -47,26 +47,24 @@ class Contents(NamedTuple):
 
     def in_study(self, measures: Collection[str]) -> Contents:
         """The names that an answer has about a study with these measures."""
-        names = [name for name in self.numbers if name != ...]
-        return self._replace(numbers=[*names, *measures])
+        return self._replace(numbers=[*_without_ellipsis(self.numbers), *measures])
 
     def check_key(self, key: str) -> None:
         """Refuse what is no key of `Answer.values`, but for an index; raises an InputError."""
         # A number, a number in a list, or a column.
-        name, _, rest = key.rpartition(".")
+        name, _, ending = key.rpartition(".")
         names = self.numbers
-        wanted = key
-        legal = [number for number in self.numbers if number != ...]
-        legal += [
-            f"{table}.COLUMN" for table in self.tables
-        ]  # the columns of all tables would fill the screen
+        number = key
+        # The columns of all tables would fill the screen.
+        legal = _without_ellipsis(names)
+        legal += [f"{table}.COLUMN" for table in self.tables]
         if name in self.tables:
             names = self.tables[name]
-            wanted = rest
-            legal = [f"{name}.{column}" for column in names if column != ...]
-        elif name and rest.isdecimal():
-            wanted = name
-        if ... not in names and wanted not in names:
+            number = ending
+            legal = [f"{name}.{column}" for column in _without_ellipsis(names)]
+        elif name and ending.isdecimal():
+            number = name
+        if ... not in names and number not in names:
             raise InputError(
                 "fail_if",
                 f"the answer has no number {key!r}{did_you_mean(key, self.keys)}",
@@ -76,13 +74,14 @@ class Contents(NamedTuple):
     @property
     def keys(self) -> list[str]:
         """All names of numbers, and `table.column`, without those that a study gives."""
-        columns = [
-            f"{table}.{name}"
-            for table, names in self.tables.items()
-            for name in names
-            if name != ...
-        ]
-        return [*(name for name in self.numbers if name != ...), *columns]
+        keys = _without_ellipsis(self.numbers)
+        for table, names in self.tables.items():
+            keys += [f"{table}.{name}" for name in _without_ellipsis(names)]
+        return keys
+
+
+def _without_ellipsis(names: Collection[str | EllipsisType]) -> list[str]:
+    return [name for name in names if isinstance(name, str)]
 
 
 OF_ALL = ("driven", "rough", "simulations")
@@ -161,6 +160,14 @@ class Answer:
         What CSV has unless a table is named; by default the first table.
     draw
         Draws the answer; by default the values of the first table with their intervals.
+
+    Examples
+    --------
+    >>> answer = sv.risk("smoke", samples=64)
+    >>> answer.numbers["samples"], answer.numbers["failures"]
+    (64, 1)
+    >>> list(answer.tables)
+    ['sensitivity']
     """
 
     question: str
@@ -185,21 +192,20 @@ class Answer:
         # Each table with units and meanings.
         tables = {}
         for name, frame in self.tables.items():
-            columns = columns_of(frame).items()
-            tables[name] = {
-                "columns": {
-                    key: {"unit": column.unit, "meaning": column.meaning}
-                    for key, column in columns
-                },
-                "rows": [plain(row) for row in frame.to_dict("records")],
+            columns = {
+                key: {"unit": column.unit, "meaning": column.meaning}
+                for key, column in columns_of(frame).items()
             }
-        head = {
+            rows = list(map(plain, frame.to_dict("records")))
+            tables[name] = {"columns": columns, "rows": rows}
+        answer = {
             "question": self.question,
             "study": getattr(self.study, "name", None),
             "verdict": self.verdict,
-            **({"tested": self.tested} if self.tested else {}),
         }
-        return {**head, "numbers": plain(self.numbers), "tables": tables}
+        if self.tested:
+            answer["tested"] = self.tested
+        return {**answer, "numbers": plain(self.numbers), "tables": tables}
 
     def table(self, name: str | None = None) -> pd.DataFrame:
         """A table by name, the first one by default.
@@ -225,12 +231,9 @@ class Answer:
         tables = {name: self.table(name)}
         remarks = self.tables.get("remarks")
         if remarks is not None:
-            is_about_it = (
-                remarks["table"].isin([name, "all"])
-                if "table" in remarks
-                else slice(None)
-            )
-            tables["remarks"] = remarks[is_about_it]
+            if "table" in remarks:
+                remarks = remarks[remarks["table"].isin([name, "all"])]
+            tables["remarks"] = remarks
         return replace(self, tables=tables, folded=(), lead=name, is_whole=True)
 
     def render(
@@ -265,23 +268,21 @@ class Answer:
             If there is no such number.
         """
         # A column, a number, or a number in a list.
-        Contents(
-            self.numbers,
-            {name: [*map(str, frame)] for name, frame in self.tables.items()},
-        ).check_key(key)
-        name, _, rest = key.rpartition(".")
+        columns = {name: list(map(str, frame)) for name, frame in self.tables.items()}
+        Contents(self.numbers, columns).check_key(key)
+        name, _, ending = key.rpartition(".")
         if name in self.tables:
-            return list(plain(self.tables[name][rest].tolist()))
+            return list(plain(self.tables[name][ending].tolist()))
         if key in self.numbers:
             return [self.numbers[key]]
         value = self.numbers[name]
-        if not (isinstance(value, list | tuple) and int(rest) < len(value)):
+        if not (isinstance(value, list | tuple) and int(ending) < len(value)):
             raise InputError(
                 "fail_if",
                 f"the answer has no number {key!r}",
                 f"{name}, which is {cell_text(value)}",
             )
-        return [value[int(rest)]]
+        return [value[int(ending)]]
 
 
 def _draw_intervals(answer: Answer) -> Figure:
@@ -295,11 +296,10 @@ def _draw_intervals(answer: Answer) -> Figure:
 
     # Columns that have an interval.
     frame = answer.table()
-    names = [
-        name
-        for name in map(str, frame)
-        if f"{name}{LOW}" in frame and frame[name].notna().any()
-    ]
+    names = []
+    for name in map(str, frame):
+        if f"{name}{LOW}" in frame and frame[name].notna().any():
+            names.append(name)
     if not names or frame.empty:
         raise InputError(
             "plot", "the answer has nothing to draw", "the answer as a table"
@@ -310,9 +310,8 @@ def _draw_intervals(answer: Answer) -> Figure:
     figure, axes = new_figure(frame.attrs["title"], 1, len(names), size, sharey=True)
     places = range(len(frame), 0, -1)
     for axis, name in zip(axes[0], names, strict=True):
-        value, low, high = (
-            frame[f"{name}{end}"].to_numpy(float) for end in ("", LOW, HIGH)
-        )
+        columns = [name, f"{name}{LOW}", f"{name}{HIGH}"]
+        value, low, high = frame[columns].to_numpy(float).T
         axis.errorbar(
             value,
             places,

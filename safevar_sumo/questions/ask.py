@@ -17,7 +17,6 @@ from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
-from msgspec.structs import replace as replace_in
 from rich.console import Console
 
 from safevar_sumo.errors import InputError, unknown_name, warn
@@ -56,9 +55,15 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.evaluator import Evaluator
 
 QUESTIONS = {
-    name: f"safevar_sumo.questions.{name}"
-    for name in ("compare", "explain", "permit", "repair", "risk", "rules", "tolerance")
-} | {"validate": "safevar_sumo.reference.agreement"}
+    "compare": "safevar_sumo.questions.compare",
+    "explain": "safevar_sumo.questions.explain",
+    "permit": "safevar_sumo.questions.permit",
+    "repair": "safevar_sumo.questions.repair",
+    "risk": "safevar_sumo.questions.risk",
+    "rules": "safevar_sumo.questions.rules",
+    "tolerance": "safevar_sumo.questions.tolerance",
+    "validate": "safevar_sumo.reference.agreement",
+}
 """The module of each question, whose function has the question's name."""
 
 
@@ -88,14 +93,9 @@ class Question:
 
         # Its parameters: what it is about, and options.
         parameters = list(inspect.signature(compute).parameters.values())
-        if (
-            sum(
-                parameter.kind
-                in (parameter.POSITIONAL_ONLY, parameter.POSITIONAL_OR_KEYWORD)
-                for parameter in parameters
-            )
-            < 2
-        ):
+        # Kinds of parameters are in order: positional ones come first.
+        last_kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+        if len(parameters) < 2 or parameters[1].kind > last_kind:
             raise InputError(
                 f"question {self.name!r}",
                 f"takes ({', '.join(map(str, parameters))})",
@@ -109,14 +109,16 @@ class Question:
         }
         """Further positional parameters, and whether each is a file instead of a subject."""
         # Options that all questions have.
-        own = inspect.signature(compute).parameters
-        further = [option for option in COMMON_OPTIONS if option.name not in own]
-        known = inspect.signature(Question.__call__).parameters
-        common = [known[option.name] for option in further]
-        shown = [parameters[0], *parameters[2:], *common]
-        self.__signature__ = inspect.Signature(shown, return_annotation="Answer")
-        texts = "\n".join(f"{option.name}\n    {option.meaning}" for option in further)
-        self.__doc__ = f"{inspect.cleandoc(compute.__doc__ or '')}\n{texts}"
+        names = [parameter.name for parameter in parameters]
+        common_parameters = inspect.signature(Question.__call__).parameters
+        parameters.pop(1)  # the evaluator
+        texts = [inspect.cleandoc(compute.__doc__ or "")]
+        for option in COMMON_OPTIONS:
+            if option.name not in names:
+                parameters.append(common_parameters[option.name])
+                texts.append(f"{option.name}\n    {option.meaning}")
+        self.__signature__ = inspect.Signature(parameters, return_annotation="Answer")
+        self.__doc__ = "\n".join(texts)
 
     @cached_property
     def options(self) -> list[Option]:
@@ -176,55 +178,52 @@ class Question:
             Simulate everything again. Default: use simulations of earlier commands again.
         """
         # Where the question itself cuts encounters, it gets the whole of them.
-        is_own = any(option.name == UP_TO for option in self.options)
-        cut, values = (None, {**values, UP_TO: up_to}) if is_own else (up_to, values)
+        options = {option.name: option for option in self.options}
+        cut = up_to
+        if UP_TO in options:
+            cut = None
+            values[UP_TO] = up_to
         # Options that it has, with legal values.
-        known = {option.name: option for option in self.options}
-        for name in values.keys() - known.keys():
+        for name in values.keys() - options.keys():
             raise TypeError(
                 f"{self.name}() got an unexpected keyword argument {name!r}"
             )
         if source is None or len(others) != len(self.others):
             names = ["source", *self.others]
             raise InputError(f"{self.name}()", f"takes exactly {' and '.join(names)}")
-        values = {name: known[name].check(value) for name, value in values.items()}
+        values = {name: options[name].check(value) for name, value in values.items()}
 
         def subject_of(source: StudyLike | Results) -> Subject:
             subject = study_or_case(
                 source, as_it_is_now=as_it_is_now, results_only=self.takes_results_only
             )
-            shortfall = "" if isinstance(subject, Study) else subject.shortfall
-            if shortfall:
-                warn(shortfall)
+            if not isinstance(subject, Study) and subject.shortfall:
+                warn(subject.shortfall)
             return part_of(subject, ranges, point, cut)
 
-        from safevar_sumo.campaign.cache import (
-            keep_simulations,  # SUMO takes long to load
-        )
+        from safevar_sumo.campaign.cache import keep_simulations
 
         # What it is about, as studies, results or files.
         cuts = {"point": point, "up_to": cut}
-        named = [_name(source), *map(_name, others)]
-        command = self.command_line(named, cuts, values, ["--ranges"] * ranges)
-        how: JsonObject = {"pool": pool, "jobs": jobs, "simulations": simulations}
+        names = [_name(source), *map(_name, others)]
+        command = self.command_line(names, cuts, values, ["--ranges"] * ranges)
+        how = {"pool": pool, "jobs": jobs, "simulations": simulations}
         how |= {"cluster": cluster, "as_it_is_now": as_it_is_now}
         subjects: list[Any] = [subject_of(source)]
-        for other, is_file in zip(others, self.others.values(), strict=True):
-            subjects.append(Path(str(other)) if is_file else subject_of(other))
+        for further, is_file in zip(others, self.others.values(), strict=True):
+            subjects.append(Path(str(further)) if is_file else subject_of(further))
         with keep_simulations(command, fresh=fresh):
             # A rough answer, which comes much earlier, may be shown before the answer.
-            is_long = (
-                self.has_rough_answer
-                and not any(values.get(name) for name in (QUICK, "out"))
-                and simulations is None
-            )
-            if is_long and progress is True and sys.stderr.isatty():
+            is_long = self.has_rough_answer and simulations is None
+            is_short = values.get(QUICK) or values.get("out")
+            is_shown = progress is True and sys.stderr.isatty()
+            if is_long and not is_short and is_shown:
                 with open_progress(True) as show:
                     part = Parts(show).begin("rough answer")
-                    first = self.answer(
-                        subjects, {**values, "quick": True}, **how, progress=part
+                    rough = self.answer(
+                        subjects, {**values, QUICK: True}, **how, progress=part
                     )
-                print_text(Console(stderr=True), f"{first.verdict}\n")
+                print_text(Console(stderr=True), f"{rough.verdict}\n")
             answer = self.answer(
                 subjects, values, **how, progress=progress, called=_name(source)
             )
@@ -252,18 +251,13 @@ class Question:
         from safevar_sumo.questions.answer import Answer
         from safevar_sumo.questions.by_criterion import subject_by
         from safevar_sumo.questions.case import Case
-        from safevar_sumo.questions.evaluator import (
-            open_evaluator,  # SUMO takes long to load
-        )
+
+        # SUMO takes long to load.
+        from safevar_sumo.questions.evaluator import open_evaluator
 
         # Simulations by the criterion that is asked for.
         if values.get(QUICK):
-            subjects = [
-                with_own_set(one)
-                if isinstance(one, Case)
-                else replace_in(one, spread={})
-                for one in subjects
-            ]
+            subjects = list(map(with_own_set, subjects))
         study = study_in(subjects[0])
         with (
             open_progress(progress) as show,
@@ -292,15 +286,15 @@ class Question:
                 )
 
             # An answer about a driving system that fails by itself begins with that.
-            about = (
-                evaluator
-                if answer.study is study
-                else evaluator.for_study(answer.study)
-            )
-            reason = about.no_verdict
+            if answer.study is not study:
+                reason = evaluator.for_study(answer.study).no_verdict
+            else:
+                reason = evaluator.no_verdict
             evaluator.end()
         numbers = {"driven": not reason, **answer.numbers}
-        rough = ROUGH if values.get(QUICK) else ""
+        rough = ""
+        if values.get(QUICK):
+            rough = ROUGH
         if account.most is not None:
             numbers |= {"rough": True, "simulations": account.spent}
             rough = f"Rough answer (--simulations {account.most}):"
@@ -308,13 +302,13 @@ class Question:
             numbers["rough"] = bool(rough or numbers.get("rough"))
         sentences = reason, rough, answer.verdict, cites, account.undefined_in_words
         verdict = " ".join(filter(None, sentences))
-        following = (
-            self._following(subjects[0], evaluator, called, values) or answer.next
-        )
-        most = account.asked if account.most is None else account.most
-        command = "" if most is None else f" --simulations {most}"
+        limit = account.asked if account.most is None else account.most
         return replace(
-            answer, verdict=verdict, numbers=numbers, next=following, command=command
+            answer,
+            verdict=verdict,
+            numbers=numbers,
+            next=self._next(subjects[0], evaluator, called, values) or answer.next,
+            command="" if limit is None else f" --simulations {limit}",
         )
 
     def _criterion(
@@ -323,23 +317,25 @@ class Question:
         """What is unsafe, the values of options with it, and where it comes from: a study's own
         criterion stands where neither a criterion nor a margin is asked for.
         """
-        option = next(
-            (one.name for one in self.options if one.metavar == CRITERION), ""
-        )
+        names = [option.name for option in self.options if option.metavar == CRITERION]
+        if not names:
+            return None, values, ""
+        (name,) = names
         # Who states a distance to keep means a collision, whatever the study calls unsafe.
-        if not option or any(
-            values.get(name) is not None for name in (option, "margin")
-        ):
-            return values.get(option), values, ""
-        own = study.unsafe
-        cites = (
-            f"Criterion: {own.criterion or None} ({own.source})." if own.source else "",
-            f"Not simulated: {own.not_simulated}." if own.not_simulated else "",
-        )
-        criterion = Unsafe.parse(own.criterion) if own.criterion else None
-        return criterion, {**values, option: criterion}, " ".join(filter(None, cites))
+        if values.get(name) is not None or values.get("margin") is not None:
+            return values.get(name), values, ""
+        stated = study.unsafe
+        cites = []
+        if stated.source:
+            cites.append(f"Criterion: {stated.criterion or None} ({stated.source}).")
+        if stated.not_simulated:
+            cites.append(f"Not simulated: {stated.not_simulated}.")
+        criterion = None
+        if stated.criterion:
+            criterion = Unsafe.parse(stated.criterion)
+        return criterion, {**values, name: criterion}, " ".join(cites)
 
-    def _following(
+    def _next(
         self, subject: Subject, evaluator: Evaluator, called: str, values: JsonObject
     ) -> str:
         """The command that comes next, if it has an answer: the page is about results of `study`,
@@ -352,11 +348,15 @@ class Question:
             evaluator.system.meets_nobody and not evaluator.study.unsafe.criterion
         ):
             return ""
-        is_too_early = declared.next == "report" and isinstance(subject, Study)
-        words = subject.words if isinstance(subject, Study) else quote(called)
-        cut = values.get(UP_TO) if isinstance(subject, Study) else None
-        words += f" {flag_of(UP_TO)} {quote(cut)}" if cut else ""
-        return f"{PROGRAM_COMMAND} {'study' if is_too_early else declared.next} {words}"
+        if not isinstance(subject, Study):
+            return f"{PROGRAM_COMMAND} {declared.next} {quote(called)}"
+        name = "study"
+        if declared.next != "report":
+            name = declared.next
+        command = f"{PROGRAM_COMMAND} {name} {subject.words}"
+        if cut := values.get(UP_TO):
+            command += f" {flag_of(UP_TO)} {quote(cut)}"
+        return command
 
     def command_line(
         self,
@@ -375,27 +375,15 @@ class Question:
                 value = CARS_FILE  # a table's contents are none of the command's
             if value == option.default:
                 continue
-            texts = (
-                [""]
-                if option.kind is bool
-                else value
-                if option.is_repeated
-                else [value]
-            )
-            words += [
-                f"{option.flag} {quote(str(text))}".strip()
-                if text != ""
-                else option.flag
-                for text in texts
-            ]
-        words += [
-            *flags,
-            *(
-                f"{flag_of(name)} {quote(str(text))}"
-                for name, text in part.items()
-                if text
-            ),
-        ]
+            if option.kind is bool or value == "":
+                words.append(option.flag)
+                continue
+            for text in value if option.is_repeated else [value]:
+                words += [option.flag, quote(str(text))]
+        words += flags
+        for name, text in part.items():
+            if text:
+                words += [flag_of(name), quote(text)]
         return " ".join(words)
 
 
@@ -425,13 +413,12 @@ def find_question(name: str) -> Question:
     legal = f"{', '.join(QUESTIONS)}, or module:name of a function with @question"
     if not (":" in name or name in QUESTIONS):
         raise InputError("question", f"there is no {name!r}", legal)
-    module, _, function = (
-        name.partition(":") if ":" in name else (QUESTIONS[name], "", name)
-    )
     if ":" in name:
-        add_import_folders(
-            ()
-        )  # the working directory, which an installed program does not have on its path
+        module, _, function = name.partition(":")
+        # The working directory, which an installed program does not have on its path.
+        add_import_folders(())
+    else:
+        module, function = QUESTIONS[name], name
     invalidate_caches()  # the module may have been written a moment ago
 
     # Its module has a function with the decorator.
@@ -440,28 +427,25 @@ def find_question(name: str) -> Question:
             imported = import_module(module)
     except ModuleNotFoundError:
         raise InputError("question", f"there is no {name!r}", legal) from None
-    found = getattr(imported, function, None)
-    if not isinstance(found, Question):
-        known = [
-            name
-            for name, value in vars(imported).items()
-            if isinstance(value, Question)
-        ]
+    questions = {
+        name: value
+        for name, value in vars(imported).items()
+        if isinstance(value, Question)
+    }
+    if function not in questions:
         raise unknown_name(
             "question",
             f"{module} has no function {function!r} with @question",
             function,
-            known,
+            questions,
         )
-    return found
+    return questions[function]
 
 
 def _name(source: StudyLike | Results) -> str:
     """How a command line names a subject."""
     if isinstance(source, Results):
         return str(source.directory)
-    return (
-        source.origin.called or source.name
-        if isinstance(source, Study)
-        else str(source)
-    )
+    if isinstance(source, Study):
+        return source.origin.called or source.name
+    return str(source)

@@ -48,11 +48,10 @@ class Bar(NamedTuple):
         for ends, letter in ((self.alone, "▒"), (self.together, "█")):
             if ends:
                 cells[(middles >= ends[0]) & (middles <= ends[1])] = letter
-        for share, letter in (
-            *((share, "|") for share in self.specified),
-            (self.original, "o"),
-        ):
-            cells[min(int(share * CELLS), CELLS - 1)] = letter
+        places = np.multiply([*self.specified, self.original], CELLS).astype(int)
+        *limits, original = np.minimum(places, CELLS - 1)
+        cells[limits] = "|"
+        cells[original] = "o"
         return "".join(cells)
 
     @property
@@ -73,38 +72,29 @@ class Bar(NamedTuple):
             )
 
         # Ranges beneath, then the domain's outline, limits and the original.
-        ranges = [
-            rectangle(ends, name)
-            for ends, name in ((self.alone, "alone"), (self.together, "together"))
-        ]
-        ticks = [
-            f'<path class="tick" d="M{x(share)} 0v{HEIGHT}"/>'
-            for share in self.specified
-        ]
-        parts = [
-            *ranges,
-            rectangle((0, 1), "domain"),
-            *ticks,
-            f'<circle cx="{x(self.original)}" cy="{HEIGHT / 2:g}" r="3"/>',
-        ]
+        shapes = rectangle(self.alone, "alone")
+        shapes += rectangle(self.together, "together")
+        shapes += rectangle((0, 1), "domain")
+        for share in self.specified:
+            shapes += f'<path class="tick" d="M{x(share)} 0v{HEIGHT}"/>'
+        shapes += f'<circle cx="{x(self.original)}" cy="{HEIGHT / 2:g}" r="3"/>'
         size = f'width="{WIDTH}" height="{HEIGHT}" viewBox="0 0 {WIDTH} {HEIGHT}"'
-        return f'<svg class="bar" {size} aria-hidden="true">{"".join(parts)}</svg>'
+        return f'<svg class="bar" {size} aria-hidden="true">{shapes}</svg>'
 
 
 def bars_of(limits: pd.DataFrame, domains: Iterable[tuple[float, float]]) -> list[Bar]:
     """The bars of a table of limits, whose characteristics have these domains."""
     bars = []
     for row, (lower, upper) in zip(limits.to_dict("records"), domains, strict=True):
-        shares = {
-            name: tuple(
-                float(np.clip((row[end] - lower) / (upper - lower), 0, 1))
-                for end in (f"{name}_low", f"{name}_high")
-                if not pd.isna(row[end])
-            )
-            for name in ("together", "alone", "specified")
-        }
-        original = float(np.clip((row["original"] - lower) / (upper - lower), 0, 1))
-        bars.append(Bar(original, **shares))
+        ends = [row["original"]]
+        for name in ("together", "alone", "specified"):
+            ends += [row[f"{name}_low"], row[f"{name}_high"]]
+        values = np.array(ends, dtype=float)
+        original, *shares = np.clip((values - lower) / (upper - lower), 0, 1).tolist()
+        pairs = zip(shares[::2], shares[1::2], strict=True)
+        bars.append(
+            Bar(original, *(tuple(filter(np.isfinite, pair)) for pair in pairs))
+        )
     return bars
 
 

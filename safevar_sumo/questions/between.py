@@ -19,7 +19,6 @@ from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.scope import moving_axes, points_of_tests
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.study import PHASE, RANGES, Domain, MatrixTest, Study, axis_of
-from safevar_sumo.study.encounters import Axes
 from safevar_sumo.sumo.system import System, assemble
 
 PLACES = 8
@@ -50,7 +49,7 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
     unsafe by `new_car` in it.
     """
     study = model.evaluator.study
-    tests = list[MovingTest]()
+    tests = []
     for test, points in points_of_tests(study, assemble(study).points):
         axes = moving_axes(study, test, points)
         lists = study.lists_of(test)
@@ -75,7 +74,7 @@ def in_ranges(
     """
     moving = []
     for test, domains in tests:
-        over: Axes = {
+        over = {
             **study.lists_of(test),
             **{name: axis_of(domains[name]) for name in domains},
         }
@@ -96,40 +95,43 @@ def with_set_axes(
         together.
     """
     names = {*changes} - {*system.characteristics.names}
-    found = _with_axes(study, system, names)
+    extended = _with_axes(study, system, names)
     if PHASE in names:
-        phased = in_phases(found, assemble(found))
-        if phased == found:
+        phased = in_phases(extended, assemble(extended))
+        if phased == extended:
             raise InputError(
                 "",
                 f"study {study.name!r} has no {PHASE}",
                 "a study whose actors move on tracks, and react to nobody",
             )
-        found = phased
-    return found, system if found == study else assemble(found)
+        extended = phased
+    if extended == study:
+        return study, system
+    return extended, assemble(extended)
 
 
 def _with_axes(study: Study, system: System, names: set[str]) -> Study:
     """A study in which those of the names that are listed axes, which a scenario can move, may have
     any value, in the tests that have all of them.
     """
-    moving = [
-        (test, moving_axes(study, test, own))
-        for test, own in points_of_tests(study, system.points)
-        if test
-    ]
-    axes = names & {name for _, domains in moving for name in domains}
+    moving = []
+    axes = set[str]()
+    for test, points in points_of_tests(study, system.points):
+        if test:
+            domains = moving_axes(study, test, points)
+            moving.append((test, domains))
+            axes |= names & domains.keys()
     if not axes:
         return study
-    kept = [
-        (test, {name: domains[name] for name in domains if name in axes})
-        for test, domains in moving
-        if axes <= domains.keys()
-    ]
-    if not kept:
+    tests = []
+    for test, domains in moving:
+        if axes <= domains.keys():
+            domains_of_axes = {name: domains[name] for name in domains if name in axes}
+            tests.append((test, domains_of_axes))
+    if not tests:
         raise InputError(
             "",
             f"no test has {join_phrases(sorted(axes))} together",
             "values of one test's axes",
         )
-    return in_ranges(study, kept)
+    return in_ranges(study, tests)

@@ -85,7 +85,7 @@ class Box:
             else rng.integers(2**size, size=MAX_CORNERS)
         )
         points = np.zeros((len(numbers), len(self.lower)))
-        points[:, worn] = numbers[:, np.newaxis] >> np.arange(size) & 1
+        points[:, worn] = numbers[:, None] >> np.arange(size) & 1
 
         # The corners meet several encounters.
         if not (~of_vehicle & is_open).any():

@@ -39,10 +39,10 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     name = unsafe.bound.measure
     metrics = study.metrics
     matrix = study.matrix
-    known = [metric.name for metric in assemble(study).measuring.scoring.metrics]
-    legal = {*known, *OPTIONAL_METRICS}
+    measured = [metric.name for metric in assemble(study).measuring.scoring.metrics]
+    legal = {*measured, *OPTIONAL_METRICS}
     check_name("unsafe", f"study {study.name!r} has no metric {name!r}", name, legal)
-    if name not in known:
+    if name not in measured:
         metrics = replace_in(metrics, also=[*metrics.also, name])
     allows = matrix is not None and any(
         test.allowed_impact_speed for test in matrix.tests
@@ -68,11 +68,9 @@ def subject_by(
     """A subject of a question by a criterion; files stay as they are."""
     if isinstance(subject, Path):
         return subject
-    return (
-        study_by(subject, unsafe)
-        if isinstance(subject, Study)
-        else case_by(subject, unsafe, evaluator)
-    )
+    if isinstance(subject, Study):
+        return study_by(subject, unsafe)
+    return case_by(subject, unsafe, evaluator)
 
 
 def cases_by(
@@ -89,15 +87,14 @@ def cases_by(
     InputError
         If it is not one of a study.
     """
-    found = []
-    for case in cases:
-        own = unsafe or case.unsafe
-        if unsafe is None and own.below is None:
-            found.append(case)
+    cases = list(cases)
+    for place, case in enumerate(cases):
+        criterion = unsafe or case.unsafe
+        if unsafe is None and criterion.below is None:
             continue
         with open_evaluator(case.study, None, jobs, progress, cluster) as evaluator:
-            found.append(case_by(case, own, evaluator))
-    return found
+            cases[place] = case_by(case, criterion, evaluator)
+    return cases
 
 
 def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:

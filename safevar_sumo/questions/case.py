@@ -94,13 +94,13 @@ class Case:
     @property
     def settings(self) -> FloatArray:
         """The original vehicle, then the solutions; shape (1 + M, n)."""
-        solutions = self.solutions[[*self.characteristics.names]].to_numpy(dtype=float)
+        solutions = self.solutions[list(self.characteristics.names)].to_numpy(float)
         return np.concatenate([self.characteristics.original_settings, solutions])
 
     @property
     def different_solutions(self) -> pd.DataFrame:
         """The solutions, of equal ones the first."""
-        return self.solutions.drop_duplicates([*self.characteristics.names])
+        return self.solutions.drop_duplicates(list(self.characteristics.names))
 
     def simulated_as(
         self, study: Study, scoring: Scoring, evaluations: Evaluations
@@ -113,22 +113,18 @@ class Case:
             "f_safe": evaluations.f_safe,
             **evaluations.metrics,
             "outcome": evaluations.outcome,
+            "collision_speed": evaluations.collision_speed,
         }
-        columns["collision_speed"] = evaluations.collision_speed
         solutions = self.solutions.drop(
-            columns=[name for name in self.original if name not in evaluations.metrics]
+            columns=list(self.original.keys() - evaluations.metrics.keys())
         )
+        for name, values in columns.items():
+            solutions[name] = values[1:]
+        original = NamedValues()
+        for metric in scoring.metrics:
+            original[metric.name] = float(evaluations.metrics[metric.name][0])
         return replace(
-            self,
-            study=study,
-            scoring=scoring,
-            original={
-                metric.name: float(evaluations.metrics[metric.name][0])
-                for metric in scoring.metrics
-            },
-            solutions=solutions.assign(
-                **{name: values[1:] for name, values in columns.items()}
-            ),
+            self, study=study, scoring=scoring, original=original, solutions=solutions
         )
 
     @property
@@ -145,26 +141,17 @@ class Case:
     @property
     def algorithms(self) -> tuple[str, ...]:
         """Algorithms that have solutions or a finished run, in the study's order."""
-        names = {
-            *self.solutions["algorithm"],
-            *(algorithm for algorithm, _ in self.finished_runs),
-        }
-        return tuple(
-            name
-            for name in dict.fromkeys([*self.study.search.labels, *sorted(names)])
-            if name in names
-        )
+        names = {*self.solutions["algorithm"], *dict(self.finished_runs)}
+        in_order = dict.fromkeys([*self.study.search.labels, *sorted(names)])
+        return tuple(filter(names.__contains__, in_order))
 
     def original_degrees(self, solutions: pd.DataFrame) -> pd.Series[float]:
         """The original vehicle's safety degree beside each solution: in the solution's own
         encounter, where encounters are ranges.
         """
-        own = solutions.get(ORIGINAL_DEGREE)
-        return (
-            pd.Series(self.original[SAFETY_DEGREE], index=solutions.index)
-            if own is None
-            else own
-        )
+        if ORIGINAL_DEGREE in solutions:
+            return solutions[ORIGINAL_DEGREE]
+        return pd.Series(self.original[SAFETY_DEGREE], index=solutions.index)
 
     @property
     def why_no_solution(self) -> str:
@@ -182,9 +169,8 @@ class Case:
                 f"in none of {number_of(len(self.evaluations), 'encounter')} the original vehicle"
                 f" keeps at least {margin:g} m of clearance (scenario.margin)"
             )
-        valid = feasible.dropna(
-            subset=[objective.name for objective in self.scoring.objectives]
-        )
+        objectives = [objective.name for objective in self.scoring.objectives]
+        valid = feasible.dropna(subset=objectives)
         return (
             f"the algorithms returned none of {number_of(len(valid), 'setting')} that have a value"
             " of every objective; of these,"
@@ -239,13 +225,11 @@ class Case:
         """
         finished = Counter(algorithm for algorithm, _ in self.finished_runs)
         planned = self.study.search.runs
-        labels = self.study.search.labels if self.has_runs else ()
-        unfinished = [
-            f"{finished[name]} of {planned} runs of {name}"
-            for name in labels
-            if finished[name] < planned
-        ]
-        if not unfinished:
+        unfinished = []
+        for name in self.study.search.labels:
+            if finished[name] < planned:
+                unfinished.append(f"{finished[name]} of {planned} runs of {name}")
+        if not (self.has_runs and unfinished):
             return ""
         return (
             f"The results of {self.name} are incomplete: {', '.join(unfinished)} are finished. Only"
@@ -255,7 +239,9 @@ class Case:
     @property
     def remarks(self) -> list[str]:
         """Notes for the readers of every table of this case."""
-        remarks = [self.shortfall] if self.shortfall else []
+        remarks = []
+        if self.shortfall:
+            remarks.append(self.shortfall)
         if not self.has_runs:
             remarks.append(
                 f"The solutions of {self.name} are imported and belong to no run. The metrics of"
@@ -279,9 +265,9 @@ def solutions_for_metric(solutions: pd.DataFrame, metric: Measure) -> pd.DataFra
     """The solutions that count for a metric; for TET and TIT only those without collision
     (docs/method.md, section 4).
     """
-    return (
-        solutions if metric.over_collisions else solutions[~are_collisions(solutions)]
-    )
+    if metric.over_collisions:
+        return solutions
+    return solutions[~are_collisions(solutions)]
 
 
 def are_collisions(solutions: pd.DataFrame) -> pd.Series[bool]:
@@ -299,17 +285,11 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
     """
     # Each directory once.
     paths = [Path(check_text("directory", directory)) for directory in directories]
-    duplicates = [
-        path
-        for path, count in Counter(path.resolve() for path in paths).items()
-        if count > 1
-    ]
-    if duplicates:
-        raise InputError(
-            "directories",
-            f"{duplicates[0]} is given twice",
-            "each results directory once",
-        )
+    for path, count in Counter(map(Path.resolve, paths)).items():
+        if count > 1:
+            raise InputError(
+                "directories", f"{path} is given twice", "each results directory once"
+            )
 
     # What each directory holds, as a case.
     cases = []
@@ -320,28 +300,20 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
             study = msgspec.structs.replace(
                 study, origin=Origin(places=folders_of(path, manifest))
             )
-            scoring = (
-                msgspec.convert(manifest["scoring"], Scoring)
-                if "scoring" in manifest
-                else PUBLISHED_SCORING
+            facts = {name: manifest[name] for name in OF_ALGORITHMS if name in manifest}
+            if "scoring" in manifest:
+                facts["scoring"] = msgspec.convert(manifest["scoring"], Scoring)
+            case = build_case(
+                study,
+                manifest["original"],
+                solutions,
+                evaluations,
+                finished,
+                has_runs="imported" not in manifest,
+                failures=tuple(failures),
+                **facts,
             )
-            cases.append(
-                build_case(
-                    study,
-                    manifest["original"],
-                    solutions,
-                    evaluations,
-                    finished,
-                    scoring=scoring,
-                    has_runs="imported" not in manifest,
-                    failures=tuple(failures),
-                    **{
-                        name: manifest[name]
-                        for name in OF_ALGORITHMS
-                        if name in manifest
-                    },
-                )
-            )
+            cases.append(case)
         except (TypeError, ValueError, KeyError, ArithmeticError) as error:
             raise InputError(
                 path,
@@ -351,10 +323,11 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
 
     # Names that tell them apart.
     names = Counter(case.name for case in cases)
-    return [
-        replace(case, name=f"{case.name} ({path})") if names[case.name] > 1 else case
-        for case, path in zip(cases, paths, strict=True)
-    ]
+    for place, path in enumerate(paths):
+        name = cases[place].name
+        if names[name] > 1:
+            cases[place] = replace(cases[place], name=f"{name} ({path})")
+    return cases
 
 
 def build_case(
@@ -364,19 +337,19 @@ def build_case(
     evaluations: pd.DataFrame,
     finished: Sequence[tuple[str, int]],
     scoring: Scoring = PUBLISHED_SCORING,
-    **others: Any,
+    **facts: Any,
 ) -> Case:
     """Put a case together; in `original` an undefined metric is None or missing."""
     # Columns that all cases of the study have.
-    names = [metric.name for metric in scoring.metrics]
-    columns = [*names, *(objective.name for objective in scoring.objectives)]
-    metrics = {
-        name: np.nan if original.get(name) is None else float(original[name])
-        for name in names
-    }
+    metrics = NamedValues()
+    for metric in scoring.metrics:
+        value = original.get(metric.name)
+        metrics[metric.name] = np.nan if value is None else float(value)
+    names = [*metrics, *(objective.name for objective in scoring.objectives)]
 
     def with_all_columns(frame: pd.DataFrame) -> pd.DataFrame:
-        return frame.assign(**{name: np.nan for name in columns if name not in frame})
+        absent = [name for name in names if name not in frame]
+        return frame.assign(**dict.fromkeys(absent, np.nan))
 
     solutions = with_all_columns(solutions)
     evaluations = with_all_columns(evaluations)
@@ -390,5 +363,5 @@ def build_case(
         evaluations=evaluations,
         finished_runs=tuple(finished),
         scoring=scoring,
-        **others,
+        **facts,
     )

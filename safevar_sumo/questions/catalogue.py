@@ -6,9 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from inspect import getdoc
+from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
+import numpy as np
 import pandas as pd
 
 from safevar_sumo.ads import ADS
@@ -26,23 +28,30 @@ from safevar_sumo.scenarios import (
     TrackScenario,
     WorldScenario,
     equals_clear,
+    weather_of,
 )
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.search import DESCRIPTIONS
-from safevar_sumo.study import free_parameters, study_names, unit_text
+from safevar_sumo.study import Study, free_parameters, study_names, unit_text
 from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 if TYPE_CHECKING:
     from safevar_sumo.check.trials import Extent
 
+NO_STUDY: Any = None
 NAME: Columns = {"name": "name in a study"}
 DESCRIBED: Columns = NAME | {"description": "what it is"}
 SCENARIO: Columns = DESCRIBED | {
     "search": "axes of its encounters, and their widest ranges"
 }
-STUDIES: Columns = NAME | {
-    key: f"its {key}" for key in ("title", "vehicle", "ads", "scenario", "weather")
+STUDIES: Columns = {
+    **NAME,
+    "title": "its title",
+    "vehicle": "its vehicle",
+    "ads": "its ads",
+    "scenario": "its scenario",
+    "weather": "its weather",
 }
 DOMAINS: Columns = {
     "unit": "its unit",
@@ -77,14 +86,14 @@ WEATHER: Columns = NAME | {
     "water": Column("mm", "depth of the water on the road"),
     "effect": "none: an ADS drives as in clear weather, unless its parameters differ",
 }
-FURTHER_OBJECTIVES: Mapping[str, object] = {
-    **{
-        name: f"{objective.title.capitalize()} [{objective.unit}]."
-        for name, objective in OBJECTIVES.items()
-        if name not in METRICS
-    },
-    UNSAFE_SHARE.name: f"Only with [scenario] repeats: {UNSAFE_SHARE.description}",
+FURTHER_OBJECTIVES = {
+    name: f"{objective.title.capitalize()} [{objective.unit}]."
+    for name, objective in OBJECTIVES.items()
+    if name not in METRICS
 }
+FURTHER_OBJECTIVES[UNSAFE_SHARE.name] = (
+    f"Only with [scenario] repeats: {UNSAFE_SHARE.description}"
+)
 FINDINGS: Columns = {
     "finding": "what is wrong",
     "where": "place in the user's code",
@@ -138,24 +147,16 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
         )
 
     # The user's own scenario, or everything.
-    own = {}
+    scenarios = SCENARIOS
     if kind is not None and ":" in kind:
-        own[kind] = (
-            Lookup()
-            .class_of(SCENARIOS, kind, "KIND", TrackScenario, WorldScenario)
-            .target
-        )
+        named = Lookup().class_of(SCENARIOS, kind, "KIND", TrackScenario, WorldScenario)
+        scenarios = {kind: named.target}
         kind = "scenarios"
-    effects = [
-        "none" if equals_clear(weather) else "yes" for weather in WEATHERS.values()
-    ]
-    weathers = pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values())).assign(
-        effect=effects
-    )
-    metrics = (
-        (name, metric.description)
-        for name, metric in {**METRICS, **OPTIONAL_METRICS}.items()
-    )
+    weathers = pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values()))
+    has_effect = ~np.array(list(map(equals_clear, WEATHERS.values())))
+    weathers["effect"] = np.where(has_effect, "yes", "none")
+    metrics = {**METRICS, **OPTIONAL_METRICS}.items()
+    described_metrics = [(name, metric.description) for name, metric in metrics]
 
     # A table for each kind.
     tables = {
@@ -164,10 +165,10 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
             "Characteristics of vehicles", VEHICLES, _characteristics()
         ),
         "ads": tabulate("ADSs", DESCRIBED, _described(ADS)),
-        "scenarios": tabulate("Scenarios", SCENARIO, _scenarios(own or SCENARIOS)),
+        "scenarios": tabulate("Scenarios", SCENARIO, _scenarios(scenarios)),
         "weathers": tabulate("Weathers", WEATHER, weathers),
         "algorithms": tabulate("Algorithms", DESCRIBED, DESCRIPTIONS.items()),
-        "metrics": tabulate(METRICS_TITLE, DESCRIBED, metrics),
+        "metrics": tabulate(METRICS_TITLE, DESCRIBED, described_metrics),
         "objectives": tabulate(
             "Objectives; every metric can be one, too",
             DESCRIBED,
@@ -182,14 +183,13 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
             [*tables, "characteristics", "cache"],
         )
         tables = {kind: tables[kind]}
-    counts = ", ".join(
-        f"{frame.iloc[:, 0].nunique()} {name}" for name, frame in tables.items()
-    )
-    verdict = f"A study can name {', '.join(own) or counts}."
-    no_study: Any = None
+    texts = [f"{frame.iloc[:, 0].nunique()} {name}" for name, frame in tables.items()]
+    if scenarios is not SCENARIOS:
+        texts = list(scenarios)
+    verdict = f"A study can name {', '.join(texts)}."
     return Answer(
         question="list",
-        study=no_study,
+        study=NO_STUDY,
         verdict=verdict,
         numbers={"passed": True},
         tables=tables,
@@ -205,10 +205,8 @@ def _list_characteristics(name: str | None) -> Answer:
         )
     study = read_study(name)
     items = CharacteristicSet.of(study).vehicle
-    rows = [
-        (*(getattr(item, key) for key in [*CHARACTERISTICS][:-1]), _in_a_workshop(item))
-        for item in items
-    ]
+    facts_of = attrgetter(*list(CHARACTERISTICS)[:-1])
+    rows = [(*facts_of(item), _in_a_workshop(item)) for item in items]
     title = f"Characteristics of {study.name}"
     return Answer(
         question="list",
@@ -229,19 +227,18 @@ def _list_cache() -> Answer:
     verdict = f"Simulations are not kept: {variable} is {simulations.OFF}."
     rows = []
     if folder is not None:
-        entries, size = (
-            simulations.Cache(folder).extent() if folder.is_dir() else (0, 0)
-        )
+        entries = size = 0
+        if folder.is_dir():
+            entries, size = simulations.Cache(folder).extent()
         rows = [(str(folder), entries, size / 1e6, limit)]
         verdict = (
             f"The folder {folder} keeps earlier simulations ({size / 1e6:.1f} MB of at most"
             f" {limit:,.0f} MB). You may delete it, and {variable} names another folder."
         )
-    no_study: Any = None
     return Answer(
         question="list",
         is_whole=True,
-        study=no_study,
+        study=NO_STUDY,
         verdict=verdict,
         numbers={"passed": True},
         tables={"cache": tabulate("Cache of simulations", CACHE, rows)},
@@ -252,35 +249,35 @@ def _in_a_workshop(item: Characteristic) -> str | None:
     """How a workshop measures a characteristic, and what it does beyond the limit; None if the
     study says neither.
     """
-    remedy = f"beyond its limit: {item.remedy}" if item.remedy else ""
-    place = "" if item.workshop else "not in a workshop: "
-    measurement = f"{place}{item.measurement}" if item.measurement else ""
-    return "; ".join(filter(None, (measurement, remedy))) or None
+    texts = []
+    if item.measurement:
+        place = "" if item.workshop else "not in a workshop: "
+        texts.append(f"{place}{item.measurement}")
+    if item.remedy:
+        texts.append(f"beyond its limit: {item.remedy}")
+    return "; ".join(texts) or None
 
 
 def _studies() -> Iterator[tuple[str, ...]]:
     for study in map(read_study, study_names()):
-        weather = (
-            study.weather if isinstance(study.weather, str) else study.weather.name
-        )
         yield (
             study.name,
             study.title,
             study.vehicle.model,
             study.ads.model,
             study.scenario.model,
-            weather,
+            weather_of(study.weather).name,
         )
 
 
 def _characteristics() -> Iterator[tuple[float | str, ...]]:
-    studies = {
-        study.vehicle.model or study.scenario.model: study
-        for study in reversed([*map(read_study, study_names())])
-    }
+    studies = dict[str, Study]()
+    for study in map(read_study, study_names()):
+        studies.setdefault(study.vehicle.model or study.scenario.model, study)
+    facts_of = attrgetter(*list(VEHICLES)[1:])
     for vehicle, study in sorted(studies.items()):
-        for row in CharacteristicSet.of(study).vehicle:
-            yield vehicle, *(getattr(row, name) for name in list(VEHICLES)[1:])
+        for item in CharacteristicSet.of(study).vehicle:
+            yield vehicle, *facts_of(item)
 
 
 def _described(models: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
@@ -294,18 +291,16 @@ def description_of(model: Any) -> str:
 
 def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]]:
     for name, description in _described(models):
-        own = (
-            {}
-            if models[name].brakes_fully
-            else {
-                **free_parameters(models[name]),
-                **(WEATHER_PARAMETERS if models[name].mover.has("weather") else {}),
-            }
-        )
-        domains = (
-            f"{key} {parameter.lower:g} to {parameter.upper:g}{unit_text(parameter.unit)}"
-            for key, parameter in own.items()
-        )
+        model = models[name]
+        parameters = dict[str, Any]()
+        if not model.brakes_fully:
+            parameters |= free_parameters(model)
+            if model.mover.has("weather"):
+                parameters |= WEATHER_PARAMETERS
+        domains = []
+        for key, parameter in parameters.items():
+            unit = unit_text(parameter.unit)
+            domains.append(f"{key} {parameter.lower:g} to {parameter.upper:g}{unit}")
         yield name, description, "; ".join(domains)
 
 
@@ -336,7 +331,7 @@ def check(
     from safevar_sumo.sumo.system import assemble
 
     study = study_to_check(name)
-    extents: list[Extent] = []
+    extents = []
 
     def tell(extent: Extent) -> None:
         """How long it takes, if it takes long."""
@@ -346,44 +341,33 @@ def check(
                 f"{number_of(extent.vehicles, 'vehicle')}, about {extent.seconds:.0f} s"
             )
 
-    in_new_process = find_in_new_process(
-        study
-    )  # first, as a simulator may end its process
+    # First, as a simulator may end its process.
+    in_new_process = find_in_new_process(study)
     with open_progress(True) as progress:
         findings = check_study(study, vehicles=vehicles, progress=progress, tell=tell)
     if not findings:
-        check_algorithms(
-            study, assemble(study)
-        )  # what the command `study` would refuse
+        # What the command `study` would refuse.
+        check_algorithms(study, assemble(study))
         findings = in_new_process
-    rows = [
-        (
-            item.finding,
-            item.where,
-            item.input,
-            item.expected,
-            item.check,
-            CHECKS[item.check],
-        )
-        for item in findings
-    ]
-    blocks = [
-        part
-        for finding, where, shown, expected, _, advice in rows
-        for part in (
-            ("where", where),
-            ("found", f"{finding}, with {shown}" if shown else finding),
-            ("expected", expected),
+    rows = []
+    blocks = []
+    for item in findings:
+        advice = CHECKS[item.check]
+        rows.append({**item._asdict(), "advice": advice})
+        text = f"{item.finding}, with {item.input}" if item.input else item.finding
+        blocks += [
+            ("where", item.where),
+            ("found", text),
+            ("expected", item.expected),
             ("what to do", advice),
-        )
-    ]
+        ]
+    number = "passed"
+    if findings:
+        number = number_of(len(findings), "finding")
     return Answer(
         question="check",
         study=study,
-        verdict=(
-            f"{name}: {number_of(len(findings), 'finding') if findings else 'passed'}."
-            f"{''.join(map(_extent_in_words, extents))}"
-        ),
+        verdict=f"{name}: {number}.{''.join(map(_extent_in_words, extents))}",
         numbers={
             "passed": not findings,
             "vehicles": sum(extent.vehicles for extent in extents),
@@ -401,9 +385,11 @@ def _extent_in_words(extent: Extent) -> str:
     """What was simulated, and what was not tried."""
     points = number_of(extent.points, "point")
     text = f" {number_of(extent.vehicles, 'vehicle')} at {points} of the study."
-    left = []
+    remainders = []
     if extent.points < extent.all_points:
-        left.append(f"the other {extent.all_points - extent.points} points")
+        remainders.append(f"the other {extent.all_points - extent.points} points")
     if extent.vehicles < extent.all_vehicles:
-        left.append(f"more vehicles (--vehicles {extent.all_vehicles})")
-    return f"{text} Not tried: {' and '.join(left)}." if left else text
+        remainders.append(f"more vehicles (--vehicles {extent.all_vehicles})")
+    if remainders:
+        text += f" Not tried: {' and '.join(remainders)}."
+    return text

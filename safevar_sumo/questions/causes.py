@@ -230,11 +230,12 @@ def directions(
     characteristics: CharacteristicSet, changes: NamedValues
 ) -> tuple[str, ...]:
     """The directions of changes, without their sizes, such as ('mass up', 'tireFric down')."""
-    return tuple(
-        f"{item.name} {'up' if changes[item.name] > item.original else 'down'}"
-        for item in characteristics
-        if item.name in changes
-    )
+    texts = []
+    for item in characteristics:
+        if item.name in changes:
+            is_larger = changes[item.name] > item.original
+            texts.append(f"{item.name} {'up' if is_larger else 'down'}")
+    return tuple(texts)
 
 
 def count_distinct_causes(

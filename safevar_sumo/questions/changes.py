@@ -49,7 +49,9 @@ def read_changes(
         characteristic = characteristics.members[characteristics.names.index(name)]
         values[name] = _parse(change, text, characteristic.original)
         is_relative = SIGNED_NUMBER.fullmatch(text) and characteristic.original
-        hint = f", or {name}={text}% of the original" if is_relative else ""
+        hint = ""
+        if is_relative:
+            hint = f", or {name}={text}% of the original"
         characteristic.check(
             values[name], beyond=bool(beyond), otherwise=hint, switch=switch
         )

@@ -75,6 +75,14 @@ class Evaluator:
         Number of settings simulated so far; of equal settings in one call only one is simulated.
     account
         What the question may simulate and has simulated, with evaluators of other studies, too.
+
+    Examples
+    --------
+    >>> with open_evaluator(read_study("smoke")) as evaluator:
+    ...     vehicles = evaluator.feasible_settings(4)
+    ...     evaluations = evaluator.evaluate(vehicles, "some vehicles")
+    >>> evaluations.f_safe.round(1)
+    array([2.4, 2.1, 2.9, 2.2])
     """
 
     def __init__(
@@ -109,7 +117,9 @@ class Evaluator:
     def in_phases(self) -> Evaluator | None:
         """An evaluator of settings that end with the phase of their encounter; None without."""
         study = in_phases(self.study, self.system)
-        return None if study == self.study else self.for_study(study, verified=0)
+        if study == self.study:
+            return None
+        return self.for_study(study, verified=0)
 
     def evaluate(
         self, settings: FloatArray, stage: str, *, ignore_constraints: bool = False
@@ -140,11 +150,9 @@ class Evaluator:
         if not is_feasible.any():
             return not_simulated
         simulated = self._simulate_shown(rows[is_feasible], stage, verified, selection)
-        both = Evaluations.concatenate([simulated, not_simulated])
-        rows_of_both = np.concatenate(
-            [np.flatnonzero(is_feasible), np.flatnonzero(~is_feasible)]
-        )
-        return both.take(np.argsort(rows_of_both))  # in the order of the settings
+        evaluations = Evaluations.concatenate([simulated, not_simulated])
+        # In the order of the settings.
+        return evaluations.take(np.argsort(np.argsort(~is_feasible, kind="stable")))
 
     def begin(
         self, settings: NamedValues, least: int = 1, *, of_list: bool = False
@@ -169,7 +177,9 @@ class Evaluator:
             elif of_list and self.left is None:
                 simulations = expected * len(self.system.points)
                 print_price_of_list(self.study, self.system, self._pool, simulations)
-        share = 1.0 if self.left is None else self.left / expected
+        share = 1.0
+        if self.left is not None:
+            share = self.left / expected
         planned = {name: share * number for name, number in settings.items()}
         self.phases.plan(planned, len(self.system.points))
 
@@ -177,7 +187,9 @@ class Evaluator:
     def left(self) -> int | None:
         """The number of settings that may follow; None without a limit."""
         account = self.account
-        return None if account.most is None else int(account.left) // self._each
+        if account.most is None:
+            return None
+        return int(account.left) // self._each
 
     def limit(
         self, simulations: int | None, questions: int, *, quick: bool = False
@@ -186,14 +198,15 @@ class Evaluator:
         one of so many that share the time. A quick one searches less.
         """
         seconds = sum(np.max(point.scenario.duration) for point in self.system.points)
-        self.account.effort = (
-            float(np.clip(QUICK_SECONDS / seconds, *QUICK)) if quick else 1.0
-        )
+        self.account.effort = 1.0
+        if quick:
+            self.account.effort = float(np.clip(QUICK_SECONDS / seconds, *QUICK))
         self.account.asked = self.account.most = simulations
         self.account.questions = questions
         self.account.is_question = True
-        limits = simulations is not None and self.system.mover.takes_long
-        self._pool.spare = spare(simulations or 0, 0) if limits else None
+        self._pool.spare = None
+        if simulations is not None and self.system.mover.takes_long:
+            self._pool.spare = spare(simulations, 0)
         self._pool.checked = 0
 
     def scaled(self, number: float) -> int:
@@ -205,7 +218,9 @@ class Evaluator:
         at most this part of those that may follow. It is at least 1.
         """
         number = self.scaled(number)
-        return max(number if self.left is None else min(number, self.left // part), 1)
+        if self.left is not None:
+            number = min(number, self.left // part)
+        return max(number, 1)
 
     @property
     def _each(self) -> int:
@@ -270,15 +285,10 @@ class Evaluator:
             name: np.where(is_left_out, np.nan, values)
             for name, values in evaluations.metrics.items()
         }
-        return replace(
-            evaluations,
-            outcome=np.where(
-                is_left_out & ~evaluations.failed,
-                Outcome.INFEASIBLE.value,
-                evaluations.outcome,
-            ),
-            metrics={**metrics, ORIGINAL_DEGREE: evaluations.column(ORIGINAL_DEGREE)},
-        )
+        metrics[ORIGINAL_DEGREE] = evaluations.column(ORIGINAL_DEGREE)
+        counts = ~is_left_out | evaluations.failed
+        outcome = np.where(counts, evaluations.outcome, Outcome.INFEASIBLE.value)
+        return replace(evaluations, outcome=outcome, metrics=metrics)
 
     def evaluate_over_encounters(
         self, settings: FloatArray, unsafe: Unsafe, stage: str
@@ -292,14 +302,11 @@ class Evaluator:
         encounters = np.concatenate(
             [self.characteristics.original_settings, self.critical_encounters]
         )
-        pairs = np.where(of_vehicle, settings[:, np.newaxis], encounters).reshape(
-            -1, settings.shape[1]
-        )
-        evaluations = self.evaluate(pairs, stage)
-        worst = np.argmin(
-            unsafe.robustness(evaluations).reshape(-1, len(encounters)), axis=1
-        )
-        return evaluations.take((np.arange(len(settings)) * len(encounters)) + worst)
+        pairs = np.where(of_vehicle, settings[:, None], encounters)
+        evaluations = self.evaluate(pairs.reshape(-1, settings.shape[1]), stage)
+        robustness = unsafe.robustness(evaluations).reshape(-1, len(encounters))
+        first_rows = np.arange(len(settings)) * len(encounters)
+        return evaluations.take(first_rows + robustness.argmin(axis=1))
 
     @cached_property
     def critical_encounters(self) -> FloatArray:
@@ -322,29 +329,27 @@ class Evaluator:
             return 0.0
         originals = self._originals
         is_possible = self.region.feasible(originals.settings)
-        return (
-            float(np.mean(~originals.valid[is_possible])) if is_possible.any() else 0.0
-        )
+        if not is_possible.any():
+            return 0.0
+        return float(np.mean(~originals.valid[is_possible]))
 
     @cached_property
     def _originals(self) -> Evaluations:
         """Evaluations of the original vehicle in encounters over the domain."""
         # Of few simulations an eighth chooses encounters, and the others are of vehicles there.
-        drawn = sobol_settings(self.characteristics, self.at_most(CANDIDATES, 8))
-        return self.evaluate(
-            self.characteristics.with_original_vehicle(drawn),
-            "encounters of the original",
-        )
+        settings = sobol_settings(self.characteristics, self.at_most(CANDIDATES, 8))
+        originals = self.characteristics.with_original_vehicle(settings)
+        return self.evaluate(originals, "encounters of the original")
 
     def feasible_settings(self, number: int) -> FloatArray:
         """`number` settings that cover the feasible part of the domain evenly."""
-        drawn = 0
+        total = 0
 
         def draw_next(count: int) -> FloatArray:
             """The next `count` settings of the Sobol sequence."""
-            nonlocal drawn
-            drawn += count
-            return sobol_settings(self.characteristics, drawn)[-count:]
+            nonlocal total
+            total += count
+            return sobol_settings(self.characteristics, total)[-count:]
 
         return self.region.draw_feasible(draw_next, number)
 
@@ -359,9 +364,8 @@ class Evaluator:
             If encounters are ranges, and the original vehicle is not safe in the original
             encounter.
         """
-        evaluations = self.evaluate(
-            self.characteristics.original_settings, "original vehicle"
-        )
+        settings = self.characteristics.original_settings
+        evaluations = self.evaluate(settings, "original vehicle")
         if len(self.characteristics.scenario) and evaluations.infeasible[0]:
             raise InputError(
                 self.study.source,
@@ -386,10 +390,10 @@ class Evaluator:
         if not self.system.mover.is_exact:
             jobs = [(Task(study=study), self.characteristics.original_settings)]
             self.account.spend(self._each)
-            now = record(
-                carry_out(evaluate_settings, jobs, self._pool)[0], 0
-            )  # nothing kept
-            refuse_other_original(Path(case.name), case.original, now)
+            (evaluations,) = carry_out(evaluate_settings, jobs, self._pool)
+            refuse_other_original(
+                Path(case.name), case.original, record(evaluations, 0)
+            )
 
     @cached_property
     def no_verdict(self) -> str:
@@ -444,9 +448,9 @@ class Evaluator:
         """Refuse what is measured in an encounter, as a distance, where nobody else is on the
         road.
         """
-        if self.system.meets_nobody and np.isnan(
-            self.evaluate_original().column(measure)[0]
-        ):
+        if not self.system.meets_nobody:
+            return
+        if np.isnan(self.evaluate_original().column(measure)[0]):
             raise InputError(
                 "unsafe",
                 "nobody else is on the road, so that no vehicle collides or is too close",
@@ -467,7 +471,8 @@ class Evaluator:
         """An evaluator of another study, on the same pool; `verified` settings are simulated in
         SUMO, too.
         """
-        verified = self._verified if verified is None else verified
+        if verified is None:
+            verified = self._verified
         return Evaluator(study, self._pool, verified=verified, account=self.account)
 
 

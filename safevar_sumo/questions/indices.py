@@ -54,10 +54,9 @@ def _problem(names: Sequence[str]) -> JsonObject:
     """SALib's problem: each characteristic by its quantile. SALib reserves endings of names, so
     that it gets numbers.
     """
-    numbers = [str(number) for number in range(len(names))]
     return {
         "num_vars": len(names),
-        "names": numbers,
+        "names": list(map(str, range(len(names)))),
         "bounds": [[0.0, 1.0]] * len(names),
     }
 
@@ -120,7 +119,7 @@ def given_data_indices(
 
     # Characteristics that vary in the sample.
     varies = np.ptp(evaluations.settings, axis=0) > 0
-    names = [*compress(evaluator.characteristics.names, varies)]
+    names = list(compress(evaluator.characteristics.names, varies))
     problem = _problem(names)
     options = {"num_resamples": RESAMPLES, "conf_level": confidence, "method": "sobol"}
 
@@ -134,10 +133,11 @@ def given_data_indices(
             )
         return indices
 
-    first = "S1", "first order, with everything that depends on it"
-    return _table(
-        names, evaluations, criterion, indices_of, {"first": first, "total": UNDEFINED}
-    )
+    kinds = {
+        "first": ("S1", "first order, with everything that depends on it"),
+        "total": UNDEFINED,
+    }
+    return _table(names, evaluations, criterion, indices_of, kinds)
 
 
 def _table(
@@ -155,19 +155,19 @@ def _table(
     # such as one that collides.
     degree = evaluations.f_safe
     output_names = dict(OUTPUTS)
-    own = evaluations.column(criterion.measure)
-    if criterion.measure != F_SAFE.name and np.isfinite(own).all():
-        degree = own
+    measured = evaluations.column(criterion.measure)
+    if criterion.measure != F_SAFE.name and np.isfinite(measured).all():
+        degree = measured
         output_names["degree"] = criterion.measure
 
     # Outputs that vary enough have indices.
     is_unsafe = criterion.runs(evaluations).mean(axis=0)
     failures = is_unsafe.sum()
-    found = dict[str, Indices]()
+    indices = {}
     if len(degree) >= LEAST_VEHICLES and np.ptp(degree) > 0:
-        found["degree"] = indices_of(degree)
+        indices["degree"] = indices_of(degree)
     if MIN_OUTCOMES <= failures <= len(degree) - MIN_OUTCOMES:
-        found["unsafe"] = indices_of(is_unsafe)
+        indices["unsafe"] = indices_of(is_unsafe)
 
     # An index of each output, with its interval.
     columns: Columns = {
@@ -176,31 +176,31 @@ def _table(
     values = dict[str, FloatArray]()
     undefined = np.full(len(names), np.nan)
     for output, of_what in output_names.items():
-        of_output = found.get(output, {})
+        of_output = indices.get(output, {})
         for index, (key, meaning) in kinds.items():
             name = f"{output}_{index}"
-            value = np.asarray(of_output.get(key, undefined), dtype=float)
-            half = np.asarray(of_output.get(f"{key}_conf", undefined), dtype=float)
-            ends = {
-                name: value,
-                f"{name}{LOW}": value - half,
-                f"{name}{HIGH}": value + half,
-            }
+            value = np.asarray(of_output.get(key, undefined), float)
+            half = np.asarray(of_output.get(f"{key}_conf", undefined), float)
             # An estimate may lie beyond what a share can be.
-            values |= {key: np.clip(end, 0, 1) for key, end in ends.items()}
-            head = (
-                f"{of_what.removeprefix('the ')}: {index}" if output == "degree" else ""
-            )
-            meaning = f"share of the variance of {of_what}: {meaning}"
+            values[name] = np.clip(value, 0, 1)
+            values[f"{name}{LOW}"] = np.clip(value - half, 0, 1)
+            values[f"{name}{HIGH}"] = np.clip(value + half, 0, 1)
             column = Column(
-                "-", meaning, ".2f", head=head, is_detail=output == "unsafe"
+                "-", f"share of the variance of {of_what}: {meaning}", ".2f"
             )
+            if output == "degree":
+                head = f"{of_what.removeprefix('the ')}: {index}"
+                column = column._replace(head=head)
+            else:
+                column = column._replace(is_detail=True)
             columns |= with_interval(name, column)
 
     # The characteristic that decides most comes first.
     frame = pd.DataFrame({"characteristic": names, **values})
-    last = "degree_first" if kinds["total"] == UNDEFINED else "degree_total"
-    frame = frame.sort_values(last, ascending=False, kind="stable", ignore_index=True)
+    largest = "degree_first" if kinds["total"] == UNDEFINED else "degree_total"
+    frame = frame.sort_values(
+        largest, ascending=False, kind="stable", ignore_index=True
+    )
     table = tabulate(
         "What decides: shares of the variance (Sobol indices)", columns, frame
     )

@@ -54,7 +54,9 @@ class Model(NamedTuple):
     def in_phases(self) -> Model | None:
         """The model of settings that end with the phase of their encounter; None without phases."""
         evaluator = self.evaluator.in_phases
-        return None if evaluator is None else self._replace(evaluator=evaluator)
+        if evaluator is None:
+            return None
+        return self._replace(evaluator=evaluator)
 
     def evaluate(self, settings: FloatArray, stage: str) -> Evaluations:
         """The evaluations of M settings, shape (M, n)."""
@@ -173,7 +175,7 @@ def models_of(
     """
     in_fits = replace(unsafe, keep=0.0)
     members = [Model(0, evaluator, unsafe)]
-    left_out = list[Model]()
+    left_out = []
     for number, fitted in enumerate(other_sets(evaluator.study, fits), 1):
         model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
         if with_unsafe_originals:

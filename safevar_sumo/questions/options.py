@@ -25,19 +25,21 @@ class Range(NamedTuple):
     def __contains__(self, value: object) -> bool:
         assert isinstance(value, Real)
         number = float(value)
-        return (
-            self.low < number < self.high
-            if self.is_open
-            else self.low <= number <= self.high
-        )
+        if self.is_open:
+            return self.low < number < self.high
+        return self.low <= number <= self.high
 
     def __str__(self) -> str:
-        before, between = ("between", "and") if self.is_open else ("from", "to")
-        ends = [
-            f"{end:,}" if isinstance(end, int) else f"{end:,.12g}"
-            for end in (self.low, self.high)
-        ]
-        return f"{before} {ends[0]} {between} {ends[1]}"
+        low, high = map(_with_commas, (self.low, self.high))
+        if self.is_open:
+            return f"between {low} and {high}"
+        return f"from {low} to {high}"
+
+
+def _with_commas(number: float) -> str:
+    if isinstance(number, int):
+        return f"{number:,}"
+    return f"{number:,.12g}"
 
 
 Count = Annotated[int, Range(1, 100_000_000)]
@@ -100,12 +102,13 @@ class Option(NamedTuple):
         # A table NAME=VALUE, a text, or several.
         if self.is_repeated:
             if isinstance(value, Mapping):
-                value = [f"{name}={inner}" for name, inner in value.items()]
+                value = [f"{name}={number}" for name, number in value.items()]
             values = (value,) if isinstance(value, str) else tuple(value)
-            if twice := next((text for text in values if values.count(text) > 1), None):
-                raise InputError(
-                    self.name, f"{twice!r} is given twice", "each value once"
-                )
+            for text in values:
+                if values.count(text) > 1:
+                    raise InputError(
+                        self.name, f"{text!r} is given twice", "each value once"
+                    )
             return values
         is_object = self.metavar == CARS_FILE and not isinstance(value, str)
         if value is None or is_object or self.kind is bool:
@@ -116,15 +119,14 @@ class Option(NamedTuple):
             return check_text(self.name, value)
 
         # A number within its limits.
-        number, words = (
-            (Integral, "a whole number") if self.kind is int else (Real, "a number")
-        )
-        words = f"{words} {self.limits}" if self.limits else words
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, number)
-            or (self.limits and value not in self.limits)
-        ):
+        number, words = Real, "a number"
+        if self.kind is int:
+            number, words = Integral, "a whole number"
+        is_legal = isinstance(value, number) and not isinstance(value, bool)
+        if self.limits:
+            words += f" {self.limits}"
+            is_legal = is_legal and value in self.limits
+        if not is_legal:
             raise InputError(self.name, repr(value), words)
         return value
 
@@ -152,15 +154,11 @@ def options_of(function: Callable[..., Any]) -> list[Option]:
     options = []
     for parameter in inspect.signature(function).parameters.values():
         if parameter.kind is parameter.KEYWORD_ONLY:
-            hint = parameter.annotation  # a text where the module postpones annotations
+            hint = parameter.annotation
+            if isinstance(hint, str):  # where the module postpones annotations
+                hint = eval(hint, names)
             meaning = " ".join(texts.get(parameter.name, "").split())
-            options.append(
-                _option(
-                    parameter,
-                    eval(hint, names) if isinstance(hint, str) else hint,
-                    meaning,
-                )
-            )
+            options.append(_option(parameter, hint, meaning))
     return options
 
 
@@ -169,17 +167,18 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
     metavar = None
     if get_origin(hint) is Annotated:
         hint, extra = get_args(hint)
-        limits, metavar = (
-            (extra, None) if isinstance(extra, Range) else (None, str(extra))
-        )
-    is_repeated = any(get_origin(kind) is tuple for kind in (hint, *get_args(hint)))
-    kinds = [
-        kind
-        for kind in (bool, int, float, Path)
-        if kind is hint or kind in get_args(hint)
-    ]
-    kind = str if is_repeated or not kinds else kinds[0]
-    choices = get_args(hint) if get_origin(hint) is Literal else ()
+        if isinstance(extra, Range):
+            limits = extra
+        else:
+            metavar = str(extra)
+    hints = (hint, *get_args(hint))
+    is_repeated = any(get_origin(kind) is tuple for kind in hints)
+    kind: type = str
+    if not is_repeated:
+        kind = next((kind for kind in (bool, int, float, Path) if kind in hints), str)
+    choices = ()
+    if get_origin(hint) is Literal:
+        choices = get_args(hint)
     return Option(
         parameter.name,
         kind,

@@ -34,8 +34,8 @@ def planned_over_sets(
     are simulated with the study's own set, and that of its first vehicles with each of the first
     `fits` sets, by default with all.
     """
-    others = len(other_sets(study, fits))
-    return {stage: settings, STAGE: (others + bool(others)) * min(settings, VEHICLES)}
+    number = len(other_sets(study, fits))
+    return {stage: settings, STAGE: (number + bool(number)) * min(settings, VEHICLES)}
 
 
 class SharesOverSets(NamedTuple):
@@ -71,22 +71,21 @@ class SharesOverSets(NamedTuple):
         in_groups = np.any([np.zeros_like(is_first), *groups], axis=0)
         is_chosen = is_first | (in_groups & (np.cumsum(in_groups) <= VEHICLES))
         members = np.array([is_first, *groups])[:, is_chosen]
-        rows = list[list[tuple[float, float, float]]]()
+        rows = []
         if evaluator.left is None and other_sets(evaluator.study, fits):
-            for model in models_of(
-                evaluator, unsafe, fits, with_unsafe_originals=True
-            ).members:
+            models = models_of(evaluator, unsafe, fits, with_unsafe_originals=True)
+            for model in models.members:
                 runs = model.evaluator.evaluate(settings[is_chosen], STAGE)
                 of_runs = unsafe.runs(runs).mean(axis=0)
                 rows.append([_share(of_runs[group & runs.valid]) for group in members])
         table = np.array(rows).reshape(-1, len(members), 3)
         return cls(evaluator.study, table[..., 0], table[..., 1:])
 
-    def of_all(self, own: float) -> list[float]:
-        """The share of all vehicles, by the number of the set; `own` where a single set was asked
+    def of_all(self, share: float) -> list[float]:
+        """The share of all vehicles, by the number of the set; `share` where a single set was asked
         about.
         """
-        return self.shares[:, 0].tolist() or [own]
+        return self.shares[:, 0].tolist() or [share]
 
     @property
     def numbers(self) -> JsonObject:
@@ -94,16 +93,16 @@ class SharesOverSets(NamedTuple):
         return {INTERVALS: self.intervals[:, 0].tolist()}
 
     def ends(
-        self, group: int, own: Sequence[float]
+        self, group: int, facts: Sequence[float]
     ) -> tuple[float, float, float, float]:
-        """The least and the greatest share of a group, and the ends of their intervals; `own` are
+        """The least and the greatest share of a group, and the ends of their intervals; `facts` are
         the share and interval of more of its vehicles with the study's own set.
         """
         rows = np.column_stack([self.shares[:, group], self.intervals[:, group]])
-        share, low, high = np.vstack([own, rows]).T
-        least, lowest = np.fmin.reduce([share, low], axis=1).tolist()
+        share, low, high = np.vstack([facts, rows]).T
+        smallest, lowest = np.fmin.reduce([share, low], axis=1).tolist()
         greatest, highest = np.fmax.reduce([share, high], axis=1).tolist()
-        return least, greatest, lowest, highest
+        return smallest, greatest, lowest, highest
 
     def in_words(self) -> str:
         """The least and the greatest share of all vehicles; that the study's own set was the only
@@ -118,12 +117,11 @@ class SharesOverSets(NamedTuple):
                 " were not simulated."
             )
         shares = self.shares[:, 0]
-        least, greatest = map(
-            self._in_words, (np.nanargmin(shares), np.nanargmax(shares))
-        )
-        range_in_words = f"ranges from {least} to {greatest} over"
-        if least == greatest:
-            range_in_words = f"is {least} in each of"
+        smallest = self._in_words(np.nanargmin(shares))
+        greatest = self._in_words(np.nanargmax(shares))
+        range_in_words = f"ranges from {smallest} to {greatest} over"
+        if smallest == greatest:
+            range_in_words = f"is {smallest} in each of"
         return (
             f" The share of unsafe vehicles {range_in_words} the {len(self.shares)} parameter sets"
             f" of the vehicle model (alternative calibrations; at most {VEHICLES} vehicles each)."
@@ -131,10 +129,12 @@ class SharesOverSets(NamedTuple):
 
     def _in_words(self, number: np.intp) -> str:
         """The share of all vehicles with a set, and its number if no other interval overlaps."""
-        others = np.delete(self.intervals[:, 0], number, axis=0)
+        intervals = np.delete(self.intervals[:, 0], number, axis=0)
         low, high = self.intervals[number, 0]
-        is_apart = ((others[:, 1] < low) | (others[:, 0] > high)).all()
-        name = f"set {number}, " if is_apart else ""
+        is_apart = ((intervals[:, 1] < low) | (intervals[:, 0] > high)).all()
+        name = ""
+        if is_apart:
+            name = f"set {number}, "
         interval = (
             f"{name}95 % confidence interval {percentage(low)} to {percentage(high)} %"
         )

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from difflib import get_close_matches
+from itertools import chain
+from typing import Any
 
 import numpy as np
 from msgspec.structs import replace
@@ -39,14 +41,13 @@ def part_of_study(
         If the study has no such part.
     """
     if ranges and study.encounters != RANGES:
-        whole = with_ranges(study)
-        if whole.encounters != RANGES:
+        study = with_ranges(study)
+        if study.encounters != RANGES:
             raise InputError(
                 "ranges",
                 f"no axis of study {study.name!r} has a range",
                 "a study with such an axis",
             )
-        study = whole
     if point is not None:
         study = at_point(study, point)
     if up_to is None:
@@ -64,28 +65,29 @@ def at_point(study: Study, name: str) -> Study:
         If no test and no point has this name.
     """
     check_text("point", name)
-    reduced = study
-    alone = [test for test in study.tests if test.name == name]
-    points = () if alone else assemble(study).matrix
-    if not alone:  # a listed encounter has no ranges
-        reduced = study.listed()
-        at_points = [each for test in reduced.tests for each in reduced.points_of(test)]
-        pairs = zip(points, at_points, strict=True)
-        alone = [test for point, test in pairs if point.name == name]
-    if not alone:
-        names = [
-            *{test.name: 0 for test in study.tests}
-            | {point.name: 0 for point in points}
-        ]
-        similar = [one for one in names if name in one] or get_close_matches(
-            name, names, N_SIMILAR_POINTS, 0
-        )
-        legal = f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
-        raise InputError(
-            "point", repr(name), legal if points else "a study with a matrix"
-        )
+    origin = replace(study.origin, point=name)
+    tests = [test for test in study.tests if test.name == name]
+    if tests:
+        return replace(study.with_tests(tests), origin=origin)
 
-    return replace(reduced.with_tests(alone), origin=replace(study.origin, point=name))
+    # A listed encounter has no ranges.
+    listed = study.listed()
+    points = assemble(study).matrix
+    tests_at_points = chain.from_iterable(map(listed.points_of, listed.tests))
+    for point, test in zip(points, tests_at_points, strict=True):
+        if point.name == name:
+            tests.append(test)
+    if tests:
+        return replace(listed.with_tests(tests), origin=origin)
+    named: list[Any] = [*study.tests, *points]
+    names = list(dict.fromkeys(item.name for item in named))
+    similar = [text for text in names if name in text] or get_close_matches(
+        name, names, N_SIMILAR_POINTS, 0
+    )
+    legal = (
+        f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
+    )
+    raise InputError("point", repr(name), legal if points else "a study with a matrix")
 
 
 def study_up_to(study: Study, text: str) -> Study:
@@ -101,16 +103,14 @@ def study_up_to(study: Study, text: str) -> Study:
         If the study does not vary the parameter, or the value is no number or beyond the values
         that are driven.
     """
-    name, _, value = (part.strip() for part in text.partition("="))
-    axes = [
-        axis
-        for test in study.tests
-        for axis in study.axes_of(test)
-        if _values(study, test, axis)
-    ]
-    known = [*dict.fromkeys([*study.ranges, *axes])]
+    name, value = _name_and_value(text)
+    axes = dict.fromkeys(study.ranges)
+    for test in study.tests:
+        axes |= {
+            axis: None for axis in study.axes_of(test) if _values(study, test, axis)
+        }
     problem = f"study {study.name!r} does not vary {name!r}"
-    if name and not known:
+    if name and not axes:
         in_ranges = ", with --ranges" if name in study.axes else ""
         raise InputError(OPTION, problem, f"an axis whose values are listed{in_ranges}")
     try:
@@ -119,18 +119,24 @@ def study_up_to(study: Study, text: str) -> Study:
         high = math.nan
     if not (name and math.isfinite(high)):
         raise InputError(OPTION, repr(text), FORM)
-    check_name(OPTION, problem, name, known)
-    if name in study.ranges:
-        domain = study.ranges[name]
-        low, highest, unit = domain.lower, domain.upper, unit_text(domain.unit)
-        if not low < high <= highest:
-            raise InputError(
-                OPTION,
-                f"{name}={high:g} is outside the domain of study {study.name!r}",
-                f"a value above {low:g} and up to {highest:g}{unit}",
-            )
-    cut = study if name in study.ranges else _lists_up_to(study, name, high)
-    return _ranges_up_to(cut, name, high)
+    check_name(OPTION, problem, name, axes)
+    if name not in study.ranges:
+        return _ranges_up_to(_lists_up_to(study, name, high), name, high)
+    domain = study.ranges[name]
+    if not domain.lower < high <= domain.upper:
+        raise InputError(
+            OPTION,
+            f"{name}={high:g} is outside the domain of study {study.name!r}",
+            f"a value above {domain.lower:g} and up to {domain.upper:g}"
+            f"{unit_text(domain.unit)}",
+        )
+    return _ranges_up_to(study, name, high)
+
+
+def _name_and_value(text: str) -> tuple[str, str]:
+    """The axis and the value that an option states."""
+    name, _, value = text.partition("=")
+    return name.strip(), value.strip()
 
 
 def smaller_cuts(study: Study, text: str | None) -> list[Study]:
@@ -139,27 +145,22 @@ def smaller_cuts(study: Study, text: str | None) -> list[Study]:
     """
     if text is None:
         return []
-    name, _, high = (part.strip() for part in text.partition("="))
+    name, highest = _name_and_value(text)
+    values = set[float]()
+    for test in study.tests:
+        values |= {*_values(study, test, name)}
     if name in study.ranges:
         domain = study.ranges[name]
-        values = (
-            np.linspace(domain.lower, domain.upper, PARTS + 1)[1:]
-            .round(DECIMALS)
-            .tolist()
-        )
-    else:
-        values = sorted(
-            {value for test in study.tests for value in _values(study, test, name)}
-        )
-    return [
-        study_up_to(study, f"{name}={each}") for each in values if each < float(high)
-    ]
+        ends = np.linspace(domain.lower, domain.upper, PARTS + 1)[1:]
+        values = {*ends.round(DECIMALS).tolist()}
+    smaller_values = sorted(value for value in values if value < float(highest))
+    return [study_up_to(study, f"{name}={value}") for value in smaller_values]
 
 
 def names_left_out(study: Study, cut: Study) -> list[str]:
     """The names of the tests of a study that are left out where it is cut."""
-    left = [test.name for test in cut.tests]
-    return [test.name for test in study.tests if test.name not in left]
+    names = [test.name for test in cut.tests]
+    return [test.name for test in study.tests if test.name not in names]
 
 
 def _ranges_up_to(study: Study, name: str, high: float) -> Study:
@@ -167,12 +168,11 @@ def _ranges_up_to(study: Study, name: str, high: float) -> Study:
 
     def cut(axes: dict[str, AxisTable]) -> Axes:
         axis = axes.get(name)
-        domain = None if axis is None else axis.range
-        if axis is None or domain is None or domain.upper <= high:
+        if axis is None or axis.range is None or axis.range.upper <= high:
             return {**axes}
-        if domain.lower >= high:  # a list may end where the range begins
+        if axis.range.lower >= high:  # a list may end where the range begins
             return {**axes, name: axis.at}
-        original = min(domain.original, high)
+        original = min(axis.range.original, high)
         return {**axes, name: replace(axis, upper=high, original=original)}
 
     def begins_below(test: MatrixTest) -> bool:
@@ -186,25 +186,32 @@ def _ranges_up_to(study: Study, name: str, high: float) -> Study:
 
 def _lists_up_to(study: Study, name: str, high: float) -> Study:
     """The study whose lists of an axis end at a value; without tests that begin above it."""
-    all_points = assemble(study).points
-    by_test = [(test, own) for test, own in points_of_tests(study, all_points) if test]
-    driven = [value for test, _ in by_test for value in _values(study, test, name)]
-    if not min(driven) <= high <= max(driven):
-        units = [searchable_in(points[0].scenario) for _, points in by_test]
-        unit = next((unit_text(each[name].unit) for each in units if name in each), "")
+    tests = []
+    all_values = list[float]()
+    unit = ""
+    for test, points in points_of_tests(study, assemble(study).points):
+        if test is None:
+            continue
+        values = _values(study, test, name)
+        if not values:
+            tests.append(test)
+            continue
+        all_values += values
+        values_up_to = [value for value in values if value <= high]
+        axes = searchable_in(points[0].scenario)
+        if name in axes:
+            unit = unit or unit_text(axes[name].unit)
+            if values_up_to and max(values) > high:
+                values_up_to = sorted({*values_up_to, high})
+        if values_up_to:
+            tests.append(_with_list(study, test, name, values_up_to))
+    low, highest = min(all_values), max(all_values)
+    if not low <= high <= highest:
         raise InputError(
             OPTION,
             f"{name}={high:g} is not among the values that study {study.name!r} drives",
-            f"a value from {min(driven):g} to {max(driven):g}{unit}",
+            f"a value from {low:g} to {highest:g}{unit}",
         )
-    tests = list[MatrixTest]()
-    for test, points in by_test:
-        values = _values(study, test, name)
-        kept = [value for value in values if value <= high]
-        if kept and max(values) > high and name in searchable_in(points[0].scenario):
-            kept = sorted({*kept, high})
-        if kept or not values:
-            tests.append(_with_list(study, test, name, kept) if values else test)
     return study.with_tests(tests)
 
 
@@ -222,4 +229,6 @@ def _values(study: Study, test: MatrixTest, name: str) -> Sequence[float]:
     numbers.
     """
     values = study.lists_of(test).get(name, ())
-    return values if are_numbers(values) else ()
+    if are_numbers(values):
+        return values
+    return ()

@@ -114,11 +114,11 @@ def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
         low = high = share_of.get(driver)
         if number and len(verdicts) < collisions:
             low, high = clopper_pearson(avoided, number)
-        points = [*filter(None, verdicts["point"][verdicts[driver].isna()].unique())]
+        points = list(filter(None, verdicts["point"][verdicts[driver].isna()].unique()))
         counts = (driver, avoided, number - avoided, len(verdicts) - number)
         rows.append((*counts, share_of.get(driver), low, high, points))
     shares = dict.fromkeys(("share", "share_low", "share_high"), float)
-    return pd.DataFrame(rows, columns=[*COLUMNS]).astype(shares)
+    return pd.DataFrame(rows, columns=list(COLUMNS)).astype(shares)
 
 
 def avoided_by(verdicts: Mapping[Any, Any]) -> str:
@@ -170,7 +170,7 @@ def _assess_at_point(
 ) -> FloatArray:
     """The verdicts of all drivers on M collisions at one point, shape (M, drivers)."""
     approach = approach_parameters(system)
-    verdicts = list[FloatArray]()
+    verdicts = []
     if approach is None:
         return np.full((len(settings), len(drivers)), np.nan)
     with_original = np.concatenate([system.characteristics.original_settings, settings])

@@ -90,16 +90,17 @@ class Account:
     @property
     def left(self) -> float:
         """Simulations that may follow."""
-        return float("inf") if self.most is None else self.most - self.spent
+        if self.most is None:
+            return float("inf")
+        return self.most - self.spent
 
     @property
     def undefined_in_words(self) -> str:
         """How often the metric was undefined, in a sentence; empty if it never was."""
+        if not self.undefined:
+            return ""
         of_all = f"{self.undefined:,} of {self.judged:,} simulated settings, which count as safe"
-        remark = (
-            f"Remark: {self.measure} is undefined, without a collision, in {of_all}."
-        )
-        return remark if self.undefined else ""
+        return f"Remark: {self.measure} is undefined, without a collision, in {of_all}."
 
     def spend(self, simulations: int) -> None:
         """Count simulations that begin.
@@ -142,8 +143,8 @@ class Account:
         if self.asked is not None and self.asked >= expected + parts:
             self.most = None
             # Half of what is more than usual: some searches take longer than they are expected to.
-            more = self.asked / (2 * (expected + parts))
-            self.effort = min(max(self.effort, more), MOST_EFFORT)
+            effort = self.asked / (2 * (expected + parts))
+            self.effort = min(max(self.effort, effort), MOST_EFFORT)
         if seconds is None:
             return
         longest = LONGEST / self.questions
@@ -152,24 +153,23 @@ class Account:
             parts = sum(spare(self.most, self.least))
         if self.most is not None:
             self.spent += parts
-        number = min(expected, float("inf") if self.most is None else self.most)
-        words = _price(number, seconds)
+        words = _price(expected, seconds)
         if self.most is not None:
-            words = f"at most {words.removeprefix('about ')}, of about {expected:,.0f} in full"
-        how = "with" if self.asked is not None else "besides"
-        check = f", {how} {checked:,} for a check of the class" if checked else ""
-        if self.asked is not None and checked:
-            check += ", which is shorter than usual"
-        print_text(
-            Console(file=sys.stderr), f"{words} (one takes {seconds:.2g} s{check})"
-        )
+            price = _price(min(expected, self.most), seconds).removeprefix("about ")
+            words = f"at most {price}, of about {expected:,.0f} in full"
+        words += f" (one takes {seconds:.2g} s"
+        if checked and self.asked is None:
+            words += f", besides {checked:,} for a check of the class"
+        elif checked:
+            words += f", with {checked:,} for a check of the class, which is shorter than usual"
+        print_text(Console(file=sys.stderr), f"{words})")
 
 
 def round_down(number: float) -> int:
     """A number of simulations with `DIGITS` digits, at least 1."""
-    whole = max(int(number), 1)
-    unit = 10 ** max(len(str(whole)) - DIGITS, 0)
-    return int(whole // unit * unit)
+    simulations = max(int(number), 1)
+    unit = 10 ** max(len(str(simulations)) - DIGITS, 0)
+    return int(simulations // unit * unit)
 
 
 def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | None:
@@ -216,6 +216,6 @@ def _price(simulations: float, seconds: float) -> str:
 
 
 def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}"
+    return f"{hours}:{minutes:02}:{seconds:02}"

@@ -74,7 +74,7 @@ class Phases:
         estimate of how many follow.
         """
         if self._is_stage:
-            yield lambda left: None
+            yield lambda number: None
             return
         self._begin(name, settings)
         self._is_stage = True
@@ -84,19 +84,19 @@ class Phases:
         finally:
             self._is_stage = False
 
-    def begin_round(self, number: int, most: int, *, is_known: bool = False) -> None:
+    def begin_round(self, number: int, rounds: int, *, is_known: bool = False) -> None:
         """Begin a round of the phase under way, from 1 on; there are at most, or known to be, as
-        many as `most`.
+        many as `rounds`.
         """
-        self._round = f", round {number} of {'' if is_known else 'at most '}{most}"
-        done = self._done - self._before
+        self._round = f", round {number} of {'' if is_known else 'at most '}{rounds}"
+        simulations = self._done - self._before
         if not is_known:
-            self._expected = max(self._expected, (1 + OVERRUN) * done)
+            self._expected = max(self._expected, (1 + OVERRUN) * simulations)
         else:
             # The mean of the rounds so far, and of one as it was planned.
-            self._planned_round = self._planned_round or self._expected / most
-            self._expected = done + (most - number + 1) * (
-                (self._planned_round + done) / number
+            self._planned_round = self._planned_round or self._expected / rounds
+            self._expected = simulations + (rounds - number + 1) * (
+                (self._planned_round + simulations) / number
             )
         self._show()
 
@@ -105,7 +105,7 @@ class Phases:
         if name not in self._later and self._name:
             return
         planned = 0.0
-        for earlier in [*self._later]:
+        for earlier in list(self._later):
             if name not in self._later:
                 break
             planned = self._later.pop(earlier)
@@ -115,17 +115,19 @@ class Phases:
         self._waiting = 0
         self._expected = planned if settings is None else self._points * settings
 
-    def expect(self, left: float) -> None:
+    def expect(self, settings: float) -> None:
         """Expect that so many settings follow in the phase under way, and at least a small share of
         those so far: nobody knows whether one of them fails, and more are necessary.
         """
-        done = self._done - self._before
-        self._expected = done + max(self._points * left, LEAST_SHARE * done)
+        simulations = self._done - self._before
+        self._expected = simulations + max(
+            self._points * settings, LEAST_SHARE * simulations
+        )
 
     def _show(self) -> None:
         self._show_whole(f"{self._name}{self._round}", *self._counts())
 
     def _counts(self) -> tuple[int, int]:
         """The number of simulations that are done, and the expected total."""
-        left = max(self._before + self._expected - self._done, self._waiting)
-        return self._done, round(self._done + left + sum(self._later.values()))
+        remainder = max(self._before + self._expected - self._done, self._waiting)
+        return self._done, round(self._done + remainder + sum(self._later.values()))

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from html import escape
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+import numpy as np
 import pandas as pd
 from rich.console import Console
 
@@ -42,22 +43,18 @@ CODE = re.compile("`([^`<>]+)`")
 """What a text quotes as code."""
 SCOPE = "Scope: "
 NOTES = (
-    *(
-        SCOPE,
-        "Valid for: ",
-        "Remark: ",
-        "Changed: ",
-        "Criterion: ",
-        "Not simulated: ",
-        "Unsafe means: ",
-    ),
+    SCOPE,
+    "Valid for: ",
+    "Remark: ",
+    "Changed: ",
+    "Criterion: ",
+    "Not simulated: ",
+    "Unsafe means: ",
     "Safe means: ",
-    *(
-        "An encounter counts only",
-        "A vehicle counts only",
-        "Left out",
-        "If all changes go",
-    ),
+    "An encounter counts only",
+    "A vehicle counts only",
+    "Left out",
+    "If all changes go",
 )
 """Beginnings of sentences of a verdict that one screen has below the table."""
 MAX_ROWS = 200
@@ -97,27 +94,28 @@ def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
     its attribute `shown_whole` is the number of rows up to which it is.
     """
     # Sentences of the verdict by kind.
-    plain_sentences = list[str]()
-    notes = list[str]()
+    plain_sentences = []
+    notes = []
     for sentence in SENTENCE_END.split(answer.verdict):
         if sentence.startswith(NOTES):
             notes.append(sentence.replace(SCOPE, "Valid for: ", 1))
         else:
             plain_sentences.append(sentence)
     if answer.tested:
-        first, *further = SENTENCE_END.split(answer.tested)
-        notes.insert(1, f"Tested: {first}")
-        notes += [sentence for sentence in further if sentence.startswith(NOTES)]
+        method, *remarks = SENTENCE_END.split(answer.tested)
+        notes.insert(1, f"Tested: {method}")
+        notes += [remark for remark in remarks if remark.startswith(NOTES)]
 
     # The lead, and what it does not show.
     lead = pd.DataFrame()
     others = dict(answer.tables)
     name = next(iter(others), "") if answer.lead == "" else answer.lead or ""
     if name not in answer.folded and len(others.get(name, ())):
-        whole = next(reader_tables(name, others.pop(name)))[1]
-        few = whole.attrs.get("shown_whole", 0)
-        lead = lead_table(whole, few if len(whole) <= few else max_rows)
-        cut = len(whole.attrs.get("lead_rows", whole)) - len(lead)
+        _, table = next(reader_tables(name, others.pop(name)))
+        rows_of_few = table.attrs.get("shown_whole", 0)
+        is_short = len(table) <= rows_of_few
+        lead = lead_table(table, rows_of_few if is_short else max_rows)
+        cut = len(table.attrs.get("lead_rows", table)) - len(lead)
         if cut > 0:
             notes.insert(0, f"{cut} more rows: --details.")
     unsaid = max(len(plain_sentences) - MAX_SENTENCES, 0)
@@ -127,12 +125,15 @@ def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
 def _more(answer: Answer, screen: Screen) -> str:
     """The last line: what else there is, and the next question."""
     names = [name for name, frame in screen.others.items() if len(frame)]
-    unsaid = number_of(screen.unsaid, "more sentence") if screen.unsaid else ""
-    behind = ", ".join(filter(None, [unsaid, *names]))
-    following = (
-        f" Next: {answer.next}" if answer.next and answer.numbers.get("driven") else ""
-    )
-    return f"More: --details{f' ({behind})' if behind else ''}, --json.{following}"
+    if screen.unsaid:
+        names.insert(0, number_of(screen.unsaid, "more sentence"))
+    contents = ""
+    if names:
+        contents = f" ({', '.join(names)})"
+    line = f"More: --details{contents}, --json."
+    if answer.next and answer.numbers.get("driven"):
+        line += f" Next: {answer.next}"
+    return line
 
 
 def print_answer(answer: Answer, console: Console, *, details: bool) -> None:
@@ -144,13 +145,16 @@ def print_answer(answer: Answer, console: Console, *, details: bool) -> None:
         return
 
     # As many rows of the table as there are lines for.
-    show = _print_whole if answer.is_whole else _print_screen
-    for max_rows in range(MAX_LINES if answer.is_whole else MAX_LEAD_ROWS, 0, -1):
+    show, size = _print_screen, MAX_LEAD_ROWS
+    if answer.is_whole:
+        show, size = _print_whole, MAX_LINES
+    for max_rows in range(size, 0, -1):
         draft = Console(width=console.width, no_color=True, force_terminal=False)
         with draft.capture() as capture:
             show(answer, max_rows, draft)
         lines = capture.get().splitlines()
-        if sum(max(1, -(-len(line) // draft.width)) for line in lines) <= MAX_LINES:
+        widths = np.maximum(list(map(len, lines)), 1)
+        if np.ceil(widths / draft.width).sum() <= MAX_LINES:
             break
     show(answer, max_rows, console)
 
@@ -159,9 +163,9 @@ def _print_whole(answer: Answer, max_rows: int, console: Console) -> None:
     print_text(console, answer.verdict.replace(f" {SCOPE}", f"\n{SCOPE}"))
     for frame in _short_tables(answer).values():
         cut = len(frame) - max_rows
-        shown = frame[:max_rows] if cut > 0 else frame
-        shown.attrs = {**frame.attrs, "bars": frame.attrs.get("bars", ())[:max_rows]}
-        _print_table(console, shown)
+        part = frame[:max_rows]
+        part.attrs = {**frame.attrs, "bars": frame.attrs.get("bars", ())[:max_rows]}
+        _print_table(console, part)
         if cut > 0:
             print_text(console, f"{cut} more rows: --details.")
     for text in _details_in_words(answer):
@@ -191,9 +195,9 @@ def render(
     first, as CSV. Text is one screen, with a table's name or `details` all.
     """
     if form == "csv":
-        frame = (
-            answer.table(table) if table or answer.listing is None else answer.listing
-        )
+        frame = answer.listing
+        if table or frame is None:
+            frame = answer.table(table)
         cells = frame.map(csv_cell).rename(columns=csv_cell)
         return cells.to_csv(index=False, lineterminator="\n")
     if table is not None:
@@ -214,101 +218,100 @@ def render(
 
 def _html(answer: Answer) -> str:
     """One screen, below which the rest is folded; all of an answer that is whole."""
-    every = map(html_table, _short_tables(answer).values())
+    tables = map(html_table, _short_tables(answer).values())
     if answer.is_whole:
-        return _marked([f"<p>{escape(answer.verdict)}</p>", *every])
+        return _html_of([answer.verdict], tables)
     screen = screen_of(answer)
-    first, *later = map(escape, screen.sentences)
-    verdict = " ".join([first, *(f"<span>{sentence}</span>" for sentence in later)])
-    parts = [f"<p>{verdict}</p>", html_table(screen.lead)]
-    parts += [f"<p>{escape(note)}</p>" for note in screen.notes]
-
-    # All sentences and tables.
-    folded = [
-        f"<p>{escape(text)}</p>"
-        for text in (answer.verdict, *_details_in_words(answer))
+    verdict, *sentences = map(escape, screen.sentences)
+    for sentence in sentences:
+        verdict += f" <span>{sentence}</span>"
+    parts = [
+        f"<p>{verdict}</p>",
+        html_table(screen.lead),
+        _html_of(screen.notes),
+        "<details><summary>Details</summary>",
+        _html_of([answer.verdict, *_details_in_words(answer)], tables),
+        "</details>",
     ]
-    parts += ["<details><summary>Details</summary>", *folded, *every, "</details>"]
-    return _marked(parts)
+    return _html_of([], parts)
 
 
-def _marked(parts: Iterable[str]) -> str:
-    """Parts of HTML, in which what texts quote as code is marked."""
-    return CODE.sub(r"<code>\1</code>", "\n".join(filter(None, parts)))
+def _html_of(texts: Iterable[str], parts: Iterable[str] = ()) -> str:
+    """Texts as paragraphs, and parts of HTML; what texts quote as code is marked."""
+    paragraphs = [f"<p>{escape(text)}</p>" for text in texts]
+    html = "\n".join(filter(None, [*paragraphs, *parts]))
+    return CODE.sub(r"<code>\1</code>", html)
 
 
 def _latex(answer: Answer) -> str:
     """All tables that are short, with remarks below them."""
-    shown = _short_tables(answer)
-    remarks = shown.pop("remarks", None)
-    tables = [
-        latex_table(_label_of(answer, name), frame) for name, frame in shown.items()
-    ]
-    notes = [] if remarks is None else [latex_notes(remarks)]
+    parts = [LATEX_PREAMBLE]
+    notes = []
+    for name, frame in _short_tables(answer).items():
+        if name == "remarks":
+            notes.append(latex_notes(frame.iloc[:, -1]))
+        else:
+            parts.append(latex_table(_label_of(answer, name), frame))
     if answer.tested:
-        notes.append(latex_notes(pd.DataFrame([_tested_in_words(answer)])))
-    return "\n".join([LATEX_PREAMBLE, *tables, *notes])
+        notes.append(latex_notes([_tested_in_words(answer)]))
+    return "\n".join(parts + notes)
 
 
 def _tested_in_words(answer: Answer) -> str:
-    return f"How this was tested: {answer.tested}" if answer.tested else ""
+    return f"How this was tested: {answer.tested}"
 
 
 def _details_in_words(answer: Answer) -> Iterator[str]:
     """How an answer was tested, and the tables that readers do not see."""
+    if answer.tested:
+        yield _tested_in_words(answer)
     long = [
         f"{name} ({len(frame):,} rows)"
         for name, frame in _shown_tables(answer).items()
         if len(frame) > MAX_ROWS
     ]
     folded = [name for name in answer.folded if len(answer.tables.get(name, ()))]
-    sentences = [f"By --format csv --table NAME: {', '.join(long)}."] if long else []
-    sentences += [f"By --table NAME: {', '.join(folded)}."] if folded else []
-    yield from filter(None, (_tested_in_words(answer), " ".join(sentences)))
+    sentences = []
+    if long:
+        sentences.append(f"By --format csv --table NAME: {', '.join(long)}.")
+    if folded:
+        sentences.append(f"By --table NAME: {', '.join(folded)}.")
+    if sentences:
+        yield " ".join(sentences)
 
 
 def _shown_tables(answer: Answer) -> Frames:
     """The tables of all details, by name; without remarks on others, and without a table of no
     remark.
     """
-    shown = {
-        name: frame
-        for name, frame in answer.tables.items()
-        if name not in answer.folded
-    }
-    remarks = shown.pop("remarks", None)
+    tables = {**answer.tables}
+    for name in answer.folded:
+        tables.pop(name, None)
+    remarks = tables.pop("remarks", None)
     if remarks is not None:
-        about = (
-            remarks[~remarks["table"].isin(answer.folded)]
-            if "table" in remarks
-            else remarks
-        )
-        if "table" in about:  # "all" would be read as a part of the remark
-            about = about.replace({"table": {"all": ""}})
-        shown |= {} if about.empty else {"remarks": about}
-    return {
-        label: part
-        for name, frame in shown.items()
-        for label, part in reader_tables(name, frame)
-    }
+        if "table" in remarks:
+            remarks = remarks[~remarks["table"].isin(answer.folded)]
+            # "all" would be read as a part of the remark.
+            remarks = remarks.replace({"table": {"all": ""}})
+        if not remarks.empty:
+            tables["remarks"] = remarks
+    parts = Frames()
+    for name, frame in tables.items():
+        parts |= reader_tables(name, frame)
+    return parts
 
 
 def _short_tables(answer: Answer) -> Frames:
-    return {
-        name: frame
-        for name, frame in _shown_tables(answer).items()
-        if len(frame) <= MAX_ROWS
-    }
+    tables = _shown_tables(answer).items()
+    return {name: frame for name, frame in tables if len(frame) <= MAX_ROWS}
 
 
 def _label_of(answer: Answer, table: str) -> str:
     """The label of a table in LaTeX, which tables of other studies, questions and commands do not
     have.
     """
-    digest = (
-        f"-{zlib.crc32(answer.command.encode()) % 0x10000:04x}"
-        if answer.command
-        else ""
-    )
     study = getattr(answer.study, "name", "safevar")
-    return f"{study}-{answer.question.replace(':', '-')}-{table}{digest}"
+    label = f"{study}-{answer.question.replace(':', '-')}-{table}"
+    if answer.command:
+        label += f"-{zlib.crc32(answer.command.encode()) % 0x10000:04x}"
+    return label

@@ -10,6 +10,7 @@ themselves (Plischke, Borgonovo, Smith 2013, European Journal of Operational Res
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -60,27 +61,20 @@ NO_PROBABILITY = (
 )
 COLUMNS = [
     "characteristic",
-    *(
-        f"{output}_{index}{end}"
-        for output in OUTPUTS
-        for index in ("first", "total")
-        for end in ("", LOW, HIGH)
-    ),
+    *map("".join, product(OUTPUTS, ("_first", "_total"), ("", LOW, HIGH))),
 ]
 
 
 @question
 @contents(
-    *(
-        "unsafe",
-        "samples",
-        "failures",
-        "probability",
-        "interval",
-        "confidence",
-        "by_set",
-        INTERVALS,
-    ),
+    "unsafe",
+    "samples",
+    "failures",
+    "probability",
+    "interval",
+    "confidence",
+    "by_set",
+    INTERVALS,
     lead="sensitivity",
     next="explain",
     sensitivity=COLUMNS,
@@ -124,12 +118,11 @@ def risk(
         # Few simulations are for the design only where it takes at most half of them.
         has_design = has_design and 2 * of_design <= evaluator.left
         samples = min(samples, evaluator.left - has_design * of_design)
-    drawn = evaluator.evaluate(
-        model.draw(samples, default_rng(study.search.seed)), SAMPLING
-    )
+    vehicles = model.draw(samples, default_rng(study.search.seed))
+    evaluations = evaluator.evaluate(vehicles, SAMPLING)
 
     # How many are unsafe.
-    simulated = drawn.take(np.flatnonzero(drawn.valid))
+    simulated = evaluations.take(evaluations.valid)
     failures = criterion.number(simulated)
     total = len(simulated)
     if not total:
@@ -139,11 +132,12 @@ def risk(
 
     # With which probability, also in other parameter sets, and which characteristics decide.
     low, high = clopper_pearson(failures, total, confidence)
-    over_sets = SharesOverSets.of(evaluator, criterion, drawn.settings)
-    indices, of_whom = given_data_indices, simulated
+    over_sets = SharesOverSets.of(evaluator, criterion, evaluations.settings)
     if has_design:
-        indices, of_whom = sobol_indices, design_of(evaluator, model)
-    table = indices(evaluator, of_whom, criterion, confidence)
+        design = design_of(evaluator, model)
+        table = sobol_indices(evaluator, design, criterion, confidence)
+    else:
+        table = given_data_indices(evaluator, simulated, criterion, confidence)
     numbers = {"unsafe": str(criterion), "samples": total, "failures": failures}
     numbers |= {
         "probability": failures / total,
@@ -159,8 +153,8 @@ def risk(
         f"{over_sets.in_words()}"
         f"{NO_PROBABILITY if not study.variation else ''}"
     )
-    left_out = int(drawn.infeasible.sum())
-    if failed := samples - total - left_out:
+    infeasible = int(evaluations.infeasible.sum())
+    if failed := samples - total - infeasible:
         verdict += f" {failed:,} vehicles could not be simulated and are left out."
     if not has_design and total < LEAST_VEHICLES:
         verdict += f" What decides is unknown: that needs {LEAST_VEHICLES} vehicles."
@@ -172,7 +166,7 @@ def risk(
     return Answer(
         question="risk",
         study=study,
-        verdict=with_scope(study, left_out, verdict, criterion.remark),
+        verdict=with_scope(study, infeasible, verdict, criterion.remark),
         numbers=numbers,
         tables={"sensitivity": table},
         folded=() if has_shares else ("sensitivity",),
@@ -184,12 +178,12 @@ def _bound_in_words(high: float, total: int, confidence: float) -> str:
     and Pearson's upper end of 0 of n is 1 - ((1 - confidence) / 2)^(1 / n).
     """
     words = f" No vehicle is unsafe, so the share is at most {percentage(high)} %."
-    needed = math.ceil(math.log((1 - confidence) / 2) / math.log1p(-RARE))
+    number = math.ceil(math.log((1 - confidence) / 2) / math.log1p(-RARE))
     further = (
-        f" To show at most {percentage(RARE)} %, {needed:,} vehicles are needed of which none is"
+        f" To show at most {percentage(RARE)} %, {number:,} vehicles are needed of which none is"
         " unsafe (--samples)."
     )
-    return f"{words}{further if total < needed else ''}"
+    return f"{words}{further if total < number else ''}"
 
 
 def deciding_in_words(table: pd.DataFrame, failures: float) -> str:
@@ -201,21 +195,22 @@ def deciding_in_words(table: pd.DataFrame, failures: float) -> str:
     index = "total" if table["degree_total"].notna().any() else "first"
 
     # The largest share, of all orders if it is known.
-    first = table.iloc[0]
-    share, low, high = (first[f"degree_{index}{end}"] for end in ("", LOW, HIGH))
+    name = f"degree_{index}"
+    largest = table.iloc[0]
+    share, low, high = largest[[name, f"{name}{LOW}", f"{name}{HIGH}"]]
     in_words = table.attrs[OF_WHAT]
     words = f" No vehicle was found that changes {in_words['degree']}, so nothing decides it."
     if np.isfinite(share):
-        name = first["characteristic"]
+        characteristic = largest["characteristic"]
         causes = (
             f"causes {100 * share:.0f} % of the variance of {in_words['degree']}"
             f" ({100 * low:.0f} to {100 * high:.0f} %)"
         )
-        _, *rivals = table[table[f"degree_{index}{HIGH}"] >= low]["characteristic"]
-        words = f" {name} decides most: it {causes}."
+        _, *rivals = table[table[f"{name}{HIGH}"] >= low]["characteristic"]
+        words = f" {characteristic} decides most: it {causes}."
         if rivals:
             words = (
-                f" What decides most is uncertain: {name} {causes}, and the interval of"
+                f" What decides most is uncertain: {characteristic} {causes}, and the interval of"
                 f" {join_phrases(rivals[:MAX_RIVALS])} overlaps with that."
             )
 
@@ -246,8 +241,9 @@ def _probability_in_words(
         for name, distribution in study.variation.items()
         if distribution != Uniform()
     ]
-    rest = ["the others uniform"] if len(variation) < len(study.domains) else []
-    manner = join_phrases(variation + rest)
+    if len(variation) < len(study.domains):
+        variation.append("the others uniform")
+    manner = join_phrases(variation)
     vehicles = (
         f"Of {number_of(total, 'vehicle')} that vary as the study says ({manner})"
     )

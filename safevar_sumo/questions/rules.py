@@ -129,9 +129,8 @@ def rules(
     # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
-    vehicles = VariationModel(study).draw(
-        samples, np.random.default_rng(study.search.seed)
-    )
+    rng = np.random.default_rng(study.search.seed)
+    vehicles = VariationModel(study).draw(samples, rng)
     evaluations = evaluator.evaluate(vehicles, SAMPLED_STAGE)
     is_first_half = np.arange(len(evaluations)) < len(evaluations) // 2
     training = evaluations.take(evaluations.valid & is_first_half)
@@ -146,19 +145,17 @@ def rules(
         )
 
     # Rules are boxes in which unsafe vehicles are dense.
-    trained = np.tile(
-        training.settings, (len(of_runs), 1)
-    )  # with repeats, each run is one
+    # With repeats, each run is a row.
+    trained = np.tile(training.settings, (len(of_runs), 1))
     boxes, remark = _boxes(trained, of_runs.ravel(), characteristics)
     groups = [is_within(box, vehicles) & ~is_first_half for box in boxes]
     over_sets = SharesOverSets.of(evaluator, criterion, vehicles, groups)
     rows = []
     for number, box in enumerate(boxes, 1):
-        own = shares(box, testing.settings, unsafe_in_test)
-        rows.append(
-            (conditions(box, characteristics), *own, *over_sets.ends(number, own[:3]))
-        )
-    frame = pd.DataFrame(rows, columns=[*COLUMNS])
+        facts = shares(box, testing.settings, unsafe_in_test)
+        ends = over_sets.ends(number, facts[:3])
+        rows.append((conditions(box, characteristics), *facts, *ends))
+    frame = pd.DataFrame(rows, columns=list(COLUMNS))
     frame = frame.sort_values(
         "coverage", ascending=False, kind="stable", ignore_index=True
     )
@@ -204,11 +201,10 @@ def _rule_in_words(table: pd.DataFrame, share: float) -> str:
     rule = denser.iloc[0]
     over_sets = ""
     if rule["density_least"] < rule["density_greatest"]:
-        least, greatest, low, high = (
-            f"{100 * rule[f'density_{end}']:.0f}" for end in ENDS
-        )
+        shares_over_sets = 100 * rule[[f"density_{end}" for end in ENDS]]
+        smallest, largest, low, high = shares_over_sets.map("{:.0f}".format)
         interval = f"with 95 % confidence {low} to {high} %"
-        over_sets = f" ({least} to {greatest} % over the parameter sets, {interval})"
+        over_sets = f" ({smallest} to {largest} % over the parameter sets, {interval})"
     return (
         f" {100 * rule['coverage']:.0f} % of the unsafe vehicles have {rule['rule']}. Of all"
         f" vehicles in this region {100 * rule['density']:.0f} % are unsafe{over_sets}."
@@ -225,7 +221,9 @@ def conditions(box: FloatArray, characteristics: CharacteristicSet) -> str:
             texts.append(f"{item.name} above {low:g}{item.suffix}")
         elif high < np.inf:
             texts.append(f"{item.name} below {high:g}{item.suffix}")
-    return join_phrases(texts) if texts else "everywhere"
+    if texts:
+        return join_phrases(texts)
+    return "everywhere"
 
 
 def shares(
@@ -238,9 +236,10 @@ def shares(
     count = round(float(unsafe[is_inside].sum()), SHARE_DECIMALS)
     values = []
     for total in (int(is_inside.sum()), round(float(unsafe.sum()), SHARE_DECIMALS)):
-        values += (
-            [count / total, *clopper_pearson(count, total)] if total else [np.nan] * 3
-        )
+        if total:
+            values += [count / total, *clopper_pearson(count, total)]
+        else:
+            values += [np.nan] * 3
     return values
 
 
@@ -271,23 +270,17 @@ def _find_boxes(
     lower = characteristics.lower
     width = characteristics.upper - characteristics.lower
     tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
-    leaves = list(
-        _boxes_of_leaves(
-            tree, 0, np.repeat(UNLIMITED, len(width), axis=1), lower, width
-        )
-    )
+    domain = np.repeat(UNLIMITED, len(width), axis=1)
+    leaves = list(_boxes_of_leaves(tree, 0, domain, lower, width))
     densest, _ = max(leaves, key=lambda leaf: leaf[1])
     dense_boxes = [box for box, density in leaves if density > 0.5] or [densest]
 
     # Rounded, without conditions that do not help.
-    digits = [
-        LIMIT_DIGITS - 1 - math.floor(math.log10(its_width)) for its_width in width
-    ]
-    rounded = [
-        np.array([list(map(round, ends, digits)) for ends in box.tolist()])
-        for box in dense_boxes
-    ]
-    boxes = [_drop_useless_conditions(box, settings, is_unsafe) for box in rounded]
+    digits = LIMIT_DIGITS - 1 - np.floor(np.log10(width)).astype(int)
+    boxes = []
+    for box in dense_boxes:
+        rounded = [list(map(round, ends, digits.tolist())) for ends in box.tolist()]
+        boxes.append(_drop_useless_conditions(np.array(rounded), settings, is_unsafe))
     boxes.sort(key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings)))
 
     # Boxes that add enough unsafe vehicles to those before.
@@ -316,28 +309,30 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
         """The index of the strongest pruning whose score is within a standard error of the best."""
         means = results["mean_test_score"]
         best = np.argmax(means)
-        least = means[best] - results["std_test_score"][best] / math.sqrt(FOLDS - 1)
-        return int(np.flatnonzero(means >= least)[-1])
+        threshold = means[best] - results["std_test_score"][best] / math.sqrt(FOLDS - 1)
+        return int(np.flatnonzero(means >= threshold)[-1])
 
     # Trees that are pruned more and more.
     tree = DecisionTreeClassifier(
         max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, random_state=0
     )
-    strengths = np.unique(
-        np.maximum(tree.cost_complexity_pruning_path(inputs, is_unsafe).ccp_alphas, 0.0)
-    )
-    strengths = strengths[:-1]  # the strongest pruning leaves no condition
-    evenly_spaced = np.unique(
-        np.linspace(0, len(strengths) - 1, MAX_PRUNINGS).round().astype(int)
-    )
-    prunings = {
-        "ccp_alpha": strengths[evenly_spaced] if len(strengths) else np.zeros(1)
-    }
+    path = tree.cost_complexity_pruning_path(inputs, is_unsafe)
+    # The strongest pruning leaves no condition.
+    strengths = np.unique(np.maximum(path.ccp_alphas, 0.0))[:-1]
+    if len(strengths):
+        places = np.linspace(0, len(strengths) - 1, MAX_PRUNINGS).round()
+        strengths = strengths[np.unique(places.astype(int))]
+    else:
+        strengths = np.zeros(1)
 
     # The smallest tree that predicts about as well as the best.
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
     search = GridSearchCV(
-        tree, prunings, scoring="neg_brier_score", cv=folds, refit=smallest_good_enough
+        tree,
+        {"ccp_alpha": strengths},
+        scoring="neg_brier_score",
+        cv=folds,
+        refit=smallest_good_enough,
     )
     return search.fit(inputs, is_unsafe).best_estimator_
 
@@ -356,15 +351,15 @@ def _boxes_of_leaves(
     # Both sides of the node's condition.
     column = int(tree.feature[node])
     threshold = lower[column] + tree.threshold[node] * width[column]
-    above = box.copy()
-    above[0, column] = threshold
+    upper_part = box.copy()
+    upper_part[0, column] = threshold
     yield from _boxes_of_leaves(
-        tree, int(tree.children_right[node]), above, lower, width
+        tree, int(tree.children_right[node]), upper_part, lower, width
     )
-    below = box.copy()
-    below[1, column] = threshold
+    lower_part = box.copy()
+    lower_part[1, column] = threshold
     yield from _boxes_of_leaves(
-        tree, int(tree.children_left[node]), below, lower, width
+        tree, int(tree.children_left[node]), lower_part, lower, width
     )
 
 
@@ -374,12 +369,10 @@ def _drop_useless_conditions(
     """Drop conditions while the lower bound of the density does not fall."""
 
     def least_density(box: FloatArray) -> float:
-        inside = is_unsafe[is_within(box, settings)]
-        return (
-            clopper_pearson(int(np.count_nonzero(inside)), len(inside))[0]
-            if len(inside)
-            else 0.0
-        )
+        flags = is_unsafe[is_within(box, settings)]
+        if not len(flags):
+            return 0.0
+        return clopper_pearson(int(np.count_nonzero(flags)), len(flags))[0]
 
     while np.isfinite(box).any():
         columns = np.flatnonzero(np.isfinite(box).any(axis=0))

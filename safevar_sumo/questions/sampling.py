@@ -73,7 +73,9 @@ def clopper_pearson(
 
     if count != int(count) or total != int(total):
         beta, tail = scipy.stats.beta, 0.5 - confidence / 2
-        low = beta.ppf(tail, count, total - count + 1) if count else 0.0
+        low = 0.0
+        if count:
+            low = beta.ppf(tail, count, total - count + 1)
         return float(low), float(
             beta.isf(tail, count + 1, total - count)
         ) if count < total else 1.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace as replace_in
 
@@ -182,7 +182,9 @@ def part_of(
     if isinstance(subject, Study):
         return part_of_study(subject, ranges, point, up_to)
     refuse_part_of_results(ranges=ranges, up_to=up_to)
-    return subject if point is None else case_at(subject, point)
+    if point is None:
+        return subject
+    return case_at(subject, point)
 
 
 def refuse_part_of_results(*, ranges: bool, up_to: str | None) -> None:
@@ -196,12 +198,17 @@ def refuse_part_of_results(*, ranges: bool, up_to: str | None) -> None:
 
 def study_in(subject: Subject) -> Study:
     """The study itself, or the study of the results."""
-    return subject if isinstance(subject, Study) else subject.study
+    if isinstance(subject, Study):
+        return subject
+    return subject.study
 
 
-def with_own_set(case: Case) -> Case:
-    """Results whose study has its own parameter set of the vehicle model alone."""
-    return replace(case, study=replace_in(case.study, spread={}))
+def with_own_set(subject: Subject) -> Any:
+    """A subject whose study has its own parameter set of the vehicle model alone."""
+    study = replace_in(study_in(subject), spread={})
+    if isinstance(subject, Study):
+        return study
+    return replace(subject, study=study)
 
 
 def case_at(case: Case, point: str) -> Case:
@@ -249,13 +256,12 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
 
     # Without `as_it_is_now` they are refused.
     if changes and not as_it_is_now:
-        more = len(changes) - MAX_CHANGES_NAMED
-        named = "; ".join(changes[:MAX_CHANGES_NAMED]) + (
-            f" (and {more} more)" if more > 0 else ""
-        )
+        names = "; ".join(changes[:MAX_CHANGES_NAMED])
+        if len(changes) > MAX_CHANGES_NAMED:
+            names += f" (and {len(changes) - MAX_CHANGES_NAMED} more)"
         raise InputError(
             directory / MANIFEST,
-            f"{named}: new simulations would not match these results",
+            f"{names}: new simulations would not match these results",
             "the inputs of that time; questions simulate with the present ones, and warn, by"
             " `as_it_is_now=True`",
         )

@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
-from itertools import takewhile
+from itertools import product, takewhile
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -28,17 +28,24 @@ LONG_TEXT = 60
 LEAST_TEXT = 36
 MAX_LEAD_ROWS, MAX_LEAD_COLUMNS = 12, 6
 """Size of the table of one screen."""
-LATEX_PREAMBLE = "% In the preamble: " + " ".join(
-    rf"\usepackage{name}"
-    for name in ("[T1]{fontenc}", "{textcomp}", "{booktabs}", "{graphicx}")
+LATEX_PREAMBLE = (
+    r"% In the preamble: \usepackage[T1]{fontenc} \usepackage{textcomp}"
+    r" \usepackage{booktabs} \usepackage{graphicx}"
 )
 FIT_BEGIN = "\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%\n"
 LATEX_CODES = str.maketrans(
     {
-        **{character: "\\" + character for character in "{}$&#%_"},
-        **{
-            character: f"{{{character}}}" for character in "[]*"
-        },  # LaTeX reads these as arguments of the line before
+        "{": r"\{",
+        "}": r"\}",
+        "$": r"\$",
+        "&": r"\&",
+        "#": r"\#",
+        "%": r"\%",
+        "_": r"\_",
+        # LaTeX reads these as arguments of the line before.
+        "[": "{[}",
+        "]": "{]}",
+        "*": "{*}",
         "\\": r"\textbackslash{}",
         "^": r"\textasciicircum{}",
         "~": r"\textasciitilde{}",
@@ -94,11 +101,10 @@ def tabulate(
     A column `x` whose interval stands in `x_low` and `x_high` is declared once; `columns` may name
     the ends, too. Readers see the `words` in place of the texts that are their keys.
     """
-    named = {
-        name: Column("", column) if isinstance(column, str) else column
-        for name, column in columns.items()
-    }
-    frame = pd.DataFrame(rows, columns=[*named])
+    named = {}
+    for name, column in columns.items():
+        named[name] = Column("", column) if isinstance(column, str) else column
+    frame = pd.DataFrame(rows, columns=list(named))
     frame.attrs = {"title": title, "columns": named, "wide": wide, "words": words or {}}
     return frame
 
@@ -117,15 +123,14 @@ def columns_of(frame: pd.DataFrame) -> dict[str, Column]:
 def plain(value: Any) -> Any:
     """A value as JSON has it, null where undefined."""
     if isinstance(value, Mapping):
-        return {str(key): plain(inner) for key, inner in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
+        return list(map(plain, value))
     if hasattr(value, "item"):
         value = value.item()
-    is_undefined = value is pd.NA or (
-        isinstance(value, float) and not math.isfinite(value)
-    )
-    return None if is_undefined else value
+    if value is pd.NA or (isinstance(value, float) and not math.isfinite(value)):
+        return None
+    return value
 
 
 def cell_text(value: Any, number_format: str = ".4g") -> str:
@@ -135,22 +140,24 @@ def cell_text(value: Any, number_format: str = ".4g") -> str:
     if value is None:
         return "-"
     if isinstance(value, bool):
-        return "yes" if value else "no"
+        if value:
+            return "yes"
+        return "no"
     if isinstance(value, float):
         text = f"{value:{number_format}}"
-        return f"{value:,.0f}" if "e+" in text else text
+        if "e+" in text:
+            return f"{value:,.0f}"
+        return text
+    texts = []
     if isinstance(value, dict):
-        return (
-            ", ".join(
-                f"{name} {cell_text(inner, number_format)}"
-                for name, inner in value.items()
-            )
-            or "-"
-        )
+        for name, item in value.items():
+            texts.append(f"{name} {cell_text(item, number_format)}")
+        return ", ".join(texts) or "-"
     if isinstance(value, list):
+        for item in value:
+            texts.append(cell_text(item, number_format))
         is_interval = len(value) == 2 and not isinstance(value[0], dict)
-        separator = " to " if is_interval else "; "
-        return separator.join(cell_text(inner, number_format) for inner in value) or "-"
+        return (" to " if is_interval else "; ").join(texts) or "-"
     return str(value)
 
 
@@ -163,11 +170,13 @@ def csv_cell(value: Any) -> Any:
     """A value as CSV has it: a list as words, and an apostrophe before a text that a spreadsheet
     would calculate.
     """
-    value = " ".join(map(str, value)) if isinstance(value, list) else value
+    if isinstance(value, list):
+        value = " ".join(map(str, value))
     if not isinstance(value, str):
         return value
-    is_formula = value.startswith(FORMULA_STARTS) and not SIGNED.fullmatch(value)
-    return printable(f"'{value}" if is_formula else value)
+    if value.startswith(FORMULA_STARTS) and not SIGNED.fullmatch(value):
+        value = f"'{value}"
+    return printable(value)
 
 
 def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -184,35 +193,27 @@ def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.Data
     heads = frame[wide.by].unique()
     title = frame.attrs["title"]
     words = frame.attrs["words"]
-    names = [words.get(str(head), wide.head.format(head)) for head in heads]
     for value in wide.values:
         ends = ("",) if value in frame else (LOW, HIGH)
-        of_value = [f"{value}{end}" for end in ends]
-        column = columns[of_value[0]]
-        shown = {label: columns[label] for label in wide.labels}
-        shown |= {
-            f"{name}{end}": column._replace(unit="") for name in names for end in ends
-        }
+        value_columns = [f"{value}{end}" for end in ends]
+        column = columns[value_columns[0]]
+        reader_heads = {label: columns[label] for label in wide.labels}
+        for head, end in product(heads, ends):
+            text = words.get(str(head), wide.head.format(head))
+            reader_heads[f"{text}{end}"] = column._replace(unit="")
 
         # A row for each combination of labels.
         rows = []
-        for labels, group in frame.groupby([*wide.labels], sort=False):
-            by_head = group.set_index(wide.by)[of_value].reindex(heads)
+        for labels, group in frame.groupby(list(wide.labels), sort=False):
+            by_head = group.set_index(wide.by)[value_columns].reindex(heads)
             rows.append((*labels, *by_head.to_numpy().ravel()))
-        heading = (
-            title
-            if len(wide.values) == 1
-            else f"{title}: {_meaning_of([columns[end] for end in of_value])}"
-        )
-        yield f"{name}-{value}", tabulate(heading, shown, rows, words=words)
-
-
-def _meaning_of(ends: Sequence[Column]) -> str:
-    """What a column means, or a pair of them that differ in the first word: `lowest and highest
-    value`.
-    """
-    firsts = [column.meaning.partition(" ")[0] for column in ends]
-    return f"{' and '.join(firsts)} {ends[0].meaning.partition(' ')[2]}"
+        heading = title
+        if len(wide.values) > 1:
+            # A pair of columns differs in the first word: lowest and highest value.
+            meanings = [columns[name].meaning.partition(" ") for name in value_columns]
+            beginnings, _, endings = zip(*meanings, strict=True)
+            heading = f"{title}: {' and '.join(beginnings)} {endings[0]}"
+        yield f"{name}-{value}", tabulate(heading, reader_heads, rows, words=words)
 
 
 class _ReaderColumn(NamedTuple):
@@ -237,7 +238,6 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
     or alone.
     """
     columns = columns_of(frame)
-    words = frame.attrs.get("words", {})
     for name in map(str, frame):
         base = re.sub(f"({LOW}|{HIGH})$", "", name)
         column = columns.get(name, Column("", ""))
@@ -246,38 +246,40 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
         is_with_value = is_end and (base in frame or name == ends[1])
         if not column.is_shown or is_with_value:
             continue
-        of_column = ends if is_end else [name]
-        if len(frame) and frame[of_column].isna().all(
-            axis=None
-        ):  # undefined in every row
+        values = frame[ends if is_end else [name]]
+        if len(frame) and values.isna().all(axis=None):  # undefined in every row
             continue
-        texts = [cell_text(value, column.number_format) for value in frame[name]]
-        texts = [words.get(text, text) for text in texts]
-        if ends[0] in frame:
-            pairs = frame[ends].itertuples(index=False)
-            intervals = [
-                _interval_text(low, high, column.number_format) for low, high in pairs
-            ]
-            if is_end:
-                texts = intervals
-            else:
-                behind = zip(
-                    texts, intervals, frame[ends[0]] == frame[ends[1]], strict=True
-                )
-                texts = [
-                    text if exact or text == "-" else f"{text} ({interval})"
-                    for text, interval, exact in behind
-                ]
-        has_unit = column.unit not in ("", "-") and not column.unit.startswith("as ")
-        unit = f" [{column.unit}]" if has_unit else ""
-        is_number = pd.api.types.is_numeric_dtype(frame[name])
+        head = column.head or base.replace("_", " ")
+        if column.unit not in ("", "-") and not column.unit.startswith("as "):
+            head += f" [{column.unit}]"
         yield _ReaderColumn(
-            [each for each in (name, *ends) if each in frame],
-            f"{column.head or base.replace('_', ' ')}{unit}",
+            list(filter(frame.__contains__, (name, *ends))),
+            head,
             column.meaning,
-            texts,
-            is_number,
+            _texts_of(frame, name, ends, column.number_format),
+            pd.api.types.is_numeric_dtype(frame[name]),
         )
+
+
+def _texts_of(
+    frame: pd.DataFrame, name: str, ends: list[str], number_format: str
+) -> list[str]:
+    """The cells of a column for readers, with the interval between its ends if there is one."""
+    words = frame.attrs.get("words", {})
+    texts = []
+    for value in frame[name]:
+        text = cell_text(value, number_format)
+        texts.append(words.get(text, text))
+    if ends[0] not in frame:
+        return texts
+    is_exact = frame[ends[0]] == frame[ends[1]]
+    for row, (low, high) in enumerate(frame[ends].itertuples(index=False)):
+        interval = _interval_text(low, high, number_format)
+        if name in ends:
+            texts[row] = interval
+        elif not is_exact.iloc[row] and texts[row] != "-":
+            texts[row] += f" ({interval})"
+    return texts
 
 
 def lead_table(frame: pd.DataFrame, max_rows: int) -> pd.DataFrame:
@@ -285,20 +287,20 @@ def lead_table(frame: pd.DataFrame, max_rows: int) -> pd.DataFrame:
     rows, and no column that says the same in each of them, or nothing.
     """
     rows = frame.attrs.get("lead_rows", range(len(frame)))
-    lead = frame.iloc[[*rows][:max_rows]]
+    lead = frame.iloc[list(rows)[:max_rows]]
     declared = columns_of(frame)
-    kept = list[str]()
-    shown = 0
+    names = list[str]()
+    number = 0
     for column in reader_columns(lead):
         is_same = len(lead) > 1 and len(set(column.texts)) == 1
         says_something = not is_same and not set(column.texts) <= {"-", "0"}
         is_detail = declared.get(column.names[0], Column("", "")).is_detail
-        is_label = not kept and len(lead) > 1
-        if not is_detail and (is_label or says_something) and shown < MAX_LEAD_COLUMNS:
-            kept += column.names
-            shown += 1
-    lead = lead[list(dict.fromkeys(kept))]
-    lead.attrs = {name: value for name, value in frame.attrs.items() if name != "bars"}
+        is_label = not names and len(lead) > 1
+        if not is_detail and (is_label or says_something) and number < MAX_LEAD_COLUMNS:
+            names += column.names
+            number += 1
+    lead = lead[list(dict.fromkeys(names))]
+    lead.attrs = {**frame.attrs, "bars": ()}
     return lead
 
 
@@ -316,65 +318,57 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
     text are repeated, and long texts in lines of their own.
     """
     # Long texts stand below a table.
-    every = list(reader_columns(frame))
-    long = [column for column in every if column.is_long]
-    columns = [column for column in every if not column.is_long]
-    if long and not any(column.is_number for column in columns) and len(columns) < 2:
-        yield frame.attrs.get("title", "")  # lines say it all
-        for first, *others in zip(
-            *(column.texts for column in (*columns, *long)), strict=True
-        ):
-            yield ": ".join(filter(None, (first, " ".join(filter(None, others)))))
+    all_columns = list(reader_columns(frame))
+    columns = list[_ReaderColumn]()
+    long_columns = list[_ReaderColumn]()
+    least_width = 1
+    for column in all_columns:
+        (long_columns if column.is_long else columns).append(column)
+        least_width += max(_least_width(column), LEAST_TEXT * column.is_long)
+    title = frame.attrs.get("title", "")
+    has_numbers = any(column.is_number for column in columns)
+    if long_columns and len(columns) < 2 and not has_numbers:
+        yield title  # lines say it all
+        cells = [column.texts for column in (*columns, *long_columns)]
+        for label, *texts in zip(*cells, strict=True):
+            yield ": ".join(filter(None, (label, " ".join(filter(None, texts)))))
         return
-    if (
-        1
-        + sum(
-            max(_least_width(column), LEAST_TEXT * column.is_long) for column in every
-        )
-        <= width
-    ):
-        columns = every
-        long = []
+    if least_width <= width:
+        columns = all_columns
+        long_columns = []
 
     # Blocks that fit into the width, each with the labels.
     labels = list(takewhile(lambda column: not column.is_number, columns))
     if 1 + sum(map(_least_width, labels)) > width:
         labels = labels[:1]
-    blocks = [[*labels]]
+    blocks = [list(labels)]
     for column in columns[len(labels) :]:
-        if (
-            len(blocks[-1]) > len(labels)
-            and 1 + sum(map(_least_width, [*blocks[-1], column])) > width
-        ):
-            blocks.append([*labels])
+        block_width = 1 + sum(map(_least_width, [*blocks[-1], column]))
+        if len(blocks[-1]) > len(labels) and block_width > width:
+            blocks.append(list(labels))
         blocks[-1].append(column)
 
     # Bars, blocks, and long texts.
     bars = [bar.blocks for bar in frame.attrs.get("bars", ())]
     if bars and columns:
         yield WholeTable(
-            frame.attrs["title"],
+            title,
             [(labels[0].head, False, labels[0].texts), (LEGEND["text"], False, bars)],
         )
-    for number, block in enumerate(filter(None, blocks)):
-        title = "" if number or bars else frame.attrs.get("title", "")
-        yield WholeTable(
-            title, [(column.head, column.is_number, column.texts) for column in block]
-        )
-    for column in long:
-        yield from (
-            f"{label}: {text}"
-            for label, text in zip(columns[0].texts, column.texts, strict=True)
-        )
+        title = ""
+    for block in filter(None, blocks):
+        heads_and_texts = [(item.head, item.is_number, item.texts) for item in block]
+        yield WholeTable(title, heads_and_texts)
+        title = ""
+    for column in long_columns:
+        for label, text in zip(columns[0].texts, column.texts, strict=True):
+            yield f"{label}: {text}"
 
 
 def _least_width(column: _ReaderColumn) -> int:
     """The width of a column whose words are whole, with a line beside it [characters]."""
-    return 1 + max(
-        len(word)
-        for text in (column.head, *column.texts)
-        for word in text.split() or [""]
-    )
+    words = " ".join([column.head, *column.texts]).split()
+    return 1 + max(map(len, words), default=0)
 
 
 def html_table(frame: pd.DataFrame) -> str:
@@ -382,60 +376,46 @@ def html_table(frame: pd.DataFrame) -> str:
     `label`.
     """
     # Heads and cells, with the head that a phone shows beside each cell.
-    columns = list(reader_columns(frame))
-    classes = ["" if column.is_number else ' class="label"' for column in columns]
-    heads = "".join(
-        f'<th scope="col"{css} title="{escape(column.meaning)}">{escape(column.head)}</th>'
-        for css, column in zip(classes, columns, strict=True)
-    )
-    names = [f' data-head="{escape(column.head)}"' for column in columns]
-    rows = [
-        "".join(
-            f"<td{css}{name}>{escape(cell)}</td>"
-            for css, name, cell in zip(classes, names, cells, strict=True)
-        )
-        for cells in zip(*(column.texts for column in columns), strict=True)
-    ]
+    heads = ""
+    rows = [""] * len(frame)
+    for column in reader_columns(frame):
+        css = "" if column.is_number else ' class="label"'
+        head = escape(column.head)
+        heads += f'<th scope="col"{css} title="{escape(column.meaning)}">{head}</th>'
+        for row, text in enumerate(column.texts):
+            rows[row] += f'<td{css} data-head="{head}">{escape(text)}</td>'
 
     # Bars in a column of their own.
+    if not heads or not rows:
+        return ""
     title = escape(frame.attrs.get("title", ""))
+    legend = ""
     if bars := frame.attrs.get("bars"):
-        heads = (
-            f'<th scope="col" class="label" title="{LEGEND["html"]}">range</th>{heads}'
-        )
-        rows = [
-            f'<td class="label" data-head="range">{bar.svg}</td>{row}'
-            for bar, row in zip(bars, rows, strict=True)
-        ]
+        legend = f" <small>({LEGEND['html']})</small>"
+        head = f'<th scope="col" class="label" title="{LEGEND["html"]}">range</th>'
+        heads = f"{head}{heads}"
+        for row, bar in enumerate(bars):
+            cell = f'<td class="label" data-head="range">{bar.svg}</td>'
+            rows[row] = f"{cell}{rows[row]}"
     body = "\n".join(f"<tr>{row}</tr>" for row in rows)
-    legend = f" <small>({LEGEND['html']})</small>" if bars else ""
     table = (
         f"<table><caption>{title}{legend}</caption><thead><tr>{heads}</tr></thead>"
         f"<tbody>\n{body}\n</tbody></table>"
     )
-    return (
-        f'<div class="wide" role="region" tabindex="0" aria-label="{title}">{table}</div>'
-        if body
-        else ""
-    )
+    return f'<div class="wide" role="region" tabindex="0" aria-label="{title}">{table}</div>'
 
 
 def latex_table(label: str, frame: pd.DataFrame) -> str:
     """A booktabs table that fits into the line."""
     # Cells and columns by kind.
-    readable = pd.DataFrame(
-        {column.head: column.texts for column in reader_columns(frame)}
-    )
-    style = (
-        readable.style.hide()
-        .format(_escaped_for_latex)
-        .format_index(_escaped_for_latex, axis=1)
-    )
-    kinds = (
-        "r" if column.is_number else "p{6cm}" if column.is_long else "l"
-        for column in reader_columns(frame)
-    )
-    alignment = "".join(kinds)
+    readable = pd.DataFrame()
+    alignment = ""
+    for column in reader_columns(frame):
+        readable[column.head] = column.texts
+        text_alignment = "p{6cm}" if column.is_long else "l"
+        alignment += "r" if column.is_number else text_alignment
+    style = readable.style.hide().format(_escaped_for_latex)
+    style = style.format_index(_escaped_for_latex, axis=1)
     caption = _escaped_for_latex(frame.attrs.get("title", ""))
     table = style.to_latex(
         hrules=True,
@@ -449,10 +429,12 @@ def latex_table(label: str, frame: pd.DataFrame) -> str:
     )
 
 
-def latex_notes(frame: pd.DataFrame) -> str:
-    """A table of texts as small paragraphs, its last column alone."""
-    texts = [_escaped_for_latex(text) for text in frame.iloc[:, -1]]
-    return "".join(f"\\noindent{{\\footnotesize {text}\\par}}\n" for text in texts)
+def latex_notes(texts: Iterable[str]) -> str:
+    """Texts as small paragraphs."""
+    notes = ""
+    for text in map(_escaped_for_latex, texts):
+        notes += f"\\noindent{{\\footnotesize {text}\\par}}\n"
+    return notes
 
 
 def _escaped_for_latex(text: object) -> str:

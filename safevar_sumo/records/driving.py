@@ -44,7 +44,7 @@ TIME_DECIMALS = 9
 """Decimals to which sums of time steps are rounded: 0.15 s, not 0.15000000000000002 s."""
 ZERO: FloatArray = np.zeros(())
 """Scalar zero, broadcast to all N vehicles."""
-ALL_TRUE: BoolArray = np.ones((), dtype=bool)
+ALL_TRUE: BoolArray = np.ones((), bool)
 """Scalar True, broadcast to all N vehicles."""
 UNDEFINED: FloatArray = np.array(np.nan)
 """Scalar NaN, broadcast to all N vehicles."""

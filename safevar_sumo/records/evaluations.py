@@ -54,7 +54,7 @@ class Evaluations:
     def points(self) -> npt.NDArray[np.intp]:
         """`worst_points`; without a matrix the only point, 0."""
         if self.worst_points is None:
-            return np.zeros(len(self), dtype=np.intp)
+            return np.zeros(len(self), np.intp)
         return self.worst_points
 
     @property
@@ -172,7 +172,7 @@ class Evaluations:
         undefined = np.full(len(settings), np.nan)
         return cls(
             settings=settings,
-            outcome=np.full(len(settings), outcome, dtype="U16"),
+            outcome=np.full(len(settings), outcome, "U16"),
             collision_speed=undefined,
             metrics=dict.fromkeys(metrics, undefined),
             **further,
@@ -185,7 +185,7 @@ class Evaluations:
 
         The worst point of a batch without `worst_points` is the first.
         """
-        columns = dict[str, Any]()
+        columns = {}
         for name in COLUMNS:
             columns[name] = np.concatenate([getattr(batch, name) for batch in batches])
         reasons = dict[bytes, str]()

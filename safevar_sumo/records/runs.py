@@ -139,7 +139,7 @@ class Contact(NamedTuple):
     speed: FloatArray
 
 
-NO_CONTACT = Contact(np.array("", dtype="U5"), np.array(np.nan), np.array(0.0))
+NO_CONTACT = Contact(np.array("", "U5"), np.array(np.nan), np.array(0.0))
 """No contact of N vehicles."""
 for _array in NO_CONTACT:
     _array.flags.writeable = False
@@ -186,7 +186,7 @@ class SimulationRuns:
         has_stopped = np.logical_or.accumulate(
             has_moved & (trace.speed <= STANDSTILL), axis=0
         )
-        return np.asarray(trace.active & self.encounter.in_conflict & ~has_stopped)
+        return trace.active & self.encounter.in_conflict & ~has_stopped
 
     @cached_property
     def time_to_collision(self) -> FloatArray:
@@ -228,7 +228,7 @@ class SimulationRuns:
 
     def lacking(self, *quantities: str) -> BoolArray:
         """Which runs lack one of these quantities, shape (N,)."""
-        no_runs = np.zeros(len(self), dtype=bool)
+        no_runs = np.zeros(len(self), bool)
         lacks = [self.lacks.get(name, no_runs) for name in quantities]
         return np.asarray(np.any([no_runs, *lacks], axis=0))
 
@@ -326,8 +326,6 @@ class SimulationRuns:
 
         # Otherwise the speed at the end of the step.
         at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
-        return np.asarray(
-            np.where(
-                gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step
-            )
+        return np.where(
+            gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step
         )

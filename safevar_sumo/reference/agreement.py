@@ -69,7 +69,9 @@ SIMULATION_KEYS = (
 @question
 @contents(
     "rows",
-    *(f"collisions_{where}" for where in ("here", "reference", "both")),
+    "collisions_here",
+    "collisions_reference",
+    "collisions_both",
     agreement=COLUMNS,
 )
 def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:

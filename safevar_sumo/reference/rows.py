@@ -186,7 +186,7 @@ def _parse_numbers(
         raise InputError(
             path, f"row {int(row) + FIRST_ROW}, column {column.name} {fault}", legal
         )
-    return values.to_numpy(dtype=float)
+    return values.to_numpy(float)
 
 
 def package_filter(

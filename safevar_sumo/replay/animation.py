@@ -290,7 +290,7 @@ def _choose_view(bodies: Sequence[DrawnBody]) -> tuple[FloatArray, float, float,
     """
     x, y = np.stack([(body.x, body.y) for body in bodies], axis=1)
     sizes = np.array([(body.length, body.width / 2) for body in bodies])
-    length, half_width = sizes.T[:, :, np.newaxis]
+    length, half_width = sizes.T[:, :, None]
     rear = np.nanmin(x - length) - MARGIN
     front = np.nanmax(x + length) + MARGIN
     bottom = np.nanmin(y - half_width) - MARGIN
@@ -369,7 +369,9 @@ def reading(comparison: Comparison, row: int, sample: int) -> str:
     if sample >= moments.decided:
         ending = comparison.verdict(row)
     gap = trace.gap[index, row]
-    words = f"gap {max(gap, 0):.1f} m" if np.isfinite(gap) else ""
+    words = ""
+    if np.isfinite(gap):
+        words = f"gap {max(gap, 0):.1f} m"
     return f"{comparison.name(row):8}  {trace.speed[index, row]:4.1f} m/s  {words:10}  {ending}"
 
 

@@ -150,7 +150,9 @@ class Comparison:
         return dict(sorted(tracks.items()))
 
     def name(self, row: int) -> str:
-        return "original" if row == ORIGINAL else "changed"
+        if row == ORIGINAL:
+            return "original"
+        return "changed"
 
     @property
     def changes(self) -> list[str]:
@@ -255,8 +257,10 @@ def read_road(network: NetworkFiles) -> tuple[DrawnLane, ...]:
             kinds = {"walkingarea": "area", "crossing": "crossing"}
             kind = kinds.get(edge.get("function", ""), usual)
             # SUMO's lanes are 3.2 m wide by default.
-            width = 0.0 if kind == "area" else float(lane.get("width", 3.2))
-            lanes.append(DrawnLane(kind, np.array(line, dtype=float), width))
+            width = 0.0
+            if kind != "area":
+                width = float(lane.get("width", 3.2))
+            lanes.append(DrawnLane(kind, np.array(line, float), width))
     return tuple(lanes)
 
 

@@ -333,7 +333,9 @@ def export(
         setting[system.characteristics.of_vehicle]
     )
     with about(directory):
-        physics = carla_physics(values) if to == "carla" else {}
+        physics = {}
+        if to == "carla":
+            physics = carla_physics(values)
     comparison = comparison_of(
         simulate_with_original(target.study, system, setting, filtered=False)
     )

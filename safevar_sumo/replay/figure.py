@@ -51,7 +51,9 @@ def draw_comparison(comparison: Comparison) -> Figure:
     divergence = find_divergence(comparison.runs)
     trace = runs.trace
     ttc = runs.time_to_collision
-    divergence_time = None if divergence is None else float(trace.time[divergence])
+    divergence_time = None
+    if divergence is not None:
+        divergence_time = float(trace.time[divergence])
     quantities = {
         "speed [m/s]": trace.speed,
         "gap to the obstacle [m]": np.where(np.isfinite(trace.gap), trace.gap, np.nan),
@@ -220,7 +222,9 @@ def _heading(comparison: Comparison) -> str:
     """The study's title and, below it, the changes; lines break only between changes."""
     # No line breaks at "\0", which stands for the spaces of a change.
     changes = ", ".join(change.replace(" ", "\0") for change in comparison.changes)
-    line = f"changed: {changes}" if changes else "the original vehicle"
+    line = "the original vehicle"
+    if changes:
+        line = f"changed: {changes}"
     lines = [
         *textwrap.wrap(comparison.title, LINE_LENGTH),
         *textwrap.wrap(line, LINE_LENGTH),

@@ -179,7 +179,7 @@ def _points(system: System, setting: FloatArray) -> tuple[pd.DataFrame, list[str
     """The table of the points of a matrix, of which the worst ones lead, and the points at which a
     setting fails.
     """
-    results = [*simulate_all_points(system, setting[np.newaxis])]
+    results = list(simulate_all_points(system, setting[None]))
     records = map(point_record, results)
     # Side and place of a contact are columns of their own.
     points = [{**row, **row.get("contact", {})} for row in records]

@@ -68,7 +68,7 @@ class Target(NamedTuple):
             return system.characteristics.original
         values = system.characteristics.named(system.characteristics.original)
         return np.array(
-            [self.row.get(name, value) for name, value in values.items()], dtype=float
+            [self.row.get(name, value) for name, value in values.items()], float
         )
 
 
@@ -144,12 +144,10 @@ def show_simulation(
         if PHASE in values:
             values[PHASE] = round(values[PHASE], PHASE_DECIMALS)
         target_values = system.characteristics.named(target.setting(system))
-        requested = np.array([*{**target_values, **values}.values()])
+        requested = np.array(list({**target_values, **values}.values()))
         # What a study or results hold has been checked.
         if changes and not beyond:
-            system.region.check(
-                requested[np.newaxis], otherwise=", or any with --beyond"
-            )
+            system.region.check(requested[None], otherwise=", or any with --beyond")
 
     # Files that cannot be written are refused first.
     if trace is not None:

@@ -29,10 +29,12 @@ def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str,
     InputError
         If the simulations do not suffice for all questions.
     """
-    costly = list[str]()
-    free = list[str]()
+    costly = []
+    free = []
     samples = set[tuple[str, ...]]()
-    replays = simulations // PART_OF_REPLAYS if system.mover.takes_long else 0
+    replays = 0
+    if system.mover.takes_long:
+        replays = simulations // PART_OF_REPLAYS
     remaining_simulations = simulations - replays
     for text in dict.fromkeys(texts):
         name, *options = text.split()

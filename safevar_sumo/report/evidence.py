@@ -137,7 +137,7 @@ def evidence(
     check_writable(out, "out", (".zip",))
 
     command = f"evidence {results} {ask} {unsafe}"
-    how: JsonObject = {"jobs": jobs, "cluster": cluster}
+    how = {"jobs": jobs, "cluster": cluster}
     directories = dict.fromkeys(map(Path, results))
     studies = []
     files = dict[str, bytes]()
@@ -187,7 +187,7 @@ def _pack_study(
     questions, lists = _with_lists(list(dict.fromkeys(ask or usual_questions(judged))))
     folder = f"{number}-{study.name}"
     runs = list(case.finished_runs)
-    parts = dict[str, int]()
+    parts = {}
     if simulations is not None:
         system = assemble(judged.study)
         spent = (
@@ -234,7 +234,7 @@ def _with_lists(questions: Sequence[str]) -> tuple[list[str], dict[str, bytes]]:
     """Questions about the lists of cars as a pack holds them, and these lists by their names in the
     pack.
     """
-    packed = list[str]()
+    packed = []
     lists = dict[str, bytes]()
     for text in questions:
         if path := list_in(text):

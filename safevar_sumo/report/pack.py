@@ -174,7 +174,9 @@ def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
         _refuse(path, f"{DESCRIPTION} is damaged, or of another version: {error}")
 
     for name in sorted(files.keys() ^ described.files.keys()):
-        problem = f"is not named in {DESCRIPTION}" if name in files else "is missing"
+        problem = "is missing"
+        if name in files:
+            problem = f"is not named in {DESCRIPTION}"
         _refuse(path, f"{name} {problem}")
 
     # Results of other versions may differ.

@@ -166,7 +166,7 @@ def report(
     ):
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
         questions = (
-            [alone] * len(cases) if ask else [*map(usual_questions, by_criterion)]
+            [alone] * len(cases) if ask else list(map(usual_questions, by_criterion))
         )
         texts = [*chain(*map(with_speed_part, questions, by_criterion)), *joint]
         budgets = _budgets(cases, at_point, by_criterion, questions, joint, simulations)
@@ -205,7 +205,7 @@ def report(
             )
             ask_study = partial(next_answer, slice(number, number + 1))
             studies.append(with_answers(study, questions[number], ask_study))
-        shared = [*map(partial(next_answer, slice(None)), joint)]
+        shared = list(map(partial(next_answer, slice(None)), joint))
         # This process simulates the replays.
         stack.close()
         write_whole(out, make_page(studies, parts, shared))
@@ -219,8 +219,8 @@ def _simulated(cases: Sequence[Case], point: str | None, *, quick: bool) -> list
     if point is not None:
         cases = [case_at(case, point) for case in cases]
     if quick:
-        return [*map(with_own_set, cases)]
-    return [*cases]
+        return list(map(with_own_set, cases))
+    return list(cases)
 
 
 def _budgets(
@@ -276,14 +276,16 @@ def with_speed_part(questions: Sequence[str], case: Case) -> list[str]:
     has_sheet = any(text.startswith("tolerance") for text in questions)
     if has_sheet and speeds_of(case):
         return [*questions, SPEED]
-    return [*questions]
+    return list(questions)
 
 
 def _joint_questions(ask: Sequence[str], results: int) -> list[str]:
     """The questions about all results together: of those asked, else of two results their
     comparison.
     """
-    usual = ["compare"] if results == 2 else []
+    usual = []
+    if results == 2:
+        usual = ["compare"]
     return [text for text in ask or usual if parse_question(text)[0].others]
 
 
@@ -302,7 +304,7 @@ def _later_changes(
 
 def usual_questions(case: Case) -> list[str]:
     """The questions of a page about results; a simulator has no time for the smallest changes."""
-    questions = [*USUAL_QUESTIONS]
+    questions = list(USUAL_QUESTIONS)
     if assemble(case.study).mover.takes_long:
         questions.remove(SMALLEST)
     if case.study.repair.promise or case.study.limits:
@@ -361,7 +363,9 @@ def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
 def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
     """Answers for the template: the heading, the answer in HTML, and its figure if it has one."""
     for number, answer in enumerate(answers, 1):
-        name = "smallest changes" if "staircase" in answer.tables else answer.question
+        name = "smallest changes"
+        if "staircase" not in answer.tables:
+            name = answer.question
         try:
             picture = _picture(answer.figure())
         except InputError:

@@ -12,7 +12,7 @@ from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.errors import warn
 from safevar_sumo.questions.counterexamples import fewest_changes
 from safevar_sumo.questions.words import change_texts, replay_command
-from safevar_sumo.records import FloatArray, JsonObject, NamedValues
+from safevar_sumo.records import JsonObject, NamedValues
 from safevar_sumo.replay.animation import player_of
 from safevar_sumo.replay.comparison import (
     comparison_of,
@@ -38,8 +38,10 @@ def replays(
     each set of changed characteristics. Their players have numbers from `start` on.
     """
     characteristics = study.case.characteristics
-    settings = dict[str, FloatArray]()
-    limit = study.simulations if study.system.mover.takes_long else None
+    settings = {}
+    limit = None
+    if study.system.mover.takes_long:
+        limit = study.simulations
     if limit is None and (fewest := fewest_changes(study.case, jobs=1)) is not None:
         settings["Fewest changes"] = fewest.settings[0]
     settings.update(zip(study.choices, study.chosen_settings, strict=True))

@@ -289,7 +289,7 @@ def trust(study: ReportedStudy) -> Answer:
     they leave out.
     """
     case = study.case
-    tables = dict[str, pd.DataFrame]()
+    tables = {}
     fitted = (
         "Published data were used to fit the vehicle. " if case.study.spread else ""
     )
@@ -304,7 +304,9 @@ def trust(study: ReportedStudy) -> Answer:
         )
         lowest = agreement["spearman"].min()
         highest = agreement["spearman"].max()
-        ending = f" to {highest:.2f}" if lowest != highest else ""
+        ending = ""
+        if lowest != highest:
+            ending = f" to {highest:.2f}"
         verdict = (
             f"The safety degrees were compared with {number_of(len(agreement), 'file')} of"
             f" published simulations. The rank correlation is {lowest:.2f}{ending}. Nothing was"

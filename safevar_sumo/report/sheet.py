@@ -70,7 +70,9 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         reasons = [claim.verdict]
 
     *tests, road = claim.numbers.get("scope", "").split("; ")
-    rows = {} if problem else _rows_of(limits)
+    rows = {}
+    if not problem:
+        rows = _rows_of(limits)
     items = study.case.characteristics.vehicle
     parts = [
         _row_of_part(item, rows.get(item.name))
@@ -78,7 +80,9 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         if item.is_for_workshop and not problem
     ]
     # The greatest speed holds for the values that the study states of what no workshop measures.
-    stated = study.case.study.unmeasured_values if up_to else {}
+    stated = {}
+    if up_to:
+        stated = study.case.study.unmeasured_values
     unmeasured = [
         f"{item.short_name} {_limit_in_words(item, rows.get(item.name), stated.get(item.name))}"
         for item in items
@@ -104,7 +108,7 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         "reasons": reasons,
         "vehicle": name_and_sentence(VEHICLES, limits.study.vehicle.model),
         "ads": name_and_sentence(ADS, limits.study.ads.model),
-        "tests": [*map(_tests_in_words, tests)],
+        "tests": list(map(_tests_in_words, tests)),
         "road": road,
         "in_ranges": ranges,
         "command": limits.command,
@@ -145,7 +149,7 @@ def speed_values(study: ReportedStudy) -> JsonObject:
         return {}
 
     # What a workshop does not measure has the value that the study states, if it states one.
-    texts = list[str]()
+    texts = []
     rows = _rows_of(limits)
     for item in study.case.characteristics.vehicle:
         if item.is_for_workshop or item.name not in study.case.study.unmeasured:
@@ -153,7 +157,9 @@ def speed_values(study: ReportedStudy) -> JsonObject:
             texts += [f"{item.name} >= {low!r}", f"{item.name} <= {high!r}"]
     is_contact = unsafe.is_collision and margin
     criterion = {"margin": margin} if is_contact else {"unsafe": unsafe}
-    rough = {QUICK: True} if limits.numbers["rough"] else {}
+    rough = {}
+    if limits.numbers["rough"]:
+        rough = {QUICK: True}
     return {"others": "new", "limits": tuple(texts), **criterion, **rough}
 
 
@@ -163,7 +169,7 @@ def with_answers(
     """A study with the answers to questions and, if it has a sheet, with that about its speed as
     the last one: the sheet is about the limits of that question, whatever else was asked.
     """
-    study = replace(study, answers=[*map(ask, questions)])
+    study = replace(study, answers=list(map(ask, questions)))
     values = speed_values(study)
     if not values:
         return study
@@ -280,7 +286,9 @@ def _limit_in_words(
 
     # A pure number that is 1 in the original vehicle is a share of its value.
     is_share = not item.suffix and item.original == 1
-    unit = " of the original vehicle's" if is_share else item.suffix
+    unit = " of the original vehicle's"
+    if not is_share:
+        unit = item.suffix
     sides = zip(("at least", "at most"), (low, high), domain, strict=True)
     ends = [f"{word} {end:.10g}{unit}" for word, end, bound in sides if end != bound]
     if not ends and item.original == item.upper:

@@ -113,7 +113,7 @@ def answer_about(
                 f"{len(question.others) + 1} results directories",
             )
         command = question.command_line(
-            [*map(str, directories)], {"point": point}, options
+            list(map(str, directories)), {"point": point}, options
         )
         answer = question.answer(
             cases,

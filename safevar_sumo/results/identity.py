@@ -65,7 +65,7 @@ def packages_of(study: Study) -> tuple[str, ...]:
     """
     has_pymoo = any(name.startswith(PYMOO) for name in study.search.algorithms)
     has_pymoo = has_pymoo and find_spec("pymoo") is not None
-    packages = [*PACKAGES]
+    packages = list(PACKAGES)
     packages += [
         LIBRARIES[key] for key in (study.ads.model, study.ads.kind) if key in LIBRARIES
     ]
@@ -102,7 +102,7 @@ def _without_ranges(tables: Tables) -> JsonObject:
     if matrix := tables.get("matrix"):
         result["matrix"] = dict(matrix)
         if tests := matrix.get("tests"):
-            result["matrix"]["tests"] = [*map(lists, tests)]
+            result["matrix"]["tests"] = list(map(lists, tests))
     if constraints := result.pop("constraints", None):
         names = tables["vehicle"]["characteristics"].keys()
         constraints = [item for item in constraints if item["sum"].keys() <= names]

@@ -347,24 +347,24 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
     """The batch of evaluations in a line; raises an error if its columns are wrong or have
     different lengths.
     """
-    if len({len(values) for values in line.values()}) > 1:
+    if len(set(map(len, line.values()))) > 1:
         raise ValueError
     columns = {
-        name: np.array(values, dtype=float)
+        name: np.array(values, float)
         for name, values in line.items()
         if name not in (POSITION, OUTCOME, REASON, POINT)
     }
-    settings = np.stack([columns.pop(name) for name in characteristics], axis=1)
+    settings = np.stack(list(map(columns.pop, characteristics)), axis=1)
     reasons = zip(
         map(bytes, settings), line.get(REASON, [None] * len(settings)), strict=True
     )
     worst_points = None
     if POINT in line:
-        worst_points = np.array(line[POINT], dtype=np.intp)
-    speed, f_diff, f_num_diff = (columns.pop(name) for name in OBJECTIVE_COLUMNS)
+        worst_points = np.array(line[POINT], np.intp)
+    speed, f_diff, f_num_diff = map(columns.pop, OBJECTIVE_COLUMNS)
     return Evaluations(
         settings=settings,
-        outcome=np.array(line[OUTCOME], dtype="U16"),
+        outcome=np.array(line[OUTCOME], "U16"),
         collision_speed=speed,
         f_diff=f_diff,
         f_num_diff=f_num_diff,

@@ -83,7 +83,7 @@ def load_runs(directory: str | Path) -> StoredResults:
     folder = Path(directory)
     manifest = read_manifest(folder)
     study = manifest["study"]
-    characteristics = [*convert_table(study, Study).domains]
+    characteristics = list(convert_table(study, Study).domains)
     if "imported" in manifest:
         return StoredResults(
             manifest,
@@ -182,7 +182,7 @@ def row_of_handle(solutions: pd.DataFrame, handle: SolutionId) -> int:
         return all_handles.index(handle)
     # Of each run the last handle stays.
     last_handles = {solution[:2]: str(solution) for solution in all_handles}
-    examples = ", ".join([*last_handles.values()][:MAX_EXAMPLES])
+    examples = ", ".join(list(last_handles.values())[:MAX_EXAMPLES])
     raise InputError(
         "solution",
         f"there is no solution {handle}",

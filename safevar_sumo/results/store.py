@@ -177,7 +177,7 @@ def stored_journals(
     """
     study = manifest["study"]
     search = study["search"]
-    characteristics = [*convert_table(study, Study).domains]
+    characteristics = list(convert_table(study, Study).domains)
     digest = identity_digest(manifest)
     labels = dict.fromkeys(map(label_of, search["algorithms"]))
     for algorithm, run in product(labels, range(search["runs"])):
@@ -222,7 +222,7 @@ def evaluations_frame(
     frames = [
         pd.DataFrame(
             {
-                "algorithm": np.full(len(evaluations), algorithm, dtype=object),
+                "algorithm": np.full(len(evaluations), algorithm, object),
                 "run": np.full(len(evaluations), run),
                 **dict(zip(characteristics, evaluations.settings.T, strict=True)),
                 "f_safe": evaluations.f_safe,
@@ -269,7 +269,7 @@ def refuse_other_original(
             is_same = old == new
         else:
             # A value that is undefined, None, becomes NaN.
-            pair = np.array([old, new], dtype=float)
+            pair = np.array([old, new], float)
             is_same = bool(
                 np.isclose(pair[0], pair[1], ROUNDING, ROUNDING, equal_nan=True)
             )

@@ -275,7 +275,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         start = _Start.of(self)
         target = self.parameter("target")
         way = start.profile.travelled(times)
-        end: Quantity = np.inf
+        end = np.inf
         if self.is_on_foot:
             end = start.distance_to_impact + self.stop - start.side * start.impact_left
         path = np.minimum(way, end) - start.distance_to_impact

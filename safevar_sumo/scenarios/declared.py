@@ -155,7 +155,7 @@ class _Declared:
             )
 
         # The values say more than the class, and the study more than both.
-        declared: Parameters = {
+        declared = {
             "unit": parameter.unit,
             "lower": parameter.lower,
             "upper": parameter.upper,

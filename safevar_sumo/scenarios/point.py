@@ -40,7 +40,7 @@ class Point(NamedTuple):
         """Whether the encounters with these values are some of this point's, of shape (N,), or one
         truth for all.
         """
-        holds: Quantity = True
+        holds = True
         for name, domain in (self.ranges or {}).items():
             if name in values:
                 holds &= (values[name] >= domain.lower) & (values[name] <= domain.upper)

@@ -195,14 +195,14 @@ class PedestrianCrossing(
             yield from replace(walk, speed=speed).benign()
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        times = np.arange(samples)[:, np.newaxis]
+        times = np.arange(samples)[:, None]
         speed, start = self.walking_speed, self.lateral_start
         if speed is None:
             speed = WALKING_SPEED
         if start is None:
             start = LATERAL_START
         lateral = speed * step * times - start
-        turned = np.zeros((samples, 1), dtype=bool)
+        turned = np.zeros((samples, 1), bool)
 
         if self.turns_after is not None:
             is_past = lateral > self.turns_after + ROUNDING
@@ -232,7 +232,7 @@ class PedestrianCrossing(
             path - half_width,
             clear_point,
             lateral,
-            np.zeros(len(lateral), dtype=bool),
+            np.zeros(len(lateral), bool),
         )
 
     def observe(

@@ -51,7 +51,7 @@ ALSO_SAMPLED = {
 """What a trace may have at each sample."""
 OF_COLLISION = {IMPACT_SPEED: SPEED, STRUCK_SPEED: Legal()}
 """What a collision has besides, and may have."""
-OUTCOMES = [outcome.value for outcome in [*Outcome][:6]]
+OUTCOMES = [outcome.value for outcome in list(Outcome)[:6]]
 """How a run may end: all but failures of the simulator and settings that are not simulated."""
 ENDS_APART = (Outcome.PASSED, Outcome.STOPPED, Outcome.TIMEOUT)
 """Outcomes of runs in which nothing was touched."""
@@ -83,7 +83,7 @@ def check_result(
     names = [SAFETY_DEGREE]
     if TIME in result:
         check = _checked_trace
-        names = [*SAMPLED]
+        names = list(SAMPLED)
     for name in (*names, OUTCOME):
         if name not in result:
             raise code.wrong(

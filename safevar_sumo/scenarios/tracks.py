@@ -284,7 +284,7 @@ class TrackScenario(Scenario):
         # Before its encounter each body keeps its first velocity.
         early = np.minimum(since, 0.0)
         way = self.start_speed * later
-        late_tracks = list[Track]()
+        late_tracks = []
         for track in tracks:
             along, lateral, speed = (np.atleast_2d(column)[:1] for column in track[6:])
             x = track.x + way + speed * along * early

@@ -68,7 +68,7 @@ class Problem:
         """
         filtered = self.characteristics.filter(settings)
         if not self.region:
-            return np.ones(len(filtered), dtype=bool)
+            return np.ones(len(filtered), bool)
         return self.region.feasible(filtered)
 
     def repaired(self, settings: FloatArray) -> FloatArray:

@@ -137,9 +137,9 @@ class Ranges:
         """
         for _ in range(1 + MAX_REDRAWS):
             setting = self._draw_setting(rng)
-            if self._problem.feasible(setting[np.newaxis])[0]:
+            if self._problem.feasible(setting[None])[0]:
                 return setting
-        return np.asarray(self._problem.repaired(setting[np.newaxis])[0])
+        return np.asarray(self._problem.repaired(setting[None])[0])
 
     def _draw_setting(self, rng: Generator) -> FloatArray:
         setting = self._characteristics.original.copy()
@@ -212,7 +212,7 @@ def _scores(
     degree, and further ones are scaled to [0, 1], too.
     """
     values = np.where(
-        scoring.valid(evaluations)[:, np.newaxis], scoring.values(evaluations), np.nan
+        scoring.valid(evaluations)[:, None], scoring.values(evaluations), np.nan
     )
     score = safety_weight * _normalise(values[:, 0])
     for objective, column in zip(scoring.objectives[1:], values[:, 1:].T, strict=True):

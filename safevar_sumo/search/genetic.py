@@ -101,7 +101,7 @@ class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             generation = problem.uniform(
                 min(problem.population, problem.evaluations), rng
             )
-        offspring = [*map(Individual, generation.tolist())]
+        offspring = list(map(Individual, generation.tolist()))
         survivors = list[Individual]()
         used = 0
 
@@ -200,10 +200,10 @@ class Reproduction:
             self._misses = 0
         if self._misses > MAX_MISSES:
             self._misses = 0
-            return [
-                *map(Individual, self._problem.repaired(np.array(children)).tolist())
-            ]
-        return [*compress(children, feasible)]
+            return list(
+                map(Individual, self._problem.repaired(np.array(children)).tolist())
+            )
+        return list(compress(children, feasible))
 
 
 def request_evaluations(

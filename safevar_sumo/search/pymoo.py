@@ -240,14 +240,14 @@ def _score(
     valid = scoring.valid(evaluations)
     violations = scoring.violation(evaluations)
     values = np.where(
-        valid[:, np.newaxis],
+        valid[:, None],
         scoring.values(evaluations)[:, : algorithm.problem.n_obj],
         FAILED,
     )
     violations = np.where(
         valid | (violations > 0), np.minimum(violations, FAILED), FAILED
     )
-    population.set("F", values, "G", violations[:, np.newaxis])
+    population.set("F", values, "G", violations[:, None])
     population.apply(lambda individual: individual.evaluated.update("FGH"))
     algorithm.evaluator.n_eval += len(evaluations)
 

@@ -54,7 +54,7 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
             new = {bytes(setting): row for row, setting in enumerate(front.settings)}
             for setting in archive.settings:
                 new.pop(bytes(setting), None)
-            rows = [*new.values()]
+            rows = list(new.values())
             number = 10 + len(archive) // 10
             promising = number * 4 // 5
             rows[promising:] = sorted(

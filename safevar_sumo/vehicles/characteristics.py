@@ -71,7 +71,9 @@ class Characteristic:
     @property
     def words(self) -> str:
         """Meaning and real-world counterpart in one line; empty if the study gives neither."""
-        counterpart = f"counterpart: {self.counterpart}" if self.counterpart else ""
+        counterpart = ""
+        if self.counterpart:
+            counterpart = f"counterpart: {self.counterpart}"
         return "; ".join(text for text in (self.meaning, counterpart) if text)
 
     @property
@@ -197,7 +199,9 @@ class Characteristic:
         # A legal value outside the domain has a way to be accepted.
         elif is_number and self.is_legal(value, beyond=True):
             problem += " is outside its domain"
-            hint = f", or any with {switch}" if switch else ""
+            hint = ""
+            if switch:
+                hint = f", or any with {switch}"
         raise InputError("", problem, f"{expected}{self.suffix}{otherwise}{hint}")
 
     def is_legal(self, values: Quantity, *, beyond: bool) -> Quantity:
@@ -275,7 +279,7 @@ class CharacteristicSet:
     @cached_property
     def of_vehicle(self) -> BoolArray:
         """Which members are the vehicle's, shape (n,)."""
-        return np.array([not member.is_scenario for member in self.members], dtype=bool)
+        return np.array([not member.is_scenario for member in self.members], bool)
 
     def of_others(
         self, characteristics: CharacteristicSet, settings: FloatArray
@@ -283,7 +287,7 @@ class CharacteristicSet:
         """Settings of other characteristics, shape (N, m), with those of this set alone, shape
         (N, n).
         """
-        return settings[:, [characteristics.names.index(name) for name in self.names]]
+        return settings[:, list(map(characteristics.names.index, self.names))]
 
     def with_original_vehicle(self, settings: FloatArray) -> FloatArray:
         """The original vehicle in the encounters of settings, shape (N, n)."""
@@ -305,7 +309,7 @@ class CharacteristicSet:
     @property
     def original_settings(self) -> FloatArray:
         """The original setting alone, shape (1, n)."""
-        return self.original[np.newaxis]
+        return self.original[None]
 
     @cached_property
     def lower(self) -> FloatArray:
@@ -323,7 +327,7 @@ class CharacteristicSet:
         """One attribute of all characteristics as a read-only array, shape (n,)."""
         values = np.array(
             [getattr(characteristic, attribute) for characteristic in self.members],
-            dtype=float,
+            float,
         )
         values.flags.writeable = False
         return values
@@ -376,7 +380,7 @@ class CharacteristicSet:
         """
         return np.asarray(
             np.count_nonzero(self.changed(filtered) & self.of_vehicle, axis=1),
-            dtype=float,
+            float,
         )
 
     def setting(

@@ -122,7 +122,7 @@ class FeasibleRegion:
         """
         # The first one, if any, stands for all.
         for setting in settings[~self.feasible(settings)][:1]:
-            row = setting[np.newaxis]
+            row = setting[None]
             bound = next(
                 bound
                 for bound in self.bounds

@@ -294,10 +294,10 @@ class WornVehicle(
             / self.wheelbase
         )
 
-        tangent: FloatArray | None = None
+        tangent = None
         if "sensorAngle" in c:
             exact_tangent = np.tan(np.radians(c["sensorAngle"]))
-            tangent = np.asarray(np.round(exact_tangent, TANGENT_DECIMALS), dtype=float)
+            tangent = np.asarray(np.round(exact_tangent, TANGENT_DECIMALS), float)
         return _PreparedWorn(
             step=step,
             mass=mass,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -112,16 +113,14 @@ def tables(
         )
     cases = _cases_of(results)
     if algorithm:
-        known = {
-            label
-            for case in cases
-            for label in (*case.algorithms, *case.study.search.labels)
-        }
+        labels = set[str]()
+        for case in cases:
+            labels |= {*case.algorithms, *case.study.search.labels}
         check_name(
             "algorithm",
             f"the results have no {algorithm!r}",
             label_of(algorithm),
-            known,
+            labels,
         )
     causes_of_cases = {
         case.name: _causes_of_runs(case, causes, jobs)
@@ -130,24 +129,24 @@ def tables(
     }
 
     # Tables, figures, and the command that gives them.
-    asked = table if table in ON_REQUEST else ""
+    names: Collection[str] = FUNCTIONS
+    options = {"algorithm": algorithm, "alpha": alpha, "causes": causes}
+    if table in ON_REQUEST:
+        names = [table]
+        options["table"] = table
     answer = answer_questions(
-        cases,
-        Choices(label_of(algorithm), alpha, causes_of_cases),
-        [asked] if asked else FUNCTIONS,
+        cases, Choices(label_of(algorithm), alpha, causes_of_cases), names
     )
     if figures is not None:
         save_figures(cases, figures)
     words = [PROGRAM_COMMAND, "tables"]
     words += [quote(str(getattr(source, "directory", source))) for source in results]
-    options = {"algorithm": algorithm, "alpha": alpha, "causes": causes, "table": asked}
     for name, value in options.items():
-        words += [f"--{name}", quote(str(value))] if value not in ("", ALPHA, 0) else []
+        if value not in ("", ALPHA, 0):
+            words += [f"--{name}", quote(str(value))]
     has_runs = any(case.has_runs for case in cases)
-    lead = next(
-        (name for name in (OVER_RUNS if has_runs else POOLED) if name in answer.tables),
-        "",
-    )
+    leading: Collection[str] = OVER_RUNS if has_runs else POOLED
+    lead = next(filter(answer.tables.__contains__, leading), "")
     folded = AS_PUBLISHED if has_runs else ()
     return replace(answer, command=" ".join(words), lead=lead, folded=folded)
 
@@ -207,46 +206,46 @@ def answer_questions(
         label = next(iter(columns))  # of the case
         if name == CAUSES and not choices.causes:
             continue
-        options = [choices] if name in CHOSEN else []
+        if name in CHOSEN:
+            compute = partial(compute, choices=choices)
         parts = []
         for case in cases:
             try:
-                part = compute(case, *options)
+                part = compute(case)
             except UnanswerableError as error:
                 errors.append(error)
                 remarks.append((name, f"{error.source}: {error.problem}."))
             else:
                 parts.append(part.assign(**{label: case.name}))
-                of_case = f"{case.name}: " if len(cases) > 1 else ""
-                notes = _remarks(name, case, part, choices.alpha)
-                remarks += [(name, f"{of_case}{note}") for note in notes]
-        shown = {**columns, label: columns[label]._replace(is_shown=len(cases) > 1)}
+                beginning = f"{case.name}: " if len(cases) > 1 else ""
+                for note in _remarks(name, case, part, choices.alpha):
+                    remarks.append((name, f"{beginning}{note}"))
+        of_case = columns[label]._replace(is_shown=len(cases) > 1)
         rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
-        frames[name] = tabulate(title, shown, rows, wide=wide, words=words)
+        frames[name] = tabulate(
+            title, {**columns, label: of_case}, rows, wide=wide, words=words
+        )
 
     # Nothing at all is an error; remarks stand once.
     if errors and all(frame.empty for frame in frames.values()):
         raise errors[0]
-    of_all = [
-        ("all", remark)
-        for case in cases
-        for remark in (
+    verdict = [*map(_verdict, cases)]
+    of_all = []
+    for case in cases:
+        # Which runs and settings are in no table.
+        verdict += [f"Remark: {remark}" for remark in case.remarks]
+        of_all += [
             *case.remarks,
             why_few_evaluations(case),
             describe_runs_without_solutions(case),
-        )
-        if remark
-    ]
-    different = dict.fromkeys([*of_all, *remarks])
+        ]
+    on_all = product(["all"], filter(None, of_all))
+    different = dict.fromkeys([*on_all, *remarks])
     frames["remarks"] = tabulate("Remarks", REMARKS, [*different])
-    # Which runs and settings are in no table.
-    remarks_of_cases = [
-        f"Remark: {remark}" for case in cases for remark in case.remarks
-    ]
     return Answer(
         question="tables",
         study=cases[0].study,
-        verdict=" ".join([*map(_verdict, cases), *remarks_of_cases]),
+        verdict=" ".join(verdict),
         numbers={
             "cases": len(cases),
             "solutions": sum(len(case.solutions) for case in cases),
@@ -317,7 +316,8 @@ def _remarks(
         )
     if table == "combinations" and frame.empty:
         remarks.append("No critical solution changes exactly four characteristics.")
-    return (remark[:1].upper() + remark[1:] for remark in remarks if remark)
+    for remark in filter(None, remarks):
+        yield remark[0].upper() + remark[1:]
 
 
 def _on_pooled_tests(
@@ -331,10 +331,10 @@ def _on_pooled_tests(
     with_few_runs = frame.loc[~frame["enough_runs"], tested].unique()
     if len(with_few_runs):
         names = ", ".join(map(case.title_of, with_few_runs))
-        needed = fewest_runs(table.upper(), alpha)
+        least_number = fewest_runs(table.upper(), alpha)
         yield (
             f"No p-value of pooled solutions is significant for {names}: a test needs at least"
-            f" {needed} runs of each algorithm."
+            f" {least_number} runs of each algorithm."
         )
     for metric in case.scoring.metrics:
         values = solutions_for_metric(case.solutions, metric)[metric.name]
@@ -345,14 +345,10 @@ def _on_pooled_tests(
                 " leave these out."
             )
     if table == "rq1":
-        known = (
-            {SAFETY_DEGREE} if case.study.ranges else {*case.original}
-        )  # in a solution's encounter
-        omitted = [
-            name
-            for name, value in case.original.items()
-            if math.isnan(value) or name not in known
-        ]
+        values = pd.Series(case.original, dtype=float)
+        if case.study.ranges:  # in a solution's encounter
+            values = values.where(values.index == SAFETY_DEGREE)
+        omitted = [*values.index[values.isna()]]
         if omitted:
             yield (
                 f"No test uses {join_phrases(omitted)}, because the original vehicle has no such"
@@ -379,13 +375,13 @@ def remarks_on_runs(
     tests_in_words = number_of(len(tests), "test")
     few = len(tests) - int(tests["enough_runs"].sum())
     if few:
-        needed = fewest_runs(rq, alpha, len(tests))
-        none = f"None of the {tests_in_words} of {rq} can"
-        some = f"{few} of {tests_in_words} of {rq} cannot"
-        subject = none if few == len(tests) > 1 else some
+        least_number = fewest_runs(rq, alpha, len(tests))
+        beginning = f"{few} of {tests_in_words} of {rq} cannot"
+        if few == len(tests) > 1:
+            beginning = f"None of the {tests_in_words} of {rq} can"
         yield (
-            f"{subject} be significant: after Holm's correction, a test"
-            f" needs at least {needed} runs of each algorithm."
+            f"{beginning} be significant: after Holm's correction, a test"
+            f" needs at least {least_number} runs of each algorithm."
         )
     if len(tests):
         yield f"Holm's method corrects the p-values of the {tests_in_words} of {rq} together."

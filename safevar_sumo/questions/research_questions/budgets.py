@@ -57,14 +57,12 @@ def within_budgets(case: Case) -> pd.DataFrame:
     rows = pd.concat([rows for _, rows in frames_of_runs(case, case.evaluations)])
     rows = rows.assign(evaluation=rows.groupby(["algorithm", "run"]).cumcount())
     rows = valid_evaluations(case, rows)
-    whole = case.study.search.evaluations
-    budgets = np.union1d(np.minimum(BUDGETS, whole), whole)
-    return pd.concat(
-        [
-            rows.query("evaluation < @budget").assign(simulations=budget)
-            for budget in budgets
-        ]
-    )
+    largest = case.study.search.evaluations
+    parts = list[pd.DataFrame]()
+    for budget in np.union1d(np.minimum(BUDGETS, largest), largest):
+        part = rows[rows["evaluation"] < budget]
+        parts.append(part.assign(simulations=budget))
+    return pd.concat(parts)
 
 
 def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
@@ -88,31 +86,23 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
         If there are no evaluations or no solutions, or a single algorithm.
     """
     # Every run within each budget, also if it has no valid setting there.
-    tests = rq2_runs(case, choices)[
-        "p_value"
-    ].count()  # raises if there is a single algorithm
+    tests = rq2_runs(case, choices)  # raises if there is a single algorithm
+    count = tests["p_value"].count()
     reference = reference_front(case)
     unsafe = case.unsafe
-    runs = [
-        (
-            *run,
-            budget,
-            hypervolume(
-                normalised(minimised_values(case, rows), reference),
-                case.study.search.reference_point,
-            ),
-            unsafe.rows(rows).sum(),
-        )
-        for budget, valid in within_budgets(case).groupby("simulations")
-        for run, rows in frames_of_runs(case, valid)
-    ]
+    runs = []
+    for budget, valid in within_budgets(case).groupby("simulations"):
+        for run, rows in frames_of_runs(case, valid):
+            points = normalised(minimised_values(case, rows), reference)
+            volume = hypervolume(points, case.study.search.reference_point)
+            runs.append((*run, budget, volume, unsafe.rows(rows).sum()))
     growth = pd.DataFrame(
         runs, columns=["algorithm", "n1", "simulations", "hypervolume", "unsafe"]
     )
 
     # Every pair of runs; A12 is the share in which the first is better, and half of the ties.
-    others = growth.rename(columns={"algorithm": "baseline", "n1": "n2"})
-    pairs = growth.merge(others, on="simulations", suffixes=("", "_baseline"))
+    baselines = growth.rename(columns={"algorithm": "baseline", "n1": "n2"})
+    pairs = growth.merge(baselines, on="simulations", suffixes=("", "_baseline"))
     pairs["effect_size"] = np.heaviside(
         (pairs["hypervolume"] - pairs["hypervolume_baseline"]).round(12), 0.5
     )
@@ -131,7 +121,7 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
         }
     )
     quantiles = scipy.stats.norm.isf(
-        [choices.alpha / 2 / max(tests, 1), 1 - POWER]
+        [choices.alpha / 2 / max(count, 1), 1 - POWER]
     ).sum()
     frame["runs_needed"] = np.ceil((quantiles / (frame["effect_size"] - 0.5)) ** 2 / 6)
     return with_intervals(frame, choices.alpha)

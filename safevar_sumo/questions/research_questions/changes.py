@@ -57,12 +57,12 @@ def changes_of(case: Case, solutions: pd.DataFrame) -> FloatArray:
     original value, the paper's v'' - v; shape (M, n).
     """
     vehicle = case.characteristics.vehicle
-    return solutions[list(vehicle.names)].to_numpy(dtype=float) - vehicle.original
+    return solutions[list(vehicle.names)].to_numpy(float) - vehicle.original
 
 
 def change_numbers(case: Case) -> list[str]:
     """The numbers of changed characteristics, "1".."n"."""
-    return [str(j) for j in range(1, len(case.characteristics.vehicle) + 1)]
+    return list(map(str, range(1, len(case.characteristics.vehicle) + 1)))
 
 
 def count_changes(case: Case) -> TextArray:
@@ -88,7 +88,8 @@ def _means_by_change_count(
     rows = []
     for (key, column), j in product(values, (*change_numbers(case), ANY)):
         sample = column[~np.isnan(column) & ((j == ANY) | (change_counts == j))]
-        rows.append((*key, j, np.mean(sample) if sample.size else np.nan, sample.size))
+        mean = np.mean(sample) if sample.size else np.nan
+        rows.append((*key, j, mean, sample.size))
     return pd.DataFrame(rows, columns=[*labels, "j", name, "n"])
 
 
@@ -111,15 +112,10 @@ def rq32(case: Case) -> pd.DataFrame:
     (only for j = "any"; ties share the better rank and the next one is skipped).
     """
     shares = (changes_of(case, critical_solutions(case)) != 0).astype(float)
-    values = {
-        (name,): column
-        for name, column in zip(
-            case.characteristics.vehicle.names, shares.T, strict=True
-        )
-    }
-    frame = _means_by_change_count(
-        case, ["characteristic"], "percent", values.items()
-    ).drop(columns="n")
+    keys = zip(case.characteristics.vehicle.names, strict=True)
+    values = zip(keys, shares.T, strict=True)
+    frame = _means_by_change_count(case, ["characteristic"], "percent", values)
+    frame = frame.drop(columns="n")
     frame["percent"] *= 100
     ranks = (
         frame["percent"].where(frame["j"] == ANY).rank(method="min", ascending=False)
@@ -137,11 +133,10 @@ def rq33(case: Case) -> pd.DataFrame:
     changes = changes_of(case, critical_solutions(case))
     vehicle = case.characteristics.vehicle
     originals = vehicle.named(vehicle.original)
-    values = {
-        (name, direction): np.where(np.sign(column) == sign, column, np.nan)
-        for name, column in zip(originals, changes.T, strict=True)
-        for direction, sign in (("increase", 1), ("decrease", -1))
-    }
+    values = {}
+    for name, column in zip(originals, changes.T, strict=True):
+        values[name, "increase"] = np.where(column > 0, column, np.nan)
+        values[name, "decrease"] = np.where(column < 0, column, np.nan)
     frame = _means_by_change_count(
         case, ["characteristic", "direction"], "delta", values.items()
     )
@@ -169,7 +164,7 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     solutions = critical_solutions(case)
     has_collided = are_collisions(solutions).to_numpy()
     safety_degree, tet, tit, deceleration = (
-        solutions[[SAFETY_DEGREE, "tet", "tit", "ave_dece"]].to_numpy(dtype=float).T
+        solutions[[SAFETY_DEGREE, "tet", "tit", "ave_dece"]].to_numpy(float).T
     )
     degrees = case.original_degrees(solutions)
     original = case.original
@@ -224,18 +219,14 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     is_changed = changes_of(case, critical_solutions(case)) != 0
     masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
     counts = Counter(tuple(np.flatnonzero(mask)) for mask in masks)
-    most_frequent = sorted(counts.items(), key=lambda item: (-item[1], item[0]))[
-        :COMBINATIONS_SHOWN
-    ]
+    in_order = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
     # The most frequent ones, with equal ranks for equal numbers.
     names = case.characteristics.vehicle.names
-    rows = [
-        (
-            1 + sum(other > number for other in counts.values()),
-            [names[index] for index in indices],
-            100 * number / len(masks),
-        )
-        for indices, number in most_frequent
-    ]
+    numbers = np.array(list(counts.values()))
+    rows = []
+    for indices, number in in_order[:COMBINATIONS_SHOWN]:
+        rank = 1 + np.count_nonzero(numbers > number)
+        combination = [names[index] for index in indices]
+        rows.append((rank, combination, 100 * number / len(masks)))
     return pd.DataFrame(rows, columns=["rank", "characteristics", "percent"])

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from types import MappingProxyType
 from typing import NamedTuple
@@ -58,7 +59,6 @@ BETTER = {CAUSES: True, BEST: False}
 """Whether more is better in the samples of runs that only some tables have."""
 MARKS = {"large": "L", "medium": "M", "small": "S", "negligible": ""}
 """Magnitudes of effects in a table for a paper."""
-INTERVAL_OF_MEDIAN = ["median", "median_low", "median_high"]
 Samples = Mapping[tuple[str, str], "pd.Series[float]"]
 """Values by algorithm and name of a metric or quality indicator."""
 NOTHING: Samples = MappingProxyType({})
@@ -103,10 +103,9 @@ def rq2(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     if case.has_runs and len(case.evaluations):
         simulated = count_evaluations(case).groupby("algorithm")["simulated"].mean()
     sides = {"evaluations": "algorithm", "baseline_evaluations": "baseline"}
-    evaluations = {
-        name: frame[side].map(simulated).astype(float) for name, side in sides.items()
-    }
-    return _with_significance(frame.assign(**evaluations), choices)
+    for name, side in sides.items():
+        frame[name] = frame[side].map(simulated).astype(float)
+    return _with_significance(frame, choices)
 
 
 def rq1_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
@@ -163,16 +162,14 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """
     # An effect, marked if it is significant, with its size.
     tests = rq2_runs(case, choices)
-    texts = [
-        (
-            f"{effect:.2f}{'*' if significant else ''} {MARKS[magnitude]}".strip()
-            if magnitude in MARKS
-            else "-"
-        )
-        for effect, significant, magnitude in zip(
-            tests["effect_size"], tests["significant"], tests["magnitude"], strict=True
-        )
-    ]
+    texts = []
+    facts = tests[["effect_size", "significant", "magnitude"]]
+    for effect, is_significant, magnitude in facts.itertuples(index=False):
+        text = "-"
+        if magnitude in MARKS:
+            asterisk = "*" if is_significant else ""
+            text = f"{effect:.2f}{asterisk} {MARKS[magnitude]}".strip()
+        texts.append(text)
     columns = ["algorithm", "metric", "baseline", "effect_size", "significant"]
     return tests[columns].assign(a12=texts)
 
@@ -187,8 +184,8 @@ def compare_over_runs(
     if len(case.algorithms) > 1:
         rows["RQ2"] = _test_opponents(case, choices, over_runs=True, further=further)
     families = {
-        question: _corrected(question, rows[question], choices.alpha)
-        for question in rows
+        question: _corrected(question, tests, choices.alpha)
+        for question, tests in rows.items()
     }
     return _with_significance(pd.concat(families).droplevel(1), choices)
 
@@ -197,10 +194,11 @@ def _corrected(question: str, rows: list[JsonObject], alpha: float) -> pd.DataFr
     """The tests of a question over runs, which are corrected as a family."""
     tests = pd.DataFrame(rows)
     count = int(tests["p_value"].count())
-    is_enough = [
+    tests["p_holm"] = correct_by_holm(tests["p_value"])
+    tests["enough_runs"] = [
         can_be_significant(question, row["n1"], row["n2"], alpha, count) for row in rows
     ]
-    return tests.assign(p_holm=correct_by_holm(tests["p_value"]), enough_runs=is_enough)
+    return tests
 
 
 def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:
@@ -223,9 +221,10 @@ def with_intervals(tests: pd.DataFrame, alpha: float) -> pd.DataFrame:
     the index, against one value.
     """
     sizes = tests["n2"].where(tests.index != "RQ1")
-    rows = zip(tests["effect_size"], tests["n1"], sizes, strict=True)
-    ends = [effect_interval(*row, alpha) for row in rows]
-    low, high = zip(*ends, strict=True)
+    intervals = map(
+        partial(effect_interval, alpha=alpha), tests["effect_size"], tests["n1"], sizes
+    )
+    low, high = zip(*intervals, strict=True)
     return tests.assign(effect_size_low=low, effect_size_high=high)
 
 
@@ -235,18 +234,20 @@ def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """
     case.require_solutions()
     samples = _samples(case, choices, over_runs=True)
-    rows = [
-        (
-            algorithm,
-            metric,
-            len(values),
-            values.median(),
-            *median_interval(values, choices.alpha),
-        )
-        for (algorithm, metric), values in samples.items()
-    ]
+    rows = []
+    for (algorithm, metric), values in samples.items():
+        interval = median_interval(values, choices.alpha)
+        rows.append((algorithm, metric, len(values), values.median(), *interval))
     return pd.DataFrame(
-        rows, columns=["algorithm", "metric", "runs", *INTERVAL_OF_MEDIAN]
+        rows,
+        columns=[
+            "algorithm",
+            "metric",
+            "runs",
+            "median",
+            "median_low",
+            "median_high",
+        ],
     )
 
 
@@ -278,16 +279,20 @@ def opponents_of(case: Case, algorithm: str) -> tuple[str, list[str]]:
         If the algorithm has no finished run, or there is no other algorithm.
     """
     case.require_solutions()
-    first = algorithm or (NSGA2 if NSGA2 in case.algorithms else case.algorithms[0])
-    case.solutions_of(first)  # raises if there are none
-    others = [name for name in case.algorithms if name != first]
-    if not others:
+    if not algorithm:
+        algorithm = NSGA2 if NSGA2 in case.algorithms else case.algorithms[0]
+    case.solutions_of(algorithm)  # raises if there are none
+    opponents = [name for name in case.algorithms if name != algorithm]
+    if not opponents:
+        example = "rs"
+        if algorithm == "rs":
+            example = NSGA2
         raise UnanswerableError(
             case.name,
-            f"only {first} has finished runs",
-            f"results of another algorithm, such as {'rs' if first != 'rs' else NSGA2}",
+            f"only {algorithm} has finished runs",
+            f"results of another algorithm, such as {example}",
         )
-    return first, others
+    return algorithm, opponents
 
 
 def _test_original(
@@ -302,14 +307,14 @@ def _test_original(
         values = _values(case, algorithm, metric, over_runs)
         originals = _originals(case, algorithm, metric, over_runs)
         original = originals.mean() if case.study.ranges else case.original[metric.name]
-        test = (
-            signed_rank_test(values, originals.reindex(values.index))
-            if over_runs
-            else compare_samples(values, originals.dropna())
-        )
+        if over_runs:
+            test = signed_rank_test(values, originals.reindex(values.index))
+            runs = test.n1
+        else:
+            test = compare_samples(values, originals.dropna())
+            runs = _finished_runs(case, algorithm)
         # Below 0.5, the solutions are more unsafe than the original.
         test = test.oriented(larger_is_better=not metric.more_is_unsafe)
-        runs = test.n1 if over_runs else _finished_runs(case, algorithm)
         row = {"algorithm": algorithm, "metric": metric.name, "runs": runs}
         is_enough = not case.has_runs or can_be_significant(
             "RQ1", runs, 0, choices.alpha
@@ -323,23 +328,22 @@ def _test_opponents(
     case: Case, choices: Choices, *, over_runs: bool = False, further: Samples = NOTHING
 ) -> list[JsonObject]:
     """A row for each baseline and metric, also of `further` samples."""
-    first, others = opponents_of(case, choices.algorithm)
+    algorithm, opponents = opponents_of(case, choices.algorithm)
     samples = {**_samples(case, choices, over_runs), **further}
     # Whether larger values speak for an algorithm: a better front, more unsafe solutions, or more
     # causes.
     directions = {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
     directions = MORE_IS_BETTER | directions | BETTER
     rows = []
-    for baseline, (metric, more_is_better) in product(others, directions.items()):
-        if metric in BETTER and (first, metric) not in samples:
+    for baseline, (metric, more_is_better) in product(opponents, directions.items()):
+        values = samples.get((algorithm, metric), ())
+        if metric in BETTER and (algorithm, metric) not in samples:
             continue
-        test = compare_samples(
-            *(samples.get((name, metric), ()) for name in (first, baseline))
-        )
+        test = compare_samples(values, samples.get((baseline, metric), ()))
         test = test.oriented(larger_is_better=more_is_better)
-        runs = _finished_runs(case, first), _finished_runs(case, baseline)
+        runs = _finished_runs(case, algorithm), _finished_runs(case, baseline)
         is_enough = not case.has_runs or can_be_significant("RQ2", *runs, choices.alpha)
-        row = {"algorithm": first, "baseline": baseline, "metric": metric}
+        row = {"algorithm": algorithm, "baseline": baseline, "metric": metric}
         rows.append({**row, **test._asdict(), "enough_runs": is_enough})
     return rows
 
@@ -354,22 +358,17 @@ def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
     over runs, of the minimal causes.
     """
     # Metrics of solutions, indicators of fronts, and causes.
-    samples = {
-        (algorithm, metric.name): _values(case, algorithm, metric, over_runs)
-        for algorithm, metric in product(case.algorithms, case.scoring.metrics)
-    }
+    samples = {}
+    for name, metric in product(case.algorithms, case.scoring.metrics):
+        samples[name, metric.name] = _values(case, name, metric, over_runs)
     if case.has_runs and len(case.solutions):
         for algorithm, rows in compute_indicators(case).groupby(level="algorithm"):
-            samples |= {
-                (str(algorithm), name): rows.droplevel("algorithm")[name]
-                for name in MORE_IS_BETTER
-            }
+            for indicator, values in rows.droplevel("algorithm").items():
+                samples[str(algorithm), str(indicator)] = values
     if over_runs and case.name in choices.causes:
-        counts = choices.causes[case.name].groupby("algorithm")
-        samples |= {
-            (str(algorithm), CAUSES): rows.set_index("run")[CAUSES]
-            for algorithm, rows in counts
-        }
+        counts = choices.causes[case.name].set_index("run")
+        for label, values in counts.groupby("algorithm")[CAUSES]:
+            samples[str(label), CAUSES] = values
     return samples
 
 
@@ -415,12 +414,13 @@ def describe_runs_without_solutions(case: Case) -> str:
         return ""
 
     # How many runs of each algorithm have solutions.
-    found = case.solutions.groupby("algorithm")["run"].nunique()
-    texts = [
-        f"{case.title_of(name)} {found.get(name, 0)} of {runs}"
-        for name in case.algorithms
-        if found.get(name, 0) < (runs := _finished_runs(case, name))
-    ]
+    runs_with_solutions = case.solutions.groupby("algorithm")["run"].nunique()
+    texts = []
+    for name in case.algorithms:
+        count = runs_with_solutions.get(name, 0)
+        runs = _finished_runs(case, name)
+        if count < runs:
+            texts.append(f"{case.title_of(name)} {count} of {runs}")
     if not texts:
         return ""
     return (
@@ -432,11 +432,9 @@ def describe_runs_without_solutions(case: Case) -> str:
 
 def titles_of(cases: Iterable[Case]) -> dict[str, str]:
     """Titles of algorithms, quality indicators and the cases' metrics, by name."""
-    cases = list(cases)
-    metrics = {
-        metric.name: metric.title for case in cases for metric in case.scoring.metrics
-    }
-    algorithms = {
-        name: case.title_of(name) for case in cases for name in case.algorithms
-    }
+    algorithms = dict[str, str]()
+    metrics = dict[str, str]()
+    for case in cases:
+        algorithms |= {name: case.title_of(name) for name in case.algorithms}
+        metrics |= {metric.name: metric.title for metric in case.scoring.metrics}
     return algorithms | INDICATOR_TITLES | metrics | {BEST: "best SD of a run"}

@@ -82,17 +82,12 @@ def draw_pareto_fronts(case: Case) -> Figure:
 
     # The front of each algorithm.
     objectives = case.scoring.objectives
-    fronts = {
-        algorithm: nondominated_points(points)
-        * [objective.sign for objective in objectives]
-        for algorithm in case.algorithms
-        if len(points := points_of(case, case.solutions_of(algorithm)))
-    }
-    labels = [
-        OBJECTIVE_TITLES.get(objective.name)
-        or f"{escape_dollars(objective.title)} [{as_formula(objective.unit)}]"
-        for objective in objectives
-    ]
+    signs = [objective.sign for objective in objectives]
+    fronts = {}
+    for algorithm in case.algorithms:
+        points = points_of(case, case.solutions_of(algorithm))
+        if len(points):
+            fronts[algorithm] = nondominated_points(points) * signs
 
     # A panel for each pair of objectives.
     pairs = list(combinations(range(len(objectives)), 2))
@@ -102,15 +97,18 @@ def draw_pareto_fronts(case: Case) -> Figure:
     )
 
     # The original vehicle in the same axes.
-    known_values = {
+    original = {
+        **case.original,
         F_DIFF.name: 0.0,
         F_NUM_DIFF.name: 0.0,
         F_SAFE.name: case.original.get(SAFETY_DEGREE, np.nan),
     }
-    original = [
-        {**case.original, **known_values}.get(objective.name, np.nan)
-        for objective in objectives
-    ]
+    labels = []
+    values = []
+    for objective in objectives:
+        label = f"{escape_dollars(objective.title)} [{as_formula(objective.unit)}]"
+        labels.append(OBJECTIVE_TITLES.get(objective.name, label))
+        values.append(original.get(objective.name, np.nan))
     for axis, pair in zip(axes, pairs, strict=True):
         for (algorithm, points), colour, marker in zip(
             fronts.items(), cycle(COLOURS), cycle(MARKERS), strict=False
@@ -127,9 +125,16 @@ def draw_pareto_fronts(case: Case) -> Figure:
                 color=colour,
                 label=label,
             )
-        x, y = (original[i] for i in pair)
-        axis.scatter(x, y, marker="*", s=80, color="black", label="original vehicle")
-        if objectives[pair[0]] == F_SAFE:
+        across, up = pair
+        axis.scatter(
+            values[across],
+            values[up],
+            marker="*",
+            s=80,
+            color="black",
+            label="original vehicle",
+        )
+        if objectives[across] == F_SAFE:
             axis.axvline(
                 0,
                 color="black",
@@ -137,7 +142,7 @@ def draw_pareto_fronts(case: Case) -> Figure:
                 linestyle="--",
                 label="collision: 0 or less",
             )
-        axis.set(xlabel=labels[pair[0]], ylabel=labels[pair[1]])
+        axis.set(xlabel=labels[across], ylabel=labels[up])
     _add_legend_below(figure, axes[0])
     return figure
 
@@ -154,11 +159,11 @@ def draw_convergence(case: Case) -> Figure:
     growth = compute_convergence(case)
     runs = growth.groupby("algorithm", sort=False)["run"].nunique()
     means = count_evaluations(case).groupby("algorithm")["simulated"].mean().to_dict()
-    labels = {
-        algorithm: f"{escape_dollars(case.title_of(str(algorithm)))} ({count} runs)\n"
-        f"mean: {means[algorithm]:,.0f} simulations"
-        for algorithm, count in runs.items()
-    }
+    labels = {}
+    for algorithm, count in runs.items():
+        title = escape_dollars(case.title_of(str(algorithm)))
+        mean = f"mean: {means[algorithm]:,.0f} simulations"
+        labels[algorithm] = f"{title} ({count} runs)\n{mean}"
     figure, ((axis,),) = new_figure(
         f"{case.name}: convergence", rows=1, columns=1, size=(6.4, 4.0)
     )
@@ -261,12 +266,9 @@ def draw_changed_characteristics(case: Case) -> Figure:
 
     # Shares by characteristic and number of changes, the most frequent first.
     shares = rq32(case)
-    order = shares[shares["j"] == ANY].sort_values("rank", kind="stable")[
-        "characteristic"
-    ]
-    table = shares.pivot(index="characteristic", columns="j", values="percent").loc[
-        order, list(shares["j"].unique())
-    ]
+    ranks = shares[shares["j"] == ANY].sort_values("rank", kind="stable")
+    table = shares.pivot(index="characteristic", columns="j", values="percent")
+    table = table.loc[ranks["characteristic"], shares["j"].unique()]
     title = f"{case.name}: characteristics changed in critical solutions"
     figure, ((axis,),) = new_figure(
         title, rows=1, columns=1, size=(7.6, 1.4 + 0.3 * len(table))
@@ -383,9 +385,9 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     errors = []
     drawings = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
     for case, (name, draw) in product(cases, FIGURES_OF_ONE_CASE.items()):
-        drawings[name if len(cases) == 1 else f"{case.name}-{name}"] = partial(
-            draw, case
-        )
+        if len(cases) > 1:
+            name = f"{case.name}-{name}"
+        drawings[name] = partial(draw, case)
     for name, draw_figure in drawings.items():
         try:
             figures[name] = draw_figure()
@@ -395,9 +397,8 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     # What cannot be drawn is said.
     if not figures:
         raise errors[0]
-    for reason in dict.fromkeys(
-        f"no figure: {error.source}: {error.problem}" for error in errors
-    ):
+    reasons = [f"no figure: {error.source}: {error.problem}" for error in errors]
+    for reason in dict.fromkeys(reasons):
         warn(reason)
     return figures
 
@@ -412,8 +413,9 @@ def save_figures(cases: Sequence[Case], directory: Path) -> None:
     """
     figures = draw_figures(cases)
     make_directory(directory)
-    for (name, figure), ending in product(figures.items(), ("png", "pdf")):
-        file_name = re.sub(
-            r"[^\w.-]", "-", f"{cases[0].name}-{name}" if len(cases) == 1 else name
-        ).strip("-")
-        save(figure, directory / f"{file_name}.{ending}", "figures")
+    for name, figure in figures.items():
+        if len(cases) == 1:
+            name = f"{cases[0].name}-{name}"
+        file_name = re.sub(r"[^\w.-]", "-", name).strip("-")
+        for ending in ("png", "pdf"):
+            save(figure, directory / f"{file_name}.{ending}", "figures")

@@ -6,7 +6,7 @@ evaluations. Of all evaluations: the non-dominated ones, and the growth of their
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+from itertools import pairwise, product
 
 import moocore
 import numpy as np
@@ -50,13 +50,8 @@ def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
     """The objectives' values, smaller being better, shape (rows, objectives); NaN where
     undefined.
     """
-    signs = [objective.sign for objective in case.scoring.objectives]
-    return (
-        frame[[objective.name for objective in case.scoring.objectives]].to_numpy(
-            dtype=float
-        )
-        * signs
-    )
+    signs = {item.name: item.sign for item in case.scoring.objectives}
+    return frame[list(signs)].to_numpy(float) * list(signs.values())
 
 
 def points_of(case: Case, frame: pd.DataFrame) -> FloatArray:
@@ -116,11 +111,9 @@ def frames_of_runs(
     UnanswerableError if none of them has rows.
     """
     groups = dict(list(frame.groupby(["algorithm", "run"])))
-    runs = [
-        (algorithm, run)
-        for algorithm in case.algorithms
-        for run in case.runs_of(algorithm)
-    ]
+    runs = list[tuple[str, int]]()
+    for algorithm in case.algorithms:
+        runs += product([algorithm], case.runs_of(algorithm))
     if not runs:
         case.require_solutions()  # says that no run is finished
     if not groups.keys() & set(runs):
@@ -147,16 +140,13 @@ def nondominated_evaluations(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no evaluations.
     """
-    runs = [
-        valid_evaluations(case, rows)
-        for _, rows in frames_of_runs(case, case.evaluations)
-    ]
-    fronts: list[pd.DataFrame] = [
-        rows[moocore.is_nondominated(minimised_values(case, rows), keep_weakly=True)]
-        for rows in runs
-        if len(rows)
-    ]
-    return pd.concat([case.evaluations[:0], *fronts], ignore_index=True)
+    fronts = [case.evaluations[:0]]
+    for _, evaluations in frames_of_runs(case, case.evaluations):
+        rows = valid_evaluations(case, evaluations)
+        if len(rows):
+            points = minimised_values(case, rows)
+            fronts.append(rows[moocore.is_nondominated(points, keep_weakly=True)])
+    return pd.concat(fronts, ignore_index=True)
 
 
 def describe_rules(case: Case) -> str:
@@ -170,12 +160,12 @@ def describe_rules(case: Case) -> str:
     columns = ["algorithm", "run", *case.characteristics.names]
     fronts = nondominated_evaluations(case)
     joined = case.solutions[columns].merge(fronts[columns], "outer", indicator=True)
-    others = joined.loc[joined["_merge"] != "both", "algorithm"].unique()
-    if not len(others):
+    algorithms = joined.loc[joined["_merge"] != "both", "algorithm"].unique()
+    if not len(algorithms):
         return ""
     return (
         "the algorithms choose their solutions by different rules, so means over solutions depend"
-        f" on the rule. The solutions of {', '.join(map(case.title_of, others))} are not all"
+        f" on the rule. The solutions of {', '.join(map(case.title_of, algorithms))} are not all"
         " non-dominated vehicles of a run. The table rq2-common applies one rule to all."
     )
 
@@ -195,12 +185,9 @@ def count_evaluations(case: Case) -> pd.DataFrame:
     search = case.study.search
     rows = []
     for (algorithm, run), group in frames_of_runs(case, case.evaluations):
-        last = int(group["evaluation"].max()) + 1
-        requested = (
-            search.evaluations
-            if last > search.evaluations - search.population
-            else last
-        )
+        requested = int(group["evaluation"].max()) + 1
+        if requested > search.evaluations - search.population:
+            requested = search.evaluations
         rows.append((algorithm, run, requested, len(group), search.evaluations))
     return pd.DataFrame(
         rows, columns=["algorithm", "run", "requested", "simulated", "budget"]
@@ -216,19 +203,17 @@ def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
         requested, simulated, budget = (
             rows[["requested", "simulated", "budget"]].mean().round()
         )
-        end = (
-            "it stops by its own rule"
-            if algorithm in case.stop_by_themselves
-            else "it ended early"
-        )
-        reasons = [end] if requested < budget else []
-        reasons += (
-            ["equal vehicles are simulated once"] if simulated < requested else []
-        )
-        words = f" ({' and '.join(reasons)})" if reasons else ""
-        texts.append(
-            f"{case.title_of(str(algorithm))} {simulated:,.0f} of {budget:,.0f}{words}"
-        )
+        text = f"{case.title_of(str(algorithm))} {simulated:,.0f} of {budget:,.0f}"
+        reasons = []
+        if requested < budget and algorithm in case.stop_by_themselves:
+            reasons.append("it stops by its own rule")
+        elif requested < budget:
+            reasons.append("it ended early")
+        if simulated < requested:
+            reasons.append("equal vehicles are simulated once")
+        if reasons:
+            text += f" ({' and '.join(reasons)})"
+        texts.append(text)
     return "; ".join(texts)
 
 
@@ -246,7 +231,7 @@ def why_few_evaluations(case: Case) -> str:
     )
     is_few = (sums["simulated"] < USUAL_SHARE * sums["budget"]) & ~counts[
         "algorithm"
-    ].isin([*case.stop_by_themselves])
+    ].isin(list(case.stop_by_themselves))
     if not is_few.any():
         return ""
     texts = describe_evaluations(case, counts[is_few])
@@ -297,7 +282,9 @@ def summarise_convergence(case: Case) -> pd.DataFrame:
     growth = compute_convergence(case).groupby(
         ["algorithm", "evaluations"], sort=False
     )["hypervolume"]
-    names = {"hypervolume": 0.5, "low": 0.25, "high": 0.75}
-    return pd.DataFrame(
-        {name: growth.quantile(share) for name, share in names.items()}
-    ).reset_index()
+    quartiles = {
+        "hypervolume": growth.quantile(0.5),
+        "low": growth.quantile(0.25),
+        "high": growth.quantile(0.75),
+    }
+    return pd.DataFrame(quartiles).reset_index()

@@ -85,35 +85,31 @@ class TwoSampleTest(NamedTuple):
         """The test whose effect size is above 0.5 where X is better: A12, or 1 - A12 where smaller
         values are better.
         """
-        return (
-            self
-            if larger_is_better
-            else self._replace(effect_size=1 - self.effect_size)
-        )
+        if larger_is_better:
+            return self
+        return self._replace(effect_size=1 - self.effect_size)
 
 
 def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     """Compare two samples without undefined values by U test and effect size."""
-    first = rounded_to_rank(x)
-    second = rounded_to_rank(y)
-    if not first.size or not second.size:
-        return TwoSampleTest(np.nan, np.nan, None, first.size, second.size, None)
-    is_exact = min(
-        first.size, second.size
-    ) <= EXACT_SAMPLE_SIZE and has_distinct_values([*first, *second])
-    name, method = (
-        (EXACT_TEST, "exact") if is_exact else (ASYMPTOTIC_TEST, "asymptotic")
-    )
-    test = scipy.stats.mannwhitneyu(first, second, method=method, nan_policy="raise")
-    a12 = float(test.statistic) / (first.size * second.size)
+    sample = rounded_to_rank(x)
+    baseline = rounded_to_rank(y)
+    if not sample.size or not baseline.size:
+        return TwoSampleTest(np.nan, np.nan, None, sample.size, baseline.size, None)
+    name, method = ASYMPTOTIC_TEST, "asymptotic"
+    is_small = min(sample.size, baseline.size) <= EXACT_SAMPLE_SIZE
+    if is_small and has_distinct_values([*sample, *baseline]):
+        name, method = EXACT_TEST, "exact"
+    test = scipy.stats.mannwhitneyu(sample, baseline, method=method, nan_policy="raise")
+    a12 = float(test.statistic) / (sample.size * baseline.size)
     return TwoSampleTest(
-        float(test.pvalue), a12, magnitude_of(a12), first.size, second.size, name
+        float(test.pvalue), a12, magnitude_of(a12), sample.size, baseline.size, name
     )
 
 
 def rounded_to_rank(values: ArrayLike) -> FloatArray:
     """Values with `RANKED_DIGITS` significant digits, of any shape, in one dimension."""
-    return np.array(_decimals(values), dtype=float)
+    return np.array(_decimals(values), float)
 
 
 def _decimals(values: ArrayLike) -> list[Decimal]:
@@ -143,7 +139,7 @@ def signed_rank_test(x: ArrayLike, y: ArrayLike = 0.0) -> TwoSampleTest:
     """
     # Differences of decimal numbers have no rounding errors.
     pairs = zip(_decimals(x), _decimals(np.broadcast_to(y, np.shape(x))), strict=True)
-    differences = np.array([first - second for first, second in pairs], dtype=float)
+    differences = np.array([value - baseline for value, baseline in pairs], float)
 
     # No test of undefined or equal values.
     if not differences.size or np.isnan(differences).any():
@@ -155,12 +151,11 @@ def signed_rank_test(x: ArrayLike, y: ArrayLike = 0.0) -> TwoSampleTest:
 
     # The effect, and the exact test if no values are tied.
     effect = float(np.mean(differences > 0) + np.mean(differences == 0) / 2)
-    is_exact = differences.size <= MAX_EXACT_RUNS and has_distinct_values(
-        [0.0, *np.abs(differences)]
-    )
-    name, method = (
-        (EXACT_SIGNED_TEST, "exact") if is_exact else (ASYMPTOTIC_SIGNED_TEST, "approx")
-    )
+    is_distinct = has_distinct_values([0.0, *np.abs(differences)])
+    is_exact = differences.size <= MAX_EXACT_RUNS and is_distinct
+    name, method = ASYMPTOTIC_SIGNED_TEST, "approx"
+    if is_exact:
+        name, method = EXACT_SIGNED_TEST, "exact"
     test = scipy.stats.wilcoxon(differences, correction=not is_exact, method=method)
     return TwoSampleTest(
         float(test.pvalue), effect, magnitude_of(effect), differences.size, 1, name
@@ -174,7 +169,7 @@ def correct_by_holm(p_values: Iterable[float]) -> FloatArray:
     values = pd.Series(list(p_values), dtype=float)
     ascending = values.dropna().sort_values()
     corrected = (ascending * np.arange(len(ascending), 0, -1)).clip(upper=1.0).cummax()
-    return np.asarray(corrected.reindex(values.index), dtype=float)
+    return np.asarray(corrected.reindex(values.index), float)
 
 
 def effect_interval(effect: float, m: int, n: float, alpha: float = ALPHA) -> Interval:
@@ -199,13 +194,12 @@ def effect_interval(effect: float, m: int, n: float, alpha: float = ALPHA) -> In
 
     if math.isnan(effect):
         return math.nan, math.nan
+    low, high = 0.0, 1.0
     # From beside the effect, where the excess is below 0, whatever the effect.
-    low, high = (
-        end
-        if effect == end
-        else scipy.optimize.brentq(excess, effect + 1e-9 * (end - effect), end)
-        for end in (0.0, 1.0)
-    )
+    if effect > low:
+        low = scipy.optimize.brentq(excess, effect + 1e-9 * (low - effect), low)
+    if effect < high:
+        high = scipy.optimize.brentq(excess, effect + 1e-9 * (high - effect), high)
     return low, high
 
 
@@ -213,8 +207,10 @@ def median_interval(values: ArrayLike, alpha: float = ALPHA) -> Interval:
     """The interval of a median, at a confidence of at least 1 - alpha, between two order
     statistics; NaN if there are too few values.
     """
-    ordered = np.sort(np.asarray(values, dtype=float))
+    ordered = np.sort(np.asarray(values, float))
     rank = int(
         scipy.stats.binom.ppf(alpha / 2, ordered.size, 0.5)
     )  # the first whose probability is not too small
-    return (ordered[rank - 1], ordered[-rank]) if rank else (math.nan, math.nan)
+    if rank:
+        return (ordered[rank - 1], ordered[-rank])
+    return (math.nan, math.nan)

@@ -45,23 +45,21 @@ class PaperTable(NamedTuple):
     def of(cls, name: str, compute: Compute) -> PaperTable:
         """A table as the file has it."""
         table = DATA["tables"][name]
-        columns = dict[str, Column]()
-        known = DATA["columns"] | table.get("own", {})
+        columns = {}
+        declared = DATA["columns"] | table.get("own", {})
         for key in table["columns"]:
-            facts = (
-                {"meaning": known[key]}
-                if isinstance(known[key], str)
-                else dict(known[key])
-            )
+            facts = declared[key]
+            if isinstance(facts, str):
+                facts = {"meaning": facts}
+            facts = {"unit": "", **facts}
             has_interval = facts.pop("interval", False)
-            column = Column(**{"unit": "", **facts})
-            columns |= with_interval(key, column) if has_interval else {key: column}
-        return cls(
-            table["title"],
-            compute,
-            columns,
-            Wide(**table["wide"]) if "wide" in table else None,
-        )
+            columns[key] = Column(**facts)
+            if has_interval:
+                columns |= with_interval(key, columns[key])
+        wide = None
+        if "wide" in table:
+            wide = Wide(**table["wide"])
+        return cls(table["title"], compute, columns, wide)
 
 
 DATA = shipped_table("questions/research_questions/tables.toml")
