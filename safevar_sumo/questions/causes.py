@@ -196,23 +196,21 @@ def count_needed(
     names = characteristics.vehicle.names
     number = max(len(changed), 1)
     changed = changed[:, characteristics.of_vehicle]
-    needed = np.zeros(len(names))
+    counts = np.zeros(len(names))
     in_some = np.zeros(len(names))
     for group in filter(None, causes):
-        is_in_cause = np.array(
-            [[name in cause.changes for name in names] for cause in group]
-        )
-        needed += is_in_cause.all(axis=0)
-        in_some += is_in_cause.any(axis=0)
+        is_in_cause = [np.isin(names, list(cause.changes)) for cause in group]
+        counts += np.all(is_in_cause, axis=0)
+        in_some += np.any(is_in_cause, axis=0)
 
     # Of a sample the intervals are those of all failures.
-    intervals = np.repeat(needed[:, np.newaxis] / number, 2, axis=1)
+    intervals = np.repeat(counts[:, None] / number, 2, axis=1)
     if len(changed) < failures:
-        intervals = np.array([clopper_pearson(int(count), number) for count in needed])
+        intervals = np.array([clopper_pearson(int(count), number) for count in counts])
     shares = {
         "characteristic": names,
         "changed": changed.sum(axis=0) / number,
-        "needed": needed / number,
+        "needed": counts / number,
         "needed_low": intervals[:, 0],
         "needed_high": intervals[:, 1],
         "in_some": in_some / number,
@@ -238,6 +236,13 @@ def directions(
     return tuple(texts)
 
 
+def _kinds_of(
+    characteristics: CharacteristicSet, causes: Sequence[Cause]
+) -> set[tuple[str, ...]]:
+    """The causes without the sizes of their changes."""
+    return {directions(characteristics, cause.changes) for cause in causes}
+
+
 def count_distinct_causes(
     characteristics: CharacteristicSet, causes: Sequence[Sequence[Cause]]
 ) -> pd.DataFrame:
@@ -250,10 +255,8 @@ def count_distinct_causes(
         failures with this cause; and `share`, their share of all failures.
     """
     counts = Counter[tuple[str, ...]]()
-    for of_failure in causes:
-        counts.update(
-            {directions(characteristics, cause.changes) for cause in of_failure}
-        )
+    for group in causes:
+        counts.update(_kinds_of(characteristics, group))
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
     rows = [(key, counts[key], counts[key] / len(causes)) for key in order]
     return pd.DataFrame(rows, columns=["cause", "failures", "share"])
@@ -287,10 +290,7 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     rows = settings.to_numpy(dtype=float)
     causes = find_minimal_causes(evaluator, rows, case.unsafe, price)
     kinds = pd.Series(
-        [
-            {directions(evaluator.characteristics, cause.changes) for cause in group}
-            for group in causes
-        ],
+        [_kinds_of(evaluator.characteristics, group) for group in causes],
         settings.index,
         name="kind",
     )
