@@ -192,7 +192,7 @@ VERSIONS = {
     "needless": (
         {"ads": {"parameters": {"braking_share": 0.1}}},
         "decide",
-        r"needlessly in \d+ of \d+ benign scenes .*, and version wear in \d+\. \d+ of the",
+        r"needlessly in \d+ of \d+ benign scenes .*, and version wear in \d+\. All \d+ changed",
     ),
     "slower": (
         {"vehicle": {"characteristics": {"sensorLatency": {"original": 0.15}}}},
