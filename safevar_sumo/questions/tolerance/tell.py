@@ -185,7 +185,7 @@ def _limits_table(facts: Told) -> pd.DataFrame:
     assert isinstance(end, Column)
     shown = {**LIMITS, "alone_low": end._replace(is_detail=facts.box is not None)}
     texts = [text for row in rows if (text := row["fails_first"])]
-    words = {text: text.removeprefix("the car ") for text in texts}
+    words = {text: text.removeprefix("the vehicle ") for text in texts}
     table = tabulate(
         LIMITS_TITLE, shown, [[*row.values()] for row in rows], words=words
     )
@@ -315,7 +315,7 @@ def _row_in_ranges(facts: Told, ranges: InRanges) -> tuple[object, ...]:
     least = worst_of(ranges.unsafe, ranges.attacks)
     vehicle: tuple[object, ...] = (None, None)
     if len(unsafe):
-        verdict = "they do not hold: a car within them is unsafe."
+        verdict = "they do not hold: a vehicle within them is unsafe."
         failure = _slowest_failure(facts, ranges.task.oracle, unsafe)
         if failure is not None:
             verdict = f"they do not hold: {failure.words}."

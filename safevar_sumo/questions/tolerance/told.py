@@ -314,12 +314,12 @@ def broken_in_words(facts: Told) -> list[str]:
                 texts.append(f"{item.name} {limit_text(item, end)}")
     case = next(iter(facts.limits.broken.values()))
     failure = facts.failure(case, facts.box_of(facts.limits.specified))
-    words = "the car is unsafe" if failure is None else failure.words
+    words = "the vehicle is unsafe" if failure is None else failure.words
     return [f"{join_phrases(texts)}: with all specified limits, {words}"]
 
 
 def _outside_in_words(facts: Told, column: int) -> str:
-    """What is wrong with a limit: `brakeTorque 0.5: the car hits a pedestrian (outside by 0.08)`.
+    """What is wrong with a limit: `payload 500: the vehicle hits a pedestrian (outside by 8)`.
 
     At the specified value itself the vehicle may be safe; then what fails beyond the limit is said.
     """
@@ -340,9 +340,7 @@ def _outside_in_words(facts: Told, column: int) -> str:
                 return f"{item.name} {value}: {failure.words} (outside by {outside})"
     end = low if high is None else high
     assert end is not None
-    return (
-        f"{item.name} {limit_text(item, end)}: the car is unsafe (outside by {outside})"
-    )
+    return f"{item.name} {limit_text(item, end)}: the vehicle is unsafe (outside by {outside})"
 
 
 def _sets_in_words(facts: Told) -> Iterator[str]:
