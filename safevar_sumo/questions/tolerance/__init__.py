@@ -156,6 +156,10 @@ def tolerance(
     usual = _usual_settings(evaluator, len(columns), fits)
     planned = {name: (1 + len(smaller)) * number for name, number in usual.items()}
     evaluator.begin(planned, least=1 + 2 * len(columns) * LEAST_VALUES)
+    is_few = evaluator.left is not None
+    if is_few and fits is None:
+        # Few simulations do not suffice for other parameter sets.
+        fits = 0
     specified = specified_limits(study, limits, columns)
     _check_drawable(evaluator)
 
@@ -176,7 +180,6 @@ def tolerance(
     is_safe = not request.is_unsafe(original)
     task = _asked_of(request if is_safe else request._replace(fits=0), evaluator)
     results = find_limits(task, wider) if is_safe else no_limits(task)
-    is_few = evaluator.left is not None
     facts = Told(
         task=task,
         limits=results,

@@ -90,7 +90,13 @@ def find_limits(task: Asked, wider: FoundLimits | None = None) -> FoundLimits:
     with phases.stage(OTHER_SETS_STAGE):
         for number, fit in enumerate(task.fits[1:], 1):
             phases.begin_round(number, len(task.fits) - 1, is_known=True)
-            limits = _with_set(task, limits, fit)
+            try:
+                limits = _with_set(task, limits, fit)
+            except Exhausted:
+                # Nothing is claimed of a set that was not searched to the end.
+                failures = Failures(task.nothing, task.nothing)
+                limits = limits._replace(sides=None, failures=failures)
+                break
     if limits.sides is None or task.effort.share >= 1:
         return limits
     return limits._replace(beyond=_beyond(task, limits, limits.sides))

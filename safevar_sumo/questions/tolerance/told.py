@@ -393,7 +393,7 @@ def _box_in_words(facts: Told) -> Iterator[str]:
             words = described[""].words
         yield f"With the original vehicle itself {words}: there no limit is claimed."
     is_single = number == 1 and not facts.task.left_out
-    if is_single and facts.study.spread and not facts.is_rough:
+    if is_single and facts.study.spread:
         yield (
             "The limits were computed with one parameter set of the vehicle model; the study's"
             " other sets were not tried."
