@@ -66,7 +66,7 @@ def test_stored_outputs_are_of_todays_vehicle() -> None:
         if text.startswith("<Results of sun")
     ]
     assert results == results[:1] * len(SHOWN)
-    assert "of the unsafe vehicles have " in "".join(texts["answers"])
+    assert "of all unsafe vehicles lie in this region" in "".join(texts["answers"])
     assert all(path.stat().st_size < 500_000 for path in NOTEBOOKS.glob("*.ipynb"))
 
 
@@ -166,8 +166,8 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     printed = "".join(_texts(notebook))
     for result in (
         "joint limits hold at the same time",
-        "So the probability is about",
-        "of the unsafe vehicles have ",
+        "The probability that a vehicle",
+        "of all unsafe vehicles lie in this region",
     ):
         assert result in printed
     assert not [output for output in outputs if output.get("name") == "stderr"]

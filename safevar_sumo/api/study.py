@@ -12,10 +12,11 @@ from typing import Annotated, Literal
 
 from msgspec.structs import replace as replace_in
 
+from safevar_sumo.api import words
 from safevar_sumo.api.running import load_for_search, run
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
+from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Criterion
 from safevar_sumo.questions.by_criterion import cases_by, study_by
 from safevar_sumo.questions.case import Case, UnanswerableError, are_collisions
@@ -29,13 +30,16 @@ from safevar_sumo.questions.research_questions.answer import (
 )
 from safevar_sumo.questions.research_questions.comparisons import titles_of
 from safevar_sumo.questions.research_questions.tables import TABLES
+from safevar_sumo.questions.sentence import Sentence, Verdict
 from safevar_sumo.questions.subject import Results, load
-from safevar_sumo.questions.tables import Rows
+from safevar_sumo.questions.tables import Rows, shipped_columns
 from safevar_sumo.questions.words import (
     EXACT,
     change_texts,
+    count_in_words,
     demanded_in_words,
     encounter_in_words,
+    notes_on,
     number_of,
     replay_command,
 )
@@ -58,27 +62,7 @@ states its own number.
 """
 FEW = 60
 """Number of simulations that the verdict takes in a simulator of the user's own, roughly."""
-ALGORITHMS: Columns = {
-    "algorithm": "algorithm",
-    "finished": Column("", "finished runs", is_detail=True),
-    "runs": "runs",
-    "simulated": "different settings simulated so far",
-    "collisions": "those that collide, and the original vehicle is safe in the same encounter",
-    "invalid_tests": (
-        "those that leave a test's speed before the ADS acts: neither failure nor success"
-    ),
-    "simulator_errors": "those that cannot be simulated",
-    "best": Column(
-        "m", "least safety degree; minus the collision's speed in m/s", ".2f"
-    ),
-    "solutions": "solutions of finished runs",
-}
-CHANGES: Columns = {
-    "characteristic": "characteristic that is changed",
-    "unit": "unit of its values",
-    "original": Column("", "value of the original vehicle", ".10g"),
-    "value": Column("", "value with which the vehicle is unsafe", ".10g"),
-}
+ALGORITHMS, CHANGES = shipped_columns("study").values()
 MAX_LISTED = 3
 """Largest number of changes that the verdict lists; the table has them all."""
 RUN_TESTS = ("rq1-runs", "rq2-runs")
@@ -223,14 +207,8 @@ def _found(
     answer = summarise(results)
     reason = why_no_verdict(system)
     (case,) = cases_by([results.case], unsafe, jobs, show_no_progress)
-    criterion = ""
-    if unsafe is not None:
-        criterion = f" --unsafe {quote(str(unsafe))}"
-    directory = quote(str(results.directory))
-    questions = f"explain {study}", f"explain {directory}", f"tolerance {directory}"
-    advice = ", ".join(
-        f"{PROGRAM_COMMAND} {question}{criterion}" for question in questions
-    )
+    criterion = "" if unsafe is None else f" --unsafe {quote(str(unsafe))}"
+    advice = f"{PROGRAM_COMMAND} explain {study}{criterion}"
 
     # Questions refuse an original encounter in which the original vehicle is not safe.
     demanded = results.case.scoring.safe_original
@@ -243,17 +221,18 @@ def _found(
     if system.meets_nobody and not (unsafe or results.study.unsafe.criterion):
         advice = ""
     if breach := _breach_of_original(case):
-        sentence = f"{breach}: no change is needed."
+        sentences = [words.ALREADY_UNSAFE.fill(breach=breach)]
         advice = ""
     else:
-        sentence, changes = _verdict(results, case, jobs)
+        sentences, changes = _verdict(results, case, jobs, study)
     tables = answer.tables
     if changes:
-        frame = tabulate("The fewest unsafe changes that were found", CHANGES, changes)
+        title = "The smallest number of changes that the search found to be unsafe"
+        frame = tabulate(title, CHANGES, changes)
         tables = {"algorithms": tables["algorithms"], "fewest": frame, **tables}
     return replace(
         answer,
-        verdict=reason or sentence,
+        verdict=reason or Verdict(sentences),
         next=advice,
         numbers={"driven": not reason, **answer.numbers},
         tables=tables,
@@ -291,45 +270,63 @@ def _breach_of_original(case: Case) -> str:
     original = drive_and_score(system, case.characteristics.original_settings)
     if not case.unsafe.of(original)[0]:
         return ""
-    return f"The original vehicle itself {case.unsafe.breach_in_words(original)}"
+    return case.unsafe.breach_in_words(original)
 
 
-def _verdict(results: Results, case: Case, jobs: int | None) -> tuple[str, Rows]:
+def _verdict(
+    results: Results, case: Case, jobs: int | None, study: str
+) -> tuple[list[Sentence], Rows]:
     """How many solutions of a case of the results are unsafe, and how few changes are enough; and
     the rows of `CHANGES` of a vehicle with these.
     """
     members = case.characteristics
     solutions = case.different_solutions
     if solutions.empty:
-        return f"The search found no solution: {case.why_no_solution}.", []
+        return [words.NOTHING_RETURNED.fill(reason=case.why_no_solution)], []
     number = int(case.unsafe.rows(solutions).sum())
+    total = len(solutions)
+    template = words.UNSAFE if number else words.NOTHING_UNSAFE
     sentences = [
-        f"The search found {number_of(len(solutions), 'different solution')};"
-        f" of them {case.unsafe.number_in_words(number)}."
+        template.fill(
+            unsafe=case.unsafe,
+            total=total,
+            count=count_in_words(number, total),
+            collide=case.unsafe.verbs[number > 1],
+        ),
+        *notes_on(case.unsafe, *demanded_in_words(results.study)),
     ]
     if failed := len(case.failures):
-        sentences.append(f"{number_of(failed, 'setting')} could not be simulated.")
-    sentences += [*demanded_in_words(results.study), case.unsafe.remark]
-    counts = " ".join(filter(None, sentences))
+        vehicles = number_of(failed, "vehicle")
+        sentences.append(words.NOT_SIMULATED.fill(failed=vehicles))
     fewest = fewest_changes(case, jobs)
     if fewest is None:
-        return counts, []
+        return sentences, []
 
     values = members.named(fewest.settings[0])
     changed = [item for item in members if values[item.name] != item.original]
     texts = change_texts(members.vehicle, values, are_printed=True)
-    where = encounter_in_words(members, values, are_printed=True)
+    count = len(texts)
+    template = words.FEW_CHANGES if count <= MAX_LISTED else words.MANY_CHANGES
+    if not count:
+        template = words.ORIGINAL_UNSAFE
     options = "".join(
         f" --set {item.name}={values[item.name]:{EXACT}}" for item in changed
     )
-    if 0 < len(texts) <= MAX_LISTED:
-        where += f": {', '.join(texts)}"
-    return (
-        f"{counts} With {number_of(len(texts), 'change')}, the fewest that were found, the vehicle"
-        f" {case.unsafe.breach_in_words(fewest)}{where}. It is simulated by"
-        f" {replay_command(str(results.directory))}{options}.",
-        [(item.name, item.unit, item.original, values[item.name]) for item in changed],
-    )
+    command = f"{replay_command(str(results.directory))}{options}"
+    sentences += [
+        template.fill(
+            unsafe=case.unsafe,
+            count=number_of(count, "change"),
+            changes=", ".join(texts),
+            breach=case.unsafe.breach_in_words(fewest),
+            where=encounter_in_words(members, values, are_printed=True),
+        ),
+        words.NO_PROOF.fill(study=study),
+        words.COMMAND.fill(command=command),
+    ]
+    return sentences, [
+        (item.name, item.unit, item.original, values[item.name]) for item in changed
+    ]
 
 
 def summarise(results: Results) -> Answer:
@@ -389,8 +386,14 @@ def summarise(results: Results) -> Answer:
     return Answer(
         question="study",
         study=study,
-        verdict=(
-            f"{len(results.finished)} of {number_of(runs, 'run')} finished in {results.directory}."
+        verdict=Verdict(
+            [
+                words.PROGRESS.fill(
+                    finished=len(results.finished),
+                    runs=number_of(runs, "run"),
+                    directory=results.directory,
+                )
+            ]
         ),
         numbers={
             "results": str(results.directory),

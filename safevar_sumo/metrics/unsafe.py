@@ -139,19 +139,6 @@ class Unsafe:
             clearance += ", from bumper to bumper"
         return clearance
 
-    def number_in_words(self, number: float) -> str:
-        """How many vehicles are unsafe: `1,234 collide`, `none is unsafe (drac > 6, or a
-        collision)`.
-        """
-        counted = f"{number:,}"
-        if not number:
-            counted = "none"
-        elif number != int(number):
-            counted = f"{number:,.1f}"
-        if self.is_collision and not self.keep:
-            return f"{counted} {self.verbs[number > 1]}"
-        return f"{counted} {UnsafeStated.verbs[number > 1]} ({self.description})"
-
     @property
     def remark(self) -> str:
         """What to know of a screening limit, in a sentence; empty for any other criterion."""

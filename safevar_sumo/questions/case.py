@@ -16,7 +16,7 @@ import pandas as pd
 
 from safevar_sumo.errors import InputError, check_text, describe_error
 from safevar_sumo.metrics import PUBLISHED_SCORING, Measure, Scoring, Unsafe
-from safevar_sumo.questions.words import number_of
+from safevar_sumo.questions.words import count_in_words
 from safevar_sumo.records import (
     Evaluations,
     FloatArray,
@@ -164,17 +164,20 @@ class Case:
         # The settings that a search may return, as far as there are any.
         feasible = self.evaluations[self.scoring.feasible_rows(self.evaluations)]
         if feasible.empty:
-            margin = self.study.scenario.margin or 0.0
             return (
-                f"in none of {number_of(len(self.evaluations), 'encounter')} the original vehicle"
-                f" keeps at least {margin:g} m of clearance (scenario.margin)"
+                "the original vehicle keeps at least"
+                f" {self.study.scenario.margin or 0.0:g} m of clearance (scenario.margin) in none"
+                f" of the {len(self.evaluations):,} encounters"
             )
-        objectives = [objective.name for objective in self.scoring.objectives]
-        valid = feasible.dropna(subset=objectives)
+        valid = feasible.dropna(
+            subset=[objective.name for objective in self.scoring.objectives]
+        )
+        number = int(self.unsafe.rows(valid).sum())
         return (
-            f"the algorithms returned none of {number_of(len(valid), 'setting')} that have a value"
-            " of every objective; of these,"
-            f" {self.unsafe.number_in_words(int(self.unsafe.rows(valid).sum()))}"
+            f"the algorithms selected none of the {len(valid):,} simulated vehicles that have a"
+            " value for every objective (quantity that the search minimises)."
+            f" {count_in_words(number, len(valid)).capitalize()} vehicles with such values"
+            f" {self.unsafe.verbs[number > 1]}"
         )
 
     def require_solutions(self) -> None:

@@ -4,7 +4,7 @@ rest on.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from inspect import getdoc
 from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,8 +17,10 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.errors import InputError, check_name, warn
 from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, UNSAFE_SHARE
 from safevar_sumo.plugins import Lookup
-from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
+from safevar_sumo.questions.answer import Answer, contents, tabulate
 from safevar_sumo.questions.options import Range
+from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.scenarios import (
     SCENARIOS,
@@ -37,54 +39,23 @@ from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 if TYPE_CHECKING:
-    from safevar_sumo.check.trials import Extent
+    from safevar_sumo.check.trials import Extent, Finding
 
 NO_STUDY: Any = None
-NAME: Columns = {"name": "name in a study"}
-DESCRIBED: Columns = NAME | {"description": "what it is"}
-SCENARIO: Columns = DESCRIBED | {
-    "search": "axes of its encounters, and their widest ranges"
-}
-STUDIES: Columns = {
-    **NAME,
-    "title": "its title",
-    "vehicle": "its vehicle",
-    "ads": "its ads",
-    "scenario": "its scenario",
-    "weather": "its weather",
-}
-DOMAINS: Columns = {
-    "unit": "its unit",
-    "original": Column("as unit", "value of the original vehicle", "g"),
-    "lower": Column("as unit", "lower end of its domain", "g"),
-    "upper": Column("as unit", "upper end of its domain", "g"),
-}
-VEHICLES: Columns = {
-    "vehicle": "vehicle",
-    "name": "characteristic",
-    **DOMAINS,
-    "threshold": Column("as unit", "smallest change that the filter keeps", "g"),
-    "meaning": Column("", "what it is", is_shown=False),
-    "counterpart": Column("", "what it is in other models", is_shown=False),
-}
-CHARACTERISTICS: Columns = {
-    **NAME,
-    "short_name": Column("", "its name in sentences", is_detail=True),
-    **DOMAINS,
-    "measurement": Column("", "how a workshop measures it", is_shown=False),
-    "remedy": Column("", "what to do with a vehicle beyond its limit", is_shown=False),
-    "workshop": "how a workshop measures it, and what to do with a vehicle beyond its limit",
-}
-METRICS_TITLE = (
-    "Metrics; TET and TIT use TTC = L_s / v_L, ttc_min and drac TTC_p = gap / (v - u)"
-)
-WEATHER: Columns = NAME | {
-    "road_friction": "factor on the tyres' friction",
-    "visibility": "factor on the distance at which sensors detect an obstacle",
-    "recognition_delay": Column("s", "additional time to recognise somebody"),
-    "light": "day or night",
-    "water": Column("mm", "depth of the water on the road"),
-    "effect": "none: an ADS drives as in clear weather, unless its parameters differ",
+LISTED = shipped_columns("list")
+VEHICLES, CHARACTERISTICS = LISTED["vehicles"], LISTED["characteristics"]
+TITLES = {
+    "studies": "Studies",
+    "vehicles": "Characteristics of vehicles",
+    "ads": "Driving systems",
+    "scenarios": "Scenarios",
+    "weathers": "Weathers",
+    "algorithms": "Algorithms",
+    "metrics": (
+        "Safety metrics (TET and TIT use TTC = L_s / v_L; ttc_min and drac use"
+        " TTC_p = gap / (v - u))"
+    ),
+    "objectives": "Objectives of a search (every metric can be an objective, too)",
 }
 FURTHER_OBJECTIVES = {
     name: f"{objective.title.capitalize()} [{objective.unit}]."
@@ -94,40 +65,12 @@ FURTHER_OBJECTIVES = {
 FURTHER_OBJECTIVES[UNSAFE_SHARE.name] = (
     f"Only with [scenario] repeats: {UNSAFE_SHARE.description}"
 )
-FINDINGS: Columns = {
-    "finding": "what is wrong",
-    "where": "place in the user's code",
-    "input": "input that shows it",
-    "expected": "what is expected",
-    "check": "name of the check",
-    "advice": "what to do",
-}
-BLOCK: Columns = {
-    "part": "where, found, expected, what to do",
-    "text": "this part of a finding",
-}
-
-
-CACHE: Columns = {
-    "folder": "where simulations are kept",
-    "entries": "number of entries, each with up to some thousand simulations",
-    "size": Column("MB", "size on disk", ".1f"),
-    "limit": Column("MB", "size from which on the oldest simulations make room", ".0f"),
-}
+BLOCK, FINDINGS = shipped_columns("check").values()
 
 
 @contents(
     "passed",
-    studies=STUDIES,
-    vehicles=VEHICLES,
-    ads=DESCRIBED,
-    scenarios=SCENARIO,
-    weathers=WEATHER,
-    algorithms=DESCRIBED,
-    metrics=DESCRIBED,
-    objectives=DESCRIBED,
-    characteristics=CHARACTERISTICS,
-    cache=CACHE,
+    **LISTED,
 )
 def list_models(kind: str | None = None, study: str | None = None) -> Answer:
     """List what the package contains: studies, vehicles, driving systems, scenarios, weathers,
@@ -159,21 +102,19 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
     described_metrics = [(name, metric.description) for name, metric in metrics]
 
     # A table for each kind.
+    rows: dict[str, Any] = {
+        "studies": _studies(),
+        "vehicles": _characteristics(),
+        "ads": _described(ADS),
+        "scenarios": _scenarios(scenarios),
+        "weathers": weathers,
+        "algorithms": DESCRIPTIONS.items(),
+        "metrics": described_metrics,
+        "objectives": FURTHER_OBJECTIVES.items(),
+    }
     tables = {
-        "studies": tabulate("Studies", STUDIES, _studies()),
-        "vehicles": tabulate(
-            "Characteristics of vehicles", VEHICLES, _characteristics()
-        ),
-        "ads": tabulate("ADSs", DESCRIBED, _described(ADS)),
-        "scenarios": tabulate("Scenarios", SCENARIO, _scenarios(scenarios)),
-        "weathers": tabulate("Weathers", WEATHER, weathers),
-        "algorithms": tabulate("Algorithms", DESCRIBED, DESCRIPTIONS.items()),
-        "metrics": tabulate(METRICS_TITLE, DESCRIBED, described_metrics),
-        "objectives": tabulate(
-            "Objectives; every metric can be one, too",
-            DESCRIBED,
-            FURTHER_OBJECTIVES.items(),
-        ),
+        name: tabulate(TITLES[name], LISTED[name], listed)
+        for name, listed in rows.items()
     }
     if kind is not None:
         check_name(
@@ -183,10 +124,12 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
             [*tables, "characteristics", "cache"],
         )
         tables = {kind: tables[kind]}
-    texts = [f"{frame.iloc[:, 0].nunique()} {name}" for name, frame in tables.items()]
+    counts = ", ".join(
+        f"{frame.iloc[:, 0].nunique()} {name}" for name, frame in tables.items()
+    )
+    verdict = f"The package has {counts}."
     if scenarios is not SCENARIOS:
-        texts = list(scenarios)
-    verdict = f"A study can name {', '.join(texts)}."
+        verdict = f"A study can name {', '.join(scenarios)}."
     return Answer(
         question="list",
         study=NO_STUDY,
@@ -211,7 +154,10 @@ def _list_characteristics(name: str | None) -> Answer:
     return Answer(
         question="list",
         study=study,
-        verdict=f"{study.name} varies {number_of(len(rows), 'characteristic')}.",
+        verdict=(
+            f"The study {study.name} changes {number_of(len(rows), 'characteristic')} of the"
+            " vehicle."
+        ),
         numbers={"passed": True},
         tables={"characteristics": tabulate(title, CHARACTERISTICS, rows)},
     )
@@ -224,7 +170,10 @@ def _list_cache() -> Answer:
     folder = simulations.cache_folder()
     variable = simulations.FOLDER_VARIABLE
     limit = simulations.SIZE_LIMIT / 1e6
-    verdict = f"Simulations are not kept: {variable} is {simulations.OFF}."
+    verdict = (
+        f"Simulations are not kept, because the environment variable {variable} is"
+        f" {simulations.OFF}."
+    )
     rows = []
     if folder is not None:
         entries = size = 0
@@ -232,8 +181,9 @@ def _list_cache() -> Answer:
             entries, size = simulations.Cache(folder).extent()
         rows = [(str(folder), entries, size / 1e6, limit)]
         verdict = (
-            f"The folder {folder} keeps earlier simulations ({size / 1e6:.1f} MB of at most"
-            f" {limit:,.0f} MB). You may delete it, and {variable} names another folder."
+            f"Earlier simulations are kept in {folder}: {size / 1e6:.1f} MB of at most"
+            f" {limit:,.0f} MB. You may delete this folder. The environment variable {variable}"
+            " names another one."
         )
     return Answer(
         question="list",
@@ -241,7 +191,7 @@ def _list_cache() -> Answer:
         study=NO_STUDY,
         verdict=verdict,
         numbers={"passed": True},
-        tables={"cache": tabulate("Cache of simulations", CACHE, rows)},
+        tables={"cache": tabulate("Cache of simulations", LISTED["cache"], rows)},
     )
 
 
@@ -259,15 +209,11 @@ def _in_a_workshop(item: Characteristic) -> str | None:
 
 
 def _studies() -> Iterator[tuple[str, ...]]:
+    facts = attrgetter(
+        *("name", "title", "vehicle.model", "ads.model", "scenario.model")
+    )
     for study in map(read_study, study_names()):
-        yield (
-            study.name,
-            study.title,
-            study.vehicle.model,
-            study.ads.model,
-            study.scenario.model,
-            weather_of(study.weather).name,
-        )
+        yield *facts(study), weather_of(study.weather).name
 
 
 def _characteristics() -> Iterator[tuple[float | str, ...]]:
@@ -338,7 +284,8 @@ def check(
         extents.append(extent)
         if extent.seconds > LONG:
             warn(
-                f"{number_of(extent.vehicles, 'vehicle')}, about {extent.seconds:.0f} s"
+                f"the check simulates {number_of(extent.vehicles, 'vehicle')}, which takes about"
+                f" {extent.seconds:.0f} s"
             )
 
     # First, as a simulator may end its process.
@@ -361,13 +308,10 @@ def check(
             ("expected", item.expected),
             ("what to do", advice),
         ]
-    number = "passed"
-    if findings:
-        number = number_of(len(findings), "finding")
     return Answer(
         question="check",
         study=study,
-        verdict=f"{name}: {number}.{''.join(map(_extent_in_words, extents))}",
+        verdict=Verdict(_sentences(name, findings, extents)),
         numbers={
             "passed": not findings,
             "vehicles": sum(extent.vehicles for extent in extents),
@@ -381,15 +325,24 @@ def check(
     )
 
 
-def _extent_in_words(extent: Extent) -> str:
-    """What was simulated, and what was not tried."""
-    points = number_of(extent.points, "point")
-    text = f" {number_of(extent.vehicles, 'vehicle')} at {points} of the study."
-    remainders = []
-    if extent.points < extent.all_points:
-        remainders.append(f"the other {extent.all_points - extent.points} points")
-    if extent.vehicles < extent.all_vehicles:
-        remainders.append(f"more vehicles (--vehicles {extent.all_vehicles})")
-    if remainders:
-        text += f" Not tried: {' and '.join(remainders)}."
-    return text
+def _sentences(
+    name: str, findings: Sequence[Finding], extents: Iterable[Extent]
+) -> Iterator[Sentence]:
+    """What was found, what was simulated, and what was left out."""
+    if not findings:
+        yield Sentence("answer", f"{name} passed all checks.")
+    for finding in findings[:1]:
+        number = number_of(len(findings), "finding")
+        yield Sentence("answer", f"{name} failed: {number}. {finding}.")
+    for extent in extents:
+        points = number_of(extent.points, "test case")
+        vehicles = number_of(extent.vehicles, "vehicle")
+        further = number_of(extent.all_points - extent.points, "further test case")
+        text = f"The check simulated {vehicles} in {points} of the study."
+        if extent.points < extent.all_points:
+            text += f" The check left out {further}."
+        if extent.vehicles < extent.all_vehicles:
+            text += (
+                f" The option --vehicles {extent.all_vehicles} checks more vehicles."
+            )
+        yield Sentence("evidence", text)

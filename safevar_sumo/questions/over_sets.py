@@ -4,7 +4,7 @@ vehicles: the first ones that `risk`, `rules` and `explain` sample.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -15,7 +15,8 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import models_of
 from safevar_sumo.questions.sampling import clopper_pearson
-from safevar_sumo.questions.words import percentage
+from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.words import interval_in_words, percentage
 from safevar_sumo.records import BoolArray, FloatArray, JsonObject, NamedValues
 from safevar_sumo.study import Study
 
@@ -25,6 +26,21 @@ INTERVALS = "by_set_intervals"
 """The number of an answer that has the intervals."""
 VEHICLES = 400
 """Number of vehicles that are simulated with each set."""
+ONE_SET = Sentence(
+    "condition",
+    "This share was computed with parameter set 0 of the vehicle model (the calibration that the"
+    " study uses). Other parameter sets (alternative calibrations) were not simulated.",
+)
+SHARES = Sentence(
+    "condition",
+    "The share of unsafe vehicles ranges from {least} to {greatest} over the {sets} parameter sets"
+    " of the vehicle model (alternative calibrations; at most {most} vehicles with each set).",
+)
+SAME_SHARE = Sentence(
+    "condition",
+    "The share of unsafe vehicles is {least} in each of the {sets} parameter sets of the vehicle"
+    " model (alternative calibrations; at most {most} vehicles with each set).",
+)
 
 
 def planned_over_sets(
@@ -104,41 +120,31 @@ class SharesOverSets(NamedTuple):
         greatest, highest = np.fmax.reduce([share, high], axis=1).tolist()
         return smallest, greatest, lowest, highest
 
-    def in_words(self) -> str:
+    def sentences(self) -> Iterator[Sentence]:
         """The least and the greatest share of all vehicles; that the study's own set was the only
         one if there are others.
         """
         if not self.study.spread:
-            return ""
-        if not len(self.shares) or np.isnan(self.shares[:, 0]).all():
-            return (
-                " This share was computed with parameter set 0 of the vehicle model (the"
-                " calibration that the study uses). Other parameter sets (alternative calibrations)"
-                " were not simulated."
-            )
+            return
         shares = self.shares[:, 0]
-        smallest = self._in_words(np.nanargmin(shares))
-        greatest = self._in_words(np.nanargmax(shares))
-        range_in_words = f"ranges from {smallest} to {greatest} over"
-        if smallest == greatest:
-            range_in_words = f"is {smallest} in each of"
-        return (
-            f" The share of unsafe vehicles {range_in_words} the {len(self.shares)} parameter sets"
-            f" of the vehicle model (alternative calibrations; at most {VEHICLES} vehicles each)."
+        if np.isnan(shares).all():
+            yield ONE_SET
+            return
+        least, greatest = map(
+            self._in_words, (np.nanargmin(shares), np.nanargmax(shares))
         )
+        template = SAME_SHARE if least == greatest else SHARES
+        sets = len(shares)
+        yield template.fill(least=least, greatest=greatest, sets=sets, most=VEHICLES)
 
     def _in_words(self, number: np.intp) -> str:
         """The share of all vehicles with a set, and its number if no other interval overlaps."""
         intervals = np.delete(self.intervals[:, 0], number, axis=0)
         low, high = self.intervals[number, 0]
         is_apart = ((intervals[:, 1] < low) | (intervals[:, 0] > high)).all()
-        name = ""
-        if is_apart:
-            name = f"set {number}, "
-        interval = (
-            f"{name}95 % confidence interval {percentage(low)} to {percentage(high)} %"
-        )
-        return f"{percentage(self.shares[number, 0])} % ({interval})"
+        name = f"set {number}, " if is_apart else ""
+        interval = f"95 % confidence interval {interval_in_words(low, high)}"
+        return f"{percentage(self.shares[number, 0])} % ({name}{interval})"
 
 
 def _share(of_runs: FloatArray) -> tuple[float, float, float]:

@@ -16,6 +16,7 @@ import pandas as pd
 from rich.console import Console
 
 from safevar_sumo.errors import printable
+from safevar_sumo.questions.sentence import Sentence, Verdict
 from safevar_sumo.questions.tables import (
     LATEX_PREAMBLE,
     MAX_LEAD_ROWS,
@@ -42,19 +43,9 @@ MAX_SENTENCES = 3
 CODE = re.compile("`([^`<>]+)`")
 """What a text quotes as code."""
 SCOPE = "Scope: "
-NOTES = (
-    SCOPE,
-    "Valid for: ",
-    "Remark: ",
-    "Changed: ",
-    "Criterion: ",
-    "Not simulated: ",
-    "Unsafe means: ",
-    "Safe means: ",
-    "An encounter counts only",
-    "A vehicle counts only",
-    "Left out",
-    "If all changes go",
+NOTE = re.compile(
+    "(Valid for|Remark|Changed|Criterion|Not simulated|Counted as unsafe|Unsafe means|Safe means):"
+    " |An encounter counts|A vehicle counts|Left out|If all changes go"
 )
 """Beginnings of sentences of a verdict that one screen has below the table."""
 MAX_ROWS = 200
@@ -94,17 +85,13 @@ def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
     its attribute `shown_whole` is the number of rows up to which it is.
     """
     # Sentences of the verdict by kind.
-    plain_sentences = []
-    notes = []
-    for sentence in SENTENCE_END.split(answer.verdict):
-        if sentence.startswith(NOTES):
-            notes.append(sentence.replace(SCOPE, "Valid for: ", 1))
-        else:
-            plain_sentences.append(sentence)
+    said = _sentences_of(answer.verdict)
+    sentences = [text for kind, text in said if kind != "note"]
+    notes = [text for kind, text in said if kind == "note"]
     if answer.tested:
-        method, *remarks = SENTENCE_END.split(answer.tested)
-        notes.insert(1, f"Tested: {method}")
-        notes += [remark for remark in remarks if remark.startswith(NOTES)]
+        first, *further = SENTENCE_END.split(answer.tested)
+        notes.insert(1, f"Tested: {first}")
+        notes += filter(NOTE.match, further)
 
     # The lead, and what it does not show.
     lead = pd.DataFrame()
@@ -118,8 +105,17 @@ def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
         cut = len(table.attrs.get("lead_rows", table)) - len(lead)
         if cut > 0:
             notes.insert(0, f"{cut} more rows: --details.")
-    unsaid = max(len(plain_sentences) - MAX_SENTENCES, 0)
-    return Screen(plain_sentences[:MAX_SENTENCES], unsaid, lead, notes, others)
+    unsaid = max(len(sentences) - MAX_SENTENCES, 0)
+    return Screen(sentences[:MAX_SENTENCES], unsaid, lead, notes, others)
+
+
+def _sentences_of(verdict: str) -> list[Sentence]:
+    if isinstance(verdict, Verdict):
+        return verdict.sentences
+    return [
+        Sentence("note" if NOTE.match(text) else "answer", text)
+        for text in SENTENCE_END.split(verdict.replace(SCOPE, "Valid for: "))
+    ]
 
 
 def _more(answer: Answer, screen: Screen) -> str:

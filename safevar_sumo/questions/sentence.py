@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
-Kind = Literal["answer", "evidence", "condition", "note"]
+KINDS = "answer", "evidence", "condition", "note"
 """What a sentence is to its reader, the most important kind first; a note stands below the table.
 """
-KINDS = get_args(Kind)
 
 
 class Sentence(NamedTuple):
@@ -16,7 +15,7 @@ class Sentence(NamedTuple):
     reader needs them together.
     """
 
-    kind: Kind
+    kind: str
     text: str
 
     def fill(self, **values: object) -> Sentence:
@@ -26,13 +25,14 @@ class Sentence(NamedTuple):
 
 
 class Verdict(str):
-    """Sentences, joined to one text by spaces."""
+    """Sentences by kind, joined to one text by spaces."""
 
-    sentences: tuple[Sentence, ...]
+    sentences: list[Sentence]
 
     def __new__(cls, sentences: Iterable[Sentence]) -> Verdict:
-        """The text of sentences; one without text is left out."""
-        said = tuple(sentence for sentence in sentences if sentence.text)
-        verdict = super().__new__(cls, " ".join(sentence.text for sentence in said))
+        """The text of sentences, sorted by kind; one without text is left out."""
+        said = [sentence for sentence in sentences if sentence.text]
+        said.sort(key=lambda sentence: KINDS.index(sentence.kind))
+        verdict = super().__new__(cls, " ".join(text for _, text in said))
         verdict.sentences = said
         return verdict

@@ -16,6 +16,7 @@ import pandas as pd
 from safevar_sumo.errors import printable
 from safevar_sumo.questions.bars import LEGEND
 from safevar_sumo.questions.changes import NUMBER_PATTERN
+from safevar_sumo.shipped import shipped_table
 from safevar_sumo.terminal import WholeTable
 
 LOW = "_low"
@@ -59,8 +60,8 @@ class Column(NamedTuple):
     screen leaves it to the details.
     """
 
-    unit: str
-    meaning: str
+    unit: str = ""
+    meaning: str = ""
     number_format: str = ".4g"
     is_shown: bool = True
     head: str = ""
@@ -114,6 +115,23 @@ def with_interval(name: str, column: Column) -> dict[str, Column]:
     low = column._replace(meaning=f"lower end of {name}")
     high = column._replace(meaning=f"upper end of {name}")
     return {name: column, f"{name}{LOW}": low, f"{name}{HIGH}": high}
+
+
+def columns_from(table: Mapping[str, Any]) -> dict[str, Column]:
+    """Columns as a file has them, in order."""
+    columns = dict[str, Column]()
+    for name, facts in table.items():
+        described = {"meaning": facts} if isinstance(facts, str) else dict(facts)
+        has_interval = described.pop("interval", False)
+        column = Column(**described)
+        columns |= with_interval(name, column) if has_interval else {name: column}
+    return columns
+
+
+def shipped_columns(command: str) -> dict[str, dict[str, Column]]:
+    """The columns of a command's tables, by table."""
+    tables = shipped_table("questions/columns.toml")[command]
+    return {name: columns_from(table) for name, table in tables.items()}
 
 
 def columns_of(frame: pd.DataFrame) -> dict[str, Column]:

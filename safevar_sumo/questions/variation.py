@@ -75,10 +75,9 @@ class VariationModel:
 
 def sampled_in_words(study: Study) -> str:
     """How vehicles are sampled: `sampled uniformly over the whole domain`."""
-    manner = (
-        "as [variation] says" if study.variation else "uniformly over the whole domain"
-    )
-    return f"sampled {manner}"
+    if study.variation:
+        return "sampled as the study states ([variation])"
+    return "sampled uniformly over the whole domain"
 
 
 def _quantile_function(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from shlex import quote
 
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.questions.sentence import Sentence
 from safevar_sumo.records import Outcome
@@ -201,6 +202,11 @@ def percentage(share: float) -> str:
     return f"{value:.0f}" if value >= 9.95 else f"{value:.2g}"
 
 
+def interval_in_words(low: float, high: float) -> str:
+    """The interval of a share, such as `0.25 to 0.5 %`."""
+    return f"{percentage(low)} to {percentage(high)} %"
+
+
 def bound_in_words(at_most: float) -> str:
     """The upper bound of a share, which is one-sided."""
     return f"with {100 * CONFIDENCE:g} % confidence at most {100 * at_most:.3g} %"
@@ -227,10 +233,10 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
     return [own, *demanded_in_words(study), *([left] if left_out else [])]
 
 
-def with_scope(study: Study, left_out: int, *sentences: str) -> str:
-    """Sentences of a verdict on sampled vehicles, and which vehicles and encounters count."""
-    scope = [*counted_in_words(study, left_out), *constraints_in_words(study)]
-    return " ".join(filter(None, [*sentences, *scope]))
+def notes_on(unsafe: Unsafe, *texts: str) -> list[Sentence]:
+    """Notes, among them what is unsafe where that is not a collision alone."""
+    means = "" if unsafe.is_collision else f"Unsafe means: {unsafe.description}."
+    return [Sentence("note", text) for text in (*texts, unsafe.remark, means)]
 
 
 def demanded_in_words(study: Study) -> list[str]:

@@ -14,7 +14,7 @@ import scipy
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import METRICS
-from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
+from safevar_sumo.questions.answer import Answer, contents, tabulate
 from safevar_sumo.questions.ask import question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
@@ -26,6 +26,7 @@ from safevar_sumo.questions.figures import (
     new_panels,
 )
 from safevar_sumo.questions.research_questions.statistics import rounded_to_rank
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import two_decimals
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData, read_reference
@@ -37,19 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-COLUMNS: Columns = {
-    "metric": (
-        "safety metric; TET and TIT of the settings that collide neither here nor in the reference"
-    ),
-    "unit": "unit of the metric and of its errors",
-    "spearman": Column("-", "Spearman's rank correlation", ".3f"),
-    "mean_absolute_error": Column(
-        "as in column unit", "mean absolute difference from the published value", ".3f"
-    ),
-    "bias": Column(
-        "as in column unit", "mean difference (here minus published)", ".3f"
-    ),
-}
+COLUMNS = shipped_columns("validate")["agreement"]
 STAGE = "settings"
 """The phase of progress."""
 SHIPPED_AGREEMENT = Path(__file__).with_name("agreement.csv")

@@ -7,7 +7,9 @@ import pandas as pd
 
 from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import STOPPING_DISTANCE
-from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
+from safevar_sumo.questions.answer import Answer, Columns, tabulate
+from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import (
     EXACT,
     change_texts,
@@ -15,6 +17,7 @@ from safevar_sumo.questions.words import (
     points_in_words,
 )
 from safevar_sumo.records import FloatArray
+from safevar_sumo.replay import words
 from safevar_sumo.results import SolutionId
 from safevar_sumo.scenarios import pre_crash_sentence
 from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE
@@ -29,43 +32,7 @@ from safevar_sumo.sumo.without_effect import without_effect
 from safevar_sumo.vehicles import CharacteristicSet
 
 REMARKS: Columns = {"remark": "what to know about this simulation"}
-CHARACTERISTICS: Columns = {
-    "characteristic": "characteristic",
-    "unit": "unit of its values",
-    "original": Column("", "value of the original vehicle", "g"),
-    "simulated": Column("", "simulated value", "g"),
-    "changed": "whether the simulated value differs from the original's",
-    "meaning": Column("", "what it is", is_shown=False),
-}
-RESULTS: Columns = {
-    "result": "outcome, metric or objective",
-    "unit": "its unit",
-    "original": "of the original vehicle",
-    "simulated": "of the simulated vehicle",
-}
-POINTS: Columns = {
-    "point": "point of the study's matrix",
-    "outcome": "how the simulation ends",
-    "impact_speed": Column("m/s", "speed of the vehicle at the collision", ".2f"),
-    "relative_impact_speed": Column(
-        "m/s", "relative speed of the impact", ".2f", is_shown=False
-    ),
-    SAFETY_DEGREE: Column(
-        "m", "safety degree; minus a collision's closing speed in m/s", ".2f"
-    ),
-    "gap": Column("m", "least distance between bodies", ".2f", is_shown=False),
-    STOPPING_DISTANCE.name: Column(
-        "m", "distance from the first brake force to standstill", ".1f"
-    ),
-    "test_speed_error": Column(
-        "km/h", "deviation from the test speed before the driving system acts", "+.1f"
-    ),
-    "warning_ttc": Column(
-        "s", "time to collision at the first warning", is_shown=False
-    ),
-    "side": Column("", "side of the vehicle that touches", is_shown=False),
-    "place": Column("%", "position of the contact along that side", is_shown=False),
-}
+CHARACTERISTICS, RESULTS, POINTS = shipped_columns("simulate").values()
 OUTCOME_NAMES = (
     "outcome",
     "collision",
@@ -79,24 +46,6 @@ OUTCOME_NAMES = (
 """What every study says of a simulation besides its metrics."""
 OF_SEARCH = ("gap", "f_safe", "f_diff", "f_num_diff")
 """Results that say what others say, or that a search minimises."""
-
-
-def _meets(system: System, setting: FloatArray) -> list[str]:
-    """Sentences on an encounter that is not the study's, and on its phase."""
-    values = system.characteristics.named(setting)
-    places = [
-        f"{item.name.replace('_', ' ')} {values[item.name]:{EXACT}}{item.suffix}"
-        for item in system.characteristics.scenario
-        if item.name != PHASE and values[item.name] != item.original
-    ]
-    sentences = []
-    if places:
-        sentences.append(f"The encounter has {join_phrases(places)}.")
-    if phase := values.get(PHASE):
-        sentences.append(
-            f"The encounter begins {phase:g} steps of the driving system later."
-        )
-    return sentences
 
 
 def _fails(system: System, result: PointResult) -> bool:
@@ -129,10 +78,7 @@ def answer_of_setting(
         if name in system.characteristics.vehicle.names
     ]
     if small:
-        remarks.append(
-            f"f_diff and f_num_diff are of the filtered setting, as in a search: they count"
-            f" {' and '.join(small)} as unchanged. Everything else is of the vehicle as given."
-        )
+        remarks.append(words.IGNORED.format(small=" and ".join(small)))
 
     original = simulation.original.numbers
     simulated = simulation.numbers
@@ -140,35 +86,41 @@ def answer_of_setting(
     results = [
         (name, unit, original[name], simulated[name]) for name, unit in units.items()
     ]
-    frame = _without_repetition(tabulate("Results", RESULTS, results), simulation)
+    frame = _without_repetition(
+        tabulate("How both simulations end", RESULTS, results), simulation
+    )
     names = frame["result"]
     frame.attrs["words"] = {name: name.replace("_", " ") for name in names}
     frame.attrs["lead_rows"] = np.flatnonzero(~names.isin(OF_SEARCH)).tolist()
     tables = {"characteristics": _characteristics(simulation), "results": frame}
 
-    verdict = [simulation.no_verdict, *_verdict(simulation, len(system.matrix))]
+    sentences = _verdict(simulation, len(system.matrix))
     if system.matrix:
         tables["points"], failing = _points(system, setting)
         is_changed = simulation.setting != simulation.original.setting
-        vehicle = "changed" if is_changed else "original"
-        verdict.append(
-            points_in_words(f"The {vehicle} vehicle", failing, len(system.matrix))
-        )
+        vehicle = f"The {'changed' if is_changed else 'original'} vehicle"
+        points = points_in_words(vehicle, failing, len(system.matrix))
+        sentences.append(Sentence("evidence", points))
 
     rows = [(remark,) for remark in dict.fromkeys(remarks)]
     tables["remarks"] = tabulate("Remarks", REMARKS, rows)
-    if texts := change_texts(
-        system.characteristics.vehicle, system.characteristics.named(setting)
-    ):
-        verdict.append(f"Changed: {', '.join(texts)}.")
-    verdict += _meets(system, setting)
+    named = system.characteristics.named(setting)
+    places = [
+        f"{item.name.replace('_', ' ')} {named[item.name]:{EXACT}}{item.suffix}"
+        for item in system.characteristics.scenario
+        if item.name != PHASE and named[item.name] != item.original
+    ]
+    if texts := change_texts(system.characteristics.vehicle, named):
+        sentences.append(words.CHANGES.fill(changes=", ".join(texts)))
+    if places:
+        sentences.append(words.ENCOUNTER.fill(values=join_phrases(places)))
     numbers = simulation.numbers
     if handle is not None:
         numbers = {"solution": str(handle), **numbers}
     return Answer(
         question="simulate",
         study=study,
-        verdict=" ".join(filter(None, verdict)),
+        verdict=Verdict(sentences),
         numbers=numbers,
         tables=tables,
         lead="points" if "points" in tables else "results",
@@ -183,7 +135,7 @@ def _points(system: System, setting: FloatArray) -> tuple[pd.DataFrame, list[str
     records = map(point_record, results)
     # Side and place of a contact are columns of their own.
     points = [{**row, **row.get("contact", {})} for row in records]
-    table = tabulate("Points of the matrix", POINTS, pd.DataFrame(points))
+    table = tabulate("Test cases, worst first", POINTS, pd.DataFrame(points))
     table.attrs["lead_rows"] = np.argsort(table[SAFETY_DEGREE], kind="stable").tolist()
     return table, [result.point.name for result in results if _fails(system, result)]
 
@@ -210,59 +162,49 @@ def _characteristics(simulation: Simulation) -> pd.DataFrame:
     )
 
 
-def _verdict(simulation: Simulation, point_count: int) -> list[str]:
+def _verdict(simulation: Simulation, point_count: int) -> list[Sentence]:
     """How the simulated vehicle and, if it differs, the original end; of a matrix in the worst of
     its test cases.
     """
-    demand = simulation.scoring.safe_original
-    name = simulation.pair.point.name
-    where = "The" if demand is None else "In this encounter the"
-    worst = ""
+    is_changed = simulation.setting != simulation.original.setting
+    test = simulation.pair.point.name
+    templates = words.ORIGINAL, words.CHANGED
     if point_count > 1:
-        kind = "least" if simulation.metrics[SAFETY_DEGREE] > 0 else "worst"
-        worst = f", the {kind} of {point_count} test cases ({name})"
-        where = "The"
-    elif name:
-        where = f"In the test case {name}, the"
-
-    original = f"original vehicle {simulation.original.verdict}"
-    changed = f"changed vehicle {simulation.verdict}"
-    comparison = _safety_comparison(simulation)
-    if simulation.setting == simulation.original.setting:
-        verdict = [f"{where} {original}{worst}."]
-    elif worst:
-        verdict = [
-            f"The {changed}{worst}.",
-            f"In the same test case the {original}: {comparison}.",
-        ]
-    else:
-        verdict = [f"{where} {original}.", f"The {changed}: {comparison}."]
+        templates = words.ORIGINAL_IN_WORST, words.CHANGED_IN_WORST
+    elif test:
+        templates = words.ORIGINAL_IN_TEST, words.CHANGED_IN_TEST
+    sentences = [
+        Sentence("answer", simulation.no_verdict),
+        templates[is_changed].fill(
+            original=simulation.original.verdict,
+            changed=simulation.verdict,
+            number=point_count,
+            test=test,
+        ),
+    ]
+    if is_changed:
+        sentences.append(_safety_comparison(simulation))
 
     # NaN is no safety degree that suffices.
+    demand = simulation.scoring.safe_original
     if demand is not None and not simulation.original.metrics[SAFETY_DEGREE] >= demand:
-        verdict.append(
-            "Here the original vehicle keeps less than a search demands of it in the same"
-            f" encounter: at least {demand:.2f} m."
-        )
-    return verdict
+        sentences.append(words.LEFT_OUT.fill(demand=demand))
+    return sentences
 
 
-def _safety_comparison(simulation: Simulation) -> str:
-    stop = simulation.metrics.get(STOPPING_DISTANCE.name, np.nan)
-    original_stop = simulation.original.metrics.get(STOPPING_DISTANCE.name, np.nan)
+def _safety_comparison(simulation: Simulation) -> Sentence:
+    changed, original = simulation.metrics, simulation.original.metrics
+    stop, original_stop = (
+        metrics.get(STOPPING_DISTANCE.name, np.nan) for metrics in (changed, original)
+    )
     if np.isfinite(stop / original_stop):
-        return (
-            f"the stopping distance of the changed vehicle is {stop / original_stop:.2f} times that"
-            " of the original"
-        )
-
-    degree = simulation.metrics[SAFETY_DEGREE]
-    original = simulation.original.metrics[SAFETY_DEGREE]
-    if np.isnan(degree) or np.isnan(original):
-        return "whether the changed vehicle is less safe cannot be decided"
-    if degree == original:
-        return "both are equally safe"
-    return f"the changed vehicle is {'less safe' if degree < original else 'safer'}"
+        return words.STOPPING_DISTANCE.fill(factor=stop / original_stop)
+    gain = changed[SAFETY_DEGREE] - original[SAFETY_DEGREE]
+    if np.isnan(gain):
+        return words.UNDECIDED
+    if gain:
+        return words.LESS_SAFE if gain < 0 else words.SAFER
+    return words.EQUALLY_SAFE
 
 
 def _remarks_of(system: System) -> list[str]:

@@ -34,6 +34,7 @@ from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.questions.options import SIMULATIONS, flag_of
 from safevar_sumo.questions.subject import changes_since
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import JsonObject, Outcome
 from safevar_sumo.report.budget import REPLAYS
@@ -96,13 +97,7 @@ CONTEXT, SHOWN = 40, 200
 
 
 WHOLE_NUMBER = re.compile(r"[+-]?\d[\d_]*")
-CLAIMS = {
-    "study": "study of the pack",
-    "claim": "what the pack holds",
-    "verdict": f"{SAME}, {DIFFERS}, {CANNOT} or {UNCHECKED}",
-    "packed": "value in the pack, if it differs",
-    "here": "value here, or the reason why there is none",
-}
+CLAIMS = shipped_columns("verify")["claims"]
 
 
 class Claim(NamedTuple):

@@ -29,9 +29,10 @@ from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.options import Cluster, Jobs, Simulations
 from safevar_sumo.questions.permit.fleet import list_without_names
+from safevar_sumo.questions.sentence import Sentence, Verdict
 from safevar_sumo.questions.subject import study_or_case
 from safevar_sumo.questions.tables import tabulate
-from safevar_sumo.questions.words import number_of
+from safevar_sumo.questions.words import count_in_words
 from safevar_sumo.records import JsonObject
 from safevar_sumo.report.budget import divided
 from safevar_sumo.report.claims import (
@@ -153,7 +154,10 @@ def evidence(
                 for name, content in study_files.items()
             }
     write_pack(out, studies, files)
-    return f"{out} ({out.stat().st_size / 1e6:.2f} MB, sha256 {digest_of(out)})"
+    return (
+        f"The pack is {out} ({out.stat().st_size / 1e6:.2f} MB). The SHA-256 digest of the pack is"
+        f" {digest_of(out)}."
+    )
 
 
 def _pack_study(
@@ -374,47 +378,46 @@ def verify(
 
     claims = tabulate("Claims", CLAIMS, rows)
     counts = Counter(claims["verdict"])
+    number = len(claims)
+    parts = _not_compared(description, studies.values())
+    if counts[UNCHECKED]:
+        parts.append("how many simulations had which outcome (--search compares it)")
+    said = [f"{count_in_words(counts[SAME], number)} claims of the pack are confirmed."]
+    if counts[DIFFERS]:
+        said.append(f"{counts[DIFFERS]} of the {number} claims differ.")
+    if counts[CANNOT]:
+        said.append(f"{counts[CANNOT]} of the {number} claims cannot be computed here.")
+    if parts:
+        said.append(f"These parts were not compared: {'; '.join(parts)}.")
     return Answer(
         question="verify",
         study=next(iter(studies.values())).case.study,
-        verdict=(
-            f"{counts[SAME]} of {number_of(len(claims), 'claim')} are the same, {counts[DIFFERS]}"
-            f" differ, {counts[CANNOT]} cannot be run."
-            f"{_not_compared(description, studies.values(), counts[UNCHECKED])}"
-        ),
+        verdict=Verdict(Sentence("answer", text) for text in said),
         numbers={
-            "passed": counts[SAME] + counts[UNCHECKED] == len(claims),
+            "passed": counts[SAME] + counts[UNCHECKED] == number,
             "sha256": digest_of(path),
-            "claims": len(claims),
+            "claims": number,
             **{verdict.partition(" ")[0]: counts[verdict] for verdict in VERDICTS},
         },
         tables={"claims": claims},
     )
 
 
-def _not_compared(
-    description: Description, studies: Iterable[Packed], unchecked: int
-) -> str:
-    """Sentences on what a pack says that `verify` does not check or compare, each after a space."""
-    # Versions and machines may differ, as their results are compared.
+def _not_compared(description: Description, studies: Iterable[Packed]) -> list[str]:
+    """What a pack says that `verify` does not compare: versions and machines, as their results are
+    compared.
+    """
     pairs = {
         DESCRIPTION: ({"versions": description.versions}, {"versions": versions_here()})
     }
     pairs |= {
         f"{packed.packed.folder}/{MANIFEST}": packed.versions for packed in studies
     }
-    parts = [
+    return [
         f"{key} of {file}: {stated} ({present} here)"
         for file, versions in pairs.items()
         for key, stated, present in changed_values(*versions)
     ]
-    repeats = "how many simulations had which outcome (--search repeats them)"
-    sentences = ""
-    if parts:
-        sentences += f" Not compared: {'; '.join(parts)}."
-    if unchecked:
-        sentences += f" {unchecked} unchecked: {repeats}."
-    return sentences
 
 
 def _unpack(

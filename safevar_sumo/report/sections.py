@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +18,14 @@ import pandas as pd
 from safevar_sumo.ads import ADS
 from safevar_sumo.questions.answer import (
     Answer,
-    Column,
-    Columns,
     tabulate,
-    with_interval,
 )
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.catalogue import description_of
 from safevar_sumo.questions.explain.failures import REASONS
 from safevar_sumo.questions.model_spread import compute_model_spreads
+from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import counted_in_words, number_of
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.reference.agreement import shipped_agreement
@@ -39,65 +39,27 @@ from safevar_sumo.vehicles import VEHICLES
 FIRST_CHOICES = ("smallest", "most_severe")
 """Choices of `REASONS` that select the solutions to replay, as the flags of `simulate` do."""
 NO_RESULT = {
-    Outcome.SIMULATOR_ERROR: "could not be simulated, and no result contains them",
+    Outcome.SIMULATOR_ERROR: "could not be simulated and are in no result.",
     Outcome.INVALID_TEST: (
-        "are invalid tests, which are neither failures nor successes: the vehicle left the"
-        " tolerance of the test's speed, the driving system acted before the test allows it, or"
-        " nothing happened"
+        "drove invalid tests, which count neither as failures nor as successes. In such a test the"
+        " vehicle misses the speed of the test, the driving system acts too early, or nothing"
+        " happens."
     ),
 }
-"""Outcomes of settings about which nothing is known."""
+"""Outcomes of vehicles about which nothing is known."""
 GENERAL_LIMITS = (
     "A search that finds no failure proves nothing about vehicles that it did not simulate.",
     (
-        "The simulation has one vehicle that keeps its lane. Unless the study says otherwise, the"
-        " model leaves out single wheels, suspension, wind, sensor noise and other traffic."
+        "The simulated vehicle keeps its lane. Unless the study states them, the simulation has no"
+        " separate wheels and axles, no suspension, no wind, no sensor noise and no further"
+        " traffic."
     ),
     (
-        "The driving system and the vehicle are models. Where published data exist, this section"
-        " says how far the models agree with them."
+        "The driving system and the vehicle are models. This section states how far both models"
+        " agree with published data, where such data exist."
     ),
 )
-CHARACTERISTICS: Columns = {
-    "characteristic": "characteristic of the vehicle, or of its encounter",
-    "unit": "unit of its values",
-    "original": Column("as in column unit", "value of the original vehicle"),
-    "lowest": Column("as in column unit", "lower end of its domain"),
-    "highest": Column("as in column unit", "upper end of its domain"),
-    "threshold": Column("as in column unit", "a change smaller than this is undone"),
-    "meaning": "full name",
-}
-AGREEMENT: Columns = {
-    "file": "published data",
-    "rows": "vehicles",
-    "spearman": Column("-", "Spearman's rank correlation of the safety degrees", ".2f"),
-    "mean_absolute_error": Column("m", "mean of the absolute differences", ".2f"),
-    "bias": Column("m", "mean difference (here minus published)", ".2f"),
-    "collisions_here": "vehicles that collide here",
-    "collisions_reference": "vehicles that collide in the published data",
-    "collisions_both": "vehicles that collide in both",
-}
-SPREAD: Columns = {
-    "vehicle": "the original, or a solution",
-    **with_interval(
-        SAFETY_DEGREE,
-        Column(
-            "m or -m/s",
-            "simulated value, with the interval of 90 % of parameter sets and the model's error",
-            ".2f",
-        ),
-    ),
-    "sets": "parameter sets of the vehicle model that agree with published data about as well",
-    "collisions": "parameter sets in which it collides",
-}
-PUBLISHED: Columns = {
-    "metric": "safety metric of the original vehicle",
-    "published": "its published value",
-    "here": "its value here",
-    "difference": Column(
-        "%", "here minus published, in per cent of the published value", ".1f"
-    ),
-}
+CHARACTERISTICS, AGREEMENT, SPREAD, PUBLISHED = shipped_columns("report").values()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,38 +139,25 @@ def tested(study: ReportedStudy) -> Answer:
     """The tested vehicle, driving system and scenario, and the search."""
     case = study.case
     models = [
-        f"{title}: {name_and_sentence(catalogue, table.model)}"
-        for title, catalogue, table in (
-            ("Vehicle", VEHICLES, case.study.vehicle),
-            ("Driving system", ADS, case.study.ads),
-            ("Scenario", SCENARIOS, case.study.scenario),
+        f"The {kind} is {name_and_sentence(catalogue, table.model)}."
+        for kind, catalogue, table in (
+            ("vehicle", VEHICLES, case.study.vehicle),
+            ("driving system", ADS, case.study.ads),
         )
         if table.model
     ]
 
-    rows = [
-        (
-            item.name,
-            item.unit,
-            item.original,
-            item.lower,
-            item.upper,
-            item.threshold,
-            item.words,
-        )
-        for item in case.characteristics
-    ]
+    facts = attrgetter(
+        *("name", "unit", "original", "lower", "upper", "threshold", "words")
+    )
+    rows = map(facts, case.characteristics)
     remarks = [*case.remarks, *vehicle_remarks(study.system)]
-    sentences = [
-        f"{'. '.join(models)}; {_conditions(study)}.",
-        *counted_in_words(case.study),
-        _search(study),
-        pre_crash_sentence(study.system.points),
-    ]
+    sentences = [*models, _scenario(study), *counted_in_words(case.study)]
+    sentences += [_search(study), pre_crash_sentence(study.system.points)]
     return Answer(
         question="what was tested",
         study=case.study,
-        verdict=" ".join(filter(None, sentences)),
+        verdict=Verdict(Sentence("answer", text) for text in sentences),
         numbers={},
         tables={
             "characteristics": tabulate(
@@ -226,54 +175,56 @@ def _remarks(texts: Sequence[str]) -> pd.DataFrame:
     )
 
 
-def _conditions(study: ReportedStudy) -> str:
-    """The weather or, by test, the points of the matrix."""
+def _scenario(study: ReportedStudy) -> str:
+    """The scenario with its weather or, by test, the points of the matrix."""
     points = study.system.matrix
+    weather = study.case.weather
+    model = name_and_sentence(SCENARIOS, study.case.study.scenario.model)
+    scenario = f"The scenario is {model}, with"
     if study.point:
         return (
-            f"only the test case {study.point} of its matrix, in which all solutions were simulated"
-            " again"
+            f"{scenario} the test case {study.point} alone, in which all solutions were simulated"
+            " again."
         )
     if not study.system.mover.has("weather"):
-        words = "the simulator of the scenario moves and drives the vehicle"
-        if points:
-            words += f", in {number_of(len(points), 'test case')}"
-        return words
-    weather = study.case.weather
-    if not points and equals_clear(weather):
-        return (
-            f"weather: {weather.name} (it changes neither road nor sensors, but possibly"
-            " parameters of the driving system)"
+        number = number_of(max(len(points), 1), "test case")
+        return f"{scenario} {number}. The simulator of the scenario moves and drives the vehicle."
+    if points:
+        tests = Counter(
+            f"{dict(point.parameters)['test']}, {point.weather.name}"
+            for point in points
         )
-    if not points:
-        return f"weather: {weather.name}"
-    tests = Counter(
-        f"{dict(point.parameters)['test']}, {point.weather.name}" for point in points
-    )
-    described = "; ".join(
-        f"{test}: {number_of(count, 'test case')}" for test, count in tests.items()
-    )
-    return (
-        f"every vehicle drives all {len(points)} test cases of a matrix ({described})"
-    )
+        described = "; ".join(
+            f"{test}: {number_of(count, 'test case')}" for test, count in tests.items()
+        )
+        return (
+            f"{scenario} {len(points)} test cases, all of which every vehicle drives"
+            f" ({described})."
+        )
+    if equals_clear(weather):
+        return (
+            f"{scenario} the weather {weather.name}. This weather changes neither the road nor the"
+            " sensors."
+        )
+    return f"{scenario} the weather {weather.name}."
 
 
 def _search(study: ReportedStudy) -> str:
     case = study.case
-    search = study.case.study.search
+    search = case.study.search
     versions = ", ".join(f"{name} {value}" for name, value in study.versions.items())
     if not case.has_runs:
-        return f"The {len(case.solutions)} solutions are imported ({versions})."
+        return f"The {len(case.solutions):,} solutions were imported ({versions})."
     runs = Counter(algorithm for algorithm, _ in case.finished_runs)
     names = [
         f"{case.title_of(name)} ({number_of(count, 'run')})"
         for name, count in runs.items()
     ]
     return (
-        f"The search has {', '.join(names) or 'no finished run'}, with at most"
-        f" {search.evaluations} simulations in a run. All runs together simulated"
-        f" {len(case.evaluations)} different vehicles. The seed is {search.seed}. The versions are"
-        f" {versions}."
+        f"The search algorithms are {', '.join(names) or 'without a finished run'}, with at most"
+        f" {search.evaluations:,} simulations in each run. All runs together simulated"
+        f" {len(case.evaluations):,} different vehicles. The seed is {search.seed}, and the"
+        f" versions are {versions}."
     )
 
 
@@ -289,29 +240,23 @@ def trust(study: ReportedStudy) -> Answer:
     they leave out.
     """
     case = study.case
-    tables = {}
-    fitted = (
-        "Published data were used to fit the vehicle. " if case.study.spread else ""
-    )
-    verdict = (
-        f"{fitted}The simulations of this study were not compared with published ones. Nobody knows"
-        " whether another simulator or a real vehicle behaves in the same way."
-    )
+    tables = dict[str, pd.DataFrame]()
+    sentences = [
+        "The simulations of this study were not compared with published ones. Nobody knows whether"
+        " another simulator or a real vehicle behaves in the same way."
+    ]
     agreement = shipped_agreement(case.study)
     if len(agreement):
-        tables["agreement"] = tabulate(
-            "Agreement with published data: safety degrees", AGREEMENT, agreement
-        )
-        lowest = agreement["spearman"].min()
-        highest = agreement["spearman"].max()
-        ending = ""
-        if lowest != highest:
-            ending = f" to {highest:.2f}"
-        verdict = (
-            f"The safety degrees were compared with {number_of(len(agreement), 'file')} of"
-            f" published simulations. The rank correlation is {lowest:.2f}{ending}. Nothing was"
-            " compared with a real car."
-        )
+        title = "Agreement of the safety degrees with published data"
+        tables["agreement"] = tabulate(title, AGREEMENT, agreement)
+        ends = [f"{agreement['spearman'].agg(end):.2f}" for end in ("min", "max")]
+        sentences = [
+            "Nothing was compared with a real car. The safety degrees were compared with"
+            f" {number_of(len(agreement), 'file')} of published simulations. The rank correlation"
+            f" is {' to '.join(dict.fromkeys(ends))}."
+        ]
+    elif case.study.spread:
+        sentences.append("The vehicle model was fitted to published data.")
 
     if case.study.spread:
         settings = np.vstack([case.characteristics.original, study.chosen_settings])
@@ -323,7 +268,8 @@ def trust(study: ReportedStudy) -> Answer:
                 ["original", *study.choices], degrees, spreads, strict=True
             )
         ]
-        tables["spread"] = tabulate("The vehicle model's own uncertainty", SPREAD, rows)
+        title = "Uncertainty of the vehicle model: safety degree with its other parameter sets"
+        tables["spread"] = tabulate(title, SPREAD, rows)
 
     # No published value is 0: the study refuses it.
     published = [
@@ -332,12 +278,15 @@ def trust(study: ReportedStudy) -> Answer:
         if not math.isnan(metric := case.original.get(name, math.nan))
     ]
     tables["original"] = tabulate(
-        "The original vehicle, published and here", PUBLISHED, published
+        "Metrics of the original vehicle, published and simulated here",
+        PUBLISHED,
+        published,
     )
 
     counts = Counter(case.evaluations["outcome"])
+    number = f"{len(case.evaluations):,}"
     remarks = [
-        f"{counts[outcome]} of {len(case.evaluations)} vehicles {words}."
+        f"{counts[outcome]:,} of {number} vehicles {words}"
         for outcome, words in NO_RESULT.items()
         if counts[outcome]
     ]
@@ -345,7 +294,7 @@ def trust(study: ReportedStudy) -> Answer:
     return Answer(
         question="limits and trust",
         study=case.study,
-        verdict=verdict,
+        verdict=Verdict(Sentence("answer", text) for text in sentences),
         numbers={},
         tables=tables,
     )

@@ -421,7 +421,9 @@ def test_it_says_how_many_vehicles_it_has_simulated_and_what_it_has_not_tried(
     answer = json_of("check", "mine.toml", *options)
     assert answer["numbers"] == {"passed": True, "vehicles": vehicles, "points": 3}
     assert (
-        f"{vehicles} vehicles at 3 points of the study. Not tried: the other 2 points"
+        f"{vehicles} vehicles in 3 test cases of the study. The check left out 2 further test"
         in (answer["verdict"])
     )
-    assert ("more vehicles (--vehicles 100)" in answer["verdict"]) == (vehicles == 3)
+    assert ("--vehicles 100 checks more vehicles" in answer["verdict"]) == (
+        vehicles == 3
+    )

@@ -167,9 +167,9 @@ def test_the_fewest_changes_collide_as_they_are_printed_and_no_fewer_of_them_do(
     verdict = json_of(
         "study", str(slippery.parent / "slippery.toml"), "--out", str(slippery)
     )["verdict"]
-    command = verdict.partition("It is simulated by python -m safevar_sumo ")[
-        2
-    ].partition(". ")[0]
+    command = verdict.partition(
+        "This command simulates the vehicle: python -m safevar_sumo "
+    )[2].partition(". ")[0]
     command = command.rstrip(".")
     typed, chosen = (
         json_of(*one)["numbers"]
@@ -178,10 +178,12 @@ def test_the_fewest_changes_collide_as_they_are_printed_and_no_fewer_of_them_do(
             ("simulate", str(slippery), "--solution", "fewest"),
         )
     )
-    assert f"the vehicle collides at {-typed['safety_degree']:.2f} m/s" in verdict
+    assert (
+        f"The changed vehicle collides at {-typed['safety_degree']:.2f} m/s" in verdict
+    )
     assert chosen["safety_degree"] == typed["safety_degree"]
     values = dict(re.findall(r"--set (\w+)=(\S+)", command))
-    assert f"With {len(values)} change" in verdict
+    assert f"with only {len(values)} change" in verdict
     crashes = case.solutions[case.solutions["outcome"] == "collision"]
     assert len(values) <= crashes["f_num_diff"].min()
     for left_out in values:

@@ -92,8 +92,8 @@ class Rig:
 @pytest.mark.parametrize(
     ("formula", "shares", "said"),
     [
-        ("1.8 * a + 1.2 * b", (0.692, 0.308), "decel decides most: it causes "),
-        ("(a - 0.5) * (b - 0.5)", (0, 0), "What decides most is uncertain: "),
+        ("1.8 * a + 1.2 * b", (0.692, 0.308), " has the largest influence: it causes "),
+        ("(a - 0.5) * (b - 0.5)", (0, 0), "The largest influence is uncertain. "),
     ],
 )
 @pytest.mark.filterwarnings("error")
@@ -216,7 +216,10 @@ def test_what_decides_is_said_from_enough_vehicles(rig: str) -> None:
         answer = sv.risk(rig, simulations=number, pool=InlinePool())
         is_enough = answer.numbers["samples"] >= 200
         assert is_enough == (number == 270)
-        said = "What decides is unknown: that needs 200 vehicles." in answer.verdict
+        said = (
+            "influence are unknown: at least 200 sampled vehicles are needed"
+            in answer.verdict
+        )
         shares = answer.tables["sensitivity"].drop(columns="characteristic")
         assert said == shares.isna().all(axis=None) == (not is_enough)
         assert not re.search(r"\b(nan|inf)\b", answer.render("text", details=True))

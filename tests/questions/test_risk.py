@@ -21,7 +21,7 @@ from safevar_sumo.questions.answer import HIGH, LOW, Answer
 from safevar_sumo.questions.indices import OUTPUTS
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.over_sets import STAGE, VEHICLES, SharesOverSets
-from safevar_sumo.questions.risk import deciding_in_words
+from safevar_sumo.questions.risk import influence_in_words
 from safevar_sumo.questions.rules import SAMPLED_STAGE
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
@@ -72,16 +72,18 @@ def test_no_failure_says_how_many_vehicles_would_show_a_rare_one(
     answer = of(nowhere, samples=200, confidence=confidence)
     verdict = answer.verdict
     (told,) = re.findall(
-        r"at most 0\.01 %, ([\d,]+) vehicles are needed of which", verdict
+        r"at most 0\.01 %, ([\d,]+) sampled vehicles are needed, and all", verdict
     )
     needed = int(told.replace(",", ""))
     highest = [
         clopper_pearson(0, number, confidence)[1] for number in (needed - 1, needed)
     ]
     assert highest[1] <= 1e-4 < highest[0]
-    assert "No vehicle was found that changes the safety degree" in verdict
-    assert "What decides" not in answer.render("text"), "a table without a share"
-    assert "No vehicle is unsafe" not in of(box, samples=200).verdict
+    assert "the safety degree is the same for all sampled vehicles" in verdict
+    assert "shares of the variance" not in answer.render("text"), (
+        "a table without a share"
+    )
+    assert "No sampled vehicle is unsafe" not in of(box, samples=200).verdict
 
 
 def ishigami(settings: FloatArray) -> FloatArray:
@@ -199,10 +201,7 @@ def test_a_box_is_one_rule_of_its_two_conditions() -> None:
     assert answer.numbers["failures"] / answer.numbers["samples"] == pytest.approx(
         0.09, abs=0.005
     )
-    assert (
-        "of the unsafe vehicles have a above 7 N m and b below 3 N m. Of all vehicles in this"
-        " region" in answer.verdict
-    )
+    assert "ranges of values): a above 7 N m and b below 3 N m. " in answer.verdict
 
 
 def test_rules_draw_as_the_variation_says() -> None:
@@ -217,7 +216,10 @@ def test_rules_draw_as_the_variation_says() -> None:
         for ask in (rules, risk)
     )
     assert by_rules.numbers["failures"] == by_risk.numbers["failures"]
-    assert "Of 1,000 vehicles sampled as [variation] says, " in by_rules.verdict
+    assert (
+        "of the 1,000 vehicles that were sampled as the study states"
+        in by_rules.verdict
+    )
     (rule,) = by_rules.tables["rules"]["rule"]
     assert rule.startswith("b below 3")
 
@@ -227,16 +229,16 @@ def test_rules_draw_as_the_variation_says() -> None:
     [
         (
             0.49,
-            "a decides most: it causes 60 % of the variance of the safety degree (50 to 70 %).",
+            "A has the largest influence: it causes 60 % of the variance of the safety degree (",
         ),
         (
             0.51,
-            "uncertain: a causes 60 % of the variance of the safety degree (50 to 70 %), and",
+            "uncertain. a causes 60 % of the variance of the safety degree (95 % confidence",
         ),
     ],
 )
 def test_only_an_interval_above_all_others_decides(of_b: float, said: str) -> None:
-    """And nothing is said of a table without shares."""
+    """And what decides between safe and unsafe is unknown without shares."""
     frame = pd.DataFrame(
         {
             "characteristic": ["a", "b"],
@@ -247,13 +249,12 @@ def test_only_an_interval_above_all_others_decides(of_b: float, said: str) -> No
         }
     )
     frame.attrs = {"of_what": OUTPUTS}
-    assert said in deciding_in_words(frame, 120)
+    names = {"a": "a", "b": "b"}
+    (told,) = influence_in_words(frame, 120, 0.95, names)
+    assert said in told.text
     frame["unsafe_total"] = np.nan
-    assert "that needs 100 unsafe and as many safe vehicles" in deciding_in_words(
-        frame, 1
-    )
-    assert "unknown" not in deciding_in_words(frame, 0)
-    assert deciding_in_words(frame.iloc[:0], 0) == ""
+    _, unknown = influence_in_words(frame, 1, 0.95, names)
+    assert "at least 100 unsafe and 100 safe vehicles are needed" in unknown.text
 
 
 def test_nothing_everything_and_too_little() -> None:
@@ -262,9 +263,7 @@ def test_nothing_everything_and_too_little() -> None:
     assert (row.rule, row.density, row.coverage) == ("everywhere", 1.0, 1.0)
     few = rules_of(lambda settings: (settings > 9.5).all(axis=1), n=2, samples=400)
     assert few.tables["rules"].empty
-    assert few.verdict.endswith(
-        "Ask for more vehicles by --samples, or by --simulations if you stated it."
-    )
+    assert "No region can be found, because the search has only" in few.verdict
 
 
 def test_a_rule_that_may_be_due_to_chance_is_in_no_verdict() -> None:
@@ -272,7 +271,7 @@ def test_a_rule_that_may_be_due_to_chance_is_in_no_verdict() -> None:
         lambda settings: np.sin(1e6 * settings[:, 0]) > 0.7, n=2, samples=400
     )
     table = answer.tables["rules"]
-    assert (" of the unsafe vehicles have " in answer.verdict) == (
+    assert (" lie in this region" in answer.verdict) == (
         table["density_low"] > (answer.numbers["failures"] / answer.numbers["samples"])
     ).any()
 
@@ -366,7 +365,7 @@ def test_a_parameter_set_is_named_where_its_interval_leaves_the_others_out(
 ) -> None:
     intervals = np.array([[clopper_pearson(count, VEHICLES)] for count in failing])
     shares = np.array([[count / VEHICLES] for count in failing])
-    words = SharesOverSets(load_study("wear"), shares, intervals).in_words()
+    ((_, words),) = SharesOverSets(load_study("wear"), shares, intervals).sentences()
     assert least in words
     assert greatest in words
 

@@ -372,15 +372,15 @@ def test_a_run_without_solutions_is_the_worst_run() -> None:
         ({"finished": []}, "no run is finished"),
         (
             {},
-            "returned none of 2 settings that have a value of every objective; of these, 1 is",
+            "selected none of the 2 simulated vehicles that have a value for every objective",
         ),
         (
             {"f_diff": math.nan},
-            "none of 0 settings that have a value of every objective; of these, none is",
+            "None of the 0 vehicles with such values is unsafe",
         ),
         (
             {"original_safety_degree": 0.4},
-            "in none of 2 encounters the original vehicle keeps at",
+            "m of clearance (scenario.margin) in none of the 2 encounters",
         ),
     ],
 )

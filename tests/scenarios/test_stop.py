@@ -78,4 +78,4 @@ def test_simulate_prints_the_stop_from_every_speed() -> None:
     assert answer.tables["points"]["stopping_distance"].tolist() == pytest.approx(
         distances(stops("wet", 30, 50, 80, 100, 120), treadDepth=1.6)
     )
-    assert "times that of the original" in answer.verdict
+    assert "times the stopping distance of the original" in answer.verdict

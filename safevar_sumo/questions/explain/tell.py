@@ -279,7 +279,7 @@ def other_sentences(
         yield UNSAFE_MEANS.fill(description=unsafe.description)
     notes = [unsafe.remark, *constraints_in_words(study)]
     if over_sets:
-        yield Sentence("condition", over_sets.in_words().strip())
+        yield from over_sets.sentences()
         notes += counted_in_words(study, population.left_out)
     yield from (Sentence("note", note) for note in notes)
 

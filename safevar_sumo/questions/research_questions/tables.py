@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.questions.answer import Column, Wide, with_interval
+from safevar_sumo.questions.answer import Column, Wide
 from safevar_sumo.questions.research_questions import budgets, changes, comparisons
 from safevar_sumo.questions.research_questions.fronts import (
     count_evaluations,
     summarise_convergence,
 )
+from safevar_sumo.questions.tables import columns_from
 from safevar_sumo.shipped import shipped_table
 
 CAUSES = "causes"
@@ -45,21 +46,13 @@ class PaperTable(NamedTuple):
     def of(cls, name: str, compute: Compute) -> PaperTable:
         """A table as the file has it."""
         table = DATA["tables"][name]
-        columns = {}
-        declared = DATA["columns"] | table.get("own", {})
-        for key in table["columns"]:
-            facts = declared[key]
-            if isinstance(facts, str):
-                facts = {"meaning": facts}
-            facts = {"unit": "", **facts}
-            has_interval = facts.pop("interval", False)
-            columns[key] = Column(**facts)
-            if has_interval:
-                columns |= with_interval(key, columns[key])
-        wide = None
-        if "wide" in table:
-            wide = Wide(**table["wide"])
-        return cls(table["title"], compute, columns, wide)
+        known = DATA["columns"] | table.get("own", {})
+        return cls(
+            table["title"],
+            compute,
+            columns_from({key: known[key] for key in table["columns"]}),
+            Wide(**table["wide"]) if "wide" in table else None,
+        )
 
 
 DATA = shipped_table("questions/research_questions/tables.toml")

@@ -11,7 +11,7 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import Failure, describe, limit_text
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.tables import Column, Columns, Rows, tabulate
+from safevar_sumo.questions.tables import Rows, shipped_columns, tabulate
 from safevar_sumo.questions.tolerance.oracle import Oracle
 from safevar_sumo.questions.tolerance.told import (
     InRanges,
@@ -35,77 +35,8 @@ NUMBERS = (
     *("samples", "failures", "at_most", "not_simulated", "fits", "fits_tried"),
     *("attacked", "least_attacked"),
 )
-MEANINGS = {
-    "alone": (
-        "that is safe with all others as in the original, in every parameter set",
-        "alone (only if all other parts are as new)",
-    ),
-    "together": (
-        "that is safe with all others within theirs, in every parameter set",
-        "limit, all together",
-    ),
-    "specified": ("that the user's limit allows", ""),
-}
-CHARACTERISTIC: Columns = {
-    "characteristic": "characteristic of the vehicle",
-    "unit": "unit of its values",
-}
-LIMITS: Columns = {
-    **CHARACTERISTIC,
-    "original": Column("", "value of the original vehicle", ".6g"),
-    **{
-        f"{name}_{end}": Column("", f"{end}est value {meaning}", ".10g", head=head)
-        for name, (meaning, head) in MEANINGS.items()
-        for end in ("low", "high")
-    },
-    "kept": (
-        "whether every vehicle within the specified limits is safe in every parameter set; empty"
-        " without a specified limit"
-    ),
-    "fails_first": Column(
-        "", "what fails first beyond the limit", head="just beyond it"
-    ),
-    "fails_at": Column("", "the vehicle that fails, and its encounter", is_shown=False),
-    "simulate": Column("", "the command that simulates it", is_detail=True),
-    "sentence": Column(
-        "",
-        "sentence for a maintenance manual; all these limits hold at the same time",
-        is_shown=False,
-    ),
-}
 LIMITS_TITLE = "Limits, rounded to the safe side"
-FITS: Columns = {
-    "fit": Column(
-        "-", "number of the parameter set in [spread]; 0 is the study's own", "d"
-    ),
-    "specified": (
-        "whether the specified limits hold in it; left out: the original is unsafe or keeps too"
-        " little"
-    ),
-    "least": Column(
-        "",
-        "smallest clearance that the search found [m], or the worst value of a metric",
-        ".2f",
-    ),
-}
-NEAREST: Columns = {
-    **CHARACTERISTIC,
-    "limit": Column("", "the specified value", ".10g"),
-    "nearest": Column(
-        "",
-        "the nearest value with which joint limits exist, the others as specified",
-        ".10g",
-    ),
-}
-IN_RANGES: Columns = {
-    "scope": "what they cover",
-    "kept": "whether the limits above hold there in every parameter set",
-    "verdict": "what a search for counterexamples found there",
-    "fails_at": Column(
-        "", "the vehicle that fails first, and its encounter", is_shown=False
-    ),
-    "simulate": Column("", "the command that simulates it", is_detail=True),
-}
+LIMITS, FITS, NEAREST, IN_RANGES = shipped_columns("tolerance").values()
 ROUGH = (
     "a rough answer calls no limit kept: ask without --quick, or for more simulations"
 )
@@ -181,9 +112,8 @@ def _limits_table(facts: Told) -> pd.DataFrame:
     """The row of each characteristic that varies; the screen shows those that are limited."""
     rows = [_limits_row(facts, column) for column in facts.columns]
     # Joint limits lead, without those of each alone.
-    end = LIMITS["alone_low"]
-    assert isinstance(end, Column)
-    shown = {**LIMITS, "alone_low": end._replace(is_detail=facts.box is not None)}
+    end = LIMITS["alone_low"]._replace(is_detail=facts.box is not None)
+    shown = {**LIMITS, "alone_low": end}
     texts = [text for row in rows if (text := row["fails_first"])]
     words = {text: text.removeprefix("the vehicle ") for text in texts}
     table = tabulate(

@@ -19,11 +19,8 @@ from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics.unsafe import SHARE_DECIMALS
 from safevar_sumo.questions.answer import (
     Answer,
-    Column,
-    Columns,
     contents,
     tabulate,
-    with_interval,
 )
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
@@ -35,9 +32,20 @@ from safevar_sumo.questions.over_sets import (
     planned_over_sets,
 )
 from safevar_sumo.questions.price import LEAST_SETTINGS
+from safevar_sumo.questions.rules import words
 from safevar_sumo.questions.sampling import clopper_pearson
+from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.variation import VariationModel, sampled_in_words
-from safevar_sumo.questions.words import join_phrases, percentage, with_scope
+from safevar_sumo.questions.words import (
+    constraints_in_words,
+    count_in_words,
+    counted_in_words,
+    interval_in_words,
+    join_phrases,
+    notes_on,
+    percentage,
+)
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -59,29 +67,7 @@ UNLIMITED = np.array([[-np.inf], [np.inf]])
 """Ends of a characteristic without limits; a box has the lower ends in row 0 and the upper ends in
 row 1.
 """
-ENDS = {
-    "least": "least density",
-    "greatest": "greatest density",
-    "lowest": "lowest end of an interval",
-    "highest": "highest end of an interval",
-}
-COLUMNS: Columns = {
-    "rule": "region: limits of some characteristics; all others anywhere in their domains",
-    **with_interval(
-        "density",
-        Column("-", "share of the vehicles within the region that are unsafe", ".2f"),
-    ),
-    **with_interval(
-        "coverage",
-        Column("-", "share of all unsafe vehicles that lie within the region", ".2f"),
-    ),
-    **{
-        f"density_{end}": Column(
-            "-", f"{meaning} over all parameter sets", ".2f", False
-        )
-        for end, meaning in ENDS.items()
-    },
-}
+(COLUMNS,) = shipped_columns("rules").values()
 
 
 @question
@@ -145,31 +131,25 @@ def rules(
         )
 
     # Rules are boxes in which unsafe vehicles are dense.
-    # With repeats, each run is a row.
-    trained = np.tile(training.settings, (len(of_runs), 1))
-    boxes, remark = _boxes(trained, of_runs.ravel(), characteristics)
+    trained = np.tile(
+        training.settings, (len(of_runs), 1)
+    )  # with repeats, each run is one
+    boxes = _boxes(trained, of_runs.ravel(), characteristics)
     groups = [is_within(box, vehicles) & ~is_first_half for box in boxes]
     over_sets = SharesOverSets.of(evaluator, criterion, vehicles, groups)
     rows = []
     for number, box in enumerate(boxes, 1):
-        facts = shares(box, testing.settings, unsafe_in_test)
-        ends = over_sets.ends(number, facts[:3])
-        rows.append((conditions(box, characteristics), *facts, *ends))
-    frame = pd.DataFrame(rows, columns=list(COLUMNS))
-    frame = frame.sort_values(
-        "coverage", ascending=False, kind="stable", ignore_index=True
-    )
-    table = tabulate("Regions in which many vehicles are unsafe", COLUMNS, frame)
+        own = shares(box, testing.settings, unsafe_in_test)
+        rows.append(
+            (conditions(box, characteristics), *own, *over_sets.ends(number, own[:3]))
+        )
+    frame = pd.DataFrame(rows, columns=[*COLUMNS])
+    frame = frame.sort_values("coverage", ascending=False, kind="stable")
+    title = "Regions in which many vehicles are unsafe"
+    table = tabulate(title, COLUMNS, frame.reset_index(drop=True))
 
-    # The share of unsafe vehicles, and the rule that covers most of them.
+    # The share of unsafe vehicles, and the region that has most of them.
     low, high = clopper_pearson(failures, total)
-    verdict = (
-        f"Of {total:,} vehicles {sampled_in_words(study)}, {criterion.number_in_words(failures)}:"
-        f" {percentage(failures / total)} % (95 % confidence interval"
-        f" {percentage(low)} to {percentage(high)} %)."
-        f"{over_sets.in_words()}{remark}"
-        f"{_rule_in_words(table, failures / total)}"
-    )
     numbers = {
         "unsafe": str(criterion),
         "samples": total,
@@ -179,51 +159,68 @@ def rules(
         "by_set": over_sets.of_all(failures / total),
         **over_sets.numbers,
     }
-    verdict = with_scope(
-        study, int(evaluations.infeasible.sum()), verdict, criterion.remark
-    )
+    counted = counted_in_words(study, int(evaluations.infeasible.sum()))
+    sentences = [
+        words.SHARE.fill(
+            count=count_in_words(failures, total),
+            sampled=sampled_in_words(study),
+            collide=criterion.verbs[failures > 1],
+            share=percentage(failures / total),
+            interval=interval_in_words(low, high),
+        ),
+        *over_sets.sentences(),
+        *notes_on(criterion, *counted, *constraints_in_words(study)),
+    ]
+    denser = frame[frame["density_low"] > failures / total]
+    if not boxes:
+        sentences.append(
+            words.TOO_FEW.fill(
+                unsafe=int(of_runs.sum()),
+                safe=int((~of_runs).sum()),
+                least=MIN_SETTINGS,
+            )
+        )
+    elif denser.empty:
+        sentences.append(words.NO_REGION)
+    else:
+        box = boxes[denser.index[0]]
+        region = conditions(box, characteristics, "short_name")
+        sentences += _region_in_words(denser.iloc[0], region)
     return Answer(
         question="rules",
         study=study,
-        verdict=verdict,
+        verdict=Verdict(sentences),
         numbers=numbers,
         tables={"rules": table},
     )
 
 
-def _rule_in_words(table: pd.DataFrame, share: float) -> str:
-    """The rule that covers most of the unsafe vehicles, if they are denser in it than their share
-    of all vehicles; else nothing.
+def _region_in_words(rule: pd.Series[Any], region: str) -> Iterator[Sentence]:
+    """The region of a row of the table."""
+    shares = 100 * rule[1:]
+    is_wider = rule["density_least"] < rule["density_greatest"]
+    yield words.REGION.fill(region=region)
+    density = words.DENSITY_OVER_SETS if is_wider else words.DENSITY
+    yield density.fill(**shares)
+    yield words.COVERAGE.fill(**shares)
+
+
+def conditions(
+    box: FloatArray, characteristics: CharacteristicSet, attribute: str = "name"
+) -> str:
+    """The limits of a box, such as `mass above 2500 kg`, with this attribute of each
+    characteristic; `everywhere` without any.
     """
-    denser = table[table["density_low"] > share]
-    if not len(denser):
-        return ""
-    rule = denser.iloc[0]
-    over_sets = ""
-    if rule["density_least"] < rule["density_greatest"]:
-        shares_over_sets = 100 * rule[[f"density_{end}" for end in ENDS]]
-        smallest, largest, low, high = shares_over_sets.map("{:.0f}".format)
-        interval = f"with 95 % confidence {low} to {high} %"
-        over_sets = f" ({smallest} to {largest} % over the parameter sets, {interval})"
-    return (
-        f" {100 * rule['coverage']:.0f} % of the unsafe vehicles have {rule['rule']}. Of all"
-        f" vehicles in this region {100 * rule['density']:.0f} % are unsafe{over_sets}."
-    )
-
-
-def conditions(box: FloatArray, characteristics: CharacteristicSet) -> str:
-    """The limits of a box in words, such as `mass above 2500 kg`; `everywhere` without any."""
     texts = []
     for item, low, high in zip(characteristics, *box.tolist(), strict=True):
+        name = getattr(item, attribute)
         if low > -np.inf and high < np.inf:
-            texts.append(f"{item.name} from {low:g} to {high:g}{item.suffix}")
+            texts.append(f"{name} from {low:g} to {high:g}{item.suffix}")
         elif low > -np.inf:
-            texts.append(f"{item.name} above {low:g}{item.suffix}")
+            texts.append(f"{name} above {low:g}{item.suffix}")
         elif high < np.inf:
-            texts.append(f"{item.name} below {high:g}{item.suffix}")
-    if texts:
-        return join_phrases(texts)
-    return "everywhere"
+            texts.append(f"{name} below {high:g}{item.suffix}")
+    return join_phrases(texts) if texts else "everywhere"
 
 
 def shares(
@@ -245,19 +242,13 @@ def shares(
 
 def _boxes(
     settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet
-) -> tuple[list[FloatArray], str]:
-    """The boxes that become rules; none, and a remark, if too few vehicles differ."""
+) -> list[FloatArray]:
+    """The boxes that become rules; none if too few vehicles differ."""
     if is_unsafe.all() and len(settings):
-        return [np.repeat(UNLIMITED, len(characteristics), axis=1)], ""
+        return [np.repeat(UNLIMITED, len(characteristics), axis=1)]
     if min(is_unsafe.sum(), (~is_unsafe).sum()) >= MIN_SETTINGS:
-        return _find_boxes(settings, is_unsafe, characteristics), ""
-    remark = (
-        f" No region can be found: only {int(is_unsafe.sum()):,} of the {len(settings):,} vehicles"
-        f" in the search are unsafe. At least {MIN_SETTINGS} unsafe and {MIN_SETTINGS} safe"
-        " vehicles are needed. Ask for more vehicles by --samples, or by --simulations if you"
-        " stated it."
-    )
-    return [], remark
+        return _find_boxes(settings, is_unsafe, characteristics)
+    return []
 
 
 def _find_boxes(

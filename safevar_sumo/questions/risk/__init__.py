@@ -10,6 +10,7 @@ themselves (Plischke, Borgonovo, Smith 2013, European Journal of Operational Res
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from itertools import product
 
 import numpy as np
@@ -40,25 +41,31 @@ from safevar_sumo.questions.over_sets import (
     planned_over_sets,
 )
 from safevar_sumo.questions.price import LEAST_SETTINGS
+from safevar_sumo.questions.risk import words
 from safevar_sumo.questions.sampling import clopper_pearson
-from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.questions.words import join_phrases, number_of, percentage, with_scope
+from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.variation import VariationModel, sampled_in_words
+from safevar_sumo.questions.words import (
+    constraints_in_words,
+    count_in_words,
+    counted_in_words,
+    interval_in_words,
+    notes_on,
+    number_of,
+    percentage,
+)
+from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
-from safevar_sumo.study.characteristics import Uniform
 
 SAMPLING = "sampling vehicles"
 """Phase of progress."""
 RARE = 1e-4
 """If no vehicle is unsafe, the verdict says how many would show a probability this small [-]."""
-MAX_DECIDING = 5
-"""Number of characteristics that one screen names."""
 MAX_RIVALS = 3
 """Largest number of characteristics that the verdict names beside the one with the largest share.
 """
-NO_PROBABILITY = (
-    " This share is no probability in traffic, because the study does not state how vehicles vary"
-    " ([variation])."
-)
+MAX_DECIDING = 5
+"""Number of characteristics that one screen names."""
 COLUMNS = [
     "characteristic",
     *map("".join, product(OUTPUTS, ("_first", "_total"), ("", LOW, HIGH))),
@@ -138,113 +145,100 @@ def risk(
         table = sobol_indices(evaluator, design, criterion, confidence)
     else:
         table = given_data_indices(evaluator, simulated, criterion, confidence)
-    numbers = {"unsafe": str(criterion), "samples": total, "failures": failures}
-    numbers |= {
+    numbers = {
+        "unsafe": str(criterion),
+        "samples": total,
+        "failures": failures,
         "probability": failures / total,
         "interval": [low, high],
         "confidence": confidence,
+        "by_set": over_sets.of_all(failures / total),
+        **over_sets.numbers,
     }
-    numbers |= {"by_set": over_sets.of_all(failures / total), **over_sets.numbers}
 
     # In words.
-    verdict = (
-        f"{_probability_in_words(study, criterion, failures, total)} ({100 * confidence:g} %"
-        f" confidence interval {percentage(low)} to {percentage(high)} %)."
-        f"{over_sets.in_words()}"
-        f"{NO_PROBABILITY if not study.variation else ''}"
-    )
-    infeasible = int(evaluations.infeasible.sum())
-    if failed := samples - total - infeasible:
-        verdict += f" {failed:,} vehicles could not be simulated and are left out."
+    left_out = int(evaluations.infeasible.sum())
+    sentences = _share_in_words(study, criterion, numbers, samples - total - left_out)
     if not has_design and total < LEAST_VEHICLES:
-        verdict += f" What decides is unknown: that needs {LEAST_VEHICLES} vehicles."
+        sentences.append(words.UNKNOWN_INFLUENCE.fill(least=LEAST_VEHICLES))
     else:
-        verdict += deciding_in_words(table, failures)
-    verdict += "" if failures else _bound_in_words(high, total, confidence)
+        names = {item.name: item.short_name for item in evaluator.characteristics}
+        sentences += influence_in_words(table, failures, confidence, names)
+    sentences += over_sets.sentences()
+    counted = counted_in_words(study, left_out)
+    sentences += notes_on(criterion, *counted, *constraints_in_words(study))
     table.attrs["lead_rows"] = range(min(MAX_DECIDING, len(table)))
     has_shares = table.drop(columns="characteristic").notna().any(axis=None)
     return Answer(
         question="risk",
         study=study,
-        verdict=with_scope(study, infeasible, verdict, criterion.remark),
+        verdict=Verdict(sentences),
         numbers=numbers,
         tables={"sensitivity": table},
         folded=() if has_shares else ("sensitivity",),
     )
 
 
-def _bound_in_words(high: float, total: int, confidence: float) -> str:
-    """What a sample without an unsafe vehicle says, and how many vehicles would say more. Clopper
-    and Pearson's upper end of 0 of n is 1 - ((1 - confidence) / 2)^(1 / n).
+def _share_in_words(
+    study: Study, unsafe: Unsafe, numbers: JsonObject, failed: int
+) -> list[Sentence]:
+    """The share of unsafe vehicles, and how many vehicles would show more if none is unsafe.
+
+    Clopper and Pearson's upper end of 0 of n is 1 - ((1 - confidence) / 2)^(1 / n).
     """
-    words = f" No vehicle is unsafe, so the share is at most {percentage(high)} %."
-    number = math.ceil(math.log((1 - confidence) / 2) / math.log1p(-RARE))
-    further = (
-        f" To show at most {percentage(RARE)} %, {number:,} vehicles are needed of which none is"
-        " unsafe (--samples)."
-    )
-    return f"{words}{further if total < number else ''}"
+    said = [words.SHARE, words.SAMPLED, words.NO_PROBABILITY]
+    if study.variation:
+        said = [words.PROBABILITY, words.SAMPLED]
+    confidence = numbers["confidence"]
+    needed = math.ceil(math.log((1 - confidence) / 2) / math.log1p(-RARE))
+    if not numbers["failures"]:
+        said.append(words.BOUND)
+        said += [words.NEEDED] * (numbers["samples"] < needed)
+    said += [words.NOT_SIMULATED] * bool(failed)
+
+    slots = {
+        "count": count_in_words(numbers["failures"], numbers["samples"]),
+        "sampled": sampled_in_words(study),
+        "unsafe": unsafe,
+        "do": unsafe.verbs[numbers["failures"] > 1],
+        "share": percentage(numbers["probability"]),
+        "interval": interval_in_words(*numbers["interval"]),
+        "high": percentage(numbers["interval"][1]),
+        "confidence": 100 * confidence,
+        "rare": percentage(RARE),
+        "needed": needed,
+        "failed": number_of(failed, "vehicle"),
+    }
+    return [template.fill(**slots) for template in said]
 
 
-def deciding_in_words(table: pd.DataFrame, failures: float) -> str:
-    """Which characteristic decides the table's measure, as the interval of its share of the
-    variance is above those of all others, or which may.
+def influence_in_words(
+    table: pd.DataFrame, failures: float, confidence: float, names: Mapping[str, str]
+) -> Iterator[Sentence]:
+    """Which characteristic has the largest influence on the table's measure, if the interval of its
+    share of the variance is above those of all others, or which may; `names` are those of
+    sentences.
     """
     if table.empty:
-        return ""
+        return
     index = "total" if table["degree_total"].notna().any() else "first"
 
     # The largest share, of all orders if it is known.
-    name = f"degree_{index}"
-    largest = table.iloc[0]
-    share, low, high = largest[[name, f"{name}{LOW}", f"{name}{HIGH}"]]
-    in_words = table.attrs[OF_WHAT]
-    words = f" No vehicle was found that changes {in_words['degree']}, so nothing decides it."
-    if np.isfinite(share):
-        characteristic = largest["characteristic"]
-        causes = (
-            f"causes {100 * share:.0f} % of the variance of {in_words['degree']}"
-            f" ({100 * low:.0f} to {100 * high:.0f} %)"
-        )
-        _, *rivals = table[table[f"{name}{HIGH}"] >= low]["characteristic"]
-        words = f" {characteristic} decides most: it {causes}."
-        if rivals:
-            words = (
-                f" What decides most is uncertain: {characteristic} {causes}, and the interval of"
-                f" {join_phrases(rivals[:MAX_RIVALS])} overlaps with that."
-            )
+    share, low, high = (100 * table[f"degree_{index}{end}"] for end in ("", LOW, HIGH))
+    name, *rivals = table["characteristic"].map(names)[~(high < low[0])]
+    template = words.UNCERTAIN_INFLUENCE if rivals else words.LARGEST_INFLUENCE
+    if np.isnan(share[0]):
+        template = words.NO_INFLUENCE
+    yield template.fill(
+        name=name,
+        measure=table.attrs[OF_WHAT]["degree"],
+        share=share[0],
+        low=low[0],
+        high=high[0],
+        confidence=100 * confidence,
+        rivals=", ".join(rivals[:MAX_RIVALS]),
+    )
 
     # Without the outcome's own shares, what decides it is unknown.
     if failures and table[f"unsafe_{index}"].isna().all():
-        words += (
-            " What decides whether a vehicle is unsafe is unknown: that needs"
-            f" {MIN_OUTCOMES} unsafe and as many safe vehicles."
-        )
-    return words
-
-
-def _probability_in_words(
-    study: Study, criterion: Unsafe, failures: float, total: int
-) -> str:
-    """The share of unsafe vehicles, and how vehicles vary."""
-    share = f"{percentage(failures / total)} %"
-    if not study.variation:
-        vehicles = (
-            f"{number_of(total, 'vehicle')} that were sampled uniformly over the"
-            " whole domain"
-        )
-        return f"Of {vehicles}, {criterion.number_in_words(failures)}: {share}"
-
-    # Distributions other than the uniform one.
-    variation = [
-        f"{name} {distribution.__struct_config__.tag}"
-        for name, distribution in study.variation.items()
-        if distribution != Uniform()
-    ]
-    if len(variation) < len(study.domains):
-        variation.append("the others uniform")
-    manner = join_phrases(variation)
-    vehicles = (
-        f"Of {number_of(total, 'vehicle')} that vary as the study says ({manner})"
-    )
-    return f"{vehicles}, {criterion.number_in_words(failures)}. So the probability is about {share}"
+        yield words.FEW_OUTCOMES.fill(least=MIN_OUTCOMES)
