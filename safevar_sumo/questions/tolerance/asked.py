@@ -91,10 +91,6 @@ class Effort(NamedTuple):
     confirmations: int = 3
     share: float = MAX_UNSAFE_SHARE
 
-    def plan(self, budget: int) -> SearchPlan:
-        """A search for a counterexample."""
-        return SearchPlan(budget, self.generation, self.more)
-
 
 USUAL = Effort()
 """How much is searched by default."""
@@ -179,7 +175,9 @@ class Asked(NamedTuple):
             cases = cases._replace(center=space.center)
             return search_cases(oracle, cases, start, plan, rng)
 
-        return [partial(search, self.effort.plan(budget)) for budget in budgets]
+        size = self.effort.generation
+        more = self.effort.more
+        return [partial(search, SearchPlan(budget, size, more)) for budget in budgets]
 
     def boxes(self, longest: FloatArray) -> Boxes:
         """Boxes with the specified limits, whose other sides are at most so long."""

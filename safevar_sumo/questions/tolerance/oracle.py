@@ -117,7 +117,6 @@ class Oracle:
         evaluator = self.own.evaluator
         self.phases = evaluator.phases
         self._region = evaluator.region
-        self._account = evaluator.account
         self._simulations = max(
             simulations_of_setting(world.model.evaluator.system)
             for world in self.worlds
@@ -130,7 +129,7 @@ class Oracle:
     @property
     def available(self) -> float:
         """The number of cases that may follow; infinite without a limit."""
-        return self._account.left // self._simulations
+        return self.own.evaluator.account.left // self._simulations
 
     def __call__(self, cases: FloatArray) -> FloatArray:
         """What each of M cases leaves, shape (M,): below 0 it is unsafe, infinite where it does not

@@ -94,8 +94,10 @@ def find_limits(task: Asked, wider: FoundLimits | None = None) -> FoundLimits:
                 limits = _with_set(task, limits, fit)
             except Exhausted:
                 # Nothing is claimed of a set that was not searched to the end.
-                failures = Failures(task.nothing, task.nothing)
-                limits = limits._replace(sides=None, failures=failures)
+                nothing = task.nothing
+                limits = limits._replace(
+                    sides=None, failures=Failures(nothing, nothing)
+                )
                 break
     if limits.sides is None or task.effort.share >= 1:
         return limits
