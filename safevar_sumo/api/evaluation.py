@@ -159,10 +159,10 @@ def _read_settings(
                 expected = (
                     f"{SETTINGS_FORMAT}; here n = {len(names)}: {', '.join(names)}"
                 )
-                got = (
-                    f"an array of shape {array.shape}" if array.ndim else repr(settings)
-                )
-                raise InputError("settings", got, expected)
+                problem = repr(settings)
+                if array.ndim:
+                    problem = f"an array of shape {array.shape}"
+                raise InputError("settings", problem, expected)
             index = pd.RangeIndex(len(array))
     except (TypeError, ValueError) as error:
         kind = type(settings).__name__

@@ -78,11 +78,9 @@ def run(
                 )
         keys = [RunKey(*key) for key in only]
 
-    directory = (
-        Path("results") / loaded_study.name
-        if out is None
-        else Path(check_text("out", out))
-    )
+    directory = Path("results", loaded_study.name)
+    if out is not None:
+        directory = Path(check_text("out", out))
     if out == "":
         raise InputError("out", "''", "a directory")
 

@@ -242,10 +242,8 @@ def _found(
 def directory_name(study: Study) -> str:
     """The name of a directory of results: that of the study, and of the part that is searched."""
     origin = study.origin
-    parts = ["ranges" if origin.ranges else "", origin.point, origin.up_to]
-    return re.sub(
-        r"[^A-Za-z0-9_.=-]+", "_", "-".join([study.name, *filter(None, parts)])
-    )
+    parts = (study.name, "ranges" * origin.ranges, origin.point, origin.up_to)
+    return re.sub(r"[^A-Za-z0-9_.=-]+", "_", "-".join(filter(None, parts)))
 
 
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:

@@ -317,9 +317,8 @@ def key_of_settings(
 def content_of(evaluations: Evaluations) -> bytes:
     """Evaluations without failures as the content of an entry."""
     arrays = {name: getattr(evaluations, name) for name in COLUMNS}
-    arrays |= {
-        f"{METRIC}{name}": values for name, values in evaluations.metrics.items()
-    }
+    for name, values in evaluations.metrics.items():
+        arrays[f"{METRIC}{name}"] = values
     if evaluations.worst_points is not None:
         arrays[POINTS] = evaluations.worst_points
     buffer = BytesIO()
@@ -334,16 +333,12 @@ def evaluations_in(content: bytes | None) -> Evaluations | None:
     try:
         with np.load(BytesIO(zlib.decompress(content)), allow_pickle=False) as file:
             arrays = dict(file)
-        metrics = {
-            name.removeprefix(METRIC): values
-            for name, values in arrays.items()
-            if name.startswith(METRIC)
-        }
-        return Evaluations(
-            **{name: arrays[name] for name in COLUMNS},
-            metrics=metrics,
-            worst_points=arrays.get(POINTS),
-        )
+        metrics = {}
+        for name, values in arrays.items():
+            if name.startswith(METRIC):
+                metrics[name.removeprefix(METRIC)] = values
+        columns = {name: arrays[name] for name in COLUMNS}
+        return Evaluations(**columns, metrics=metrics, worst_points=arrays.get(POINTS))
     except (ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error):
         return None
 

@@ -194,15 +194,14 @@ def _remarks(
 
 def _about_algorithms(study: Study) -> JsonObject:
     """What a manifest says of the study's algorithms: titles, and which stop by themselves."""
-    algorithms = {name: algorithm_of(name, study) for name in study.search.labels}
-    stopping = [
-        name for name, algorithm in algorithms.items() if algorithm.stops_by_itself
-    ]
-    titles = {
-        name: algorithm.title
-        for name, algorithm in algorithms.items()
-        if algorithm.title
-    }
+    titles = {}
+    stopping = []
+    for name in study.search.labels:
+        algorithm = algorithm_of(name, study)
+        if algorithm.title:
+            titles[name] = algorithm.title
+        if algorithm.stops_by_itself:
+            stopping.append(name)
     return {"titles": titles, "stop_by_themselves": stopping}
 
 
@@ -278,7 +277,7 @@ def repeat_in_sumo(
         progress(phase, verified, len(sample))
 
     show([])
-    return {remark for remark in carry_out(verify_settings, jobs, pool, show) if remark}
+    return {*filter(None, carry_out(verify_settings, jobs, pool, show))}
 
 
 def journal_progress(
@@ -287,10 +286,10 @@ def journal_progress(
     """A function that shows the evaluations that runs have asked for, as their journals tell; of
     those that have not finished, all others are to come.
     """
-    readers = [
-        JournalReader(journal_file(directory, str(key)), study.search.evaluations)
-        for key in keys
-    ]
+    readers = list[JournalReader]()
+    for key in keys:
+        file = journal_file(directory, str(key))
+        readers.append(JournalReader(file, study.search.evaluations))
 
     def show(ended: Sequence[int]) -> None:
         evaluations = sum(reader.asked() for reader in readers)

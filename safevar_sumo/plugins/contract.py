@@ -115,9 +115,9 @@ def check_open_runs(are_open: BoolArray) -> Iterator[None]:
 def open_rows(holds: BoolArray) -> IntArray:
     """The indices at which `holds` is true, shape (N,), without those of runs that have ended."""
     are_open = _open_runs.get()
-    return np.flatnonzero(
-        holds if are_open is None or are_open.shape != holds.shape else holds & are_open
-    )
+    if are_open is not None and are_open.shape == holds.shape:
+        holds = holds & are_open
+    return np.flatnonzero(holds)
 
 
 class Legal(NamedTuple):
@@ -137,16 +137,17 @@ class Legal(NamedTuple):
     def __str__(self) -> str:
         if self.kinds == "b":
             return "truth values"
-        bounds = (
-            f"{'above' if self.above else 'from'} {self.lowest:g} to {self.highest:g}"
-        )
+        begin = "above" if self.above else "from"
+        text = f"numbers {begin} {self.lowest:g} to {self.highest:g}"
         if self.infinite:
-            return f"numbers {bounds}"
-        return f"numbers {bounds}, finite"
+            return text
+        return f"{text}, finite"
 
     def holds(self, numbers: FloatArray) -> BoolArray:
         """Which numbers are legal."""
-        is_legal = (numbers > self.lowest) if self.above else (numbers >= self.lowest)
+        is_legal = numbers >= self.lowest
+        if self.above:
+            is_legal = numbers > self.lowest
         is_legal &= (numbers <= self.highest) & (self.infinite | np.isfinite(numbers))
         return is_legal | (self.undefined & np.isnan(numbers))
 
@@ -217,7 +218,9 @@ class UserCode(NamedTuple):
         shape
             The shape; None accepts any.
         """
-        expected = f"{legal}, shape {shape}" if shape is not None else str(legal)
+        expected = str(legal)
+        if shape is not None:
+            expected += f", shape {shape}"
         try:
             array = np.asarray(value)
         except ValueError:
@@ -293,11 +296,9 @@ class Returned(NamedTuple):
                 method, quoted(result), f"a tuple of {len(self.parts)}: {names}"
             )
 
-        shape = (
-            None
-            if self.like is None or not self.parts
-            else _shape_of(arguments[self.like])
-        )
+        shape = None
+        if self.like is not None and self.parts:
+            shape = _shape_of(arguments[self.like])
         for columns, value in zip(self.parts, values, strict=False):
             for name, legal in columns.items():
                 if name and not hasattr(value, name):
@@ -387,11 +388,10 @@ def violation(candidate: Any, base: type) -> str:
 
 def contract_of(base: type) -> str:
     """What a class of this base must have, in words."""
-    methods = [
-        f"{name}({', '.join(parameters)})"
-        for name, parameters in _methods(base).items()
-        if hasattr(getattr(base, name), ABSTRACT)
-    ]
+    methods = []
+    for name, parameters in _methods(base).items():
+        if hasattr(getattr(base, name), ABSTRACT):
+            methods.append(f"{name}({', '.join(parameters)})")
     return (
         f"a class such as {base.__module__.rpartition('.')[0]}.{base.__name__} with"
         f" {', '.join(methods)}"
@@ -432,12 +432,9 @@ def read_only(value: UserValue) -> Any:
             return type(value)(*views)
         return tuple(views)
     if is_dataclass(value) and not isinstance(value, type):
+        names = (field.name for field in fields(value))
         return replace(
-            value,
-            **{
-                field.name: read_only(getattr(value, field.name))
-                for field in fields(value)
-            },
+            value, **{name: read_only(getattr(value, name)) for name in names}
         )
     if isinstance(value, Mapping):
         return MappingProxyType({key: read_only(item) for key, item in value.items()})

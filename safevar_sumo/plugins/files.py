@@ -68,9 +68,8 @@ def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
         paths |= files
         for path in files:
             if path.suffix == ".py":
-                waiting += [
-                    (imported, own_folders) for imported in _imported_modules(path)
-                ]
+                for imported in _imported_modules(path):
+                    waiting.append((imported, own_folders))
     return paths
 
 
@@ -97,10 +96,11 @@ def files_in(path: Path) -> list[Path]:
     """A file itself, or every file in a folder, without Python's cache and hidden files."""
     if path.is_file():
         return [path]
-    files = (file for file in path.rglob("*") if file.is_file())
-    return [
-        file for file in files if not HIDDEN.search(file.relative_to(path).as_posix())
-    ]
+    files = []
+    for file in filter(Path.is_file, path.rglob("*")):
+        if not HIDDEN.search(file.relative_to(path).as_posix()):
+            files.append(file)
+    return files
 
 
 def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
@@ -111,26 +111,23 @@ def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
     folders
         The folders of the study's file and of the files that it extends.
     """
-    named = {name_of_file(Path(os.path.abspath(path)), folders): path for path in paths}
-    return {
-        name: sha256(path.read_bytes()).hexdigest()[:DIGEST_LENGTH]
-        for name, path in sorted(named.items())
-    }
+    files = Files()
+    for path in paths:
+        name = name_of_file(Path(os.path.abspath(path)), folders)
+        files[name] = sha256(path.read_bytes()).hexdigest()[:DIGEST_LENGTH]
+    return dict(sorted(files.items()))
 
 
 def digests_by_name(names: Iterable[str], folders: Sequence[str]) -> Files:
     """Digests of the files with these names, as far as they exist."""
-    return digests(
-        (Path(path) for name in names if (path := file_by_name(name, folders))), folders
-    )
+    paths = (file_by_name(name, folders) for name in names)
+    return digests(map(Path, filter(None, paths)), folders)
 
 
 def name_of_file(path: Path, folders: Sequence[str]) -> str:
     """A file's path relative to the first folder that contains it; its whole path if none does."""
-    folder = next(
-        (folder for folder in _naming_folders(folders) if path.is_relative_to(folder)),
-        path.anchor,
-    )
+    candidates = filter(path.is_relative_to, _naming_folders(folders))
+    folder = next(candidates, path.anchor)
     if folder != path.anchor:
         return path.relative_to(folder).as_posix()
     return path.as_posix()

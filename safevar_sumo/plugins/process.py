@@ -229,29 +229,20 @@ def record_opened(folders: Sequence[str]) -> Iterator[list[str]]:
         this_process.opened = None
     this_process.modules |= sys.modules.keys() - modules
 
-    own_folders = [
+    own_folders = tuple(
         f"{os.path.abspath(folder)}{os.sep}" for folder in (*folders, os.getcwd())
-    ]
+    )
     # Libraries keep such files as lists of fonts there.
     caches = (platformdirs.user_cache_path(), platformdirs.user_config_path())
     not_the_users = (*SYSTEM_FOLDERS, *(f"{path}{os.sep}" for path in caches))
-    data = (
-        path for path in opened if os.path.isfile(path) and not path.endswith(".pyc")
-    )
-    # What is newer than the block was written by the code.
-    names.extend(
-        sorted(
-            name_of_file(Path(path), folders)
-            for path in data
-            if is_user_file(path)
-            and f"{os.sep}{CACHE}{os.sep}" not in path
-            and os.path.getmtime(path) < start
-            and (
-                path.startswith(tuple(own_folders))
-                or not path.startswith(not_the_users)
-            )
-        )
-    )
+    for path in filter(is_user_file, opened):
+        is_of_user = path.startswith(own_folders) or not path.startswith(not_the_users)
+        is_cache = path.endswith(".pyc") or f"{os.sep}{CACHE}{os.sep}" in path
+        # What is newer than the block was written by the code.
+        is_older = os.path.isfile(path) and os.path.getmtime(path) < start
+        if is_of_user and is_older and not is_cache:
+            names.append(name_of_file(Path(path), folders))
+    names.sort()
 
 
 def file_of_module(name: str) -> str:

@@ -113,11 +113,12 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
             f"is not CSV: {str(error).splitlines()[0]}",
             "a CSV file with a header and rows",
         ) from None
-    by_plain_name = {_plain_name(str(column)): str(column) for column in table}
-    columns = {
-        name: by_plain_name.get(_plain_name(name), name)
-        for name in characteristics.names
-    }
+    names = [*map(str, table)]
+    plain_names = [*map(_plain_name, names)]
+    by_plain_name = dict(zip(plain_names, names, strict=True))
+    columns = {}
+    for name in characteristics.names:
+        columns[name] = by_plain_name.get(_plain_name(name), name)
     columns |= COLUMNS
     if columns[OPTIONAL_METRIC] not in table:
         del columns[OPTIONAL_METRIC]
@@ -127,7 +128,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         problem = f"lacks the columns {', '.join(missing_columns)}"
     if missing_columns or table.empty:
         raise InputError(path, problem, "the format of the published package")
-    counts = Counter(_plain_name(str(column)) for column in table)
+    counts = Counter(plain_names)
     doubled = [column for column in columns.values() if counts[_plain_name(column)] > 1]
     if doubled:
         raise InputError(
@@ -174,9 +175,8 @@ def _parse_numbers(
     path: Path, column: pd.Series[str], lowest: float, highest: float
 ) -> FloatArray:
     values = pd.to_numeric(column, errors="coerce")
-    for row, cell in column[
-        ~(np.isfinite(values) & values.between(lowest, highest))
-    ].items():
+    is_legal = np.isfinite(values) & values.between(lowest, highest)
+    for row, cell in column[~is_legal].items():
         legal = f"a number in [{lowest:g}, {highest:g}]"
         if lowest == -np.inf:
             legal = "a finite number"
@@ -270,12 +270,11 @@ def import_published(
         )
 
     characteristics = CharacteristicSet.of(loaded_study)
-    solutions = {
-        algorithm: evaluations_of(
-            read_reference(path, characteristics), characteristics
-        )
-        for algorithm, path in files.items()
-    }
-    names = {algorithm: path.name for algorithm, path in files.items()}
+    solutions = {}
+    names = {}
+    for algorithm, path in files.items():
+        data = read_reference(path, characteristics)
+        solutions[algorithm] = evaluations_of(data, characteristics)
+        names[algorithm] = path.name
     write_imported(directory, loaded_study, solutions, metrics, names)
     return load(directory)

@@ -8,6 +8,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
 import msgspec
@@ -149,10 +150,8 @@ def evidence(
                 number, directory, ask, unsafe, how, show, part
             )
             studies.append(described)
-            files |= {
-                f"{described.folder}/{name}": content
-                for name, content in study_files.items()
-            }
+            for name, content in study_files.items():
+                files[f"{described.folder}/{name}"] = content
     write_pack(out, studies, files)
     return (
         f"The pack is {out} ({out.stat().st_size / 1e6:.2f} MB). The SHA-256 digest of the pack is"
@@ -227,7 +226,7 @@ def _pack_study(
         )
         answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
         packed.ask_speed()
-        opened = {name: "" for names in pool.opened.values() for name in names}
+        opened = dict.fromkeys(chain(*pool.opened.values()))
     packed.pool = None
     files |= _files_of_user(study, opened, [])
     files |= {STUDY: packed.study_file(), ANSWERS: answers, PAGE: packed.page()}
@@ -251,7 +250,7 @@ def _with_lists(questions: Sequence[str]) -> tuple[list[str], dict[str, bytes]]:
 
 
 def _files_of_user(
-    study: Study, named: Mapping[str, str], questions: Sequence[str]
+    study: Study, named: Iterable[str], questions: Sequence[str]
 ) -> dict[str, bytes]:
     """The user's files that the results depend on, the files of the user's questions, and the views
     of networks, without which SUMO does not start, by their names in a pack.
@@ -259,7 +258,7 @@ def _files_of_user(
     places = study.origin.places
     names = [name for name in named if not is_of_shipped_network(name)]
     # What a study names beside itself is there in a pack, too.
-    beside = [*data_files(study), *(name for _, name in fmus_of(study))]
+    beside = (*data_files(study), *dict(fmus_of(study)).values())
     paths_beside = [os.path.abspath(Path(places[0], name)) for name in beside]
     outside = [
         path for path in paths_beside if not Path(path).is_relative_to(places[0])
@@ -272,23 +271,22 @@ def _files_of_user(
         )
 
     # SUMO does not start without the views that a network names.
-    for name in [name for name in names if Path(name).name == OPTIONS_FILE]:
-        if view := options_in(Path(file_by_name(name, places))).get(
-            "gui-settings-file"
-        ):
-            names.append(str(Path(name).with_name(view)))
-    paths = {
-        name: Path(place) for name in names if (place := file_by_name(name, places))
-    }
+    for name in names[:]:
+        if Path(name).name == OPTIONS_FILE:
+            options = options_in(Path(file_by_name(name, places)))
+            if view := options.get("gui-settings-file"):
+                names.append(str(Path(name).with_name(view)))
+    paths = {}
+    for name in names:
+        if place := file_by_name(name, places):
+            paths[name] = Path(place)
 
     modules = [
         text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]
     ]
     folders = [folder for folder in (*places, os.getcwd(), *sys.path) if folder]
     for path in code_files(modules, places):
-        folder = max(
-            (folder for folder in folders if path.is_relative_to(folder)), key=len
-        )
+        folder = max(filter(path.is_relative_to, folders), key=len)
         paths[path.relative_to(folder).as_posix()] = path
     return {f"{CODE}/{name}": path.read_bytes() for name, path in sorted(paths.items())}
 
@@ -344,12 +342,10 @@ def verify(
         for number, described in enumerate(description.studies):
             place = Path(folder, str(number))
             studies[place] = _unpack(path, described, files, place, jobs, show)
-        names_of_studies = {
-            f"{packed.packed.folder}/{name}"
-            for packed in studies.values()
-            for name in packed.files
-        }
-        if unknown := files.keys() - names_of_studies:
+        unknown = {*files}
+        for packed in studies.values():
+            unknown -= {f"{packed.packed.folder}/{name}" for name in packed.files}
+        if unknown:
             raise InputError(path, f"{min(unknown)} belongs to no study", PACK)
 
         # Its code runs only if the user trusts it.
@@ -371,10 +367,8 @@ def verify(
         rows = [compare_claim(names, of_files)]
         for place, packed in studies.items():
             with only_from(str(place / CODE)):
-                rows += [
-                    compare_claim(packed.case.study.name, claim)
-                    for claim in packed.claims(place, search)
-                ]
+                for claim in packed.claims(place, search):
+                    rows.append(compare_claim(packed.case.study.name, claim))
 
     claims = tabulate("Claims", CLAIMS, rows)
     counts = Counter(claims["verdict"])
@@ -436,21 +430,16 @@ def _unpack(
         If it is damaged.
     """
     prefix = f"{described.folder}/"
-    own_files = {
-        name.removeprefix(prefix): content
-        for name, content in files.items()
-        if name.startswith(prefix)
-    }
-    code = {
-        name: content
-        for name, content in own_files.items()
-        if name.startswith(f"{CODE}/")
-    }
-    lists = {name for name in own_files if name.startswith(f"{LISTS}/")}
+    own_files = {}
+    for name, content in files.items():
+        if name.startswith(prefix):
+            own_files[name.removeprefix(prefix)] = content
+    code = [name for name in own_files if name.startswith(f"{CODE}/")]
+    lists = [name for name in own_files if name.startswith(f"{LISTS}/")]
 
     # Anybody may have edited a pack: its files are checked before one of them is used.
     try:
-        for name in sorted(FILES ^ (own_files.keys() - code.keys() - lists)):
+        for name in sorted(FILES ^ (own_files.keys() - {*code, *lists})):
             problem = "belongs to no claim" if name in own_files else "is missing"
             raise ValueError(f"{name} {problem}")
         (folder / CODE).mkdir(parents=True)

@@ -145,7 +145,8 @@ def report(
         If a directory holds no results, there is no such question or point, or the file cannot be
         written.
     """
-    unsafe = None if unsafe is None else Unsafe.parse(unsafe)
+    if unsafe is not None:
+        unsafe = Unsafe.parse(unsafe)
     out = Path(check_text("out", out))
     check_writable(out, "out", (".html", ".htm"))
 
@@ -317,20 +318,17 @@ def make_page(
 ) -> str:
     """The page about studies, with answers about all of them."""
     names = ", ".join(study.case.name for study in studies)
-    of_shared = [
-        (f"The answer {answer.question}", answer.command)
-        for answer in shared
-        if answer.command
-    ]
+    commands = [*chain(*map(page_commands, studies))]
+    for answer in shared:
+        if answer.command:
+            commands.append((f"The answer {answer.question}", answer.command))
     template = template_environment(TEMPLATE_FOLDER).get_template("report.html.j2")
+    described = [_study_parts(*pair, parts) for pair in enumerate(studies, 1)]
     page = template.render(
         title=f"Safety report: {names}",
-        studies=[
-            _study_parts(number, study, parts)
-            for number, study in enumerate(studies, 1)
-        ],
+        studies=described,
         shared=list(_sections("all", shared)),
-        commands=[*chain(*map(page_commands, studies)), *of_shared],
+        commands=commands,
         css=Markup((TEMPLATE_FOLDER / "report.css").read_text(encoding="utf-8")),
     )
     # Units have powers, as in m/s^2.

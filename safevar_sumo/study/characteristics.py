@@ -161,11 +161,8 @@ def check_variation(
 
 def stated_values(distribution: Distribution) -> dict[str, float]:
     """The parameters of a distribution that a study states."""
-    return {
-        name: value
-        for name, value in msgspec.structs.asdict(distribution).items()
-        if value is not None
-    }
+    fields = msgspec.structs.asdict(distribution)
+    return {name: value for name, value in fields.items() if value is not None}
 
 
 def _check_distribution(key: str, row: Domain, distribution: Distribution) -> None:

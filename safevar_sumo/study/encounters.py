@@ -206,13 +206,6 @@ class MatrixTest(Table, frozen=True, kw_only=True):
         return as_axes(self.over)
 
 
-def at_values(test: MatrixTest, values: Mapping[str, Any]) -> MatrixTest:
-    """A test with one value of each of these axes."""
-    return replace(
-        test, over={**test.over, **{name: [value] for name, value in values.items()}}
-    )
-
-
 class MatrixTable(Table, frozen=True, kw_only=True):
     """The `tests` at whose points every setting is simulated.
 
@@ -306,13 +299,15 @@ class Encounters(Table, frozen=True, kw_only=True):
     @property
     def _named_axes(self) -> list[tuple[str, AxisTable]]:
         """The axes of all tests, with their names."""
-        return [pair for _, axes in self._axes_by_test for pair in axes.items()]
+        pairs = list[tuple[str, AxisTable]]()
+        for test in self._tests_or_none:
+            pairs += self.axes_of(test).items()
+        return pairs
 
     @property
-    def _axes_by_test(self) -> list[tuple[MatrixTest | None, dict[str, AxisTable]]]:
-        """The axes of each test, or of the only one."""
-        tests: list[MatrixTest | None] = [*self.tests] or [None]
-        return [(test, self.axes_of(test)) for test in tests]
+    def _tests_or_none(self) -> list[MatrixTest | None]:
+        """The tests; None for the encounters of a study without any."""
+        return [*self.tests] or [None]
 
     def axes_of(self, test: MatrixTest | None) -> dict[str, AxisTable]:
         """The axes of a test, its own first; those of all tests, unless it has values of them."""
@@ -348,42 +343,42 @@ class Encounters(Table, frozen=True, kw_only=True):
         axes of all tests whose values may be any, each as wide as in its widest test; those of
         [scenario.over] alone come last.
         """
-        by_test = [(test, self.ranges_of(test)) for test, _ in self._axes_by_test]
         domains: dict[str, list[Domain]] = {}
-        for test, ranges in by_test:
-            for name in ranges:
-                if test and name in test.over:
+        for test in self.tests:
+            for name in self.ranges_of(test):
+                if name in test.over:
                     domains[name] = []
-        for _, ranges in by_test:
-            for name, domain in ranges.items():
+        for alternatives in map(self.ranges_of, self._tests_or_none):
+            for name, domain in alternatives.items():
                 domains.setdefault(name, []).append(domain)
-        return {name: _widest(alternatives) for name, alternatives in domains.items()}
+        return dict(zip(domains, map(_widest, domains.values()), strict=True))
 
     def points_of(self, test: MatrixTest) -> list[MatrixTest]:
         """A test at each of its points alone: at each combination of its listed values, in each of
         its weathers.
         """
         lists = self.lists_of(test)
-        weathers = [[weather] for weather in test.weathers] or [[]]
-        return [
-            replace(
-                at_values(test, dict(zip(lists, values, strict=True))), weathers=weather
-            )
-            for values in product(*lists.values())
-            for weather in weathers
-        ]
+        points = []
+        for values in product(*lists.values()):
+            over = dict(test.over)
+            for name, value in zip(lists, values, strict=True):
+                over[name] = [value]
+            point = replace(test, over=over)
+            for weather in test.weathers:
+                points.append(replace(point, weathers=[weather]))
+            if not test.weathers:
+                points.append(point)
+        return points
 
     def mapped(self, change: Callable[[dict[str, AxisTable]], Axes]) -> Self:
         """The study with other axes of each test, and of all; lists alone are written as such."""
 
         def changed(over: Axes) -> Axes:
-            axes = as_axes(change(as_axes(over)))
-            lists = {
-                name: axis.at
-                for name, axis in axes.items()
-                if axis == AxisTable(at=axis.at)
-            }
-            return {**axes, **lists}
+            axes: Axes = {}
+            for name, axis in as_axes(change(as_axes(over))).items():
+                is_list = axis == AxisTable(at=axis.at)
+                axes[name] = axis.at if is_list else axis
+            return axes
 
         matrix = self.matrix
         if matrix is not None:

@@ -39,7 +39,8 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     # Keys about the scenario of the base say nothing of another scenario.
     inherited = dict(base.tables)
     own_keys = keys_with(OF_STUDY, Study)
-    if _names_scenario(overrides, base.tables):
+    base_model = table_in(base.tables, "scenario").get("model")
+    if table_in(overrides, "scenario").get("model", base_model) != base_model:
         own_keys += keys_with(OF_SCENARIO, Study)
     for key in own_keys:
         inherited.pop(key, None)
@@ -49,11 +50,11 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     tables = _merge(inherited, overrides)
 
     # Keys about a system say nothing of one in which these parts differ.
-    parts = [
-        key
-        for key in keys_with(PART_OF_SYSTEM, Study)
-        if _model_and_network(tables.get(key)) != _model_and_network(inherited.get(key))
-    ]
+    parts = []
+    for key in keys_with(PART_OF_SYSTEM, Study):
+        inherited_part = _model_and_network(inherited.get(key))
+        if _model_and_network(tables.get(key)) != inherited_part:
+            parts.append(key)
     base_keys: tuple[str, ...] = ()
     if parts:
         base_keys += keys_with(OF_SYSTEM, Study)
@@ -70,14 +71,12 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     remarks = base.remarks
     # What is about one study alone is dropped without a remark: no study inherits it.
     named_keys = {*tables, *keys_with(OF_STUDY, Study)}
-    dropped = [
-        f"[{key}]"
-        for key, value in base.tables.items()
-        if isinstance(value, dict) and key not in named_keys
-    ]
-    for name in sorted(
-        _scenario_parameters(base.tables) - _scenario_parameters(tables)
-    ):
+    dropped = []
+    for key, value in base.tables.items():
+        if isinstance(value, dict) and key not in named_keys:
+            dropped.append(f"[{key}]")
+    parameters = _scenario_parameters(base.tables) - _scenario_parameters(tables)
+    for name in sorted(parameters):
         dropped.append(f"{name} of [scenario]")
     if parts and dropped:
         differences = " and a different ".join(parts).replace("ads", "ADS")
@@ -90,16 +89,17 @@ def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:
     """A table [scenario] that a study inherits: of another weather without the axes of its
     parameters, and for tests of other models with these alone.
     """
-    axes = scenario["over"]
-    names = {*axes}
-    if "weather" in overrides:
-        names -= {*WEATHER}
+    axes = dict(scenario["over"])
     tests = _tables_in(table_in(overrides, "matrix"), "tests")
-    if tests and all(
-        test.get("model") not in (None, scenario.get("model")) for test in tests
-    ):
-        names &= {*WEATHER}
-    return {**scenario, "over": {name: axes[name] for name in axes if name in names}}
+    models = [test.get("model") for test in tests]
+    has_other_models = tests and not (None in models or scenario.get("model") in models)
+    for name in scenario["over"]:
+        is_dropped = has_other_models
+        if name in WEATHER:
+            is_dropped = "weather" in overrides
+        if is_dropped:
+            del axes[name]
+    return {**scenario, "over": axes}
 
 
 def _for_tests(tables: Tables, overrides: Tables) -> Parameters:
@@ -144,14 +144,6 @@ def table_in(tables: object, key: str) -> Parameters:
     if isinstance(tables, dict) and isinstance(tables.get(key), dict):
         return dict(tables[key])
     return {}
-
-
-def _names_scenario(tables: Tables, base_tables: Tables) -> bool:
-    """Whether a table [scenario] names another model than that of its base, whose matrix is not
-    about it.
-    """
-    base_model = table_in(base_tables, "scenario").get("model")
-    return bool(table_in(tables, "scenario").get("model", base_model) != base_model)
 
 
 def _scenario_parameters(tables: Tables) -> set[str]:

@@ -216,16 +216,11 @@ def _with_parameters(
     if not isinstance(table, dict) or not isinstance(table.get("parameters", {}), dict):
         return tables
 
-    inner_tables = {
-        key: value
-        for key, value in table.items()
-        if isinstance(value, dict) and key not in record.__struct_fields__
-    }
-    other_keys = {key: value for key, value in table.items() if key not in inner_tables}
-    parameters = {**other_keys.get("parameters", {}), **inner_tables}
-    if not inner_tables:
-        return tables
-    return {**tables, name: {**other_keys, "parameters": parameters}}
+    moved = {**table, "parameters": dict(table.get("parameters", {}))}
+    for key, value in table.items():
+        if isinstance(value, dict) and key not in record.__struct_fields__:
+            moved["parameters"][key] = moved.pop(key)
+    return {**tables, name: moved}
 
 
 def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:

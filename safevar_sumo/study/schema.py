@@ -248,9 +248,8 @@ class Study(Encounters, frozen=True, kw_only=True):
         check_variation(self.domains, self.variation)
         check_limits(rows, self.limits, table="limits.")
         check_unmeasured(rows, self.unmeasured_values)
-        if len({len(values) for values in self.spread.values()}) > 1 or not all(
-            self.spread.values()
-        ):
+        lengths = {*map(len, self.spread.values())}
+        if len(lengths) > 1 or 0 in lengths:
             raise InputError(
                 "",
                 "spread: its lists differ in length or are empty",

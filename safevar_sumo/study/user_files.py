@@ -40,24 +40,22 @@ def user_modules(study: Study) -> list[str]:
 def user_code(study: Study) -> list[tuple[str, str]]:
     """Keys and names of a study's user code."""
     tests = [test.model for test in study.tests]
-    algorithms = [
-        name for name in study.search.algorithms if not name.startswith(PYMOO)
-    ]
     names_by_key = {
         "vehicle.model": [study.vehicle.model],
         "ads.model": [study.ads.model],
         "scenario.model": [study.scenario.model, *tests],
         "metrics.also": study.metrics.also,
         "search.objectives": study.search.objectives,
-        "search.algorithms": algorithms,
+        "search.algorithms": study.search.algorithms,
     }
     fmus = fmus_of(study)
-    return [
-        (key, name)
-        for key, names in names_by_key.items()
-        for name in dict.fromkeys(names)
-        if ":" in name and (key, name) not in fmus
-    ]
+    pairs = []
+    for key, names in names_by_key.items():
+        for name in dict.fromkeys(names):
+            is_code = ":" in name and not name.startswith(PYMOO)
+            if is_code and (key, name) not in fmus:
+                pairs.append((key, name))
+    return pairs
 
 
 def data_files(study: Study) -> dict[str, str]:
@@ -98,8 +96,6 @@ def _scenario_files(study: Study) -> list[str]:
             axes = study.axes_of(test)
             if "file" in axes:
                 texts += axes["file"].at
-            texts += [
-                study.scenario.parameters.get("file"),
-                test.parameters.get("file"),
-            ]
+            for table in (study.scenario, test):
+                texts.append(table.parameters.get("file"))
     return [*dict.fromkeys(text for text in texts if isinstance(text, str))]

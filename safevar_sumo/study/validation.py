@@ -149,9 +149,8 @@ def _expected_in_words(place: _Place, expected: str) -> str:
     for meta in getattr(place.declared[-1], "__metadata__", ()):
         if meta.pattern and meta.description:
             return str(meta.description)
-    legal = re.sub(
-        r"\b(?:" + "|".join(WORDS) + r")\b", lambda word: WORDS[word[0]], expected
-    )
+    kinds = rf"\b(?:{'|'.join(WORDS)})\b"
+    legal = re.sub(kinds, lambda word: WORDS[word[0]], expected)
     return legal.replace("`", "").replace(" | ", " or ")
 
 
@@ -182,13 +181,11 @@ def _intended_type(kind: Any, value: Any) -> Any:
         return _intended_type(get_args(kind)[0], value)
     if get_origin(kind) not in (Union, UnionType):
         return kind
-    kinds = [
-        member
-        for member in get_args(kind)
-        if member is not NoneType
-        and (_is_record(member) or get_origin(member) is dict)
-        == isinstance(value, dict)
-    ]
+    kinds = []
+    for member in get_args(kind):
+        is_table = _is_record(member) or get_origin(member) is dict
+        if member is not NoneType and is_table == isinstance(value, dict):
+            kinds.append(member)
     for record in filter(_is_record, kinds):
         config = record.__struct_config__
         if value.get(config.tag_field or "") == config.tag:

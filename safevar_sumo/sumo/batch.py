@@ -17,7 +17,6 @@ from safevar_sumo.scenarios import (
     WEATHER_PARAMETERS,
     Point,
     Scenario,
-    TrackScenario,
     WorldScenario,
 )
 from safevar_sumo.sumo.bodies import SceneWorld
@@ -80,18 +79,19 @@ def reason_against_scenes(system: System) -> str:
     if isinstance(system.ads, TraciController):
         return "a controller written for TraCI reads the running simulation"
     searched = {*system.characteristics.scenario.names} - WEATHER_PARAMETERS.keys()
-    played = (
-        point.scenario
-        for point in system.points
-        if isinstance(point.scenario, WorldScenario)
-    )
-    if searched and any(
-        type(scenario).layout is WorldScenario.layout for scenario in played
-    ):
-        return (
-            f"each encounter has traffic of its own, by {', '.join(sorted(searched))}"
-        )
+    if searched and any(map(_has_own_traffic, system.points)):
+        names = ", ".join(sorted(searched))
+        return f"each encounter has traffic of its own, by {names}"
     return system.scenes.reason_against_scenes(system.points)
+
+
+def _has_own_traffic(point: Point) -> bool:
+    """Whether no recorded scene can be laid out for the encounters of a point."""
+    scenario = point.scenario
+    return (
+        isinstance(scenario, WorldScenario)
+        and type(scenario).layout is WorldScenario.layout
+    )
 
 
 def drive_all(
@@ -119,26 +119,22 @@ def drive_all(
     # Compilation takes longer than many a simulation, and is no part of its time limit.
     system.vehicle.compile()
     with user_errors(system.source), end_if_longer(system.time_limit):
-        reason = reason_against_scenes(system)
-        traffic = traffic_of(system, encounters, OVERTIME if reason else 0.0)
         # SUMO is slow: it simulates only where neither bodies on tracks, at all points at once, nor
         # a scene that it has played once can stand in for it.
-        if reason:
+        if reason_against_scenes(system):
+            traffic = traffic_of(system, encounters, OVERTIME)
             with open_points_world(system, encounters, traffic) as sumo_world:
                 observer = observer_of(scenario, sumo_world, traffic)
-                runs = drive(on_road, vehicles, sumo_world, observer, listen)
-        elif traffic is not None:
-            lane = LaneWorld(
-                traffic, _start_speeds(on_road.points, len(settings)), traffic.step
-            )
+                return drive(on_road, vehicles, sumo_world, observer, listen)
+        traffic = traffic_of(system, encounters, 0.0)
+        if traffic is not None:
+            start_speeds = _start_speeds(on_road.points, len(settings))
+            lane = LaneWorld(traffic, start_speeds, traffic.step)
             vehicles = np.tile(vehicles, (len(system.points), 1))
-            runs = drive(on_road, vehicles, lane, traffic, listen)
-        else:
-            world = _recorded_world(system, encounters, scenario)
-            runs = drive(
-                on_road, vehicles, world, observer_of(scenario, world, None), listen
-            )
-    return runs
+            return drive(on_road, vehicles, lane, traffic, listen)
+        world = _recorded_world(system, encounters, scenario)
+        observer = observer_of(scenario, world, None)
+        return drive(on_road, vehicles, world, observer, listen)
 
 
 def _recorded_world(
@@ -154,13 +150,14 @@ def _recorded_world(
     if scenario_there is point.scenario:
         return RecordedWorld(scene, len(encounters))
 
-    # Paired vehicles share a scene.
-    size = _vehicles_per_encounter(encounters)
+    # Where a variant and the original take turns, a pair shares a scene.
+    size = 1
+    if np.array_equal(encounters[::2], encounters[1::2]):
+        size = 2
     scenario = system.at_encounters(encounters[::size]).points[0].scenario
     assert isinstance(scenario, WorldScenario)
-    return RecordedWorld(
-        scenes_of_encounters(scene, scenario, len(encounters) // size), size
-    )
+    scenes = scenes_of_encounters(scene, scenario, len(encounters) // size)
+    return RecordedWorld(scenes, size)
 
 
 def observer_of(
@@ -178,7 +175,7 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
     seconds `longer` than their scenarios take; None if the scenario observes a world itself.
     """
     points = system.points
-    if not all(isinstance(point.scenario, TrackScenario) for point in points):
+    if not system.has_tracks:
         return None
     group = np.repeat(np.arange(len(points)), len(encounters))
     n_encounters = 1
@@ -207,18 +204,6 @@ def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:
     return np.concatenate(
         [np.zeros(n) + point.scenario.start_speed for point in points]
     )
-
-
-def _vehicles_per_encounter(encounters: FloatArray) -> int:
-    """How many vehicles in a row meet the same encounter: 2 if a variant and the original take
-    turns, else 1.
-    """
-    is_paired = len(encounters) % 2 == 0 and np.array_equal(
-        encounters[::2], encounters[1::2]
-    )
-    if is_paired:
-        return 2
-    return 1
 
 
 def open_points_world(

@@ -5,6 +5,7 @@ first.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from operator import itemgetter
 from typing import NamedTuple, Protocol
 
@@ -279,9 +280,9 @@ def distance_between(
     at `middle`: the least distance of a corner of either rectangle to the other one; 0 if they
     overlap.
     """
-    squares = [
-        _square_outside(x - middle, y, length, width) for x, y in corners_of(body)
-    ]
+    squares = []
+    for corner_x, corner_y in corners_of(body):
+        squares.append(_square_outside(corner_x - middle, corner_y, length, width))
     # In the body's axes the four corners of a vehicle are its middle plus what all vehicles share.
     x = middle - body.x
     lengthwise = x * body.along - body.y * body.left
@@ -306,10 +307,7 @@ def distance_between(
         & (np.abs(lengthwise) < (body.length + length * cosine + width * sine) / 2)
         & (np.abs(across) < (body.width + length * sine + width * cosine) / 2)
     )
-    nearest = squares[0]
-    for square in squares[1:]:
-        nearest = np.minimum(nearest, square)
-    return np.where(overlaps, 0.0, np.sqrt(nearest))
+    return np.where(overlaps, 0.0, np.sqrt(reduce(np.minimum, squares)))
 
 
 def _square_outside(
@@ -379,16 +377,14 @@ def _overlaps_along(body: Body, obstacle: Body) -> FloatArray:
     """The overlaps in that direction of the own bodies in which they are less deep [m]."""
     axes = _axes_of(body)
     distance = _dot(obstacle.middle - body.middle, axes)
-    return np.asarray(
-        np.minimum(*(_joint_extent(body, obstacle, axes) - np.abs(distance)))
-    )
+    overlaps = _joint_extent(body, obstacle, axes) - np.abs(distance)
+    return np.asarray(overlaps.min(axis=0))
 
 
 def _axes_of(body: Body) -> FloatArray:
     """The directions along and across M bodies, unit vectors, shape (2, M, 2)."""
-    return np.stack(
-        [body.along, np.stack([-body.along[:, 1], body.along[:, 0]], axis=1)]
-    )
+    across = np.stack([-body.along[:, 1], body.along[:, 0]], axis=1)
+    return np.stack([body.along, across])
 
 
 def _joint_extent(body: Body, obstacle: Body, axes: FloatArray) -> FloatArray:

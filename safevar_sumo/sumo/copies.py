@@ -8,6 +8,7 @@ import math
 import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -65,6 +66,9 @@ def copied_id(copy: int | str, name: str) -> str:
     return f"{copy}.{name}"
 
 
+_marked_id = partial(copied_id, _COPY_PLACEHOLDER)
+
+
 def copy_and_name(copied: str) -> tuple[int, str]:
     """The copy to which an id belongs, and the name in the original network: the inverse of
     `copied_id`.
@@ -100,14 +104,12 @@ def write_roads(root: ElementTree.Element, n: int, file: Path) -> None:
     blocks = []
     for tag, children in groupby(root, key=lambda child: child.tag):
         if tag in SHARED_ELEMENTS:
-            blocks += [
-                ElementTree.tostring(child, encoding="unicode") for child in children
-            ]
+            for child in children:
+                blocks.append(ElementTree.tostring(child, encoding="unicode"))
         else:
             elements = "".join(_marked_xml(child, ROAD_IDS) for child in children)
-            blocks += [
-                elements.replace(_COPY_PLACEHOLDER, str(copy)) for copy in range(n)
-            ]
+            for copy in range(n):
+                blocks.append(elements.replace(_COPY_PLACEHOLDER, str(copy)))
     _write(root, blocks, file)
 
 
@@ -121,14 +123,12 @@ def write_demand(roots: Sequence[ElementTree.Element], n: int, file: Path) -> No
         If an element cannot be copied.
     """
     traffics = [[*_departures(root)] for root in roots]
-    copies = [
-        (time, copy, text)
-        for copy in range(n)
-        for time, text in traffics[copy % len(roots)]
-    ]
-    copies.sort(key=itemgetter(0))
-    blocks = [text.replace(_COPY_PLACEHOLDER, str(copy)) for _, copy, text in copies]
-    _write(roots[0], blocks, file)
+    departures = []
+    for copy in range(n):
+        for time, text in traffics[copy % len(roots)]:
+            departures.append((time, text.replace(_COPY_PLACEHOLDER, str(copy))))
+    departures.sort(key=itemgetter(0))
+    _write(roots[0], map(itemgetter(1), departures), file)
 
 
 def _departures(root: ElementTree.Element) -> Iterable[tuple[float, str]]:
@@ -172,14 +172,12 @@ def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:
                 ", ".join(ids),
             )
         for name in set(ids[part.tag]) & part.attrib.keys():
-            ids_in_copy = (
-                copied_id(_COPY_PLACEHOLDER, id_) for id_ in part.attrib[name].split()
-            )
-            part.set(name, " ".join(ids_in_copy))
+            marked_ids = map(_marked_id, part.attrib[name].split())
+            part.set(name, " ".join(marked_ids))
     return ElementTree.tostring(element, encoding="unicode")
 
 
-def _write(root: ElementTree.Element, blocks: Sequence[str], file: Path) -> None:
+def _write(root: ElementTree.Element, blocks: Iterable[str], file: Path) -> None:
     """Write a file with the root's tag and attributes, without those of a namespace, and `blocks`
     of XML in it.
     """

@@ -19,7 +19,6 @@ from safevar_sumo.records import (
     TIME_DECIMALS,
     BoolArray,
     Command,
-    Encounter,
     FloatArray,
     IntArray,
     Observation,
@@ -77,20 +76,23 @@ def drive(
     memory = ads.start(n, system.nominal._replace(length=length, width=width), step)
     perception = Perception([point.weather for point in points], step, size)
     robot = DrivingRobot(points, vehicle, prepared, state, step)
-    is_tested = np.repeat([point.scenario.is_hit_in_front for point in points], size)
+    is_tested = np.zeros(n, dtype=bool)
+    may_go_on = np.zeros(n, dtype=bool)
+    last_sample = np.zeros(n, dtype=int)
+    for k, point in enumerate(points):
+        group = slice(k * size, (k + 1) * size)
+        is_tested[group] = point.scenario.is_hit_in_front
+        may_go_on[group] = point.scenario.goes_on
+        last_sample[group] = np.round(last_sample_of(point, step))
     contacts = FirstContacts(n, is_tested)
     outcomes = _Outcomes(n)
-    last_samples = [np.zeros(size) + last_sample_of(point, step) for point in points]
-    last_sample = np.round(np.concatenate(last_samples)).astype(int)
-    may_go_on = np.repeat([point.scenario.goes_on for point in points], size)
-    log = _Log(
-        world, int(last_sample.max()) + 1 + round(may_go_on.any() * OVERTIME / step)
-    )
+    most_overtime = round(may_go_on.any() * OVERTIME / step)
+    log = _Log(world, int(last_sample.max()) + 1 + most_overtime)
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.capacity):
             time = sample * step
             speed = motion.speeds
-            scene = observer.observe(motion, outcomes.is_open)
+            scene = observer.observe(motion)
             # Who sees nobody drives through everybody: its run ends at the place of the encounter.
             if system.sees_nobody:
                 scene = scene._replace(
@@ -99,23 +101,19 @@ def drive(
             collisions = contacts.count(world, motion.hits, scene)
             # SUMO misses contacts in some places; bodies on tracks touch wherever they overlap.
             if isinstance(observer, SceneObserver):
-                contacts.check(
-                    observer.world, scene, outcomes.is_open & ~scene.over, time
-                )
+                is_checked = outcomes.is_open & ~scene.over
+                contacts.check(observer.world, scene, is_checked, time)
             # Tracks go on, and so may a run among them; a scene ends by its time.
             if isinstance(observer, Traffic):
                 ends = may_go_on & outcomes.is_open & (sample == last_sample)
                 if ends.any():
                     may_go_on &= ~_go_on(observer, motion, ends, last_sample)
-            active = outcomes.note_sample(
-                speed, scene.over, collisions, sample >= last_sample
-            )
+            is_last = sample >= last_sample
+            active = outcomes.note_sample(speed, scene.over, collisions, is_last)
 
-            observation = perception.observe(time, speed, scene)
-            observation = observation._replace(
-                throttle=state.throttle, brake=state.brake
-            )
-            observation, state = vehicle.sense(prepared, state, observation)
+            truth = perception.observe(time, speed, scene)
+            truth = truth._replace(throttle=state.throttle, brake=state.brake)
+            observation, state = vehicle.sense(prepared, state, truth)
             if listen is not None:
                 listen(observation)
             command, memory = ads.drive(observation, memory)
@@ -136,9 +134,18 @@ def drive(
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
     trace = log.trace()
-    encounter = observer.encounter(trace)
-    outcomes.ended = outcomes.classify()
-    return _runs(points, outcomes, robot, contacts, trace=trace, encounter=encounter)
+    allowed_impacts = [point.allowed_impact_speed for point in points]
+    return SimulationRuns(
+        trace=trace,
+        encounter=observer.encounter(trace),
+        outcome=np.where(robot.invalid, Outcome.INVALID_TEST, outcomes.classify()),
+        collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed),
+        contact=contacts.first,
+        test_speed_error=robot.error,
+        warning_ttc=outcomes.warning_ttc,
+        centre_to_centre=points[0].scenario.centre_to_centre,
+        allowed_impact_speed=np.asarray(per_vehicle(allowed_impacts, size)),
+    )
 
 
 def _go_on(
@@ -156,33 +163,6 @@ def last_sample_of(point: Point, step: float) -> Quantity:
     return point.scenario.duration / step + point.phase
 
 
-def _runs(
-    points: Sequence[Point],
-    outcomes: _Outcomes,
-    robot: DrivingRobot,
-    contacts: FirstContacts,
-    *,
-    trace: Trace,
-    encounter: Encounter,
-) -> SimulationRuns:
-    """The runs of N vehicles that have ended."""
-    ended = outcomes.ended
-    size = len(ended) // len(points)
-    return SimulationRuns(
-        trace=trace,
-        encounter=encounter,
-        outcome=np.where(robot.invalid, Outcome.INVALID_TEST, ended),
-        collision_speed=np.where(robot.invalid, np.nan, outcomes.collision_speed),
-        contact=contacts.first,
-        test_speed_error=robot.error,
-        warning_ttc=outcomes.warning_ttc,
-        centre_to_centre=points[0].scenario.centre_to_centre,
-        allowed_impact_speed=np.asarray(
-            per_vehicle([point.allowed_impact_speed for point in points], size)
-        ),
-    )
-
-
 class RoadVehicles(NamedTuple):
     """Vehicles on the road: their constants, their ADS and their first motion."""
 
@@ -197,17 +177,14 @@ def enter(system: System, settings: FloatArray, world: VehicleWorld) -> RoadVehi
     n = len(settings)
 
     characteristics = system.characteristics.columns(settings)
-    prepared = vehicle.prepare(
-        characteristics, *_roads(system.points, n, world.step_length)
-    )
+    roads = _roads(system.points, n, world.step_length)
+    prepared = vehicle.prepare(characteristics, *roads)
     types = vehicle.sumo_type(prepared)
 
     # A controller that was written for SUMO drives in it, beside SUMO's own driver.
-    ads = (
-        FullBrake()
-        if system.points[0].scenario.brakes_fully
-        else with_tau(system.ads, types.tau)
-    )
+    ads = with_tau(system.ads, types.tau)
+    if system.points[0].scenario.brakes_fully:
+        ads = FullBrake()
     if not isinstance(ads, TraciController):
         return RoadVehicles(prepared, ads, world.enter(types))
     motion = world.enter(ads.known_types(system.nominal, types), keeps_drivers=True)
@@ -227,13 +204,10 @@ def _check_finite(
     if is_finite.all():
         return
     for copy in open_rows(~is_finite)[:1]:
-        changes = [
-            f"{characteristic.name} = {value:g}"
-            for characteristic, value in zip(
-                characteristics, settings[copy], strict=True
-            )
-            if value != characteristic.original
-        ]
+        changes = []
+        for member, value in zip(characteristics, settings[copy], strict=True):
+            if value != member.original:
+                changes.append(f"{member.name} = {value:g}")
         values = ", ".join(changes) or "the original's values"
         raise InputError(
             "vehicle",
@@ -265,11 +239,11 @@ def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
     """
     (point,) = system.points
     latency, reach, scale = system.vehicle.sensors(prepared) or Sensors.perfect(n)
-    # Nobody is within a negative range.
-    reach_in_weather = (
-        np.full(n, -1.0) if system.sees_nobody else reach * point.weather.visibility
-    )
-    return Sensors(latency + point.weather.recognition_delay, reach_in_weather, scale)
+    reach = reach * point.weather.visibility
+    if system.sees_nobody:
+        # Nobody is within a negative range.
+        reach = np.full(n, -1.0)
+    return Sensors(latency + point.weather.recognition_delay, reach, scale)
 
 
 class _Log:
@@ -286,14 +260,12 @@ class _Log:
         self._frame = world.frame
         self._positions = np.zeros((capacity, world.n, 2))
 
-        # Truths keep one byte instead of eight.
-        names = (field.name for field in fields(Trace) if field.name not in OF_ALL_RUNS)
-        self._columns: dict[str, Any] = {
-            name: np.zeros((capacity, world.n)) for name in names
-        }
-        self._columns |= {
-            name: np.zeros((capacity, world.n), dtype=bool) for name in TRUTHS
-        }
+        self._columns = dict[str, Any]()
+        for field in fields(Trace):
+            if field.name not in OF_ALL_RUNS:
+                # Truths keep one byte instead of eight.
+                kind = bool if field.name in TRUTHS else float
+                self._columns[field.name] = np.zeros((capacity, world.n), dtype=kind)
 
     def write(
         self,
@@ -337,8 +309,6 @@ class _Outcomes:
         self.is_checked = np.ones(n, dtype=bool)
         self.collision_speed = np.full(n, np.nan)
         self.warning_ttc = np.full(n, np.nan)
-        self.ended: TextArray = np.array([])
-        """The outcomes of all runs, once no run is open."""
         self._has_moved = np.zeros(n, dtype=bool)
         self._has_stopped = np.zeros(n, dtype=bool)
         self._is_over = np.zeros(n, dtype=bool)
@@ -373,10 +343,9 @@ class _Outcomes:
         """Note the time to collision, not as it is sensed, of each open run's first warning."""
         if warns is not None:
             closing_speed = speed - scene.obstacle_speed
-            is_first = (
-                warns & self.is_open & np.isnan(self.warning_ttc) & (closing_speed > 0)
-            )
-            np.copyto(self.warning_ttc, scene.gap / closing_speed, where=is_first)
+            is_first = np.isnan(self.warning_ttc) & self.is_open & (closing_speed > 0)
+            time_to_collision = scene.gap / closing_speed
+            np.copyto(self.warning_ttc, time_to_collision, where=is_first & warns)
 
     def classify(self) -> TextArray:
         """The outcomes of all runs, once no run is open."""

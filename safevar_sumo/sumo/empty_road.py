@@ -12,7 +12,6 @@ import numpy as np
 
 from safevar_sumo.errors import SimulationError
 from safevar_sumo.records import Outcome, SimulationRuns
-from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System
 
@@ -64,14 +63,10 @@ def find_problems(system: System) -> dict[str, EmptyRoadFault]:
     # The study's own simulations decide, and report their errors.
     except SimulationError:
         return {}
-    # A searched scenario is the one of the original encounter.
-    members = system.characteristics
-    values = members.scenario.columns(members.scenario.original_settings)
-    points = [encounter(point, values) for point in system.points]
     problems = {}
-    for point, result in zip(points, results, strict=True):
+    for point, _, runs in results:
         if not point.scenario.brakes_fully:
-            problem = _problem(result.runs, result.point.scenario.test_speed)
+            problem = _problem(runs, point.scenario.test_speed)
             if problem is not None:
                 problems[point.name] = problem
     return problems
@@ -85,7 +80,9 @@ def sentence_on(problems: dict[str, EmptyRoadFault], n_points: int) -> str:
         return ""
     point, problem = next(iter(problems.items()))
     count = sum(fault.reason is problem.reason for fault in problems.values())
-    where = f" at {count} of {n_points} points, such as {point}" if n_points > 1 else ""
+    where = ""
+    if n_points > 1:
+        where = f" at {count} of {n_points} points, such as {point}"
     return (
         f"On a first drive, with nobody in sight, the original vehicle {problem.words}{where}. So"
         " its drives with somebody in sight do not show how it reacts to them: no verdict."
@@ -101,22 +98,21 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     # The sample after the last active one ended the run.
     trace = runs.trace
     end = int(np.count_nonzero(trace.active)) + 1
-    gap, speed, brake, position, obstacle_speed, obstacle_width = (
-        np.broadcast_to(values, trace.gap.shape)[:end, 0]
-        for values in (
-            trace.gap,
-            trace.speed,
-            trace.brake,
-            trace.position,
-            trace.obstacle_speed,
-            trace.obstacle_width,
-        )
+    columns = np.broadcast_arrays(
+        trace.gap,
+        trace.speed,
+        trace.brake,
+        trace.position,
+        trace.obstacle_speed,
+        trace.obstacle_width,
     )
+    gap, speed, brake, position, obstacle_speed, obstacle_width = np.stack(columns)[
+        :, :end, 0
+    ]
 
     # Cruise controls brake to hold a speed, but take little off it.
-    if (
-        (brake > MIN_PEDAL) & (speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN)
-    ).any():
+    is_slower = speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN
+    if (is_slower & (brake > MIN_PEDAL)).any():
         return EmptyRoadFault(Reason.BRAKES, "brakes without an obstacle")
 
     approach = speed[-1] - obstacle_speed[-1]
@@ -136,22 +132,19 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     if gap[-1] <= 0 or (keeps_speed and is_alone):
         return None
 
-    distance = position[-1] - position[0]
-    of_needed = f" of {distance + gap[-1]:.1f}" if np.isfinite(gap[-1]) else ""
-    if (
-        runs.outcome[0] == Outcome.PASSED
-        and speed[-1] > max(speed[0], MIN_SLOWDOWN) - SLOW_APPROACH
-    ):
+    distance = f"{position[-1] - position[0]:.1f}"
+    if np.isfinite(gap[-1]):
+        distance += f" of {position[-1] - position[0] + gap[-1]:.1f}"
+    slow_speed = max(speed[0], MIN_SLOWDOWN) - SLOW_APPROACH
+    if runs.outcome[0] == Outcome.PASSED and speed[-1] > slow_speed:
         words = f"is late for the encounter: the others have left after {trace.time[end - 1]:.1f} s"
         return EmptyRoadFault(
             Reason.LATE,
-            f"{words}, when it has come {distance:.1f}{of_needed} m at {speed[-1]:.1f} m/s",
+            f"{words}, when it has come {distance} m at {speed[-1]:.1f} m/s",
         )
-    commanded = (
-        f"with at most {trace.throttle[:end, 0].max():.2g} of the throttle and {brake.max():.2g} of"
-        " the brake"
-    )
+    throttle = trace.throttle[:end, 0].max()
+    commanded = f"with at most {throttle:.2g} of the throttle and {brake.max():.2g} of the brake"
     return EmptyRoadFault(
         Reason.STANDS,
-        f"never reaches the encounter (it gets {distance:.1f}{of_needed} m, {commanded})",
+        f"never reaches the encounter (it gets {distance} m, {commanded})",
     )

@@ -51,11 +51,13 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
     """
     for point in points:
         legal = searchable_in(point.scenario)
-        ranges = study.ranges if point.ranges is None else point.ranges
+        ranges = _ranges_of(point, study.ranges)
+        kind = type(point.scenario).__name__
+        if point.name:
+            kind = f"{point.name} of [matrix]: {kind}"
         for name, domain in ranges.items():
             key = f"over.{name}"
-            where = f"{key}: {point.name} of [matrix]: " if point.name else f"{key}: "
-            problem = f"{where}{type(point.scenario).__name__} has no such parameter to search"
+            problem = f"{key}: {kind} has no such parameter to search"
             check_name("", problem, name, legal)
             widest = legal[name]
             if widest.unit and domain.unit != widest.unit:
@@ -105,37 +107,44 @@ def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
     scenario is the same object if only weather and phase vary.
     """
     values = point.own(values)
-    phase = values.pop(PHASE, point.phase) if point.scenario.has_phase else point.phase
-    of_weather = {
-        name: value for name, value in values.items() if name in WEATHER_PARAMETERS
-    }
-    of_scenario = {
-        name: value for name, value in values.items() if name not in of_weather
-    }
+    phase = point.phase
+    if point.scenario.has_phase:
+        phase = values.pop(PHASE, phase)
+    names = WEATHER_PARAMETERS.keys() & values.keys()
+    of_weather = {name: values.pop(name) for name in names}
     weather = replace_fields(point.weather, **of_weather)
-    scenario = point.scenario.at(of_scenario) if of_scenario else point.scenario
+    scenario = point.scenario
+    if values:
+        scenario = scenario.at(values)
     return point._replace(scenario=scenario, weather=weather, phase=phase)
 
 
 def original_encounter(point: Point, ranges: Mapping[str, Domain]) -> Point:
     """A point at the original values of its own ranges, or of all."""
-    point_ranges = ranges if point.ranges is None else point.ranges
-    return encounter(
-        point, {name: domain.original for name, domain in point_ranges.items()}
-    )
+    return encounter(point, _originals(_ranges_of(point, ranges)))
+
+
+def _ranges_of(point: Point, ranges: Mapping[str, Domain]) -> Mapping[str, Domain]:
+    """A point's own ranges, or all."""
+    if point.ranges is None:
+        return ranges
+    return point.ranges
+
+
+def _originals(ranges: Mapping[str, Domain]) -> dict[str, Quantity]:
+    return {name: domain.original for name, domain in ranges.items()}
 
 
 def scenes_of_encounters(
     recording: Recording, scenario: WorldScenario, n: int
 ) -> Recording:
     """The scenes of N vehicles whose scenario has arrays as parameters, from a recorded scene."""
-    samples = 1 + int(
-        np.max(np.round(np.asarray(scenario.duration) / recording.step_length))
-    )
-    layout = scenario.layout(recording, recording.step_length, samples)
-    tracks = {
-        name: _extended(track, samples) for name, track in recording.tracks.items()
-    }
+    step = recording.step_length
+    samples = 1 + int(np.max(np.round(np.asarray(scenario.duration) / step)))
+    layout = scenario.layout(recording, step, samples)
+    tracks = {}
+    for name, track in recording.tracks.items():
+        tracks[name] = _extended(track, samples)
 
     if layout.pedestrian:
         track = recording.tracks[layout.pedestrian]
@@ -148,11 +157,12 @@ def scenes_of_encounters(
             np.empty((samples, n)), *place, sign * dir_x, sign * dir_y, layout.speed
         )[1:]
         tracks[layout.pedestrian] = track._replace(motion=np.stack(columns, axis=-1))
+    start = layout.front
+    if start is None:
+        start = recording.start
     return replace(
         recording,
-        start=np.broadcast_to(
-            recording.start if layout.front is None else layout.front, n
-        ),
+        start=np.broadcast_to(start, n),
         speed=np.broadcast_to(recording.speed, n),
         tracks=tracks,
     )
@@ -194,9 +204,10 @@ def met_at(point: Point, system: System, settings: FloatArray) -> BoolArray:
     those that have one at their ends.
     """
     members = system.characteristics.scenario
+    if not len(members):
+        return np.ones(len(settings), dtype=bool)
     encounters = np.clip(system.split(settings)[1], members.lower, members.upper)
-    is_met = point.meets(members.columns(encounters)) if len(members) else True
-    return np.broadcast_to(is_met, len(settings))
+    return np.broadcast_to(point.meets(members.columns(encounters)), len(settings))
 
 
 def in_place_of_unmet(
@@ -204,7 +215,7 @@ def in_place_of_unmet(
 ) -> FloatArray:
     """Settings, of which those that have no encounter of a point stand in its original one."""
     members = system.characteristics
-    originals = {name: domain.original for name, domain in (point.ranges or {}).items()}
+    originals = _originals(point.ranges or {})
     original = np.array([originals.get(item.name, item.original) for item in members])
     return np.where(is_met[:, np.newaxis] | members.of_vehicle, settings, original)
 

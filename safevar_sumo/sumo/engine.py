@@ -177,35 +177,32 @@ def traci_api() -> Api:
 
 def sumo_options(files: CopiedNetwork, step: float | None = None) -> list[str]:
     """The options with which SUMO simulates copies of a network; see `open_world`."""
-    options = {
-        "-c": files.options,
-        "-n": files.network,
-        "-r": files.traffic,
-        "--verbose": "false",
-        "--duration-log.disable": "true",
-        "--duration-log.statistics": "false",
-        "--no-step-log": "true",
-        "--no-warnings": "true",
-        "--xml-validation": "never",
-        "--xml-validation.net": "never",
-        "--xml-validation.routes": "never",
-    }
-
     # What the simulation needs overrules what the user's options say.
     stated = options_in(files.options)
-    step = step_of(stated) if step is None else step
-    fixed_options = own_options(stated) | {"step-length": repr(step)}
-    return [
-        *as_arguments(fixed_options),
-        *(str(text) for option in options.items() for text in option),
-    ]
+    if step is None:
+        step = step_of(stated)
+    options = own_options(stated) | {
+        "step-length": repr(step),
+        "configuration-file": str(files.options),
+        "net-file": str(files.network),
+        "route-files": str(files.traffic),
+        "verbose": "false",
+        "duration-log.disable": "true",
+        "duration-log.statistics": "false",
+        "no-step-log": "true",
+        "no-warnings": "true",
+        "xml-validation": "never",
+        "xml-validation.net": "never",
+        "xml-validation.routes": "never",
+    }
+    return as_arguments(options)
 
 
 def own_options(stated: Mapping[str, str]) -> dict[str, str]:
     """The options with which SUMO starts whatever a network's file states: `OWN_OPTIONS`, and no
     file to write.
     """
-    return OWN_OPTIONS | {name: NO_FILE for name in stated if OUTPUT.fullmatch(name)}
+    return OWN_OPTIONS | dict.fromkeys(filter(OUTPUT.fullmatch, stated), NO_FILE)
 
 
 def step_of(stated: Mapping[str, str]) -> float:

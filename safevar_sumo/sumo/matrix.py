@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -63,22 +64,13 @@ def point_record(result: PointResult) -> JsonObject:
     """
     evaluations = result.evaluations
     runs = result.runs
-    test_speed_error, warning_ttc, side, place = (
-        np.broadcast_to(column, len(evaluations))[0]
-        for column in (
-            runs.test_speed_error,
-            runs.warning_ttc,
-            runs.contact.side,
-            runs.contact.place,
-        )
-    )
     values = {
         "impact_speed": evaluations.collision_speed[0],
         "relative_impact_speed": runs.relative_speed[0],
         SAFETY_DEGREE: evaluations.f_safe[0],
         "gap": evaluations.gaps(runs.middles_apart)[0],
-        "test_speed_error": test_speed_error / KMH,
-        "warning_ttc": warning_ttc,
+        "test_speed_error": np.ravel(runs.test_speed_error)[0] / KMH,
+        "warning_ttc": np.ravel(runs.warning_ttc)[0],
     }
     if STOPPING_DISTANCE.name in evaluations.metrics:
         values[STOPPING_DISTANCE.name] = evaluations.metrics[STOPPING_DISTANCE.name][0]
@@ -86,10 +78,13 @@ def point_record(result: PointResult) -> JsonObject:
         "point": result.point.name,
         **dict(result.point.parameters),
         "outcome": str(evaluations.outcome[0]),
-        **{name: finite_or_none(value) for name, value in values.items()},
     }
+    for name, value in values.items():
+        record[name] = finite_or_none(value)
+    side = str(np.ravel(runs.contact.side)[0])
     if side:
-        record["contact"] = {"side": str(side), "place": float(place)}
+        place = float(np.ravel(runs.contact.place)[0])
+        record["contact"] = {"side": side, "place": place}
     return record
 
 
@@ -128,12 +123,8 @@ def drive_and_score(
     size = max(1, batch_size(system) // (system.repeats * (1 + takes_pairs)))
     if len(settings) > size:
         batches = np.split(settings, range(size, len(settings), size))
-        return Evaluations.concatenate(
-            [
-                drive_and_score(system, batch, with_originals=with_originals)
-                for batch in batches
-            ]
-        )
+        score_batch = partial(drive_and_score, system, with_originals=with_originals)
+        return Evaluations.concatenate([*map(score_batch, batches)])
 
     vehicles = settings
     if takes_pairs:
@@ -174,7 +165,7 @@ def _beside(
     """
     n = len(settings)
     # Among bodies on tracks the original meets an encounter of several settings once.
-    if all(isinstance(point.scenario, TrackScenario) for point in system.points):
+    if system.has_tracks:
         distinct, number = np.unique(originals, axis=0, return_inverse=True)
         return np.concatenate([settings, distinct]), np.arange(n), n + np.ravel(number)
     # In recorded scenes both take turns, as pairs share a scene.
@@ -183,17 +174,21 @@ def _beside(
 
 
 def evaluate_matrix(system: System, settings: FloatArray) -> Evaluations:
-    """Evaluate settings, shape (N, n), at their worst points. Traces are dropped, as they would
-    take gigabytes.
-    """
-    results = {
-        result.point.name: result.evaluations
-        for result in simulate_points(system, settings)
-    }
-    at_points = [results[point.name] for point in system.points]
+    """Evaluate settings, shape (N, n), at their worst points."""
+    at_points = evaluate_points(system, settings)
     numbers = worst_points(system, at_points)
     rows = numbers * len(settings) + np.arange(len(settings))
     return replace(Evaluations.concatenate(at_points).take(rows), worst_points=numbers)
+
+
+def evaluate_points(system: System, settings: FloatArray) -> list[Evaluations]:
+    """Evaluations of settings, shape (N, n), at every point, in the points' order. Traces are
+    dropped, as they would take gigabytes.
+    """
+    evaluations = {}
+    for result in simulate_points(system, settings):
+        evaluations[result.point.name] = result.evaluations
+    return [evaluations[point.name] for point in system.points]
 
 
 def settings_per_batch(system: System) -> int:
@@ -245,10 +240,9 @@ def simulate_all_points(system: System, settings: FloatArray) -> list[PointResul
     """Simulate settings, shape (N, n), at every point; results are in the points' order. Raises the
     errors of `drive_all`.
     """
-    by_name = {
-        result.point.name: result for result in simulate_points(system, settings)
-    }
-    return [by_name[point.name] for point in system.points]
+    names = [point.name for point in system.points]
+    results = simulate_points(system, settings)
+    return sorted(results, key=lambda result: names.index(result.point.name))
 
 
 def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResult]:
@@ -264,31 +258,25 @@ def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResul
     for points in groups:
         # Settings that have no encounter of these points keep their rows, for the others' sake.
         is_met = met_at(points[0], system, settings)
-        vehicles = (
-            settings
-            if is_met.all()
-            else in_place_of_unmet(points[0], system, settings, is_met)
-        )
+        vehicles = settings
+        if not is_met.all():
+            vehicles = in_place_of_unmet(points[0], system, settings, is_met)
         runs = drive_all(replace(system, points=points), vehicles)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
         if not is_met.all():
             evaluations = evaluations.where(is_met, Outcome.INFEASIBLE)
-        for point, start in zip(points, range(0, len(points) * n, n), strict=True):
-            yield PointResult(
-                point,
-                evaluations.take(np.arange(start, start + n)),
-                runs.of(slice(start, start + n)),
-            )
+        rows = np.arange(n)
+        for k, point in enumerate(points):
+            start = k * n
+            at_point = evaluations.take(start + rows)
+            yield PointResult(point, at_point, runs.of(slice(start, start + n)))
 
 
 def worst_point(system: System, setting: FloatArray) -> Point:
     """The worst point of a setting, shape (n,); see `worst_points`."""
     if not system.matrix:
         return system.points[0]
-    at_points = [
-        result.evaluations
-        for result in simulate_all_points(system, setting[np.newaxis])
-    ]
+    at_points = evaluate_points(system, setting[np.newaxis])
     return system.points[int(worst_points(system, at_points)[0])]
 
 
@@ -303,9 +291,10 @@ def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
         scenario = point.scenario
         key: Hashable = point.name
         if isinstance(scenario, TrackScenario):
-            # The bodies at time 0 are those of all times.
-            one_batch = len(system.points) <= size
-            n_bodies = 0 if one_batch else len(scenario.tracks(np.zeros((1, 1))))
+            n_bodies = 0
+            if len(system.points) > size:
+                # The bodies at time 0 are those of all times.
+                n_bodies = len(scenario.tracks(np.zeros((1, 1))))
             key = (
                 scenario.vut_length,
                 scenario.vut_width,

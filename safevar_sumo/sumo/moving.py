@@ -136,25 +136,14 @@ class Moving(NamedTuple):
         """
         cover = self.track
         track = body.track
-        return (
-            self.faces_along
-            and body.faces_along
-            and len(track.x) == len(track.y) == 1
-            and bool(
-                (
-                    np.abs(track.x - cover.x) <= (cover.length - track.length) / 2 + TIE
-                ).all()
-            )
-            and bool(
-                (
-                    np.abs(track.y - cover.y) <= (cover.width - track.width) / 2 + TIE
-                ).all()
-            )
-        )
-
-    def is_covered_by(self, bodies: Sequence[Moving]) -> bool:
-        """Whether one of other bodies covers this one."""
-        return any(body.covers(self) for body in bodies if body is not self)
+        can_cover = body is not self and self.faces_along and body.faces_along
+        if not can_cover or len(track.x) > 1 or len(track.y) > 1:
+            return False
+        dx = np.abs(track.x - cover.x)
+        dy = np.abs(track.y - cover.y)
+        is_inside_x = dx <= (cover.length - track.length) / 2 + TIE
+        is_inside_y = dy <= (cover.width - track.width) / 2 + TIE
+        return bool((is_inside_x & is_inside_y).all())
 
 
 def _rotated(track: Track) -> BoolArray:

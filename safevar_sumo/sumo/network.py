@@ -112,9 +112,9 @@ def open_network(network: str) -> NetworkFiles:
             f"there is no network {network!r}{did_you_mean(network, names)}",
             f"one of {', '.join(names)}, or {LEGAL_FOLDERS}",
         )
-    folder, roads_file = (
-        (path, _roads_in(path)) if path.is_dir() else (path.parent, path.name)
-    )
+    folder, roads_file = path.parent, path.name
+    if path.is_dir():
+        folder, roads_file = path, _roads_in(path)
 
     names = [roads_file, *_sources_of(folder / roads_file), TRAFFIC_FILE, OPTIONS_FILE]
     if (folder / OPTIONS_FILE).is_file():
@@ -123,9 +123,9 @@ def open_network(network: str) -> NetworkFiles:
         if not (folder / name).is_file():
             raise InputError(folder, f"{name} is missing", LEGAL_FOLDERS)
     digests = tuple((name, _digest((folder / name).read_bytes())) for name in names)
-    return NetworkFiles(
-        folder, NETWORK_FILE if is_shipped(network) else roads_file, digests
-    )
+    if is_shipped(network):
+        roads_file = NETWORK_FILE
+    return NetworkFiles(folder, roads_file, digests)
 
 
 def is_shipped(network: str) -> bool:
@@ -162,7 +162,8 @@ def _roads_in(folder: Path) -> str:
     names = _names_in(folder, RECIPE_ENDING) or _names_in(folder, NETWORK_ENDING)
     if len(names) > 1 and (folder / OPTIONS_FILE).is_file():
         stated = options_in(folder / OPTIONS_FILE).get("net-file")
-        names = [name for name in names if name == stated] or names
+        if stated in names:
+            names = [stated]
     if len(names) != 1:
         raise InputError(
             folder,
@@ -180,12 +181,11 @@ def _sources_of(file: Path) -> list[str]:
     """The files that a configuration names; none for a built network."""
     if file.name.endswith(NETWORK_ENDING):
         return []
-    values = [
-        value
-        for option, value in options_in(file).items()
-        if SOURCE_OPTION.fullmatch(option)
-    ]
-    return [name.strip() for value in values for name in value.split(",")]
+    names = list[str]()
+    for option, value in options_in(file).items():
+        if SOURCE_OPTION.fullmatch(option):
+            names += map(str.strip, value.split(","))
+    return names
 
 
 class CopiedNetwork(NamedTuple):
@@ -356,11 +356,10 @@ def _code_digest() -> str:
 
 def road_digests(network: NetworkFiles) -> list[str]:
     """Digests of a network's roads: of its sources, the file as it was built, and its changes."""
-    digests = [
-        digest
-        for name, digest in network.digests
-        if name not in (TRAFFIC_FILE, OPTIONS_FILE)
-    ]
+    digests = []
+    for name, digest in network.digests:
+        if name not in (TRAFFIC_FILE, OPTIONS_FILE):
+            digests.append(digest)
     if network.is_built:
         digests.append(_digest(network.path(network.roads_file).read_bytes()))
     return [*digests, repr(network.lane_changes)]
@@ -404,20 +403,17 @@ def networks_for(scenarios: Sequence[Scenario]) -> list[NetworkFiles]:
     """The networks of several scenarios, whose files are read once per network; raises the errors
     of `network_for`.
     """
-    names = {scenario.network for scenario in scenarios}
-    networks = {name: open_network(name) for name in names}
-    return [
-        _network_for(scenario, networks[scenario.network]) for scenario in scenarios
-    ]
-
-
-def _network_for(scenario: Scenario, network: NetworkFiles) -> NetworkFiles:
-    network = network._replace(
-        lane_changes=_frozen(scenario.lanes(_BuiltRoads(network)))
-    )
-    return network._replace(
-        traffic_changes=_frozen(scenario.actors(_BuiltRoads(network)))
-    )
+    opened = dict[str, NetworkFiles]()
+    networks = []
+    for scenario in scenarios:
+        if scenario.network not in opened:
+            opened[scenario.network] = open_network(scenario.network)
+        network = opened[scenario.network]
+        lanes = _frozen(scenario.lanes(_BuiltRoads(network)))
+        network = network._replace(lane_changes=lanes)
+        actors = _frozen(scenario.actors(_BuiltRoads(network)))
+        networks.append(network._replace(traffic_changes=actors))
+    return networks
 
 
 def _frozen(changes: XmlChanges) -> Changes:

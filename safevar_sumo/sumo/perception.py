@@ -10,7 +10,6 @@ import numpy as np
 from safevar_sumo.ads.base import DelayLine
 from safevar_sumo.records import (
     ALL_TRUE,
-    BoolArray,
     Encounter,
     FloatArray,
     IntArray,
@@ -39,7 +38,7 @@ _UNSEEN = np.array([*OCCLUDED.values()])[:, np.newaxis]
 class Observer(Protocol):
     """Observes the obstacles of all vehicles."""
 
-    def observe(self, motion: VehicleStates, is_open: BoolArray) -> Scene:
+    def observe(self, motion: VehicleStates) -> Scene:
         """The scene now; must be called at every sample."""
 
     def encounter(self, trace: Trace) -> Encounter:
@@ -101,7 +100,7 @@ class SceneObserver:
         self._has_begun = False
         self._memory: ScenarioMemory = None
 
-    def observe(self, motion: VehicleStates, is_open: BoolArray) -> Scene:
+    def observe(self, motion: VehicleStates) -> Scene:
         if not self._has_begun:
             self._memory = self.world.begin(self._scenario)
             self._has_begun = True
@@ -118,7 +117,6 @@ def per_vehicle(values: Sequence[Quantity], size: int) -> Quantity:
     """The values of K points, repeated for `size` vehicles each, shape (K * size,); a single value,
     or that of the only point, if all are equal.
     """
-    is_shared = len(values) == 1 or all(value == values[0] for value in values)
-    if is_shared:
+    if len(values) == 1 or all(value == values[0] for value in values):
         return values[0]
     return np.repeat(values, size)

@@ -5,7 +5,7 @@ other.
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from threading import RLock
 
@@ -16,7 +16,7 @@ from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.records import FloatArray, Nominal
-from safevar_sumo.scenarios import VUT, Point, WorldScenario, weather_of
+from safevar_sumo.scenarios import VUT, Point, TrackScenario, WorldScenario, weather_of
 from safevar_sumo.scenarios.base import Mover, Part
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -73,21 +73,26 @@ class System:
     nominal: Nominal
     measuring: Measuring
     region: FeasibleRegion
-    source: str = "study"
-    scenes: Scenes = field(default_factory=Scenes)
-    time_limit: float = 300.0
+    source: str
+    scenes: Scenes
+    time_limit: float
     sees_nobody: bool = False
     in_sumo: bool = False
-    aggregate: str = WORST
-    repeats: int = 1
-    command: str = ""
-    skips_failed: bool = False
-    criterion: Unsafe = field(default_factory=Unsafe)
+    aggregate: str
+    repeats: int
+    command: str
+    skips_failed: bool
+    criterion: Unsafe
 
     @property
     def matrix(self) -> tuple[Point, ...]:
         """The points of a matrix, which have names; none in a study with a single scenario."""
         return tuple(point for point in self.points if point.name)
+
+    @property
+    def has_tracks(self) -> bool:
+        """Whether vehicles drive among bodies on tracks, at all points."""
+        return all(isinstance(point.scenario, TrackScenario) for point in self.points)
 
     @property
     def mover(self) -> Mover:

@@ -84,10 +84,8 @@ class TraciController(Ads):
         """The types that controllers may know: those of the original vehicle, with the headways of
         SUMO's drivers.
         """
-        mass, accel, decel, max_speed, lag = (
-            np.full_like(types.mass, value) for value in nominal[:5]
-        )
-        return SumoType(mass, accel, decel, max_speed, lag, types.tau)
+        columns = (np.full_like(types.mass, value) for value in nominal[:5])
+        return SumoType._make((*columns, types.tau))
 
     def drive(
         self, observation: Observation, memory: _Memory

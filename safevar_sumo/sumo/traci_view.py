@@ -135,15 +135,13 @@ class SensedTraffic:
             return Snapshot({}, {domain: {} for domain in SENSED}, None)
         actors: dict[str, dict[str, ActorValues]] = {}
         for domain, functions in SENSED.items():
-            getters = {
-                name: getattr(getattr(api, domain), name)
-                for name in (*functions, "getLength")
-            }
+            functions_of_domain = getattr(api, domain)
             actors[domain] = {}
             for actor in names[copy, domain]:
                 id_ = copied_id(copy, actor)
                 actors[domain][actor] = {
-                    name: get(id_) for name, get in getters.items()
+                    name: getattr(functions_of_domain, name)(id_)
+                    for name in (*functions, "getLength")
                 }
 
         vehicle = actors["vehicle"].pop(VUT)
@@ -245,13 +243,11 @@ class TraciView:
         vehicle = self._api.vehicle
         vut = self._vut
         _, actors, leader = self._traffic.seen[self._copy]
-        ignores_limit = self._commands.mode & CommandedSpeed.BEYOND_LIMIT
-        limit = (
-            vehicle.getMaxSpeed(vut) if ignores_limit else vehicle.getAllowedSpeed(vut)
-        )
-        sumo_speed = min(
-            speed + accel * self._step, max(limit, speed - decel * self._step)
-        )
+        limit = vehicle.getAllowedSpeed(vut)
+        if self._commands.mode & CommandedSpeed.BEYOND_LIMIT:
+            limit = vehicle.getMaxSpeed(vut)
+        slowest = max(limit, speed - decel * self._step)
+        sumo_speed = min(speed + accel * self._step, slowest)
         if leader is not None:
             name, gap = leader
             id_ = copied_id(self._copy, name)
@@ -395,10 +391,10 @@ class TraciView:
     ) -> Value:
         """Subscribe to variables of an actor, by their numbers, at all times."""
         functions = {_constant(name): function for name, function in VARIABLES.items()}
+        if requested is None:
+            requested = map(_constant, DEFAULT_VARIABLES)
         variables: Variables = {}
-        for number in (
-            map(_constant, DEFAULT_VARIABLES) if requested is None else requested
-        ):
+        for number in requested:
             if functions.get(number) not in CALLS[domain]:
                 raise refused(
                     domain,

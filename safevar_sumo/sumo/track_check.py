@@ -126,9 +126,9 @@ def check_motion(track: Track, times: FloatArray, step: float) -> None:
         np.cumsum(np.diff(path, axis=0, prepend=path[:1]) * stays, axis=0)
         for path in (x, travelled(velocity, times))
     )
-    most = np.maximum(np.abs(way), np.abs(driven))
+    longer_way = np.maximum(np.abs(way), np.abs(driven))
     refuse(
-        np.abs(way - driven) > np.maximum(APART, most / 3),
+        np.abs(way - driven) > np.maximum(APART, longer_way / 3),
         way - driven,
         "is {:.3g} m in x from where its speed takes it",
         "an x that changes by vx, the speed along the road, times the time",
@@ -163,18 +163,17 @@ def check_start(tracks: Sequence[Track], vehicle: Body) -> None:
     InputError
         With the actors, the time [s] and what is expected.
     """
-    bodies = {
-        f"actor {track.name!r}": _first(track)
-        for track in tracks
-        if track.kind != SCREEN
-    }
+    bodies = {}
+    for track in tracks:
+        if track.kind != SCREEN:
+            bodies[f"actor {track.name!r}"] = _first(track)
     bodies["the vehicle under test"] = vehicle
     for (name, body), (obstacle_name, obstacle) in combinations(bodies.items(), 2):
-        n = max(len(body.speed), len(obstacle.speed))
         # Without a size nobody is there.
-        pair = _repeated(body, n), _repeated(obstacle, n)
-        are_there = np.all([part.length + part.width > 0 for part in pair], axis=0)
-        depth = np.where(are_there, find_overlaps(*pair), 0.0).max()
+        is_there = body.length + body.width > 0
+        has_obstacle = obstacle.length + obstacle.width > 0
+        overlaps = find_overlaps(body, obstacle)
+        depth = np.where(is_there & has_obstacle, overlaps, 0.0).max()
         if depth > TOUCH:
             problem = f"at 0 s {name} is {depth:.2f} m inside {obstacle_name}"
             raise InputError(
@@ -182,13 +181,6 @@ def check_start(tracks: Sequence[Track], vehicle: Body) -> None:
                 f"{TRACKS_KEY}: {problem}",
                 "bodies that do not overlap at the start",
             )
-
-
-def _repeated(body: Body, n: int) -> Body:
-    """A body of all encounters in columns of N encounters."""
-    return Body._make(
-        np.broadcast_to(column, (n, *column.shape[1:])) for column in body
-    )
 
 
 def _first(track: Track) -> Body:

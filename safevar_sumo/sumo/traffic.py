@@ -87,7 +87,7 @@ class Traffic:
         self._place(n_samples)
         self._ended = np.zeros((len(self._bodies), n_samples, self.n), dtype=bool)
         # Who is not in the path at the start has been approached as soon as it comes into it.
-        self._approached = [~self._row(body.is_in_path, 0) for body in self._bodies]
+        self._approached = [~self._row(body.is_in_path) for body in self._bodies]
 
     def _place(self, n_samples: int) -> None:
         """Place all bodies at this number of samples."""
@@ -97,22 +97,20 @@ class Traffic:
             self._points, times, self._n_encounters, self.step, vehicle
         )
         bodies = [Moving.of(track, self.step, self.width) for track in self.tracks]
-        highest_level = np.maximum.reduce(
-            np.broadcast_arrays(*(body.level for body in bodies))
-        )
+        levels = np.broadcast_arrays(*(body.level for body in bodies))
+        highest_level = np.maximum.reduce(levels)
         self._counts = [np.atleast_2d(body.level == highest_level) for body in bodies]
-        # Who is met comes first; scenery hides them, and is seen only where there is nobody else.
-        self._encountered = [
-            k
-            for k, body in enumerate(bodies)
-            if body.level.max() >= min(highest_level.max(), 1)
-        ]
-        self._bodies = bodies
-        screens = [body for body in bodies if body.track.kind == SCREEN]
-        self._hides = [
-            k for k, body in enumerate(bodies) if not body.is_covered_by(screens)
-        ]
         self._is_avoidable = [bool(body.is_avoidable.any()) for body in bodies]
+        screens = [body for body in bodies if body.track.kind == SCREEN]
+        self._encountered = list[int]()
+        self._hides = list[int]()
+        for k, body in enumerate(bodies):
+            # Who is met comes first; scenery is seen only where there is nobody else.
+            if body.level.max() >= min(highest_level.max(), 1):
+                self._encountered.append(k)
+            if not any(screen.covers(body) for screen in screens):
+                self._hides.append(k)
+        self._bodies = bodies
 
     def are_closing(self, motion: VehicleStates) -> BoolArray:
         """Which vehicles would touch a body within `OVERTIME` at their closing speeds, at the
@@ -129,17 +127,16 @@ class Traffic:
 
     def place_until(self, n_samples: int) -> None:
         """Move all bodies up to this number of samples, if they do not yet."""
-        n_placed = self._ended.shape[1]
-        if n_samples > n_placed:
+        shortage = n_samples - self._ended.shape[1]
+        if shortage > 0:
             self._place(n_samples)
-            self._ended = np.pad(
-                self._ended, ((0, 0), (0, n_samples - n_placed), (0, 0))
-            )
+            self._ended = np.pad(self._ended, ((0, 0), (0, shortage), (0, 0)))
 
-    def _row(self, column: Sampled, sample: int | None = None) -> Sampled:
-        return row(column, self._sample if sample is None else sample, self.group)
+    def _row(self, column: Sampled) -> Sampled:
+        """A column at this sample."""
+        return row(column, self._sample, self.group)
 
-    def observe(self, motion: VehicleStates, is_open: BoolArray) -> Scene:
+    def observe(self, motion: VehicleStates) -> Scene:
         """The scene at the sample of the last `hits`; to be called at every sample. Whoever touches
         a body sees it.
         """
@@ -157,9 +154,8 @@ class Traffic:
             if self._is_avoidable[k]:
                 self._approached[k] = self._approached[k] | (closing > APPROACH_SPEED)
                 is_never_faster = (gap > 0) & (speed <= self._row(body.least_vx))
-                ended = ended | (
-                    self._approached[k] & self._row(body.is_avoidable) & is_never_faster
-                )
+                is_avoidable = self._approached[k] & self._row(body.is_avoidable)
+                ended = ended | (is_avoidable & is_never_faster)
             self._ended[k, self._sample] = ended
             counts: BoolArray = self._row(self._counts[k])
             over = over & (ended | ~counts)
@@ -175,32 +171,28 @@ class Traffic:
         visible = self._row(self._bodies[number].is_there)
         for k in self._hides:
             if k != number:
-                line = (
-                    front - self.setback,
-                    0.0,
-                    self._row(track.x),
-                    self._row(track.y),
-                )
-                visible = visible & ~self._blocks(self._bodies[k], *line)
+                x, y = self._row(track.x), self._row(track.y)
+                blocks = self._blocks(self._bodies[k], front - self.setback, x, y)
+                visible = visible & ~blocks
         return visible
 
     def _blocks(
-        self, body: Moving, x: Quantity, y: Quantity, to_x: Quantity, to_y: Quantity
+        self, body: Moving, sensors: Quantity, x: Quantity, y: Quantity
     ) -> BoolArray:
-        """Whether a body is on the line between two points: the slab test in the body's own
-        axes.
+        """Whether a body is on the line from sensors in the middle of the lane to a point: the slab
+        test in the body's own axes.
         """
-        dx = to_x - x
-        dy = to_y - y
-        rx = x - self._row(body.track.x)
-        ry = y - self._row(body.track.y)
+        dx = x - sensors
+        dy = y
+        rx = sensors - self._row(body.track.x)
+        ry = 0.0 - self._row(body.track.y)
         if not body.faces_along:
             cosine = self._row(body.track.along)
             sine = self._row(body.track.left)
             dx, dy = dx * cosine + dy * sine, dy * cosine - dx * sine
             rx, ry = rx * cosine + ry * sine, ry * cosine - rx * sine
 
-        # In shares of the line: 0 at the sensors, 1 at the other point.
+        # In shares of the line: 0 at the sensors, 1 at the point.
         enter: Quantity = -np.inf
         leave: Quantity = np.inf
         for position, change, size in (
@@ -244,14 +236,15 @@ class Traffic:
             time_to_arrival = np.maximum(view.gap, 0.0) / closing
             lateral = self._row(body.track.y)
             drift = self._row(body.vy)
+            is_closing = view.closing > 0
             lateral_at_arrival = lateral + drift * np.where(
-                view.closing > 0, time_to_arrival, 0.0
+                is_closing, time_to_arrival, 0.0
             )
-            comes = (view.closing > 0) & (
-                np.abs(lateral_at_arrival) < self.width / 2 + self._row(body.half_width)
-            )
+            reach = self.width / 2 + self._row(body.half_width)
+            comes = is_closing & (np.abs(lateral_at_arrival) < reach)
             # A leader at the vehicle's speed who makes way is nobody to brake for.
-            leaves = (np.sign(lateral) * drift > 0) & (view.closing <= APPROACH_SPEED)
+            makes_way = np.sign(lateral) * drift > 0
+            leaves = makes_way & (view.closing <= APPROACH_SPEED)
             is_in_way = (self._row(body.is_in_path) & ~leaves) | comes
             rank = (
                 view.gap
@@ -264,13 +257,12 @@ class Traffic:
 
         # Most bodies are nobody's nearest: their scenes are not computed.
         chosen = np.argmin(np.stack(ranks), axis=0)
-        numbers = [number for number in range(len(views)) if (chosen == number).any()]
+        numbers = np.flatnonzero(np.bincount(chosen))
         scene = self._scene_of(views[numbers[0]], over)
         for number in numbers[1:]:
-            columns = zip(scene, self._scene_of(views[number], over), strict=True)
-            scene = Scene(
-                *(np.where(chosen == number, new, old) for old, new in columns)
-            )
+            is_chosen = chosen == number
+            columns = zip(self._scene_of(views[number], over), scene, strict=True)
+            scene = Scene(*(np.where(is_chosen, new, old) for new, old in columns))
         return scene
 
     def hits(
@@ -294,10 +286,8 @@ class Traffic:
             )
             vehicles = np.flatnonzero(is_beside & is_open & (self._struck == NOBODY))
             if vehicles.size:
-                overlaps = find_overlaps(
-                    self._vehicle_body(front[vehicles], speed[vehicles]),
-                    self._body(k, vehicles),
-                )
+                vehicle = self._vehicle_body(front[vehicles], speed[vehicles])
+                overlaps = find_overlaps(vehicle, self._body(k, vehicles))
                 self._struck[vehicles[overlaps > TOUCH]] = k
 
         touched = np.flatnonzero(self._struck != NOBODY)
@@ -329,13 +319,16 @@ class Traffic:
     def _body(self, number: int, vehicles: IntArray) -> Body:
         """A body at this sample, as the given vehicles meet it."""
         body = self._bodies[number]
-        group = vehicles if self.group is None else self.group[vehicles]
+        group = vehicles
+        if self.group is not None:
+            group = self.group[vehicles]
         # A column may have one value for all encounters: then "clip" takes it for each.
-        length, width, x, y, cosine, sine, speed, vy = (
+        length, width, x, y, cosine, sine, speed, drift = (
             row(column, self._sample, None).take(group, mode="clip")
             for column in (*body.track[2:], body.vy)
         )
-        drift = vy if body.faces_along else np.zeros_like(vy)
+        if not body.faces_along:
+            drift = np.zeros_like(drift)
         along = np.stack([cosine, sine], axis=1)
         return Body(np.stack([x, y], axis=1), along, length, width, speed, drift)
 
@@ -350,15 +343,12 @@ class Traffic:
         in_conflict = np.zeros(shape, dtype=bool)
         for start in range(0, shape[0], n_rows):
             samples = slice(start, min(start + n_rows, shape[0]))
+            front, speed = trace.position[samples], trace.speed[samples]
             for k in self._encountered:
-                separation, rate, counts = self._approach(
-                    k, samples, trace.position[samples], trace.speed[samples]
-                )
-                is_nearer = (
-                    counts & (separation < distance[samples])
-                    if len(self._encountered) > 1
-                    else counts
-                )
+                separation, rate, counts = self._approach(k, samples, front, speed)
+                is_nearer = counts
+                if len(self._encountered) > 1:
+                    is_nearer = counts & (separation < distance[samples])
                 np.copyto(distance[samples], separation, where=is_nearer)
                 np.copyto(closing[samples], rate, where=is_nearer)
                 in_conflict[samples] |= counts
@@ -408,10 +398,11 @@ class Traffic:
 
     def _table(self, column: Sampled, samples: slice) -> Sampled:
         """A column at some samples, for each vehicle or for all of them."""
-        values = column[samples] if len(column) > 1 else column
-        if self.group is None or values.shape[1] == 1:
-            return values
-        return values[:, self.group]
+        if len(column) > 1:
+            column = column[samples]
+        if self.group is None or column.shape[1] == 1:
+            return column
+        return column[:, self.group]
 
 
 class _View(NamedTuple):

@@ -107,14 +107,9 @@ class TrafficWorld(SumoWorld):
         ]
 
         # At every sample of every copy: their wrappers would take as long as they do.
-        self._move_person, self._move_vehicle, self._set_previous_speed = (
-            function_of(api, *name)
-            for name in (
-                ("person", "moveToXY"),
-                ("vehicle", "moveToXY"),
-                ("vehicle", "setPreviousSpeed"),
-            )
-        )
+        self._move_person = function_of(api, "person", "moveToXY")
+        self._move_vehicle = function_of(api, "vehicle", "moveToXY")
+        self._set_previous_speed = function_of(api, "vehicle", "setPreviousSpeed")
         self._routes = [api.vehicle.getRoute(id_) for id_ in self.ids(VUT)]
         self._edges = [str(route[0]) for route in self._routes]
         """The edges on which the vehicles under test depart."""
@@ -151,9 +146,7 @@ class TrafficWorld(SumoWorld):
         """Nobody is filmed without a size."""
         super().film(tracks, sample, length)
         for actor in self._actors:
-            size = self._at_copies(actor.track.length) + self._at_copies(
-                actor.track.width
-            )
+            size = self._at_copies(actor.track.length + actor.track.width)
             tracks[actor.track.name].motion[sample, size == 0] = np.nan
 
     def _add(self, actor: Placed) -> None:
@@ -161,14 +154,11 @@ class TrafficWorld(SumoWorld):
         types = self.api.vehicletype
         track = actor.track
         # Who is not there yet has the size that it will have.
-        sizes = (
-            column.max(axis=0, keepdims=True) for column in (track.length, track.width)
-        )
-        lengths, widths = map(self._of_copies, sizes)
+        lengths = self._of_copies(track.length.max(axis=0, keepdims=True))
+        widths = self._of_copies(track.width.max(axis=0, keepdims=True))
         default_type = "DEFAULT_PEDTYPE" if actor.is_person else "DEFAULT_VEHTYPE"
-        for id_, route, length, width in zip(
-            actor.ids, self._routes, lengths, widths, strict=True
-        ):
+        copies = zip(actor.ids, self._routes, lengths, widths, strict=True)
+        for id_, route, length, width in copies:
             types.copy(default_type, id_)
             types.setLength(id_, length)
             types.setWidth(id_, width)
@@ -186,9 +176,7 @@ class TrafficWorld(SumoWorld):
     def _put(self) -> None:
         """Put all actors where they are at the sample that the coming step leads to."""
         for actor in self._actors:
-            places = (
-                self._of_copies(column) for column in (actor.x, actor.y, actor.angle)
-            )
+            places = map(self._of_copies, (actor.x, actor.y, actor.angle))
             placed = zip(actor.ids, self._edges, *places, strict=True)
             if actor.is_person:
                 for id_, edge, x, y, angle in placed:
@@ -220,21 +208,17 @@ class TrafficWorld(SumoWorld):
         driving = [*self.driving.values()]
         places = {"vehicle under test": (front[driving], self._fronts[driving])}
         for actor in self._actors:
-            get_position = (
-                self._get_person_position if actor.is_person else self._get_position
-            )
-            expected = np.stack(
-                [self._at_copies(actor.x), self._at_copies(actor.y)], axis=1
-            )
-            places[f"actor {actor.track.name!r}"] = (
-                expected,
-                np.array([*map(get_position, actor.ids)]),
-            )
+            get_position = self._get_position
+            if actor.is_person:
+                get_position = self._get_person_position
+            expected = np.stack([*map(self._at_copies, (actor.x, actor.y))], axis=1)
+            actual = np.array([*map(get_position, actor.ids)])
+            places[f"actor {actor.track.name!r}"] = expected, actual
         for name, (expected, actual) in places.items():
-            if not (np.abs(actual - expected) <= PLACE_TOLERANCE).all():
-                off = np.abs(actual - expected).max()
+            distances = np.abs(actual - expected)
+            if not (distances <= PLACE_TOLERANCE).all():
                 time = self._sample * self.step_length
                 raise SimulationError(
-                    f"SUMO has the {name} {off:.2g} m beside its track at {time:g} s"
+                    f"SUMO has the {name} {distances.max():.2g} m beside its track at {time:g} s"
                 )
         return motion

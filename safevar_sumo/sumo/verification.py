@@ -67,7 +67,7 @@ def drive_again(
         contacts = FirstContacts(n, np.full(n, point.scenario.is_hit_in_front))
         for sample in range(len(trace.time)):
             watch(world)
-            scene = observer.observe(motion, is_open)
+            scene = observer.observe(motion)
             collisions = contacts.count(world, motion.hits, scene)
             values["collision"][sample, [*collisions]] = [*collisions.values()]
             values["position"][sample] = frame.along(motion.fronts)

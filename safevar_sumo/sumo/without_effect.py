@@ -31,7 +31,11 @@ def without_effect(system: System) -> list[str]:
     if not system.mover.has("a driving system"):
         return noise_remarks(system.characteristics, system.points)
     uses_traci = isinstance(system.ads, TraciController)
-    acting = _acting_attributes(system) if uses_traci else ()
+    acting = set[str]()
+    if uses_traci:
+        acting |= {*ACTING_ATTRIBUTES}
+        if _has_tau(system):
+            acting.remove("tau")
     remarks = []
     for network in dict.fromkeys(point.scenario.network for point in system.points):
         remarks += network_remarks(network, acting)
@@ -55,13 +59,6 @@ def without_effect(system: System) -> list[str]:
                 " of clear weather, and no key of [ads.parameters] delays the ADS in it"
             )
     return remarks
-
-
-def _acting_attributes(system: System) -> set[str]:
-    """Attributes of the traffic file with which SUMO's driver drives under a controller written
-    for TraCI.
-    """
-    return {name for name in ACTING_ATTRIBUTES if name != "tau" or not _has_tau(system)}
 
 
 def _has_tau(system: System) -> bool:

@@ -47,10 +47,9 @@ class SumoWorld:
         self.api = api
         self.n = n
         self.step_length: float = api.simulation.getDeltaT()
-        self._set_speed, self._get_speed, self._get_position = (
-            function_of(api, "vehicle", name)
-            for name in ("setSpeed", "getSpeed", "getPosition")
-        )
+        self._set_speed = function_of(api, "vehicle", "setSpeed")
+        self._get_speed = function_of(api, "vehicle", "getSpeed")
+        self._get_position = function_of(api, "vehicle", "getPosition")
         self._get_person_position = function_of(api, "person", "getPosition")
         self._copy_of = {id_: copy for copy, id_ in enumerate(self.ids(VUT))}
         self.driving = dict(self._copy_of)
@@ -97,27 +96,26 @@ class SumoWorld:
         """
         vehicletype = self.api.vehicletype
         ids = self.ids(VUT)
-        insertion_decel = np.full(self.n, INSERTION_DECELERATION)
-        decelerations = (insertion_decel if types is None else types.decel,) * 2
-        if keeps_drivers:
-            planned = [
-                (vehicletype.getDecel(id_), vehicletype.getEmergencyDecel(id_))
-                for id_ in ids
-            ]
-            decelerations = tuple(np.array(planned).T)
+        decel = np.full(self.n, INSERTION_DECELERATION)
         if types is None:
             self._set(vehicletype.setMaxSpeed, np.full(self.n, MAX_DEPARTURE_SPEED))
         else:
+            decel = types.decel
             self._set(vehicletype.setMass, types.mass)
             self._set(vehicletype.setAccel, types.accel)
             self._set(vehicletype.setMaxSpeed, types.max_speed)
             if types.tau is not None:
                 self._set(vehicletype.setTau, types.tau)
+        emergency_decel = decel
+        if keeps_drivers:
+            decel = np.array([*map(vehicletype.getDecel, ids)])
+            emergency_decel = np.array([*map(vehicletype.getEmergencyDecel, ids)])
         self._set_decelerations(
-            *(np.maximum(values, insertion_decel) for values in decelerations)
+            np.maximum(decel, INSERTION_DECELERATION),
+            np.maximum(emergency_decel, INSERTION_DECELERATION),
         )
         self._depart()
-        self._set_decelerations(*decelerations)
+        self._set_decelerations(decel, emergency_decel)
         if keeps_drivers:
             # SUMO drew a factor for each vehicle.
             for id_ in ids:
@@ -212,10 +210,16 @@ class SumoWorld:
     def _pairs(self, pairs: Sequence[tuple[int, str]]) -> BodyPairs:
         """Vehicles under test by their copy, each with an actor by its id."""
         ids = self.ids(VUT)
-        copies = [copy for copy, _ in pairs]
-        vehicles = Body.columns([self._body_of(ids[copy]) for copy in copies])
-        obstacles = Body.columns([self._body_of(id_) for _, id_ in pairs])
-        return BodyPairs(np.array(copies), vehicles, obstacles)
+        copies = []
+        vehicles = []
+        obstacles = []
+        for copy, id_ in pairs:
+            copies.append(copy)
+            vehicles.append(self._body_of(ids[copy]))
+            obstacles.append(self._body_of(id_))
+        return BodyPairs(
+            np.array(copies), Body.columns(vehicles), Body.columns(obstacles)
+        )
 
     def _body_of(self, id_: str) -> Body:
         domain = self._domain_of(id_)
@@ -316,8 +320,9 @@ class SumoWorld:
     def turn_back(self, person: str, copies: Sequence[int] | None = None) -> None:
         api = self.api.person
         ids = self.ids(person)
-        for copy in range(self.n) if copies is None else copies:
-            id_ = ids[copy]
+        if copies is not None:
+            ids = [ids[copy] for copy in copies]
+        for id_ in ids:
             back = [api.getRoadID(id_), api.getEdges(id_)[0]]
             api.appendWalkingStage(id_, back, 0.0, speed=api.getSpeed(id_))
             api.removeStage(id_, 0)
@@ -338,7 +343,7 @@ def function_of(api: Api, domain: str, name: str) -> Callable[..., Any]:
     function itself.
     """
     compiled = getattr(api, "_libsumo", None)
-    function: Callable[..., Any] = getattr(
-        compiled or getattr(api, domain), f"{domain}_{name}" if compiled else name
-    )
+    function: Callable[..., Any] = getattr(getattr(api, domain), name)
+    if compiled:
+        function = getattr(compiled, f"{domain}_{name}")
     return function

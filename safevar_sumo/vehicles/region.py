@@ -128,17 +128,14 @@ class FeasibleRegion:
                 for bound in self.bounds
                 if bound.excess(row)[0] > SLACK / len(self.bounds)
             )
-            values = ", ".join(
-                f"{characteristic.name} = {value:g}{characteristic.suffix}"
-                for characteristic, value in zip(
-                    self.characteristics, setting, strict=True
-                )
-                if characteristic.name in bound.constraint.sum
-            )
+            values = []
+            for member, value in zip(self.characteristics, setting, strict=True):
+                if member.name in bound.constraint.sum:
+                    values.append(f"{member.name} = {value:g}{member.suffix}")
             quantity = f"{bound.constraint.quantity} = {bound.quantity(row)[0]:g}{bound.suffix}"
             raise InputError(
                 "",
-                f"violates a constraint: {quantity} ({values})",
+                f"violates a constraint: {quantity} ({', '.join(values)})",
                 bound.condition + otherwise,
             )
 
@@ -176,9 +173,9 @@ class FeasibleRegion:
         return np.concatenate(batches)
 
     def _are_accepted(self, settings: FloatArray, filtered: bool) -> BoolArray:
-        return self.feasible(
-            self.characteristics.filter(settings) if filtered else settings
-        )
+        if filtered:
+            settings = self.characteristics.filter(settings)
+        return self.feasible(settings)
 
 
 def region_of(study: Study) -> FeasibleRegion:
