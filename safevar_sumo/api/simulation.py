@@ -337,8 +337,9 @@ def simulate(
         If SUMO fails.
     """
     loaded_study, system = load_and_assemble(study)
+    names = () if changes is None else changes.keys()
     with about("changes"):
-        loaded_study, system = with_set_axes(loaded_study, system, changes or ())
+        loaded_study, system = with_set_axes(loaded_study, system, names)
     setting = changed_setting(system, changes, filtered, beyond)
     return simulate_with_original(
         loaded_study, where_met(system, setting), setting, filtered=filtered

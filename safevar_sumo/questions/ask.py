@@ -383,7 +383,7 @@ class Question:
         words += flags
         for name, text in part.items():
             if text:
-                words += [flag_of(name), quote(text)]
+                words += [flag_of(name), quote(str(text))]
         return " ".join(words)
 
 

@@ -195,4 +195,4 @@ def test_a_set_in_which_the_original_is_unsafe_is_named_with_its_test(
         "With the original vehicle itself the vehicle hits a pedestrian ahead"
         in answer.verdict
     )
-    assert "; parameter set 1): there no limit is claimed." in answer.verdict
+    assert "in which the original vehicle fails: " in answer.verdict

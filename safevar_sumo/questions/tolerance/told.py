@@ -391,12 +391,12 @@ def _box_in_words(facts: Told) -> Iterator[str]:
         words = f"parameter set {model.fit} is unsafe"
         if described:
             words = described[""].words
-        yield f"With the original vehicle itself {words}: there no limit is claimed."
+        yield f"No limit holds in an encounter in which the original vehicle fails: {words}."
     is_single = number == 1 and not facts.task.left_out
     if is_single and facts.study.spread:
         yield (
-            "The limits were computed with one parameter set of the vehicle model; the study's"
-            " other sets were not tried."
+            "The limits were computed with one parameter set of the vehicle model, not with the"
+            " study's other sets."
         )
     if facts.without_room:
         names = join_phrases(facts.without_room)
@@ -486,9 +486,9 @@ def tested_sentences(facts: Told) -> Iterator[str]:
     if proof is not None:
         failed = ""
         if proof.not_simulated:
-            failed = f", {proof.not_simulated} could not be simulated"
+            failed = f" ({proof.not_simulated} could not be simulated)"
         bound = bound_in_words(proof.at_most).capitalize()
-        yield f"{proof.samples:,} random vehicles, none unsafe{failed}."
+        yield f"None of {proof.samples:,} sampled vehicles is unsafe{failed}."
         yield f"{bound} of uniformly sampled vehicles within the limits are unsafe."
     if remark := remark_on_phases(facts.own.in_phases):
         yield remark
