@@ -13,16 +13,12 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.scope import moving_axes, points_of_tests
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.study import PHASE, RANGES, Domain, MatrixTest, Study, axis_of
 from safevar_sumo.sumo.system import System, assemble
-
-PLACES = 8
-"""Number of random places on the axes that each vehicle meets first."""
 
 
 class MovingTest(NamedTuple):
@@ -38,10 +34,6 @@ class MovingTest(NamedTuple):
 
     test: MatrixTest
     model: Model
-
-    def box(self, box: Box) -> Box:
-        """A box of vehicles, at all places."""
-        return box.in_encounters_of(self.model.evaluator.region)
 
 
 def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:

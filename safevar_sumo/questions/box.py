@@ -10,16 +10,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.random import Generator, default_rng
+from numpy.random import Generator
 
-from safevar_sumo.questions.sampling import CONFIDENCE, Stream
+from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import FeasibleRegion
 
 MAX_CORNERS = 4096
 """Largest number of corners of a box that are simulated."""
-MET_BY_CORNERS = 32_768
-"""Number of encounters that the corners meet together, where encounters are ranges."""
 
 
 @dataclass(frozen=True)
@@ -66,35 +64,6 @@ class Box:
         return self.region.draw_feasible(
             lambda count: self.at(rng.random((count, len(self.lower)))), number
         )
-
-    def corners(self, seed: int, attempt: int) -> FloatArray:
-        """Settings at all corners; at `MAX_CORNERS` random ones if it has more.
-
-        Where encounters are ranges, each corner of the vehicle's characteristics meets
-        equally many encounters, drawn anew in each attempt.
-        """
-        # Every combination of ends, or some of them.
-        of_vehicle = self.region.characteristics.of_vehicle
-        is_open = self.lower < self.upper
-        worn = np.flatnonzero(of_vehicle & is_open)
-        rng = default_rng(seed)
-        size = len(worn)
-        numbers = (
-            np.arange(2**size)
-            if 2**size <= MAX_CORNERS
-            else rng.integers(2**size, size=MAX_CORNERS)
-        )
-        points = np.zeros((len(numbers), len(self.lower)))
-        points[:, worn] = numbers[:, None] >> np.arange(size) & 1
-
-        # The corners meet several encounters.
-        if not (~of_vehicle & is_open).any():
-            return self.at(points)
-        points = np.tile(points, (MET_BY_CORNERS // len(points), 1))
-        places = Stream.ENCOUNTERS_AT_CORNERS.generator(seed, attempt).random(
-            points.shape
-        )
-        return self.at(np.where(of_vehicle, points, places))
 
 
 class Judgement(NamedTuple):

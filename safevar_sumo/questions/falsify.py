@@ -56,30 +56,6 @@ class Falsification(NamedTuple):
         }
 
 
-def falsify(
-    box: Box,
-    judges: Sequence[Judge],
-    known: Sequence[FloatArray],
-    budget: int,
-    rng: np.random.Generator,
-) -> Falsification:
-    """Search the settings of a box that leave least, with `budget` simulations; it ends
-    `MORE_GENERATIONS` after one is unsafe.
-
-    `known` are settings for each judge, or none, which are the first generation; random ones fill
-    it up.
-
-    Notes
-    -----
-    Half of a generation are children of two parents, each value from one of the two; on average one
-    value mutates: to a random value, a step towards one, or to an end of the box. The other half
-    moves a parent towards a worse one and by a difference of two others, as differential evolution
-    does. After the first generation, half of each meets the judge to whom least is left, and half
-    another one, in turn, the next worst first: few at once make large batches.
-    """
-    return falsify_all([box], judges, [known], budget, [rng])[0]
-
-
 def falsify_all(
     boxes: Sequence[Box],
     judges: Sequence[Judge],
@@ -91,7 +67,8 @@ def falsify_all(
 ) -> list[Falsification]:
     """Falsify the claim about several boxes side by side, each with `budget` simulations,
     `generation` of them at once: a judge meets a generation of all boxes together, as few large
-    batches cost less than many small ones. What was `begun` goes on with its children.
+    batches cost less than many small ones. What was `begun` goes on with its children. A search
+    ends `MORE_GENERATIONS` after a setting is unsafe.
     """
     found = dict[int, Falsification]()
     before: Sequence[Falsification | None] = begun or [None] * len(boxes)

@@ -24,7 +24,6 @@ class Stream(IntEnum):
 
     CONFIDENCE_BOUND = 1  # vehicles within joint limits, for the upper confidence bound
     LARGER_BOXES = 2  # steps from the largest safe box that is known to larger ones
-    ENCOUNTERS_AT_CORNERS = 3  # encounters that the corners of a box meet
     JOINT_LIMITS = 4  # falsification of joint limits
     LIMITS_ALONE = 6  # falsification of the limits of one characteristic alone
     REPAIRED_BOUND = 7  # vehicles within the required range, for the bound of a repair

@@ -14,12 +14,12 @@ import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import evaluator
-from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.cases import SearchPlan, search_cases
 from safevar_sumo.questions.evaluator import open_evaluator
-from safevar_sumo.questions.falsify import falsify
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import asked
+from safevar_sumo.questions.tolerance.oracle import Oracle
 from safevar_sumo.results.identity import identity_digest, manifest_of
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, json_of, refused, run, searched
@@ -221,31 +221,21 @@ small pocket of the encounters, such as 0.15 km/h by 4 % of the path.
 @pytest.mark.parametrize("name", WORN)
 def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
     with open_evaluator(load_study(name, encounters="ranges"), jobs=2) as judging:
-        members, model = judging.characteristics, Model(0, judging, Unsafe())
-        vehicle = np.array(
+        oracle = Oracle([Model(0, judging, Unsafe())], Unsafe(), between=False)
+        original = oracle.vehicle.original
+        worn = np.array(
             [
-                {**members.named(members.original), **WORN[name]}[one]
-                for one in members.names
+                WORN[name].get(item.name, item.original)
+                for item in oracle.vehicle.members
             ]
         )
-        box = Box(
-            judging.region,
-            np.where(
-                members.of_vehicle, np.minimum(members.original, vehicle), members.lower
-            ),
-            np.where(
-                members.of_vehicle, np.maximum(members.original, vehicle), members.upper
-            ),
-        )
-        found = falsify(
-            box,
-            [lambda settings: model.robustness(settings, "attack")],
-            [],
-            5000,
-            np.random.default_rng(0),
-        )
-    assert found.robustness[0] < 0
-    assert found.simulated <= 5000
+        ends = np.sort([original, worn], axis=0)
+        space = oracle.space(0, *ends)
+        nothing = space.lower[np.newaxis][:0]
+        plan = SearchPlan(5000)
+        met = search_cases(oracle, space, nothing, plan, np.random.default_rng(0))
+    assert met.least < 0
+    assert met.simulated <= 5000
 
 
 def test_changes_are_those_of_the_vehicle(case: Case) -> None:

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from msgspec.structs import replace as replace_in
 from numpy.random import default_rng
+from numpy.testing import assert_array_equal
 
 import safevar_sumo as sv
 from safevar_sumo.ads import ADS
@@ -20,21 +21,26 @@ from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import cases, repair as question
 from safevar_sumo.questions.evaluator import open_evaluator
+from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.repair import (
-    full_braking,
     smallest,
     survivors,
     validation,
     write_repair,
 )
 from safevar_sumo.questions.repair.price import benign_scenes
-from safevar_sumo.questions.repair.problem import Parameter, Promise, RepairProblem
+from safevar_sumo.questions.repair.problem import (
+    Parameter,
+    Promise,
+    RepairProblem,
+    parameters_of,
+)
+from safevar_sumo.questions.tolerance.oracle import Oracle, product_of
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, run
-from tests.made_up import original_of
 
 SPEED, MARGIN, GAP_TODAY = 20.0, 0.3, 12.0
 """Speed [m/s] of the planted system; its gap of today lets even a new sled collide, so that the
@@ -235,11 +241,10 @@ class Adding:
         self.today, self._need = np.full(parameters, 0.1), need
 
     def robustness_of_each(
-        self, shares: FloatArray, settings: FloatArray, stage: str, points: Any = ()
-    ) -> tuple[FloatArray, Any]:
+        self, shares: FloatArray, cases: FloatArray, stage: str
+    ) -> FloatArray:
         gain = np.clip(shares - self.today, 0, 0.85).sum(axis=1)
-        robustness = gain[:, np.newaxis] - self._need * settings[:, 0]
-        return robustness, np.zeros(robustness.size, dtype=int)
+        return np.subtract.outer(gain, self._need * cases[:, 0])
 
 
 @pytest.mark.parametrize(
@@ -257,11 +262,10 @@ def test_the_smallest_changes_are_those_of_the_closed_form(
     parameters: int, need: float, changed: dict[int, float]
 ) -> None:
     problem: Any = Adding(parameters, need)
-    search = smallest.Search([problem], np.linspace(0.5, 0, 20)[:, np.newaxis])
+    search = smallest.Search(problem, np.linspace(0.5, 0, 20)[:, np.newaxis])
     search.smallest_changes()
-    search.add(
-        0, np.linspace(1, 0.5, 20)[:, np.newaxis]
-    )  # what was found before becomes a lower bound
+    # What was found before becomes a lower bound.
+    search.add(np.linspace(1, 0.5, 20)[:, np.newaxis])
     changes = [change - problem.today for change in search.smallest_changes()]
     found = {
         int(np.count_nonzero(change)): float(np.max(np.abs(change)))
@@ -302,46 +306,32 @@ def test_a_promise_that_is_kept_already_writes_no_file(
     assert not out.exists()
 
 
-def test_full_braking_takes_the_place_of_a_driving_system_whose_fitted_sets_it_does_not_have() -> (
-    None
-):
-    study = sv.load_study("rain")
-    assert any(key.startswith("ads.parameters.") for key in study.spread)
-    with open_evaluator(study, InlinePool()) as evaluator:
-        problem: Any = RepairProblem(
-            evaluator=evaluator, promise=None, parameters=[], unsafe=Unsafe(keep=0.3)
-        )  # type: ignore[arg-type]
-        assert (
-            problem.best_driver.evaluator.evaluate(original_of(evaluator), "").f_safe[0]
-            > 0.3
-        )
-
-
-def test_full_braking_saves_the_same_vehicles_if_the_hardest_points_are_asked_first(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(full_braking, "LEAST_SETTINGS", 1)
-    with open_evaluator(sv.load_study("wear"), InlinePool()) as evaluator:
+@pytest.mark.parametrize("name", ["wear", "rain"])
+def test_cases_leave_what_vehicles_leave_unless_nobody_saves_them(name: str) -> None:
+    """Full braking has no parameters of the driving system, of which `rain` fits one."""
+    unsafe = Unsafe(keep=0.3)
+    with open_evaluator(sv.load_study(name), InlinePool()) as evaluator:
         problem = RepairProblem(
-            evaluator=evaluator,
+            oracle=Oracle([Model(0, evaluator, unsafe)], unsafe, between=True),
             promise=Promise.of(evaluator.study, evaluator.region, ["all"]),
-            parameters=[],
-            unsafe=Unsafe(keep=0.3),
+            parameters=parameters_of(evaluator.study, ()),
+            budget=100,
         )
-        settings = problem.promise.draw(20, default_rng(1))
-        driver = problem.best_driver
-        is_safe = (
-            full_braking.robustness_of(
-                driver.evaluator.evaluate(settings, ""), problem.unsafe
-            )
-            >= 0
-        )
-        assert 0 < np.count_nonzero(is_safe) < len(settings)
-        for rows in (
-            np.arange(20),
-            np.flatnonzero(~is_safe),
-        ):  # the second time the hardest points are known
-            assert (driver.saves(settings[rows]) == is_safe[rows]).all()
+        vehicles = problem.promise.draw(20, default_rng(1))
+        cases = product_of(vehicles, problem.encounters)
+        left = problem.robustness_with(problem.today, cases, "")
+        expected = unsafe.robustness(evaluator.evaluate(vehicles, ""))
+        assert left.reshape(20, -1).min(axis=1) == pytest.approx(expected)
+        is_saved = problem.repairable(cases)
+        assert is_saved.all() == (name == "rain")
+        counted = np.where(is_saved, left, np.inf)
+        assert_array_equal(problem.robustness(problem.today, cases, ""), counted)
+
+        # Between the tests only encounters count that a new vehicle survives today.
+        cases[:, problem.size + 1 :] = 0.37
+        cases[:, : problem.size] = evaluator.characteristics.original
+        survives = problem.robustness_with(problem.today, cases, "") >= 0
+        assert_array_equal(problem.counts(cases), survives)
 
 
 def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:
@@ -356,9 +346,9 @@ def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(
     best.
     """
     monkeypatch.setattr(question, "SOBOL_VEHICLES", 3)
-    monkeypatch.setattr(survivors, "find_failures", lambda *_: {})
+    monkeypatch.setattr(survivors, "find_failures", lambda *_: [])
     monkeypatch.setattr(
-        survivors, "prove_change", lambda *_: (validation.Proof(5, 0, 0.45, 0), {})
+        survivors, "prove_change", lambda *_: (validation.Proof(5, 0, 0.45, 0), [])
     )
     kept = sv.repair("native", promise=["decel>=7"], pool=InlinePool())
     worst = kept.numbers["worst_today"]

@@ -1,10 +1,10 @@
 """Which smallest change of the driving system keeps all vehicles safe within a required range of
 wear, and what does it cost?
 
-The first counterexamples are corners and Sobol points of the range, without vehicles that no
-driving system keeps safe. The smallest changes that survive them (`smallest`) are falsified and
-validated (`validation`); what breaks a change is a new counterexample (`survivors`). Today's
-driving system is the change of no parameter.
+The first counterexamples are corners and Sobol points of the range in the listed encounters,
+without those that no driving system keeps safe. The smallest changes that survive them (`smallest`)
+are searched for counterexamples and validated (`validation`); what breaks a change is a new
+counterexample (`survivors`). Today's driving system is the change of no parameter.
 """
 
 from __future__ import annotations
@@ -33,14 +33,19 @@ from safevar_sumo.questions.models import check_margin, margin_of, models_of
 from safevar_sumo.questions.options import Fits, LimitTexts, Margin
 from safevar_sumo.questions.repair.answer import REPAIRS, answer_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
+from safevar_sumo.questions.repair.smallest import MOST_CHANGED
 from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
+from safevar_sumo.questions.repair.validation import usual_test
 from safevar_sumo.questions.sampling import sobol_points
+from safevar_sumo.questions.tolerance.oracle import Oracle, product_of
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, write_study
 
-ROUNDS_STAGE, USUAL_ROUNDS = "smallest change that survives", 8
-"""The phase of progress, and its usual number of rounds: each takes about the simulations of a
-falsification.
+ROUNDS_STAGE = "smallest change that survives"
+"""The phase of progress."""
+USUAL_ROUNDS, OF_ROUND = 8, 2
+"""Its usual number of rounds; in a round, changes meet the cases of this number of searches for a
+counterexample, and of another one for each test.
 """
 SOBOL_VEHICLES = 256
 """Sobol points of the promise among the first counterexamples, and corners: the same points
@@ -129,64 +134,53 @@ def repair(
     unsafe_today = replace(criterion, keep=keep, contact=evaluator.system.contact)
     promised = Promise.of(study, evaluator.region, promise)
     parameters = parameters_of(study, change)
-    budget = evaluator.scaled(cases.USUAL_BUDGET)
-    # Less than usual is no rough answer: a change that was not attacked is no repair.
-    usual = USUAL_ROUNDS * budget
-    evaluator.begin({ROUNDS_STAGE: usual}, least=usual)
     models = models_of(evaluator, unsafe_today, fits, with_unsafe_originals=True)
-    problems = [
-        RepairProblem(
-            evaluator=model.evaluator,
-            promise=promised,
-            parameters=parameters,
-            unsafe=model.unsafe,
-            fit=model.fit,
-            budget=budget,
-        )
-        for model in models.members
-    ]
-    problem = problems[0]
-    between = [
-        each
-        for one in problems
-        for each in ([] if at_tests else one.between(unsafe_today))
-    ]
-    between += [each for one in problems for each in one.in_phases()]
-    vehicles, is_repairable = _worst_first(problem, _first_vehicles(problem, subject))
-    survivors = Survivors([], len(problems), ())
+    problem = RepairProblem(
+        oracle=Oracle(models.members, unsafe_today, between=not at_tests),
+        promise=promised,
+        parameters=parameters,
+        budget=evaluator.scaled(cases.USUAL_BUDGET),
+    )
+    # Less than usual is no rough answer: a change that was not attacked is no repair.
+    searches = USUAL_ROUNDS * (OF_ROUND + problem.oracle.fits.count(0))
+    rounds = searches * problem.budget / len(evaluator.system.points)
+    usual = round(rounds + MOST_CHANGED * usual_test(problem, len(models.members)))
+    evaluator.begin({ROUNDS_STAGE: usual}, least=usual)
+    first, is_repairable = _worst_first(problem, _first_cases(problem, subject))
+    survivors = Survivors([], len(models.members), ())
     if is_repairable.any():
         with evaluator.phases.stage(ROUNDS_STAGE):
-            survivors = find_survivors(problems, between, vehicles[is_repairable])
-    worst = vehicles[np.argmax(is_repairable)]
-    not_repairable = _not_repairable(problem, vehicles[~is_repairable])
-    answer = answer_of(
-        problem, models, survivors, problem.worst_today(worst), not_repairable
-    )
+            survivors = find_survivors(problem, models.fits, first[is_repairable])
+    worst = problem.outcome_today(first[np.argmax(is_repairable)])
+    not_repairable = _not_repairable(problem, first[~is_repairable])
+    answer = answer_of(problem, models, survivors, worst, not_repairable)
     if out is not None and answer.numbers["repairs"]:
         write_repair(Path(out), answer)
     return answer
 
 
-def _first_vehicles(problem: RepairProblem, subject: Subject) -> FloatArray:
-    """The new vehicle, corners and Sobol points of the promise, and failures of results in it;
-    shape (L, n).
+def _first_cases(problem: RepairProblem, subject: Subject) -> FloatArray:
+    """The new vehicle, corners and Sobol points of the promise, and failures of results in it, in
+    the listed encounters; these failures in their own ones, too.
     """
     promise = problem.promise
+    members = promise.region.characteristics
     number = problem.evaluator.scaled(SOBOL_VEHICLES)
     points = sobol_points(number, len(promise.lower), problem.study.search.seed)
-    settings = [
-        promise.region.characteristics.original[np.newaxis],
-        promise.at(np.round(points)),
-        promise.at(points),
-    ]
+    failures = members.original[np.newaxis][:0]
     if not isinstance(subject, Study):
-        failures = subject.solutions[problem.unsafe.rows(subject.solutions)]
-        settings.append(
-            failures[list(promise.region.characteristics.names)].to_numpy(dtype=float)
-        )
-    rows = np.unique(np.concatenate(settings), axis=0)
-    rows = rows[problem.holds(rows)]
-    if not len(rows):
+        rows = subject.solutions[problem.unsafe.rows(subject.solutions)]
+        failures = rows[list(members.names)].to_numpy(dtype=float)
+        failures = failures[promise.holds(failures)]
+    settings = np.vstack(
+        [members.original, promise.at(np.round(points)), promise.at(points)]
+    )
+    settings = np.vstack([settings[promise.holds(settings)], failures])
+    vehicles = np.unique(settings[:, : problem.size], axis=0)
+    listed = product_of(vehicles, problem.encounters)
+    own = problem.cases_of(failures)
+    cases = np.vstack([listed, own[problem.counts(own)]])
+    if not len(cases):
         kept = f"keeps {problem.unsafe.keep:g} m" if problem.unsafe.keep else "is safe"
         study = problem.study
         raise InputError(
@@ -194,39 +188,44 @@ def _first_vehicles(problem: RepairProblem, subject: Subject) -> FloatArray:
             f"{study.name!r}: the new vehicle {kept} in none of the tested encounters",
             "a smaller --margin, or narrower ranges of the axes",
         )
-    return rows
+    return cases
 
 
 def _worst_first(
-    problem: RepairProblem, vehicles: FloatArray
+    problem: RepairProblem, cases: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Vehicles, shape (L, n), those first that are least safe today, and which of them a driving
-    system can survive: the others need another part, not a parameter.
+    """Cases, those first that are least safe today, and which of them a driving system can survive:
+    the others need another part, not a parameter.
     """
     robustness = problem.robustness_with(
-        problem.today, vehicles, "the driving system of today"
+        problem.today, cases, "the driving system of today"
     )
     worst_first = np.argsort(robustness, kind="stable")
-    ordered = vehicles[worst_first]
+    ordered = cases[worst_first]
     is_repairable = robustness[worst_first] >= 0
     is_unsafe = ~is_repairable
     is_repairable[is_unsafe] = problem.repairable(ordered[is_unsafe])
     return ordered, is_repairable
 
 
-def _not_repairable(problem: RepairProblem, failures: FloatArray) -> list[NamedValues]:
+def _not_repairable(problem: RepairProblem, cases: FloatArray) -> list[NamedValues]:
     """What no driving system can survive: the minimal causes of failures of full braking, shrunk to
     the limit; for each characteristic of a cause the value from which on even full braking at once
     fails.
     """
-    if not len(failures) or problem.best_driver is None:
+    driver = problem.best_driver(problem.oracle.own)
+    if not len(cases) or driver is None:
         return []
-    driver = problem.best_driver.evaluator
     unsafe = problem.unsafe
-    evenly_spaced = np.linspace(
-        0, len(failures) - 1, min(len(failures), CAUSES_OF)
-    ).astype(int)
-    causes = [*chain(*find_minimal_causes(driver, failures[evenly_spaced], unsafe))]
+    evenly_spaced = np.linspace(0, len(cases) - 1, min(len(cases), CAUSES_OF))
+    number = len(problem.promise.lower)
+    failures = np.array(
+        [
+            problem.oracle.setting(case)[1][:number]
+            for case in cases[evenly_spaced.astype(int)]
+        ]
+    )
+    causes = [*chain(*find_minimal_causes(driver, failures, unsafe))]
     parts: dict[tuple[object, ...], NamedValues] = {}
     for limits, cause in zip(
         find_cause_limits(driver, causes, unsafe), causes, strict=True

@@ -122,7 +122,9 @@ def answer_of(
         "kept_today": kept_today,
         "repairs": len(repairs),
         "not_repairable": not_repairable,
-        "simulations": sum(model.evaluator.simulated for model in models.members),
+        "simulations": sum(
+            world.model.evaluator.simulated for world in problem.oracle.worlds
+        ),
         "fits": survivors.fits if survivors.changes else 0,
         "fits_tried": len(models.members),
     }
@@ -233,7 +235,7 @@ def _row(
         "largest_change": float(np.max(np.abs(change - problem.today))),
         "fits": fits,
         **_columns_of(proof),
-        **price_of(problem.study, values, problem.encounters),
+        **price_of(problem.study, values, problem.new_vehicles),
     }
 
 

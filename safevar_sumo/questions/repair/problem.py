@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -16,14 +16,13 @@ from safevar_sumo.ads.varied import CHANGEABLE
 from safevar_sumo.campaign.evaluation import Selection
 from safevar_sumo.errors import InputError, UserCodeError, about, unknown_name
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.between import moving_tests
 from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.cases import USUAL_BUDGET
+from safevar_sumo.questions.cases import Space
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.preventability import approach_parameters
-from safevar_sumo.questions.repair.full_braking import FullBraking, robustness_of
 from safevar_sumo.questions.sampling import sobol_points
+from safevar_sumo.questions.tolerance.oracle import CaseWorld, Oracle, product_of
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import (
     BoolArray,
@@ -44,8 +43,7 @@ value that is printed is the one that has been tried.
 """
 ARRAY_CHECKS = 8
 """Sets of parameters with which a user's ADS is tried as one for all vehicles."""
-DRAWS = 20
-"""Largest number of draws for each one in an encounter in which a new vehicle is safe."""
+BRAKING_STAGE = "full braking"
 ALL = "all"
 """The promise of the whole domain."""
 
@@ -235,54 +233,45 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
 
 @dataclass(frozen=True, kw_only=True)
 class RepairProblem:
-    """A study's ADS with P parameters that may change, and what is `unsafe` within a promise, with
-    one parameter set of the vehicle model, number `fit`. `budget` is the number of simulations of
-    a falsification over all parameter sets.
+    """A study's ADS with P parameters that may change, and the cases of vehicles within a promise.
 
     Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1].
+
+    Attributes
+    ----------
+    oracle
+        The worlds of the cases: each test with each parameter set of the vehicle model.
+    budget
+        How many cases search for a counterexample to a change.
+    drivers
+        Full braking in each world in which it was asked, by its number; None without that driver.
     """
 
-    evaluator: Evaluator
+    oracle: Oracle
     promise: Promise
     parameters: list[Parameter]
-    unsafe: Unsafe
-    fit: int = 0
-    budget: int = USUAL_BUDGET
+    budget: int
+    drivers: dict[int, Evaluator | None] = field(default_factory=dict)
+
+    @property
+    def evaluator(self) -> Evaluator:
+        """The evaluator with the study's own parameter set."""
+        return self.oracle.own.evaluator
+
+    @property
+    def unsafe(self) -> Unsafe:
+        """What is unsafe with the study's own parameter set."""
+        return self.oracle.own.unsafe
 
     @property
     def study(self) -> Study:
+        """The study with its own parameter set."""
         return self.evaluator.study
 
-    def between(self, new_car: Unsafe) -> list[RepairProblem]:
-        """The same problem in each test of its matrix that moves, with its axes as ranges."""
-        tests = moving_tests(Model(self.fit, self.evaluator, self.unsafe), new_car)
-        return [
-            replace(
-                self,
-                evaluator=test.model.evaluator,
-                promise=Promise(**vars(test.box(self.promise))),
-            )
-            for test in tests
-        ]
-
-    def in_phases(self) -> list[RepairProblem]:
-        """The same problem with settings that end with the phase of their encounter, if it has
-        phases.
-        """
-        model = Model(self.fit, self.evaluator, self.unsafe).in_phases
-        if model is None:
-            return []
-        lower, upper = (
-            np.append(self.promise.lower, 0.0),
-            np.append(self.promise.upper, 1.0),
-        )
-        promise = Promise(model.evaluator.region, lower, upper)
-        return [replace(self, evaluator=model.evaluator, promise=promise)]
-
     @property
-    def has_phases(self) -> bool:
-        """Whether settings end with the phase of their encounter."""
-        return self.evaluator.characteristics.names[-1] == PHASE
+    def size(self) -> int:
+        """The number n of a vehicle's values."""
+        return len(self.oracle.vehicle)
 
     @cached_property
     def today(self) -> FloatArray:
@@ -321,153 +310,173 @@ class RepairProblem:
         if self.study.ads.kind or self.study.ads.model in ADS:
             return not self.study.ads.kind
         values = self.values(sobol_points(ARRAY_CHECKS, len(self.parameters), 0))
-        settings = self.promise.at(
-            sobol_points(ARRAY_CHECKS, len(self.promise.lower), 1)
-        )
+        points = sobol_points(ARRAY_CHECKS, len(self.promise.lower), 1)
+        rows = np.hstack([self.promise.at(points), values])
+        stage = "is it one driving system?"
         try:
             alone, together = (
-                self._evaluate(
-                    values, settings, "is it one driving system?", arrays=arrays
-                )
+                self.evaluator.evaluate_selection(rows, self._selection(arrays), stage)
                 for arrays in (False, True)
             )
         except UserCodeError:
             return False
         return not any(differences(alone.results, together.results))
 
-    def _evaluate(
-        self,
-        values: FloatArray,
-        settings: FloatArray,
-        stage: str,
-        points: Sequence[int] = (),
-        *,
-        arrays: bool,
+    def _selection(self, arrays: bool) -> Selection:
+        """Settings that end with the parameters' values."""
+        names = tuple(parameter.name for parameter in self.parameters)
+        return Selection(parameters=names, arrays=arrays)
+
+    def evaluate(
+        self, model: Model, shares: FloatArray, settings: FloatArray, stage: str
     ) -> Evaluations:
-        """Evaluate each set of values with the setting of its row, at the worst of `points`, or of
-        all without any.
-        """
-        selection = Selection(
-            tuple(parameter.name for parameter in self.parameters),
-            tuple(points) or None,
-            arrays,
-        )
-        return self.evaluator.evaluate_selection(
-            np.hstack([settings, values]), selection, stage
-        )
+        """The evaluations of each of M sets of parameters with each of L settings of a model."""
+        values = np.repeat(self.values(shares), len(settings), axis=0)
+        rows = np.hstack([np.tile(settings, (len(shares), 1)), values])
+        selection = self._selection(self.arrays)
+        return model.evaluator.evaluate_selection(rows, selection, stage)
 
-    def robustness_of_each(
-        self,
-        shares: FloatArray,
-        settings: FloatArray,
-        stage: str,
-        points: Sequence[int] = (),
-    ) -> tuple[FloatArray, IntArray | None]:
-        """What each of M sets of parameters leaves to the limit with each of L settings, shape (M,
-        L), and the worst points of these M L rows; None without a matrix.
-        """
-        values = self.values(np.repeat(shares, len(settings), axis=0))
-        evaluations = self._evaluate(
-            values,
-            np.tile(settings, (len(shares), 1)),
-            stage,
-            points,
-            arrays=self.arrays,
-        )
-        return (
-            robustness_of(evaluations, self.unsafe).reshape(len(shares), len(settings)),
-            evaluations.worst_points,
-        )
+    def outcome_today(self, case: FloatArray) -> Evaluations:
+        """How the ADS of today ends with one case."""
+        model, setting = self.oracle.setting(case)
+        stage = "the driving system of today"
+        return self.evaluate(model, self.today[np.newaxis], setting[np.newaxis], stage)
 
-    def robustness_with(
-        self, change: FloatArray, settings: FloatArray, stage: str
-    ) -> FloatArray:
-        """What one set of parameters leaves to the limit with each of L settings, shape (L,)."""
-        return self.robustness_of_each(change[np.newaxis], settings, stage)[0].reshape(
-            -1
-        )
-
-    def worst_today(self, setting: FloatArray) -> Evaluations:
-        """How the ADS of today ends with one setting, shape (n,)."""
-        return self._evaluate(
-            self.values(self.today[np.newaxis]),
-            setting[np.newaxis],
-            "the driving system of today",
-            arrays=self.arrays,
-        )
-
-    def robustness(
-        self, change: FloatArray, settings: FloatArray, stage: str
-    ) -> FloatArray:
-        """What settings leave to the margin with one set of parameters, shape (L,); infinite where
-        they do not hold, or no driving system keeps them safe.
-        """
-        robustness = np.full(len(settings), np.inf)
-        rows = np.flatnonzero(self.holds(settings))
-        robustness[rows] = self.robustness_with(change, settings[rows], stage)
-        unsafe = np.flatnonzero(robustness < 0)
-        robustness[unsafe[~self.repairable(settings[unsafe])]] = np.inf
-        return robustness
-
-    def holds(self, settings: FloatArray) -> BoolArray:
-        """Which settings are promised, shape (M,), in an encounter in which the ADS of today keeps
-        a new vehicle safe; without a search of the scenario, all promised ones count.
-        """
-        is_promised = self.promise.holds(settings)
-        characteristics = self.promise.region.characteristics
-        if len(characteristics.scenario) and is_promised.any():
-            originals = characteristics.with_original_vehicle(settings[is_promised])
-            is_promised[is_promised] = (
-                self.robustness_with(self.today, originals, "new vehicles") >= 0
-            )
-        return is_promised
-
-    def draw(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Settings that hold, drawn uniformly, shape (number, n); fewer if `DRAWS` times as many do
-        not suffice.
-        """
-        settings = np.zeros((0, len(self.promise.lower)))
-        for _ in range(DRAWS):
-            drawn = self.promise.draw(number, rng)
-            settings = np.concatenate([settings, drawn[self.holds(drawn)]])[:number]
-            if len(settings) == number:
-                break
-        return settings
+    def cases_of(self, settings: FloatArray) -> FloatArray:
+        """Settings of the study as cases with its own parameter set."""
+        n = self.size
+        axes = self.promise.region.characteristics.scenario
+        cases = np.zeros((len(settings), n + 1 + self.oracle.places))
+        cases[:, :n] = settings[:, :n]
+        shares = (settings[:, n:] - axes.lower) / (axes.upper - axes.lower)
+        cases[:, n + 2 : n + 2 + len(axes)] = shares
+        return cases
 
     @cached_property
-    def encounters(self) -> FloatArray:
+    def new_vehicles(self) -> FloatArray:
         """The new vehicle in the original encounter, and in those promised ones in which it is
         least safe of many drawn ones, shape (K, n).
         """
         original = self.promise.region.characteristics.original
         settings = self.evaluator.critical_encounters
-        return np.concatenate(
-            [original[np.newaxis], settings[self.promise.holds(settings)]]
-        )
+        return np.vstack([original, settings[self.promise.holds(settings)]])
+
+    def robustness_of_each(
+        self, shares: FloatArray, cases: FloatArray, stage: str
+    ) -> FloatArray:
+        """What each of M sets of parameters leaves to the limit with each of L cases, shape (M, L):
+        infinite without a conflict, minus infinity if invalid.
+        """
+        robustness = np.zeros((len(shares), len(cases)))
+        for number, rows, settings in self.oracle.in_worlds(cases):
+            model = self.oracle.worlds[number].model
+            runs = self.evaluate(model, shares, settings, stage)
+            left = np.where(runs.valid, model.unsafe.robustness(runs), -np.inf)
+            left[runs.infeasible] = np.inf
+            robustness[:, rows] = left.reshape(len(shares), -1)
+        return robustness
+
+    def robustness_with(
+        self, change: FloatArray, cases: FloatArray, stage: str
+    ) -> FloatArray:
+        """What one set of parameters leaves to the limit with each of L cases, shape (L,)."""
+        return self.robustness_of_each(change[np.newaxis], cases, stage).reshape(-1)
+
+    def robustness(
+        self, change: FloatArray, cases: FloatArray, stage: str
+    ) -> FloatArray:
+        """What cases leave to the limit with one set of parameters, shape (L,); infinite where they
+        do not count, or no driving system keeps them safe.
+        """
+        robustness = self.robustness_with(change, cases, stage)
+
+        # Few cases are unsafe: only there the other drivers are asked.
+        unsafe = np.flatnonzero(robustness < 0)
+        is_failure = self.counts(cases[unsafe])
+        counted = unsafe[is_failure]
+        is_failure[is_failure] = self.repairable(cases[counted])
+        robustness[unsafe[~is_failure]] = np.inf
+        return robustness
+
+    def counts(self, cases: FloatArray) -> BoolArray:
+        """Which cases are in an encounter that counts, shape (L,): a listed one at any phase, or
+        one in which the ADS of today keeps a new vehicle safe.
+        """
+        is_counted = np.full(len(cases), not self.study.ranges)
+        for number, rows, settings in self.oracle.in_worlds(cases):
+            world = self.oracle.worlds[number]
+            if world.test is not None:
+                is_counted[rows] &= self._is_listed(world, settings)
+        others = np.flatnonzero(~is_counted)
+        originals = cases[others]
+        originals[:, : self.size] = self.oracle.vehicle.original
+        robustness = self.robustness_with(self.today, originals, "new vehicles")
+        is_counted[others] = robustness >= 0
+        return is_counted
+
+    def _is_listed(self, world: CaseWorld, settings: FloatArray) -> BoolArray:
+        """Which settings of a test are in one of its listed encounters."""
+        places = world.listed()
+        original = self.oracle.vehicle.original
+        listed = world.settings(np.tile(original, (len(places), 1)), places)
+
+        # The phase, if there is one, comes after the axes.
+        axes = slice(self.size, self.size + world.places - 1)
+        is_same = settings[:, np.newaxis, axes] == listed[:, axes]
+        return np.asarray(is_same.all(axis=2).any(axis=1))
 
     @cached_property
-    def best_driver(self) -> FullBraking | None:
+    def encounters(self) -> FloatArray:
+        """The listed encounters that count, shape (E, 1 + k)."""
+        listed = np.unique(self.oracle.listed(), axis=0)
+        originals = product_of(self.oracle.vehicle.original[np.newaxis], listed)
+        return listed[self.counts(originals)]
+
+    def space(self, fit: int) -> Space:
+        """The promised cases with a parameter set."""
+        n = self.size
+        return self.oracle.space(fit, self.promise.lower[:n], self.promise.upper[:n])
+
+    def with_sets(self, cases: FloatArray, fits: IntArray | int) -> FloatArray:
+        """Cases with other parameter sets."""
+        worlds = self.oracle.fits.count(0)
+        cases = cases.copy()
+        cases[:, self.size] = cases[:, self.size] % worlds + worlds * fits
+        return cases
+
+    def best_driver(self, model: Model) -> Evaluator | None:
         """Full braking at the first possible moment; None where it has no approach
         (`approach_parameters`), and by a bound of a measure, of which it need not be the best.
         """
-        approach = (
-            None if self.unsafe.bound else approach_parameters(self.evaluator.system)
-        )
+        if self.unsafe.bound:
+            return None
+        system = model.evaluator.system
+        # A vehicle approaches as fast at each phase.
+        if system.characteristics.scenario.names == (PHASE,):
+            system = self.evaluator.system
+        approach = approach_parameters(system)
         if approach is None:
             return None
         ads = ModelTable(model="full_braking", parameters=approach)
-        study = replace_in(self.study, ads=ads, spread={})
-        return FullBraking(self.evaluator.for_study(study, verified=0), self.unsafe)
+        study = replace_in(model.evaluator.study, ads=ads, spread={})
+        return model.evaluator.for_study(study, verified=0)
 
-    def repairable(self, settings: FloatArray) -> BoolArray:
-        """Which settings full braking at the first possible moment, or else the ADS of today, keeps
+    def repairable(self, cases: FloatArray) -> BoolArray:
+        """Which cases full braking at the first possible moment, or else the ADS of today, keeps
         safe; all without that driver.
         """
-        if self.best_driver is None:
-            return np.ones(len(settings), dtype=bool)
-        is_safe = self.best_driver.saves(settings)
-        unsafe = np.flatnonzero(~is_safe)
-        is_safe[unsafe] = (
-            self.robustness_with(self.today, settings[unsafe], "full braking") >= 0
-        )
+        is_safe = np.ones(len(cases), dtype=bool)
+        for number, rows, settings in self.oracle.in_worlds(cases):
+            model = self.oracle.worlds[number].model
+            if number not in self.drivers:
+                self.drivers[number] = self.best_driver(model)
+            driver = self.drivers[number]
+            if driver is not None:
+                runs = driver.evaluate(settings, BRAKING_STAGE)
+                is_safe[rows] = runs.valid & (model.unsafe.robustness(runs) >= 0)
+
+        # A driver who brakes later may be the better one.
+        others = np.flatnonzero(~is_safe)
+        robustness = self.robustness_with(self.today, cases[others], BRAKING_STAGE)
+        is_safe[others] = robustness >= 0
         return is_safe

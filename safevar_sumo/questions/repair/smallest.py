@@ -1,16 +1,14 @@
 """The smallest changes of one and of two parameters that survive all known counterexamples.
 
 A change is a set of parameters; its size is the largest change of one of them. Changes on rings
-around the parameters of today, the smallest first, are tried with single settings at single points.
-Only the smallest of those that survive is tried with all settings at all points. Either it fails
-with a setting, with which all changes are then tried, or it is the smallest change.
+around the parameters of today, the smallest first, are tried with single cases. Only the smallest
+of those that survive is tried with all cases. Either it fails with a case, with which all changes
+are then tried, or it is the smallest change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import combinations, product
-from typing import NamedTuple
 
 import numpy as np
 
@@ -31,50 +29,32 @@ LEAST_GAIN = 0.006
 """By how much a change of two parameters has to be smaller than that of one."""
 CHUNK, BATCH = 2048, 2048
 """Number of changes that are tried at a time, the smallest first; of simulations in a batch."""
-FIRST_SETTINGS = 64
-"""Number of the worst settings with which a change is tried at all points first; then with four
-times as many, and so on.
+FIRST_CASES = 512
+"""Number of the first cases with which a change is tried first; then with four times as many, and
+so on.
 """
 
 
-class Counterexample(NamedTuple):
-    """A setting, shape (n,), with which a change failed, the number of the problem, of one
-    parameter set, and the point; none without a matrix.
-    """
-
-    setting: FloatArray
-    problem: int
-    points: tuple[int, ...]
-
-
 class Search:
-    """Searches the smallest changes that survive the settings of problems, one for each parameter
-    set of the     vehicle, shape (L, n), worst first.
+    """Searches the smallest changes that survive cases, shape (L, n + 1 + k), worst first.
 
     Counterexamples only make the smallest change of a number of parameters larger. So `_least`, a
     size at which there was none, is a lower bound for ever.
     """
 
-    def __init__(self, problems: Sequence[RepairProblem], settings: FloatArray) -> None:
-        self.problems = problems
-        self.problem = problems[0]
-        self.settings_of = {0: settings}
-        self._thinning = 1 if self.problem.arrays else THINNING
-        self._failures = list[Counterexample]()
+    def __init__(self, problem: RepairProblem, cases: FloatArray) -> None:
+        self.problem = problem
+        self.cases = cases
+        self._thinning = 1 if problem.arrays else THINNING
+        self._hardest = cases[:1]
+        """The cases with which changes failed, the last one first."""
         self._best = dict[int, FloatArray]()
         self._least = dict[int, float]()
 
-    @property
-    def settings(self) -> FloatArray:
-        """The settings that count with the study's own parameter set."""
-        return self.settings_of[0]
-
-    def add(self, problem: int, settings: FloatArray) -> None:
-        """Add counterexamples of a problem, which are tried first."""
-        rows = np.concatenate([settings, self.settings_of.get(problem, settings[:0])])
-        self.settings_of[problem] = rows[
-            np.sort(np.unique(rows, axis=0, return_index=True)[1])
-        ]
+    def add(self, cases: FloatArray) -> None:
+        """Add counterexamples, which are tried first."""
+        rows = np.concatenate([cases, self.cases])
+        self.cases = rows[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
 
     def smallest_changes(self) -> list[FloatArray]:
         """The parameters of today if they survive all counterexamples; otherwise the smallest
@@ -138,66 +118,47 @@ class Search:
         )
         return changes[((changes >= 0) & (changes <= 1)).all(axis=1)]
 
-    def _failure_of(self, change: FloatArray) -> Counterexample | None:
-        """The worst failure among the first settings with which a change fails; None if it survives
-        all.
+    def _failure_of(self, change: FloatArray) -> FloatArray | None:
+        """The worst of the first cases with which a change fails, shape (1, n + 1 + k); None if it
+        survives all.
         """
-        for number, settings in self.settings_of.items():
-            start = 0
-            size = FIRST_SETTINGS
-            while start < len(settings):
-                rows = settings[start : start + size]
-                (robustness,), points = self.problems[number].robustness_of_each(
-                    change[np.newaxis], rows, "changes with all vehicles"
-                )
-                worst = int(np.argmin(robustness))
-                if robustness[worst] < 0:
-                    return Counterexample(
-                        rows[worst],
-                        number,
-                        () if points is None else (int(points[worst]),),
-                    )
-                start = start + size
-                size = 4 * size
+        start = 0
+        size = FIRST_CASES
+        while start < len(self.cases):
+            cases = self.cases[start : start + size]
+            (robustness,) = self.problem.robustness_of_each(
+                change[np.newaxis],
+                cases,
+                "changes with all cases",
+            )
+            worst = int(np.argmin(robustness))
+            if robustness[worst] < 0:
+                return cases[worst : worst + 1]
+            start = start + size
+            size = 4 * size
         return None
 
     def _first_survivor(self, changes: FloatArray) -> int | None:
-        """The row of the first change, shape (M, P), that survives all settings; None if none
-        does.
-        """
+        """The row of the first change, shape (M, P), that survives all cases; None if none does."""
         for start in range(0, len(changes), CHUNK):
             rows = np.arange(start, min(start + CHUNK, len(changes)))
-            rows = rows[self._survivors(changes[rows], self._failures)]
+            rows = rows[self._survivors(changes[rows], self._hardest)]
             while len(rows):
                 failure = self._failure_of(changes[rows[0]])
                 if failure is None:
                     return int(rows[0])
-                self._failures.insert(0, failure)
-                rows = rows[self._survivors(changes[rows], [failure])]
+                self._hardest = np.vstack([failure, self._hardest])
+                rows = rows[self._survivors(changes[rows], failure)]
         return None
 
-    def _survivors(
-        self, changes: FloatArray, failures: Sequence[Counterexample]
-    ) -> IntArray:
-        """The rows of the changes that survive the settings of failures at their points; few at a
-        time.
-        """
+    def _survivors(self, changes: FloatArray, cases: FloatArray) -> IntArray:
+        """The rows of the changes that survive cases; few at a time."""
         alive = np.arange(len(changes))
-        for number, points in dict.fromkeys(
-            (failure.problem, failure.points) for failure in failures
-        ):
-            same = [
-                each.setting
-                for each in failures
-                if (each.problem, each.points) == (number, points)
-            ]
-            settings = np.array(same)
-            problem = self.problems[number]
-            while len(settings) and len(alive):
-                count = max(1, BATCH // len(alive))
-                robustness, _ = problem.robustness_of_each(
-                    changes[alive], settings[:count], "changes with one vehicle", points
-                )
-                alive = alive[(robustness >= 0).all(axis=1)]
-                settings = settings[count:]
+        while len(cases) and len(alive):
+            count = max(1, BATCH // len(alive))
+            robustness = self.problem.robustness_of_each(
+                changes[alive], cases[:count], "changes with one case"
+            )
+            alive = alive[(robustness >= 0).all(axis=1)]
+            cases = cases[count:]
         return alive

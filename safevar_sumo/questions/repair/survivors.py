@@ -4,26 +4,24 @@ parameter sets of the vehicle model.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
-from safevar_sumo.questions.box import Proof, proof_size
-from safevar_sumo.questions.cases import LEAST_SIMULATIONS
+from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.repair.smallest import Search
 from safevar_sumo.questions.repair.validation import (
-    MAX_UNSAFE_SHARE,
+    ATTACK_STAGE,
+    KNOWN,
     find_failures,
     prove_change,
+    usual_test,
 )
 from safevar_sumo.records import FloatArray
 
+FIRST = 1024
+"""Number of the worst cases that are the first counterexamples."""
 MAX_ROUNDS = 30
 """Largest number of rounds of attacks."""
-JOINING_VEHICLES = 64
-"""Number of the worst known vehicles that a change must survive in a parameter set in which it
-failed.
-"""
 
 
 class Survivors(NamedTuple):
@@ -38,83 +36,59 @@ class Survivors(NamedTuple):
 
 
 def find_survivors(
-    problems: Sequence[RepairProblem],
-    between: Sequence[RepairProblem],
-    vehicles: FloatArray,
+    problem: RepairProblem, fits: tuple[int, ...], cases: FloatArray
 ) -> Survivors:
-    """The smallest changes that survive in all parameter sets, also `between` the tests of a
-    matrix; where none does, those of the study's own set, and the sets in which a falsification
-    breaks one of them.
+    """The smallest changes that survive in all parameter sets, from known cases on; where none
+    does, those of the study's own set, and the sets in which a search breaks one of them.
     """
-    changes = _survivors_in(problems, between, vehicles)
-    if changes or len(problems) == 1:
-        return Survivors(changes, len(problems), ())
+    changes = _survivors_in(problem, fits, cases)
+    if changes or len(fits) == 1:
+        return Survivors(changes, len(fits), ())
+    changes = _survivors_in(problem, fits[:1], cases)
 
-    def between_of(problem: RepairProblem) -> list[RepairProblem]:
-        return [each for each in between if each.fit == problem.fit]
-
-    changes = _survivors_in(problems[:1], between_of(problems[0]), vehicles)
-
-    def breaks_one(problem: RepairProblem) -> bool:
-        tests = between_of(problem)
+    def breaks_one(fit: int) -> bool:
         return any(
-            find_failures([problem], tests, change, vehicles, 0)
+            len(find_failures(problem, (fit,), change, cases, 0))
             for change, _ in changes
         )
 
-    broken = tuple(problem.fit for problem in problems[1:] if breaks_one(problem))
-    return Survivors(changes, len(problems) - len(broken), broken)
+    broken = tuple(fit for fit in fits[1:] if breaks_one(fit))
+    return Survivors(changes, len(fits) - len(broken), broken)
 
 
 def _survivors_in(
-    problems: Sequence[RepairProblem],
-    between: Sequence[RepairProblem],
-    vehicles: FloatArray,
+    problem: RepairProblem, fits: tuple[int, ...], cases: FloatArray
 ) -> list[tuple[FloatArray, Proof]]:
     """Search, attack and prove in turns until the smallest changes survive everything; none if no
     change does.
     """
-    search = Search([*problems, *between], vehicles)
+    phases = problem.evaluator.phases
+    search = Search(problem, cases[:FIRST])
     proofs = dict[bytes, Proof]()
     attacks = 0
     failed_proofs = 0
-    # What the attack and the proof of a change take if it survives, and the last search.
-    own = problems[0]
-    phases = own.evaluator.phases
-    points = len(own.evaluator.system.points)
-    attack = own.budget + 2 * LEAST_SIMULATIONS * len(between) / points
-    proof = proof_size(0, MAX_UNSAFE_SHARE) * min(len(problems), 2)
     for each_round in range(1, MAX_ROUNDS + 1):
         changes = search.smallest_changes()
         unproved = [change for change in changes if change.tobytes() not in proofs]
         if not unproved:
             return [(change, proofs[change.tobytes()]) for change in changes]
         phases.begin_round(each_round, MAX_ROUNDS)
-        for later, change in zip(reversed(range(len(unproved))), unproved, strict=True):
+        for row, change in enumerate(unproved):
             attacks += 1
-            left = later * (attack + proof) + len(changes) * len(search.settings)
-            phases.expect(attack + proof + left)
-            failures = find_failures(
-                problems, between, change, search.settings, attacks
-            )
-            if not failures:
-                phases.expect(proof + left)
-                proved, failures = prove_change(
-                    problems, change, attacks, failed_proofs + 1
+            unsafe = find_failures(problem, fits, change, search.cases, attacks)
+            if not len(unsafe):
+                robustness = problem.robustness(change, cases, ATTACK_STAGE)
+                unsafe = cases[robustness < 0][:KNOWN]
+            if not len(unsafe):
+                # Earlier nobody knows how many rounds follow.
+                phases.expect((len(unproved) - row) * usual_test(problem, len(fits)))
+                proof, unsafe = prove_change(
+                    problem, fits, change, attacks, failed_proofs + 1
                 )
-                if failures:
+                if len(unsafe):
                     failed_proofs += 1
                 else:
-                    proofs[change.tobytes()] = proved
-            for number, settings in failures.items():
-                if number not in search.settings_of and number < len(problems):
-                    search.add(number, _worst_with_fit(problems[number], vehicles))
-                search.add(number, settings)
+                    proofs[change.tobytes()] = proof
+            if len(unsafe):
+                search.add(unsafe)
     return []
-
-
-def _worst_with_fit(problem: RepairProblem, vehicles: FloatArray) -> FloatArray:
-    """The worst of known vehicles, shape (L, n), that count with another parameter set."""
-    worst = vehicles[:JOINING_VEHICLES]
-    promised = worst[problem.holds(worst)]
-    return promised[problem.repairable(promised)]

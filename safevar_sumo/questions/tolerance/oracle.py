@@ -4,7 +4,7 @@ parameter set of the vehicle model, and their simulations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.between import MovingTest, moving_tests
 from safevar_sumo.questions.cases import Space
 from safevar_sumo.questions.models import Model
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, IntArray
 from safevar_sumo.study import PHASE
 from safevar_sumo.sumo.simulators import simulations_of_setting
 
@@ -161,22 +161,38 @@ class Oracle:
                 "a larger number",
             )
         robustness = np.full(len(cases), np.inf)
-        numbers = np.floor(cases[:, len(self.vehicle)])
-        for number in np.unique(numbers):
-            is_there = numbers == number
-            world = self.worlds[int(number)]
-            robustness[is_there] = self._measure_in(world, cases[is_there])
+        for number, rows, settings in self.in_worlds(cases):
+            world = self.worlds[number]
+            robustness[rows] = self._measure_in(
+                world,
+                cases[rows],
+                settings,
+            )
         return robustness
+
+    def in_worlds(
+        self,
+        cases: FloatArray,
+    ) -> Iterator[tuple[int, IntArray, FloatArray]]:
+        """The numbers of the worlds of cases, each with their rows and their settings there."""
+        n = len(self.vehicle)
+        numbers = np.floor(cases[:, n]).astype(int)
+        for number in np.unique(numbers).tolist():
+            rows = np.flatnonzero(numbers == number)
+            settings = self.worlds[number].settings(
+                cases[rows, :n],
+                cases[rows, n + 1 :],
+            )
+            yield number, rows, settings
 
     def _measure_in(
         self,
         world: CaseWorld,
         cases: FloatArray,
+        settings: FloatArray,
     ) -> FloatArray:
-        """What cases of a world leave."""
-        n = len(self.vehicle)
+        """What cases of a world leave, with their settings."""
         model = world.model
-        settings = world.settings(cases[:, :n], cases[:, n + 1 :])
         runs = model.evaluate(settings, STAGE)
         robustness = model.robustness_by(runs)
         robustness[~(runs.valid | runs.infeasible)] = np.nan
