@@ -6,8 +6,8 @@ Nothing here knows of studies: a judge says what cases leave.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Generator as Steps, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -185,6 +185,8 @@ class Counterexamples(NamedTuple):
 
 CaseSearch = Callable[[Space, FloatArray], Counterexamples]
 """Searches a space for unsafe cases, from known ones on, shape (K, n + 1 + k)."""
+Generations = Steps[FloatArray, FloatArray, Counterexamples]
+"""The generations of a search, which takes what the cases of each leave."""
 
 
 def search_cases(
@@ -197,13 +199,49 @@ def search_cases(
     """Search a space for the cases that leave least, from known ones on, in generations; it ends
     soon after a case is unsafe.
     """
+    return search_side_by_side(judge, [generations_of(space, start, plan, rng)])[0]
+
+
+def search_side_by_side(
+    judge: CaseJudge,
+    searches: Sequence[Generations],
+) -> list[Counterexamples]:
+    """Several searches: a generation of all meets the judge in one batch, as few large batches cost
+    less than many small ones.
+    """
+    results = dict[int, Counterexamples]()
+    judged: dict[int, Any] = dict.fromkeys(range(len(searches)))
+    while judged:
+        generations = dict[int, FloatArray]()
+        for number, robustness in judged.items():
+            try:
+                generations[number] = searches[number].send(robustness)
+            except StopIteration as end:
+                results[number] = end.value
+        if not generations:
+            break
+        ends = np.cumsum([*map(len, generations.values())])[:-1]
+        robustness = judge(np.concatenate([*generations.values()]))
+        parts = np.split(robustness, ends)
+        judged = dict(zip(generations, parts, strict=True))
+    return [results[number] for number in range(len(searches))]
+
+
+def generations_of(
+    space: Space,
+    start: FloatArray,
+    plan: SearchPlan,
+    rng: Generator,
+) -> Generations:
+    """The generations of a search of a space."""
     size = plan.generation
     generations = plan.more
     results = Counterexamples(start[:0], np.zeros(0))
     cases = np.concatenate([space.hold(start, rng), space.draw(size, rng)])
     while results.simulated < plan.budget and generations >= 0:
         cases = cases[: plan.budget - results.simulated]
-        results = results.after(cases, judge(cases))
+        robustness = yield cases
+        results = results.after(cases, robustness)
         generations -= len(results.unsafe) > 0
         parents = results.cases[:PARENTS]
         cases = (

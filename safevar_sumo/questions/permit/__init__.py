@@ -43,6 +43,8 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 MOST_VALUES = 10_000
 """Largest number of values of a grid."""
+SEARCHES = 2
+"""Simulations that search for a counterexample to a speed, in `LEAST_SIMULATIONS`."""
 NEED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(\S.*?)?\s*")
 
 
@@ -141,7 +143,7 @@ def permit(
     )
     models = models_of(evaluator, criterion, fits, with_unsafe_originals=True)
     # A claim about all cars within limits gets the search of one about joint limits.
-    budget = cases.USUAL_BUDGET if limits else cases.LEAST_SIMULATIONS
+    budget = cases.USUAL_BUDGET if limits else SEARCHES * cases.LEAST_SIMULATIONS
     budget = 0 if quick else evaluator.scaled(budget)
     search = PermitSearch(models, span, values, budget)
     _check_driven(needed, search)

@@ -6,19 +6,18 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError, check_name
-from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.phases import in_phases, meet_worst_phases
+from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.sampling import sobol_points
 from safevar_sumo.questions.scope import points_of_tests
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import FloatArray, IntArray
 from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in, unit_of
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import PHASE, Study, unit_text
@@ -31,6 +30,8 @@ MOST_ENDS = 4
 """Number of them of whose ends all combinations are met, too, each with ends of the others."""
 SPEED_UNITS = ("km/h", "m/s", "")
 """Units of parameters that may be a speed."""
+GRID_PHASES = 2
+"""Number of phases at which each of these places is met."""
 MOST_VEHICLES = 16
 """Number of vehicles that stand for a box at each of these places."""
 
@@ -88,15 +89,26 @@ class EncounterRange(NamedTuple):
     low: float
     high: float
 
-    def box(self, lower: FloatArray, upper: FloatArray, up_to: float) -> Box | None:
-        """All encounters of vehicles within limits, shape (n,), up to a value of the parameter;
-        None where there is nothing to search: no such encounter, or one vehicle in one.
-        """
-        region = self.model.evaluator.region
-        box = Box(region, lower, upper).in_encounters_of(region)
+    @property
+    def others(self) -> IntArray:
+        """The columns of the axes beside the parameter; the phase is the last."""
+        is_other = ~self.model.characteristics.of_vehicle
         if self.column is not None:
-            box = box.with_end(1, self.column, min(up_to, self.high))
-        return None if self.low > up_to or (box.lower == box.upper).all() else box
+            is_other[self.column] = False
+        return np.flatnonzero(is_other)
+
+    def settings(self, vehicles: FloatArray, places: FloatArray) -> FloatArray:
+        """The settings of M vehicles at places, as they are printed: the value of the parameter, at
+        least the least of the test, and the share of the range of each other axis.
+        """
+        members, others = self.model.characteristics, self.others
+        lower, upper = members.lower[others], members.upper[others]
+        settings = np.zeros((len(places), len(members)))
+        settings[:, : vehicles.shape[1]] = vehicles
+        settings[:, others] = lower + places[:, 1 : 1 + len(others)] * (upper - lower)
+        if self.column is not None:
+            settings[:, self.column] = places[:, 0]
+        return members.with_printed_encounters(settings)
 
     def values_in(self, settings: FloatArray) -> FloatArray:
         """The value of the parameter in each of M settings, shape (M,)."""
@@ -105,34 +117,15 @@ class EncounterRange(NamedTuple):
         return settings[:, self.column]
 
     def places(self, value: float) -> FloatArray:
-        """Encounters at a value of the parameter, as they are printed, shape (P, searched
-        parameters): Sobol points and ends of all others.
+        """Places at a value of the parameter, shape (P, 1 + other axes): Sobol points and ends of
+        all others, each at several phases.
         """
-        members = self.model.characteristics
-        count = len(members.vehicle)
-        others = [
-            at
-            for at in range(count, len(members))
-            if at != self.column and members.names[at] != PHASE
-        ]
-        points = unit_places(len(others), value)
-        settings = np.zeros((len(points), len(members)))
-        lower, upper = members.lower[others], members.upper[others]
-        settings[:, others] = lower + points * (upper - lower)
-        if self.column is not None:
-            settings[:, self.column] = value
-        return members.with_printed_encounters(settings)[:, count:]
-
-    def at_worst_phases(
-        self, settings: FloatArray, left: FloatArray, is_open: BoolArray, stage: str
-    ) -> tuple[FloatArray, FloatArray]:
-        """Settings, shape (M, n), those that are open at their worst phases, and what they leave;
-        `left` is that at phase 0.
-        """
-        if self.model.characteristics.names[-1] != PHASE:
-            return settings, left
-        judge = partial(self.robustness, stage=stage)
-        return meet_worst_phases(self.model, judge, settings, left, is_open)
+        has_phase = self.model.characteristics.names[-1] == PHASE
+        shares = unit_places(len(self.others) - has_phase, value)
+        if has_phase:
+            phases = phases_at(value, len(shares))
+            shares = np.column_stack([np.repeat(shares, GRID_PHASES, axis=0), phases])
+        return np.column_stack([np.full(len(shares), value), shares])
 
     def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
         """What settings leave to the limit, shape (M,), in encounters as they are printed.
@@ -166,6 +159,15 @@ def unit_places(dimensions: int, value: float) -> FloatArray:
     further = np.random.default_rng(seed).integers(0, 2, size=(len(corners), others))
     spread = sobol_points(SPREAD_PLACES, dimensions, seed)
     return np.concatenate([spread, np.hstack([corners, further])])
+
+
+def phases_at(value: float, number: int) -> FloatArray:
+    """Phases of so many places at a value of a parameter, shape (number x `GRID_PHASES`,): one in
+    each part of a step.
+    """
+    rng = np.random.default_rng(zlib.crc32(np.array([value, number]).tobytes()))
+    parts = np.tile(np.arange(GRID_PHASES), number)
+    return np.asarray((parts + rng.random(len(parts))) / GRID_PHASES)
 
 
 def span_of(study: Study, by: str | None) -> Span:

@@ -1,25 +1,30 @@
 """The search for the greatest value of a parameter, such as the speed, up to which each of several
 cars is safe with one parameter set.
 
-First all cars meet the encounters of a grid. Then a falsification searches the encounters below
-what was found for each of them. Nothing is assumed to be monotone: one failure at 33 km/h means "up
-to 32".
+First all cars meet the encounters of a grid. Then the encounters up to what was found for each of
+them are searched for counterexamples. Nothing is assumed to be monotone: one failure at 33 km/h
+means "up to 32".
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.box import Box
-from safevar_sumo.questions.falsify import PARENTS, Falsification, falsify_all
+from safevar_sumo.questions.cases import (
+    PARENTS,
+    Generations,
+    SearchPlan,
+    Space,
+    generations_of,
+    search_side_by_side,
+)
 from safevar_sumo.questions.permit.encounters import MOST_VEHICLES, EncounterRange
 from safevar_sumo.questions.sampling import Stream, sobol_points
-from safevar_sumo.records import FloatArray
+from safevar_sumo.records import FloatArray, IntArray
 
 BLOCK = 8
 """Number of values of the grid that cars meet before those that failed are left out; more for few
@@ -27,10 +32,10 @@ cars.
 """
 EFFICIENT = 512
 """Number of cars times values that fill a batch: a smaller one costs hardly less."""
-GENERATION = 256
-"""Number of simulations of a generation of the falsification."""
-LEAST_BUDGET = 64
-"""Fewest simulations of a falsification of one car in one test."""
+GENERATION, MORE = 512, 1
+"""Number of cases of a generation of the search for counterexamples, and the generations that
+follow the first with an unsafe case.
+"""
 SPREAD = 128
 """Number of cars that stand for all within limits, beside those at their corners."""
 
@@ -126,9 +131,10 @@ class SpeedSearch:
     failures
         The limiting failure of each of the cars; None where none was found.
     attacked
-        Number of simulations of the falsification.
+        Number of simulations of the search for counterexamples.
 
-    A car is driven no further than up to its cap, the greatest value that is of interest.
+    A car is driven no further than up to its cap, the greatest value that is of interest. A case is
+    a vehicle, the number of a test, and a place in its encounters.
     """
 
     def __init__(
@@ -141,14 +147,15 @@ class SpeedSearch:
     ) -> None:
         self.failures: list[LimitingFailure | None] = [None] * len(cars)
         self.attacked = 0
-        self._ranges = ranges
+        # The tests that go on up to some value are the first ones.
+        self._ranges = sorted(ranges, key=lambda encounters: encounters.low)
         self._cars = cars
         self._values = values
         self._caps = caps
         self._stage = stage
-        self._met: list[list[list[tuple[FloatArray, FloatArray]]]] = [
-            [[] for _ in ranges] for _ in cars
-        ]
+        self._axes = max(len(encounters.others) for encounters in ranges)
+        self._size = len(cars[0].lower)
+        self._met: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in cars]
 
     def up_to(self, car: int) -> float | None:
         """The greatest value of the grid below the limiting failure of a car, at most its cap; None
@@ -168,153 +175,133 @@ class SpeedSearch:
         while len(rest):
             alive = [
                 car
-                for car, found in enumerate(self.failures)
-                if found is None and rest[0] <= self._caps[car]
+                for car, failure in enumerate(self.failures)
+                if failure is None and rest[0] <= self._caps[car]
             ]
             vehicles = sum(self._cars[car].together for car in alive)
             size = max(BLOCK, EFFICIENT // max(vehicles, 1))
             block, rest = rest[:size], rest[size:]
-            for number, encounters in enumerate(self._ranges):
-                places = self._places(encounters, block)
-                if places and alive:
-                    self._drive(number, alive, np.concatenate(places))
+            places = self._places(block)
+            if alive and len(places):
+                cases = [self._cases(car, places) for car in alive]
+                sizes = [len(of_car) for of_car in cases]
+                robustness = self._judge(np.concatenate(cases))
+                parts = np.split(robustness, np.cumsum(sizes)[:-1])
+                for met in zip(alive, cases, parts, strict=True):
+                    self._note(*met)
 
-    def _places(
-        self, encounters: EncounterRange, block: FloatArray
-    ) -> list[FloatArray]:
-        """The encounters of a test at the values of a block. The least value of a test, which may
-        be its only one, is driven with the next value of the grid.
+    def _places(self, block: FloatArray) -> FloatArray:
+        """The numbers of tests, and their places at the values of a block, shape (P, 2 + k). The
+        least value of a test, which may be its only one, is driven with the next value of the grid.
         """
-        begin = max(encounters.low, self._values[0])
-        next_value = self._values[np.searchsorted(self._values, begin)]
-        values = [begin] if next_value in block else []
-        if encounters.column is not None:
-            values += [
-                v for v in block.tolist() if encounters.low < v <= encounters.high
-            ]
-        return [encounters.places(value) for value in values]
+        rows = [np.zeros((0, 2 + self._axes))]
+        for number, encounters in enumerate(self._ranges):
+            begin = max(encounters.low, self._values[0])
+            next_value = self._values[np.searchsorted(self._values, begin)]
+            values = [begin] if next_value in block else []
+            if encounters.column is not None:
+                values += block[
+                    (block > encounters.low) & (block <= encounters.high)
+                ].tolist()
+            for value in values:
+                places = encounters.places(value)
+                padding = 1 + self._axes - places.shape[1]
+                rows.append(np.pad(places, ((0, 0), (1, padding))))
+                rows[-1][:, 0] = number
+        return np.concatenate(rows)
 
-    def _drive(self, number: int, cars: Sequence[int], places: FloatArray) -> None:
-        """Have cars meet encounters of a test at their worst phases, and keep what they met and
-        what fails.
-        """
-        encounters = self._ranges[number]
-        of_cars = [self._settings(car, places) for car in cars]
-        rows = np.concatenate(of_cars)
-        sizes = [len(of_car) for of_car in of_cars]
-        # Values above a known failure of a car need not be met at other phases.
-        known = [self.failures[car] for car in cars]
-        most = [np.inf if failure is None else failure.value for failure in known]
-        is_open = encounters.values_in(rows) <= np.repeat(most, sizes)
-        robustness = encounters.robustness(rows, self._stage)
-        rows, robustness = encounters.at_worst_phases(
-            rows, robustness, is_open, self._stage
-        )
-        ends = np.cumsum(sizes)[:-1]
-        for car, own, left in zip(
-            cars, np.split(rows, ends), np.split(robustness, ends), strict=True
-        ):
-            self._note(car, encounters, own, left)
-            self._met[car][number].append((own, left))
-
-    def _met_within(self, car: int, number: int, box: Box) -> Falsification:
-        """What a car has met of a test within a box, the worst first."""
-        met = self._met[car][number]
-        settings = np.concatenate(
-            [np.zeros((0, len(box.lower))), *(own for own, _ in met)]
-        )
-        robustness = np.concatenate([np.zeros(0), *(left for _, left in met)])
-        is_inside = box.holds(settings) & np.isfinite(robustness)
-        order = np.flatnonzero(is_inside)[
-            np.argsort(robustness[is_inside], kind="stable")
-        ]
-        worst = order[:PARENTS]
-        return Falsification(
-            settings[worst], np.zeros(len(worst), int), robustness[worst], 0
-        )
-
-    def _settings(self, car: int, places: FloatArray) -> FloatArray:
-        """The settings in which the vehicles of a car meet encounters, some of them in each."""
+    def _cases(self, car: int, places: FloatArray) -> FloatArray:
+        """The vehicles of a car at places, some of them at each."""
         cars = self._cars[car]
         vehicles = np.concatenate([cars.at(place) for place in places])
         return np.hstack([vehicles, np.repeat(places, cars.together, axis=0)])
 
-    def _note(
-        self,
-        car: int,
-        encounters: EncounterRange,
-        settings: FloatArray,
-        robustness: FloatArray,
-    ) -> bool:
-        """Keep the failure of a car at the least value, of several the worst; whether it fails."""
-        failing = np.flatnonzero(robustness < 0)
-        if not len(failing):
-            return False
-        values = encounters.values_in(settings[failing])
-        first = np.lexsort((robustness[failing], values))[0]
-        row = failing[first]
-        found = float(values[first]), float(robustness[row])
-        known = self.failures[car]
-        if known is None or found < (known.value, known.robustness):
-            self.failures[car] = LimitingFailure(
-                found[0], encounters, settings[row], found[1]
-            )
-        return True
+    def _judge(self, cases: FloatArray) -> FloatArray:
+        """What each of M cases leaves to the limit, shape (M,)."""
+        robustness = np.zeros(len(cases))
+        for number, rows in self._by_test(cases):
+            encounters = self._ranges[number]
+            settings = self._settings(number, cases[rows])
+            robustness[rows] = encounters.robustness(settings, self._stage)
+        return robustness
+
+    def _by_test(self, cases: FloatArray) -> Iterator[tuple[int, IntArray]]:
+        """The number of each test that cases meet, and their rows."""
+        numbers = np.floor(cases[:, self._size]).astype(int)
+        for number in np.unique(numbers).tolist():
+            yield number, np.flatnonzero(numbers == number)
+
+    def _settings(self, number: int, cases: FloatArray) -> FloatArray:
+        """The settings of cases of a test."""
+        vehicles, places = cases[:, : self._size], cases[:, self._size + 1 :]
+        return self._ranges[number].settings(vehicles, places)
+
+    def _note(self, car: int, cases: FloatArray, robustness: FloatArray) -> bool:
+        """Keep what a car met, and its failure at the least value, of several the worst; whether it
+        fails.
+        """
+        self._met[car].append((cases, robustness))
+        unsafe, left = cases[robustness < 0], robustness[robustness < 0]
+        for number, rows in self._by_test(unsafe):
+            encounters = self._ranges[number]
+            settings = self._settings(number, unsafe[rows])
+            values = encounters.values_in(settings)
+            first = np.lexsort((left[rows], values))[0]
+            least = float(values[first]), float(left[rows][first])
+            known = self.failures[car]
+            if known is None or least < (known.value, known.robustness):
+                self.failures[car] = LimitingFailure(
+                    least[0], encounters, settings[first], least[1]
+                )
+        return len(unsafe) > 0
 
     def falsify(self, budget: int) -> None:
         """Search encounters of each car up to its value, with a budget for each, until nothing is
-        found.
-
-        A test without a failure up to some value has none up to a lower one, so only those that
-        fail are searched again. What is found is a value of the grid, at which all tests were
-        driven.
+        found. What is found is a value of the grid, at which all tests were driven.
         """
-        cars = range(len(self._cars))
-        waiting = [
-            [car for car in cars if self.up_to(car) is not None] for _ in self._ranges
-        ]
         attempt = 0
-        while any(waiting):
+        waiting = self._open(range(len(self._cars)))
+        while waiting:
             attempt += 1
-            waiting = [
-                self._falsify_test(number, of_test, budget, attempt)
-                for number, of_test in enumerate(waiting)
-            ]
+            # All cars side by side, each from what it met.
+            searches = [self._search(car, budget, attempt) for car in waiting]
+            results = search_side_by_side(self._judge, searches)
+            self.attacked += sum(result.simulated for result in results)
+            waiting = self._open(
+                car
+                for car, result in zip(waiting, results, strict=True)
+                if self._note(car, result.cases, result.robustness)
+            )
 
-    def _falsify_test(
-        self, number: int, waiting: Sequence[int], budget: int, attempt: int
-    ) -> list[int]:
-        """Falsify that cars are safe in a test up to their values; those that are not."""
-        encounters = self._ranges[number]
-        boxes = dict[int, Box]()
-        for car in waiting:
-            up_to = self.up_to(car)
-            own = self._cars[car]
-            box = None if up_to is None else encounters.box(own.lower, own.upper, up_to)
-            if box is not None:
-                boxes[car] = box
-        if not boxes:
-            return []
-
-        # All cars side by side, each from what it met on the grid.
-        met = [self._met_within(car, number, box) for car, box in boxes.items()]
-        stream = encounters.model.fit, number, attempt
-        rngs = [
-            Stream.PERMIT.generator(self._cars[car].number, *stream) for car in boxes
+    def _open(self, cars: Iterable[int]) -> list[int]:
+        """The cars that are safe at some value, and of which more than one case is not met yet."""
+        is_open = self._axes or any(each.column is not None for each in self._ranges)
+        return [
+            car
+            for car in cars
+            if self.up_to(car) is not None
+            and (is_open or len(self._cars[car].vehicles) > 1)
         ]
-        share = max(budget // len(self._ranges), LEAST_BUDGET)
-        judge = partial(encounters.robustness, stage=self._stage)
-        results = falsify_all(
-            *([*boxes.values()], [judge], [()] * len(boxes), share, rngs, GENERATION),
-            begun=met,
+
+    def _search(self, car: int, budget: int, attempt: int) -> Generations:
+        """The search for counterexamples to the value of a car."""
+        up_to, cars = self.up_to(car), self._cars[car]
+        assert up_to is not None
+        number = sum(encounters.low <= up_to for encounters in self._ranges)
+        ends = np.array([np.zeros(2 + self._axes), np.ones(2 + self._axes)])
+        ends[:, 0] = 0, np.nextafter(number, 0)
+        ends[:, 1] = self._values[0], up_to
+        space = Space(
+            np.append(cars.lower, ends[0]), np.append(cars.upper, ends[1]), self._size
         )
-        failing = list[int]()
-        for car, found in zip(boxes, results, strict=True):
-            self.attacked += found.simulated
-            settings = encounters.model.characteristics.with_printed_encounters(
-                found.settings
-            )
-            failing += (
-                [car] if self._note(car, encounters, settings, found.robustness) else []
-            )
-        return failing
+
+        # The worst cases so far, up to this value.
+        cases = np.concatenate([cases for cases, _ in self._met[car]])
+        robustness = np.concatenate([left for _, left in self._met[car]])
+        is_inside = (cases >= space.lower) & (cases <= space.upper)
+        robustness = np.where(is_inside.all(axis=1), robustness, np.inf)
+        worst = np.argsort(robustness, kind="stable")[:PARENTS]
+        known = cases[worst[np.isfinite(robustness[worst])]]
+        fit = self._ranges[0].model.fit
+        rng = Stream.PERMIT.generator(cars.number, fit, attempt)
+        return generations_of(space, known, SearchPlan(budget, GENERATION, MORE), rng)
