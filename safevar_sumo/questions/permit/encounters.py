@@ -101,11 +101,12 @@ class EncounterRange(NamedTuple):
         """The settings of M vehicles at places, as they are printed: the value of the parameter, at
         least the least of the test, and the share of the range of each other axis.
         """
-        members, others = self.model.characteristics, self.others
-        lower, upper = members.lower[others], members.upper[others]
-        settings = np.zeros((len(places), len(members)))
+        members = self.model.characteristics
+        others = self.others
+        width = members.upper - members.lower
+        settings = members.lower + np.zeros((len(places), 1))
         settings[:, : vehicles.shape[1]] = vehicles
-        settings[:, others] = lower + places[:, 1 : 1 + len(others)] * (upper - lower)
+        settings[:, others] += places[:, 1 : 1 + len(others)] * width[others]
         if self.column is not None:
             settings[:, self.column] = places[:, 0]
         return members.with_printed_encounters(settings)
@@ -128,22 +129,22 @@ class EncounterRange(NamedTuple):
         return np.column_stack([np.full(len(shares), value), shares])
 
     def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
-        """What settings leave to the limit, shape (M,), in encounters as they are printed.
+        """What settings leave to the limit, shape (M,).
 
         Raises
         ------
         SimulationError
             If one cannot be simulated: then no car may be called safe.
         """
-        rows = self.model.characteristics.with_printed_encounters(settings)
-        evaluations = self.model.evaluate(rows, stage)
+        evaluations = self.model.evaluate(settings, stage)
         if evaluations.failed.any():
             reason = evaluations.reason(int(np.argmax(evaluations.failed)))
             raise SimulationError(
                 f"a car cannot be simulated in test {self.test!r}: {reason}"
             )
         robustness = self.model.robustness_by(evaluations)
-        return np.where(self.model.evaluator.region.feasible(rows), robustness, np.inf)
+        is_feasible = self.model.evaluator.region.feasible(settings)
+        return np.where(is_feasible, robustness, np.inf)
 
 
 @lru_cache(maxsize=4096)

@@ -153,8 +153,9 @@ class SpeedSearch:
         self._values = values
         self._caps = caps
         self._stage = stage
-        self._axes = max(len(encounters.others) for encounters in ranges)
         self._size = len(cars[0].lower)
+        members = [encounters.model.characteristics for encounters in ranges]
+        self._axes = max(map(len, members)) - self._size
         self._met: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in cars]
 
     def up_to(self, car: int) -> float | None:
@@ -275,12 +276,11 @@ class SpeedSearch:
 
     def _open(self, cars: Iterable[int]) -> list[int]:
         """The cars that are safe at some value, and of which more than one case is not met yet."""
-        is_open = self._axes or any(each.column is not None for each in self._ranges)
         return [
             car
             for car in cars
             if self.up_to(car) is not None
-            and (is_open or len(self._cars[car].vehicles) > 1)
+            and (self._axes or len(self._cars[car].vehicles) > 1)
         ]
 
     def _search(self, car: int, budget: int, attempt: int) -> Generations:
