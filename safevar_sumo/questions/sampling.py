@@ -37,7 +37,7 @@ class Stream(IntEnum):
     SPECIFIED_BETWEEN = 11  # specified limits between the tests of a matrix
     VALIDATION = 15  # further falsifications of joint limits that passed one
     FIRST_CORNERS = 17  # corners with which the test of joint limits begins
-    PERMIT = 18  # falsification of the speed up to which a car may drive
+    PERMIT = 18  # search for counterexamples to the speed of a car
 
     def generator(self, seed: int, *counts: int) -> Generator:
         """The generator of a draw, by the seed of the study's search and what counts the draws."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,17 @@ import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions import phases
 from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.cases import (
+    SearchPlan,
+    Space,
+    generations_of,
+    search_side_by_side,
+)
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.part import at_point
-from safevar_sumo.questions.phases import COUNTS_STEPS, at_worst_phases, in_phases
+from safevar_sumo.questions.phases import COUNTS_STEPS, in_phases
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import Track, TrackScenario
 from safevar_sumo.scenarios.declared import with_ranges
@@ -104,10 +108,9 @@ def ahead(**over: object) -> Study:
     return with_ranges(study)
 
 
-def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the_speed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(phases, "NEAR", np.inf)  # also where the car stops long before
+def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the_speed() -> (
+    None
+):
     speed = {
         "unit": "km/h",
         "original": 45,
@@ -130,16 +133,24 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     some = np.arange(lower[0], lower[-1], 97)
     claim = model.in_phases
     assert claim is not None
-    judge = partial(claim.robustness, stage="phases")
-    rows, worst = at_worst_phases(claim, judge, settings[some])
-    assert_allclose(
-        worst, np.interp(speeds[some], speeds[lower], left[lower]), atol=0.01
+    rows = np.insert(settings[some], len(original), 0, axis=1)
+    searches = [
+        generations_of(
+            Space(np.append(row, 0), np.append(row, 1), len(original)),
+            np.zeros((0, len(original) + 2)),
+            SearchPlan(256, generation=128),
+            np.random.default_rng(0),
+        )
+        for row in rows
+    ]
+    results = search_side_by_side(
+        lambda cases: claim.robustness(
+            np.delete(cases, len(original), axis=1), "phases"
+        ),
+        searches,
     )
-    assert (worst <= left[some]).all()
-
-    # What is printed is what was simulated.
-    assert_array_equal(judge(rows), worst)
-    assert_array_equal(np.round(rows[:, -1], 4), rows[:, -1])
+    line = np.interp(speeds[some], speeds[lower], left[lower])
+    assert_allclose([result.least for result in results], line, atol=0.01)
 
 
 @SLOW

@@ -132,7 +132,7 @@ def verdict_of(
     *,
     is_proven: bool,
 ) -> str:
-    """What a car may do; without a falsification none may drive without a limit."""
+    """What a car may do; without a search for counterexamples none may drive without a limit."""
     if up_to is None:
         return STOP
     is_enough = up_to >= (min(top, new_car) if need is None else need)

@@ -77,7 +77,7 @@ class PermitSearch:
     listed
         The values of tests that cannot move it: nothing is known between them.
     attacked
-        Number of simulations of the falsification so far.
+        Number of simulations that searched for counterexamples so far.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class PermitSearch:
             with model.evaluator.phases.stage(name):
                 search.drive_grid()
                 if self._budget:
-                    search.falsify(self._budget)
+                    search.attack(self._budget)
             self.attacked += search.attacked
             for number, car in enumerate(waiting):
                 up_to = self._driven(search.up_to(number))

@@ -256,7 +256,7 @@ class SpeedSearch:
                 )
         return len(unsafe) > 0
 
-    def falsify(self, budget: int) -> None:
+    def attack(self, budget: int) -> None:
         """Search encounters of each car up to its value, with a budget for each, until nothing is
         found. What is found is a value of the grid, at which all tests were driven.
         """
