@@ -225,12 +225,14 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
     """
     if not study.ranges:
         return []
-    own = (
-        "Each vehicle meets an encounter of its own, with its own values of"
-        f" {join_phrases(study.ranges)}."
-    )
-    left = f"{left_out:,} encounters do not count and were left out."
-    return [own, *demanded_in_words(study), *([left] if left_out else [])]
+    axes = join_phrases(study.ranges)
+    sentences = [
+        f"Each vehicle meets an encounter of its own, with its own values of {axes}.",
+        *demanded_in_words(study),
+    ]
+    if left_out:
+        sentences.append(f"{left_out:,} encounters do not count and were left out.")
+    return sentences
 
 
 def notes_on(unsafe: Unsafe, *texts: str) -> list[Sentence]:
