@@ -114,6 +114,8 @@ def answer_of_setting(
         sentences.append(words.CHANGES.fill(changes=", ".join(texts)))
     if places:
         sentences.append(words.ENCOUNTER.fill(values=join_phrases(places)))
+    if phase := named.get(PHASE):
+        sentences.append(words.LATER.fill(phase=phase))
     numbers = simulation.numbers
     if handle is not None:
         numbers = {"solution": str(handle), **numbers}

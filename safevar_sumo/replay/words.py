@@ -45,6 +45,9 @@ LEFT_OUT = Sentence(
 )
 CHANGES = Sentence("note", "Changed: {changes}.")
 ENCOUNTER = Sentence("condition", "The encounter has {values}.")
+LATER = Sentence(
+    "condition", "The encounter begins {phase:g} steps of the driving system later."
+)
 IGNORED = (
     "The largest change (f_diff) and the number of changes (f_num_diff) count {small} as unchanged,"
     " because a search ignores such small changes. All other numbers are those of the vehicle as"

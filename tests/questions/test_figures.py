@@ -62,12 +62,12 @@ def test_the_staircase_names_the_parts_where_they_change() -> None:
     assert texts == {
         "a\nb": (40, 2),
         "a": (60, 1),
-        "none of 1,234\nsimulated": (20, 1.1),
+        "none of 1,234\ncombinations\nis unsafe": (20, 1.1),
     }
     assert (axis.get_xlim(), axis.get_ylim()) == ((0, 125), (0.5, 3.6))
     assert axis.get_xticks().tolist() == [0, 20, 40, 60, 80, 100]
     (axis,) = draw_staircase(answer_with(staircase=frame[:1])).axes
-    assert [text.get_text() for text in axis.texts] == ["a\n(one of 2)"]
+    assert [text.get_text() for text in axis.texts] == ["a\n(1 of 2)"]
 
 
 def test_bars_show_how_often_a_characteristic_is_needed() -> None:

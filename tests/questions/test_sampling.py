@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from safevar_sumo.questions import box
 from safevar_sumo.questions.model_spread import band_of, error_distance, prediction_band
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.study import SAFETY_DEGREE
-from safevar_sumo.vehicles import region_of
 from tests.questions.conftest import made_up_study
 
 
@@ -45,14 +43,3 @@ def test_a_band_holds_nine_tenths_of_the_sets_and_of_the_repeats() -> None:
     sets: Any = [SimpleNamespace(settings=settings, f_safe=row) for row in degrees]
     low, high = band_of(study, sets)
     assert (low[0], high[0]) == pytest.approx((lower[0] - 1, upper[0] + 1))
-
-
-def test_corners_are_all_combinations_of_open_ends_or_as_many_as_are_allowed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    members = region_of(made_up_study(3))
-    one = box.Box(members, np.array([1.0, 2.0, 3.0]), np.array([4.0, 2.0, 6.0]))
-    assert one.corners(0, 1).tolist() == [[1, 2, 3], [4, 2, 3], [1, 2, 6], [4, 2, 6]]
-    monkeypatch.setattr(box, "MAX_CORNERS", 3)
-    some = one.corners(0, 1)
-    assert (len(some), np.isin(some, [one.lower, one.upper]).all()) == (3, True)
