@@ -74,8 +74,9 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     `response_time` rt; b is `braking_share` of the original vehicle's greatest deceleration. After
     braking it never accelerates again.
 
-    The system warns its driver while it brakes, and while gap / closing speed of an obstacle in its
-    way is below `warning_time`. The simulated driver does not react to warnings.
+    The system warns its driver while it brakes, and while the time to collision with an obstacle in
+    its way (gap / closing speed) is below `warning_time`. The simulated driver does not react to
+    warnings.
 
     Parameters
     ----------

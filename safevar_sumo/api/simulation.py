@@ -272,7 +272,7 @@ class Simulation:
         ending = OUTCOME_VERBS[self.outcome]
         if np.isnan(safety_degree):
             return ending
-        return f"{ending}, with a safety degree of {distance}"
+        return f"{ending}, with a safety degree (smallest distance) of {distance}"
 
     @property
     def _digits(self) -> int:

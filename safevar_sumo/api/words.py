@@ -38,7 +38,7 @@ NOT_SIMULATED = Sentence(
 )
 NO_PROOF = Sentence(
     "note",
-    "The search does not prove that fewer changes are safe. The command explain {study} tries"
+    'The search does not prove that fewer changes are safe. The command "explain {study}" tries'
     " single changes and combinations of changes, each at an end of its domain (its range of"
     " values).",
 )

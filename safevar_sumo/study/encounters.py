@@ -104,11 +104,11 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
     """The scenario: its `model` and `parameters`; `over` are axes of its encounters, in a matrix of
     each test that does not state them: parameters of the scenario or of the weather.
 
-    Where encounters are ranges, the original vehicle drives in the same encounter as each variant,
-    and must keep at least `margin` [m] between bodies there: otherwise the encounter does not
-    count, as it shows nothing of the variant. Without a margin all encounters count. A simulator of
-    the user's own that is not deterministic simulates each setting `repeats` times: the share of
-    unsafe runs, the worst run, and means of metrics count.
+    In a study with ranges of encounters, the original vehicle drives in the encounter of each
+    variant, too. The encounter counts only if the original vehicle keeps at least `margin` [m]
+    between bodies: in any other, a failure says nothing about the variant. Without a margin all
+    encounters count. A simulator of the user's own that is not deterministic simulates each setting
+    `repeats` times: the share of unsafe runs, the worst run, and means of metrics count.
     """
 
     over: Annotated[Axes, ORDERED] = {}

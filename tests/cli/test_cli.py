@@ -165,7 +165,10 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
         "--details",
     )
     assert "original" in result.stdout
-    assert "The original vehicle stops, with a safety degree of 2.01 m" in result.stdout
+    assert (
+        "The original vehicle stops, with a safety degree (smallest distance) of 2.01 m"
+        in result.stdout
+    )
     assert "The changed vehicle is less safe" in result.stdout
     said = " ".join(result.stdout.replace("│", " ").split())
     assert "(f_num_diff) count dragCoeff = 0.301 as unchanged" in said

@@ -248,7 +248,7 @@ def test_a_speed_that_no_scenario_can_move_is_one_that_was_driven() -> None:
     answer = permit("stop", cars={"a": {"brakeTorque": 0.9}}, others="new", **asked)
     assert "5 values (30, 50, 80, 100 and 120 km/h)" in answer.tested
     assert "a may drive from 30 up to 80 km/h" in answer.verdict
-    assert "in the test stop at 100 km/h" in answer.verdict
+    assert "(test stop, driven at 100 km/h)" in answer.verdict
     assert "at 30, 50, 80, 100 and 120 km/h" in answer.numbers["scope"]
 
 

@@ -120,9 +120,9 @@ def explain(
 ) -> Answer:
     """Ask a STUDY which smallest changes make the vehicle unsafe, or ask results (DIR) what caused
     the failures in these results. For a study, the command simulates changes to the ends of the
-    domains (ranges of values): one by one, in pairs and in larger combinations. For results, the
-    command reduces each failure to the necessary changes, and lets other drivers drive the same
-    vehicle.
+    domains (ranges of values): one by one, in pairs and in larger combinations. For results
+    (DIR), the command reduces each failure to the changes that cause the failure, and simulates the
+    same vehicle with other drivers.
 
     Examples: python -m safevar_sumo explain rain and python -m safevar_sumo explain results/rain
 

@@ -96,10 +96,8 @@ STAIRCASE_COLUMNS: Columns = {
         "", "the parts that are changed", head="characteristics that are changed"
     ),
 }
-TITLE = (
-    "The smallest unsafe changes, each at an end of its domain (all other characteristics as in the"
-    " original vehicle)"
-)
+TITLE = "The smallest unsafe changes, each at an end of its domain"
+
 SMALLEST_NUMBERS = (
     *("tried", "up_to_changes", "complete_up_to", "causes"),
     *("containing", "containing_tried", "cures"),

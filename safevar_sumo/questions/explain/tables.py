@@ -285,8 +285,7 @@ def causes_table(
         name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted
     }
     table = tabulate(
-        "Minimal causes: smallest sets of changes that are unsafe (all other characteristics as in"
-        " the original vehicle)",
+        "Minimal causes: smallest sets of changes that are unsafe",
         columns,
         frame,
     )

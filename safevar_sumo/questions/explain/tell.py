@@ -144,7 +144,7 @@ def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Iterator[Sentence]:
     by_size = groupby(steps, lambda step: (step.size, max(step.simulated)))
     for (size, largest), group in by_size:
         alike = [*group]
-        ends = dict.fromkeys(f"{100 * alike[place].share:.0f}" for place in (0, -1))
+        ends = dict.fromkeys(f"{100 * alike[place].share:.0f}" for place in (-1, 0))
         shares = " to ".join(ends)
         if size:
             changes = "1 change is" if size == 1 else f"{_count(size)} changes are"
@@ -152,7 +152,7 @@ def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Iterator[Sentence]:
             continue
         up_to = _up_to(largest)
         if alike[0].is_cut:
-            up_to += ", because more exceed the search"
+            up_to += ", as there are too many larger ones"
         yield words.STEP_WITHOUT.fill(
             shares=shares,
             tried=sum(step.tried for step in alike),

@@ -34,7 +34,7 @@ ON_THE_WAY = (
     ),
 )
 """Of one change, and of several."""
-OTHERS = Sentence("answer", "The table has {causes} with as few changes.")
+OTHERS = Sentence("answer", "The table lists {causes} with the same number of changes.")
 NOTHING_FOUND = Sentence(
     "answer",
     "The search found no cause of {unsafe} with {up_to}, each at an end of its domain (its range of"
@@ -94,8 +94,8 @@ GAP = Sentence(
 )
 CHECKED_WITH = Sentence(
     "evidence",
-    "The checks of this cause (similar vehicles, other parameter sets) used these values:"
-    " {changes}.",
+    "The program checked this cause with similar vehicles and other parameter sets, from these"
+    " values on: {changes}.",
 )
 RUNS = Sentence("evidence", "The vehicle is unsafe in {share} % of its repeated runs.")
 SETS = Sentence(
@@ -120,13 +120,13 @@ OF_PART = Sentence(
 )
 STEP = Sentence(
     "note",
-    "If all changes go {shares} % of the way to the ends of their domains, {changes} enough for"
-    " {unsafe}.",
+    "{changes} enough for {unsafe} if each change goes {shares} % of the way to an end of its"
+    " domain.",
 )
 STEP_WITHOUT = Sentence(
     "note",
-    "If all changes go {shares} % of the way to the ends of their domains, none of {tried:,}"
-    " simulated combinations ({up_to}) {causes}.",
+    "None of {tried:,} simulated combinations ({up_to}) {causes} if each change goes {shares} % of"
+    " the way to an end of its domain.",
 )
 CONTAINING = Sentence(
     "condition",

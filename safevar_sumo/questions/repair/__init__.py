@@ -85,18 +85,18 @@ def repair(
     quick: bool = False,
 ) -> Answer:
     """Find the smallest change of the driving system's parameters that keeps worn vehicles safe.
-    You get the new values, their price (earlier and needless braking of the original vehicle),
-    and how the change was tested. Failures of results within the required wear must be safe,
-    too.
+    You get the new values of these parameters, their price (the original vehicle brakes earlier,
+    or needlessly), and how the change was tested. Failures of results within the required wear
+    must be safe, too.
 
     Example: python -m safevar_sumo repair autoware_july --promise "brakeTorque >= 0.9"
 
     Parameters
     ----------
     promise
-        Limit of wear within which the repair must keep all vehicles safe, such as "treadDepth >=
-        3", or all; may be repeated. Default: the limits under [repair.promise] of the study, else
-        under [limits].
+        The repair must keep all vehicles within this limit of wear safe, such as "treadDepth >= 3";
+        may be repeated. The word all means every wear. Default: the limits under [repair.promise]
+        of the study, else under [limits].
     margin
         Clearance that every vehicle must keep between bumpers, in metres. Default: the value of the
         study, else 0.3 m.

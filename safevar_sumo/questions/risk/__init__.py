@@ -96,8 +96,8 @@ def risk(
 ) -> Answer:
     """Estimate how likely an unsafe vehicle is, if vehicles vary as the study states under
     [variation]. You also get the characteristics with the largest influence on the safety
-    degree. Without [variation] the answer is the share of unsafe vehicles in the domain (ranges
-    of values), and no probability in traffic.
+    degree. For a study without [variation] the answer is the share of unsafe vehicles in the
+    domain (ranges of values), which is no probability in traffic.
 
     Example: python -m safevar_sumo risk rain
 
