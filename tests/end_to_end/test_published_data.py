@@ -167,7 +167,7 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(
     for path in Path("part/runs").glob("nsga2-*"):
         path.unlink()
     answer = run("explain", "part", "--jobs", "1")
-    assert "Of 0 different solutions of the search, none is unsafe" in answer.stdout
+    assert "none of the examined vehicles is unsafe" in answer.stdout
     assert "nan %" not in answer.stdout
     assert answer.stderr.count("warning") == 1, (
         "the unfinished runs, and nothing of numpy"

@@ -100,7 +100,10 @@ def test_the_failures_that_matter_come_first(case: Case, explained: Answer) -> N
         for reason in row["reason"].split("; ")
     }
     assert by_reason["fewest changes"]["changed"] == crashes["f_num_diff"].min()
-    assert by_reason["most severe"]["safety_degree"] == crashes["safety_degree"].min()
+    assert (
+        by_reason["highest collision speed"]["safety_degree"]
+        == crashes["safety_degree"].min()
+    )
     assert [
         explained.numbers[name] for name in ("failures", "analysed", "collisions")
     ] == [len(crashes[list(case.characteristics.names)].drop_duplicates())] * 3

@@ -587,7 +587,7 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
     done = subprocess.run(
         command, capture_output=True, text=True
     )  # with processes of its own as workers
-    assert (done.returncode, done.stdout[:11]) == (1, "2 of 8 clai")
+    assert (done.returncode, done.stdout[:11]) == (1, "2 of the 8 ")
     assert os.getcwd() == str(there)
     assert "mine" not in sys.modules
 

@@ -225,7 +225,7 @@ def test_the_staircase_is_on_the_page_as_a_table_and_as_steps_with_names(
     asked = "explain --of-study --simulations 600"
     page = page_of(slippery, ask=("rules --samples 20", asked), jobs=1)
     section = page.partition(">Smallest changes<")[2].partition("</section>")[0]
-    first = r'The fewest changes at a share[^\n]*\n[^\n]*>1\.0</td>[^\n]*class="label"[^>]*>(\w+)'
+    first = r'How many changes are enough[^\n]*\n[^\n]*>1\.0</td>[^\n]*class="label"[^>]*>(\w+)'
     part = re.findall(first, section)[0]
     assert f">{part}</text>" in unquote(section.partition("data:image/svg+xml,")[2])
 
@@ -396,12 +396,11 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @SLOW
 def test_all_of_it_is_of_the_point(results: Path) -> None:
     page = page_of(results, ask=["rules --samples 20"], jobs=1, point=DAY)
-    assert f"only the test case {DAY} of its matrix" in page
+    assert f"the test case {DAY} alone" in page
     (whole,) = load_cases([results])
     assert f" --point &#39;{DAY}&#39;" in page
     worst = re.findall(
-        r"\(.*most severe\): collides at ([\d.]+) m/s|\(.*most severe\): \w+ with ([\d.]+) m to"
-        r" spare",
+        r"\(.*highest collision speed\): (?:collides at ([\d.]+) m/s|\w+ with ([\d.]+) m to spare)",
         page,
     )
     speed, gap = worst[0]
