@@ -82,7 +82,7 @@ def test_limits_up_to_a_value_between_two_tests_hold_there_and_lie_between_their
     assert least[0] < least[1] < least[2]
     between = answers[1]
     assert "speed=45: fast" in between.verdict
-    assert "along (slow) at 30 to 45 km/h" in between.numbers["scope"]
+    assert "test slow (scenario along) at 30 to 45 km/h" in between.numbers["scope"]
     assert between.numbers["up_to"] == 45
     cut = assemble(study_up_to(ahead, "speed=45"))
     settings = np.tile(cut.characteristics.original, (2, 1))
