@@ -75,8 +75,8 @@ safety degree below half of the original's.
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""
 ROUGH = (
-    "Rough answer (--quick: at most an eighth of the search, with the study's own parameter set"
-    " alone; it proves nothing):"
+    "Rough answer (--quick: at most an eighth of the search, with one parameter set; it proves"
+    " nothing):"
 )
 """The beginning of such an answer."""
 

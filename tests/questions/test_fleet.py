@@ -155,9 +155,9 @@ def test_what_is_assumed_is_named_with_its_value_and_where_that_is_from() -> Non
         f"treadDepth 8 mm, {own}, sensorLatency 0.1 s",
     ]
     assert assumed_in_words(JOINT, vehicle, fleet) == (
-        "Assumed, because not measured: brakeTorque 1 (relative brake torque, as in a new car),"
+        "Assumed, because not measured: brakeTorque 1 (relative brake torque, as new),"
         " brakeResponse 0.2 s (brake actuator delay, by [unmeasured]), payload 75 kg (payload, as"
-        " in a new car), payloadCentre 2.6 m (longitudinal position of the payload, by"
+        " new), payloadCentre 2.6 m (longitudinal position of the payload, by"
         " [unmeasured]), sensorLatency 0.1 s (perception latency, by [unmeasured]) and values in 1"
         " of 2 cars that others state (column assumed, --details)."
     )

@@ -207,7 +207,7 @@ def test_the_rough_answer_lets_no_car_drive_and_says_so_in_each_form(
     cars = {"new": {}, "worn": {"treadDepth": 3}}
     answer = permit(short, cars=cars, others="new", quick=True)
     assert answer.numbers["rough"]
-    assert "the study's own parameter set alone" in answer.verdict
+    assert "with one parameter set" in answer.verdict
     assert answer.numbers["drive"] == answer.numbers["attacked"] == 0
     needing = permit(short, cars=cars, others="new", quick=True, need="34 km/h")
     assert needing.failures == (ROUGH_NEED,)

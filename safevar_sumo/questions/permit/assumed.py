@@ -46,9 +46,7 @@ def assumed_in_words(study: Study, vehicle: CharacteristicSet, fleet: Fleet) -> 
     phrases = list[str]()
     for column in np.flatnonzero(~is_stated):
         item = vehicle.members[column]
-        source = (
-            "by [unmeasured]" if item.name in study.unmeasured else "as in a new car"
-        )
+        source = "by [unmeasured]" if item.name in study.unmeasured else "as new"
         phrases.append(f"{texts[column]} ({item.short_name}, {source})")
     if further := np.sum((fleet.measured < is_stated).any(axis=1)):
         cars = f"{further} of {len(fleet.names)} cars"
