@@ -112,8 +112,8 @@ def _values_in_words(values: Sequence[float | str], is_range: bool) -> str:
 
 
 def _weather_in_words(weather: Weather) -> str:
-    """The weather with its effects, and the light: `weather clear (grip of a dry road), by day`."""
-    effects = ["grip of a dry road"]
+    """The weather with its effects, and the light: `weather clear (dry grip), by day`."""
+    effects = ["dry grip"]
     if weather.road_friction != 1 or weather.water:
         effects = [f"{100 * weather.road_friction:g} % of the grip of a dry road"]
     if weather.water:
