@@ -101,7 +101,7 @@ def test_the_failures_that_matter_come_first(case: Case, explained: Answer) -> N
     }
     assert by_reason["fewest changes"]["changed"] == crashes["f_num_diff"].min()
     assert (
-        by_reason["highest collision speed"]["safety_degree"]
+        by_reason["lowest safety degree"]["safety_degree"]
         == crashes["safety_degree"].min()
     )
     assert [

@@ -400,7 +400,7 @@ def test_all_of_it_is_of_the_point(results: Path) -> None:
     (whole,) = load_cases([results])
     assert f" --point &#39;{DAY}&#39;" in page
     worst = re.findall(
-        r"\(.*highest collision speed\): (?:collides at ([\d.]+) m/s|\w+ with ([\d.]+) m to spare)",
+        r"\(.*lowest safety degree\): (?:collides at ([\d.]+) m/s|\w+ with ([\d.]+) m to spare)",
         page,
     )
     speed, gap = worst[0]

@@ -40,7 +40,7 @@ TO_EXPLAIN = "simulate the vehicles"
 """A stage of progress."""
 REASONS = {
     "fewest": "fewest changes",
-    "most_severe": "highest collision speed",
+    "most_severe": "lowest safety degree",
     "smallest": "smallest changes",
 }
 """Reasons for choosing a failure, by the name of the choice in `CHOICES`."""
