@@ -5,7 +5,7 @@ in the order of the page.
 from __future__ import annotations
 
 import configparser
-import importlib.util
+import importlib
 import json
 import re
 import shlex
@@ -36,8 +36,10 @@ from tests.pages import PAGES, run_page
 def test_every_block_of_a_page_does_and_shows_what_it_says(
     page: str, in_tmp: Path
 ) -> None:
+    """`make docs-outputs` fills it in. Every change of the package changes the digest of a pack."""
+    digest = re.compile(r"\b[0-9a-f]{64}\b")
     for block, output in run_page(page, options_of_tests=True):
-        assert block.text == output, f"{page}: `make docs-outputs` fills it in"
+        assert digest.sub("", block.text) == digest.sub("", output)
 
 
 def test_lines_of_prose_have_at_most_100_characters() -> None:
@@ -52,10 +54,7 @@ def test_lines_of_prose_have_at_most_100_characters() -> None:
 
 def script_of_docs(name: str) -> Any:
     """A script beside the pages, as a module."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module(f"docs.{name}")
 
 
 def test_every_picture_has_its_command_and_its_page() -> None:
