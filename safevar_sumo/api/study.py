@@ -142,11 +142,11 @@ def study(
         Simulate on the workers of this Dask scheduler, such as tcp://host:8786. Default: on this
         machine.
     retry_failed
-        Simulate vehicles again that could not be simulated before. Default: such vehicles stay out
-        of the results.
+        Simulate vehicles again that could not be simulated before. Default: the results leave
+        these vehicles out.
     quiet
-        Print only errors, warnings, and an output that you ask for, such as JSON. Default: the
-        answer and the progress.
+        Print only errors, warnings, and an output that you ask for, such as JSON. Default: print
+        the answer and the progress as well.
     status
         Print how far the search in the directory is, and simulate nothing.
     """

@@ -74,9 +74,9 @@ BLOCK, FINDINGS = shipped_columns("check").values()
 )
 def list_models(kind: str | None = None, study: str | None = None) -> Answer:
     """List what the package contains: studies, vehicles, driving systems, scenarios, weathers,
-    algorithms, metrics and objectives. KIND lists only one of these kinds. `list characteristics
-    STUDY` lists the characteristics that a study changes, and how a workshop measures each one.
-    `list cache` prints the folder with earlier simulations.
+    algorithms, metrics and objectives. `list studies` prints the studies alone.
+    `list characteristics STUDY` lists the characteristics that a study changes, and how a workshop
+    measures each one. `list cache` prints the folder with earlier simulations.
 
     Example: python -m safevar_sumo list studies
     """

@@ -95,16 +95,16 @@ def show_simulation(
     as_it_is_now: bool = False,
 ) -> Answer:
     """Simulate one vehicle of a STUDY, or one solution in a directory of results (DIR), beside the
-    original vehicle. You get how both simulations end, with their safety metrics. Options write
-    the simulation step by step or as an animation.
+    original vehicle. You get how the simulations of the two vehicles end, with safety metrics. The
+    options --trace and --animate write the simulation to a file.
 
     Example: python -m safevar_sumo simulate rain --set tireFric=1.1
 
     Parameters
     ----------
     solution
-        Simulate this solution of the results, such as nsga2:3:0. A word chooses an unsafe
-        solution: smallest or fewest (changes), or most-severe (collision).
+        Simulate this solution of the results, such as nsga2:3:0. Three words also name an
+        unsafe solution: smallest or fewest (changes), or most-severe (collision).
     set
         Change a value, such as "tireFric=1.1" or "mass=+8%"; may be repeated.
     beyond

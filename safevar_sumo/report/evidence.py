@@ -96,8 +96,8 @@ def evidence(
     simulations: Simulations = None,
 ) -> str:
     """Pack results with their study, page and answers into one file, so that anybody can compute
-    every number again. `verify` computes the numbers again and reports each difference. Names of
-    cars are left out.
+    every number again. `verify` computes the numbers again and reports each difference. The pack
+    does not contain the names of cars.
 
     Example: python -m safevar_sumo evidence results/rain --out pack.zip
 
@@ -309,9 +309,9 @@ def verify(
     jobs: Jobs = None,
     progress: bool | Progress = False,
 ) -> Answer:
-    """Compute every claim of a pack of evidence again, and compare. The exit code is 0 if all
-    claims are the same, and 1 if a claim differs. Exit code 2 means a damaged pack or another
-    version.
+    """Compute every claim of a pack of evidence again, and compare the result with the claim. The
+    exit code is 0 if all claims are confirmed, and 1 if a claim differs. Exit code 2 means that the
+    pack is damaged or was written by another version.
 
     Example: python -m safevar_sumo verify pack.zip
 
@@ -320,11 +320,11 @@ def verify(
     pack
         The pack.
     search
-        Repeat the whole search, too. Default: simulate only the original vehicle and the solutions
-        again, and ask the questions again.
+        Repeat the whole search as well. Default: simulate only the original vehicle and the
+        solutions again, and ask the questions again.
     run_code
-        Run user code that the pack contains or names. Default: such a pack is an error, and no code
-        is run.
+        Run user code that the pack contains or names. Default: a pack with user code is an
+        error, and no code is run.
     jobs
         Number of worker processes. Default: one for each processor core.
     progress

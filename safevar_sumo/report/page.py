@@ -89,7 +89,7 @@ def report(
     quick: bool = False,
     simulations: Simulations = None,
 ) -> Path:
-    """Write one page (HTML) about results that opens without a network. The page has the answers,
+    """Write one HTML page about results. The page opens offline. The page has the answers,
     animated replays of failures, a sheet for the workshop, and the commands that compute every
     number again. The same results give the same page.
 
@@ -124,7 +124,7 @@ def report(
         Simulate everything again. Default: use simulations of earlier commands again.
     quick
         Give rough answers that prove nothing, with at most an eighth of the usual simulations. The
-        workshop sheet then has no line to sign.
+        workshop sheet of a rough page has no line to sign.
     simulations
         Largest number of simulations of all questions and replays of the page together.
 

@@ -116,7 +116,7 @@ def compare(
 ) -> Answer:
     """Compare two versions A and B of a study, or of results, and decide whether B may be released.
     You get RELEASE, DO NOT RELEASE (exit code 3) or DECIDE (exit code 4), with what is better
-    and what is worse in B. The same criterion counts for both versions.
+    and what is worse in B. Version A and version B are judged by one criterion.
 
     Example: python -m safevar_sumo compare autoware_july autoware_december
 
@@ -126,8 +126,8 @@ def compare(
         Number of sampled vehicles that are simulated in both versions. The sampled vehicles lie
         near the boundary between safe and unsafe.
     limits
-        Compare only vehicles within this limit, such as "treadDepth >= 3"; may be repeated. The
-        unit is that of the study.
+        Compare only vehicles within this limit, such as "treadDepth >= 3"; may be repeated.
+        State the value in the unit of the study.
     margin
         Clearance that every vehicle must keep, in metres. Default: the larger value of the two
         studies.

@@ -119,8 +119,8 @@ def explain(
     quick: bool = False,
 ) -> Answer:
     """Ask a STUDY which smallest changes make the vehicle unsafe, or ask results (DIR) what caused
-    the failures in these results. For a study, the command simulates changes to the ends of the
-    domains (ranges of values): one by one, in pairs and in larger combinations. For results
+    the failures in these results. For a study, the command sets characteristics to an end of their
+    domain (range of values): one by one, in pairs and in larger combinations. For results
     (DIR), the command reduces each failure to the changes that cause the failure, and simulates the
     same vehicle with other drivers.
 

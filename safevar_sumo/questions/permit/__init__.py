@@ -96,8 +96,8 @@ def permit(
     cars
         List of measured cars. The first column names the car, all others are characteristics.
     set
-        Ask about a single car with this measured value; may be repeated. The unit is that of the
-        study.
+        Ask about a single car with this measured value; may be repeated. State the value in the
+        unit of the study.
     limits
         Ask about all cars within this limit, such as "treadDepth >= 3"; may be repeated.
     others
@@ -121,7 +121,7 @@ def permit(
         Number of parameter sets (calibrations) of the vehicle model in which a car must be safe.
         Default: all; 0 uses only the set of the study.
     quick
-        Give a rough answer that proves nothing, from the tested speeds alone. Such an
+        Give a rough answer that proves nothing, from the tested speeds alone. A rough
         answer never says "drive".
     out
         Write the list with the highest safe speeds to this file.

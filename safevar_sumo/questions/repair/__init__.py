@@ -86,17 +86,17 @@ def repair(
 ) -> Answer:
     """Find the smallest change of the driving system's parameters that keeps worn vehicles safe.
     You get the new values of these parameters, their price (the original vehicle brakes earlier,
-    or needlessly), and how the change was tested. Failures of results within the required wear
-    must be safe, too.
+    or needlessly), and how the change was tested. Failures in results (DIR) within the promised
+    limits of wear become safe as well.
 
     Example: python -m safevar_sumo repair autoware_july --promise "brakeTorque >= 0.9"
 
     Parameters
     ----------
     promise
-        The repair must keep all vehicles within this limit of wear safe, such as "treadDepth >= 3";
-        may be repeated. The word all means every wear. Default: the limits under [repair.promise]
-        of the study, else under [limits].
+        Limit of wear within which every vehicle must be safe, such as "treadDepth >= 3"; may be
+        repeated. For every wear in the domains, write all. Default: the limits under
+        [repair.promise] of the study, else under [limits].
     margin
         Clearance that every vehicle must keep between bumpers, in metres. Default: the value of the
         study, else 0.3 m.
@@ -112,11 +112,11 @@ def repair(
     out
         Write a study with the first repair to this file.
     at_tests
-        Find a driving system that is safe in the listed test cases only. Default: also at speeds
-        and places between the listed values.
+        Test the repair only in the listed test cases. Default: test the repair also at speeds and
+        places between the listed values.
     quick
         Give a rough answer that proves nothing, with at most an eighth of the usual simulations. A
-        rough repair is not written to a file.
+        rough answer cannot be written to a file (--out).
     """
     study = evaluator.study
     evaluator.system.require("a driving system", "repair")

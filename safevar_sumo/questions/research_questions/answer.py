@@ -80,9 +80,9 @@ def tables(
     jobs: Jobs = None,
     table: str | None = None,
 ) -> Answer:
-    """Answer the three research questions of the paper from results, as tables and figures. RQ1
-    compares the search with the original vehicle, RQ2 compares the algorithms, and RQ3 describes
-    the changes. One directory of results is one case.
+    """Answer the three research questions of the published SafeVar study from results, as tables
+    and figures. RQ1 compares the search with the original vehicle, RQ2 compares the algorithms, and
+    RQ3 describes the changes. Each directory of results has its own rows in the tables.
 
     Example: python -m safevar_sumo tables results/rain --table rq3.2
 
@@ -94,7 +94,8 @@ def tables(
     alpha
         Significance level of the tests. Intervals have the confidence 1 - alpha.
     causes
-        Simulate the minimal causes of up to this many unsafe solutions of each run. Default: none.
+        Number of unsafe solutions of each run that further simulations reduce to the changes that
+        the failure needs (minimal causes). Default: none.
     figures
         Directory for all figures, as png and pdf.
     jobs
