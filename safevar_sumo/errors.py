@@ -125,7 +125,7 @@ def warn(message: str) -> None:
         == __name__.partition(".")[0]
     ):
         frame = frame.f_back
-        level = level + 1
+        level += 1
     warnings.warn(message, stacklevel=level)
 
 

@@ -122,11 +122,15 @@ class Account:
     def require(self, least: int) -> None:
         """Refuse fewer simulations than the least number for an answer."""
         self.least = least
-        if self.asked is not None and self.asked < least:
+        self._refuse_few(self.asked)
+
+    def _refuse_few(self, number: int | None) -> None:
+        """Refuse a number of simulations below the least one."""
+        if number is not None and number < self.least:
             raise InputError(
                 "simulations",
-                f"{self.asked:,} do not suffice: an answer takes at least {least:,}",
-                f"{least} or more",
+                f"{number:,} do not suffice: an answer takes at least {self.least:,}",
+                f"{self.least} or more",
             )
 
     def open(self, expected: float, seconds: float | None, checked: int = 0) -> None:
@@ -163,6 +167,7 @@ class Account:
         elif checked:
             words += f", with {checked:,} for a check of the class, which is shorter than usual"
         print_text(Console(file=sys.stderr), f"{words})")
+        self._refuse_few(self.most)
 
 
 def round_down(number: float) -> int:

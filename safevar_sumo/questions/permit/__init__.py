@@ -149,7 +149,7 @@ def permit(
     _check_driven(needed, search)
     within = _within(members, limits, study, fleet.settings[0])
     asked = [within] if limits else cars_of(members, fleet)
-    has_repairs = not quick and not limits
+    has_repairs = not (quick or limits)
     new_car, permits, repaired = _drive(
         evaluator, search, fleet, asked, with_repairs=has_repairs
     )
@@ -198,7 +198,9 @@ def _drive(
     members = evaluator.characteristics.vehicle
     cars = [Cars.one(members.original), *asked]
     phases = search.phases(cars, with_repairs=with_repairs)
-    evaluator.begin(phases, of_list=len(asked) > 1)
+    # Every encounter counts, so that the original vehicle drives in none beside a car.
+    alone = evaluator.for_study(evaluator.study.all_count)
+    alone.begin(phases, search.least, of_list=len(asked) > 1)
     new_car, *permits = search.reach(cars, [-np.inf, *[None] * len(asked)])
     if new_car.up_to is None:
         study = evaluator.study
@@ -209,7 +211,8 @@ def _drive(
             f"{unit_text(search.span.unit)}: {words}",
             "a study in which it is, or another --unsafe",
         )
-    if not with_repairs:
+    # A bound on the simulations leaves too few to search repairs, too.
+    if not with_repairs or evaluator.left is not None:
         return new_car, permits, [None] * len(permits)
     worn = fleet.measured & (fleet.settings != members.original)
     return new_car, permits, search.repair_first(asked, worn, members.original, permits)
@@ -326,8 +329,8 @@ def _grid(span: Span, step: float) -> FloatArray:
         )
     first, last = np.floor(span.low / step), np.ceil(span.high / step)
     multiples = np.round(step * np.arange(first, last + 1), 9)
-    inside = multiples[(multiples > span.low) & (multiples < span.high)]
-    return np.unique([span.low, *inside, span.high])
+    values = [span.low, *multiples, span.high]
+    return np.unique(np.clip(values, span.low, span.high))
 
 
 def _within(

@@ -97,7 +97,7 @@ class PermitAnswer:
         cars = tabulate("The cars, first those that may not drive", columns, rows)
         counts = {
             verdict: int((cars["verdict"] == verdict).sum())
-            for verdict in (DRIVE, LIMITED, STOP)
+            for verdict in NUMBERS.values()
         }
         too_slow = 0
         if self.need is not None:

@@ -10,6 +10,7 @@ import re
 import unicodedata
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import compress
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -241,17 +242,8 @@ def _cells_of_file(path: Path) -> _Cells:
 
 def _cells_of_frame(frame: pd.DataFrame) -> _Cells:
     """The cells of a frame, in which a missing value is an empty cell."""
-    rows = [
-        [
-            "" if missing else _text(cell)
-            for cell, missing in zip(row, empty, strict=True)
-        ]
-        for row, empty in zip(
-            frame.itertuples(index=False, name=None),
-            frame.isna().to_numpy(),
-            strict=True,
-        )
-    ]
+    present = frame.astype(object).where(frame.notna(), None)
+    rows = [[*map(_text, row)] for row in present.itertuples(index=False, name=None)]
     places = [f"cars, row {label}" for label in frame.index]
     return _Cells("cars", [str(name) for name in frame.columns], places, rows)
 
@@ -263,7 +255,7 @@ def _cells_of_mapping(cars: Mapping[Any, Any], place: str) -> _Cells:
             raise InputError(
                 place, f"{car!r}: {values!r}", "a mapping of values by characteristic"
             )
-    columns = list(dict.fromkeys(name for values in cars.values() for name in values))
+    columns = dict.fromkeys(name for values in cars.values() for name in values)
     rows = [
         [_text(car), *(_text(values.get(name)) for name in columns)]
         for car, values in cars.items()
@@ -310,11 +302,7 @@ def _columns(
             )
 
         # Each name once, and none that means something else.
-        tests = study.matrix.tests if study.matrix else []
-        varied = {
-            *study.ranges,
-            *(name for test in tests for name in study.axes_of(test)),
-        }
+        varied = {*study.ranges}.union(*map(study.axes_of, study.tests))
         for column, name in enumerate(names):
             if names.count(name) > 1:
                 raise InputError(
@@ -355,8 +343,8 @@ def _characteristic(name: str, header: str, vehicle: CharacteristicSet) -> int:
 def _names(cells: _Cells, naming: int) -> list[str]:
     """The names of the cars."""
     places = dict[str, str]()
-    for row, place in zip(cells.rows, cells.places, strict=True):
-        name = row[naming].strip()
+    names = [row[naming].strip() for row in cells.rows]
+    for name, place in zip(names, cells.places, strict=True):
         with about(f"{place}, column {cells.header[naming].strip()!r}"):
             if not name or not name.isprintable() or name[0] in "=+-@":
                 raise InputError(
@@ -370,7 +358,7 @@ def _names(cells: _Cells, naming: int) -> list[str]:
                 first = f"a name that no other car has ({places[key]})"
                 raise InputError("", f"the car {name!r} is there twice", first)
         places[key] = place
-    return [row[naming].strip() for row in cells.rows]
+    return names
 
 
 def _values(
@@ -457,7 +445,10 @@ def _completed(
     missing = np.isnan(settings)
     if lacking := np.flatnonzero(missing.any(axis=1)).tolist():
         names = ", ".join(
-            vehicle.names[number] for number in np.flatnonzero(missing.any(axis=0))
+            compress(
+                vehicle.names,
+                map(any, missing.T),
+            )
         )
         problem = (
             f"no value of {names}, neither measured nor under [unmeasured] of the study"

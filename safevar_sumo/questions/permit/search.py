@@ -53,10 +53,15 @@ class Permit(NamedTuple):
         return self.least.up_to
 
     @property
+    def failures(self) -> list[LimitingFailure]:
+        """The failure that limits it in each parameter set in which one was found."""
+        return [each.failure for each in self.reached if each.failure is not None]
+
+    @property
     def limiting(self) -> list[LimitingFailure]:
-        """The failures at the least values, of several parameter sets."""
-        failures = [each.failure for each in self.reached if each.failure is not None]
-        return sorted(failures, key=lambda failure: failure.value)[:MOST_LIMITING]
+        """Those at the least values."""
+        ordered = sorted(self.failures, key=lambda failure: failure.value)
+        return ordered[:MOST_LIMITING]
 
     @property
     def order(self) -> float:
@@ -78,12 +83,14 @@ class PermitSearch:
         The values of tests that cannot move it: nothing is known between them.
     attacked
         Number of simulations that searched for counterexamples so far.
+    least
+        Usual number of settings of these searches of all cars: with fewer, no speed is claimed.
     """
 
     def __init__(
         self, models: Models, span: Span, values: FloatArray, budget: int
     ) -> None:
-        self.attacked = 0
+        self.attacked = self.least = 0
         self._models = models
         self.span = span
         self._budget = budget
@@ -104,7 +111,9 @@ class PermitSearch:
         points = len(members[0].evaluator.system.points)
         vehicles = sum(car.together for car in cars)
         places = len(self.values) * USUAL_PLACES
-        each = (vehicles * places + len(cars) * self._budget) / points
+        searched = len(cars) * self._budget
+        self.least = len(members) * searched // points
+        each = (vehicles * places + searched) / points
         self._usual = len(members) * each / len(cars)
         phases = {self._stage(model.fit): each for model in members}
         return phases | ({REPAIR_STAGE: len(members) * each} if with_repairs else {})
@@ -226,11 +235,7 @@ class PermitSearch:
                     if permit.order > known[row]:
                         best[row] = column, permit
                         known[row] = permit.order
-                    failures[row] = [
-                        each.failure
-                        for each in permit.reached
-                        if each.failure is not None
-                    ]
+                    failures[row] = permit.failures
         return best
 
     def _lower(
@@ -262,6 +267,9 @@ class PermitSearch:
                 of_range, robustness.tolist(), strict=True
             ):
                 if left < 0:
-                    below = self.values[self.values < value]
-                    most = float(below[-1]) if len(below) else -np.inf
+                    below = self.values[self.values < value].tolist()
+                    most = max(
+                        below,
+                        default=-np.inf,
+                    )
                     bounds[row][column] = min(bounds[row][column], most)

@@ -166,7 +166,10 @@ class SpeedSearch:
         is_safe = self._values <= self._caps[car]
         if failure is not None:
             is_safe &= self._values < failure.value
-        return float(self._values[is_safe][-1]) if is_safe.any() else None
+        return max(
+            self._values[is_safe].tolist(),
+            default=None,
+        )
 
     def drive_grid(self) -> None:
         """Have all cars meet the encounters of the grid, from low values to high ones, each up to

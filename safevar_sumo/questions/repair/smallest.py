@@ -134,8 +134,8 @@ class Search:
             worst = int(np.argmin(robustness))
             if robustness[worst] < 0:
                 return cases[worst : worst + 1]
-            start = start + size
-            size = 4 * size
+            start += size
+            size *= 4
         return None
 
     def _first_survivor(self, changes: FloatArray) -> int | None:
