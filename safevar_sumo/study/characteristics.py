@@ -61,8 +61,9 @@ class Domain(Table, frozen=True, kw_only=True):
 
 
 class Precision(Table, frozen=True, kw_only=True):
-    """How far measurements of one vehicle may differ, the `value` in the characteristic's unit, and
-    the `source` of this value, or that it is an assumption.
+    """How exactly a characteristic is measured. Two measurements of one vehicle may differ by
+    `value`, in the characteristic's unit. `source` says where this value comes from, or that it is
+    an assumption.
     """
 
     value: PositiveNumber
@@ -70,11 +71,15 @@ class Precision(Table, frozen=True, kw_only=True):
 
 
 class CharacteristicTable(Domain, frozen=True, kw_only=True):
-    """One row of the characteristics table.
+    """A characteristic is a property of the vehicle, such as tyre friction, with its `original`
+    value and its domain (values from `lower` to `upper`).
 
-    `counterpart` is the part of a real vehicle that sets it; `measurement` says how a workshop
-    measures it, or, if `workshop` is false, who else does, and `precision` how exactly; `remedy`
-    says what to do with a vehicle beyond its limit.
+    - `meaning` describes the characteristic, and `short_name` is its name in sentences.
+    - `counterpart` is the part of a real vehicle that sets the characteristic.
+    - `measurement` says how a workshop measures the characteristic. If `workshop` is false,
+      `measurement` says who else measures it.
+    - `precision` says how exactly the characteristic is measured.
+    - `remedy` says what to do with a vehicle beyond the limit of the characteristic.
     """
 
     counterpart: ShortText = ""
@@ -105,15 +110,17 @@ class _Distribution(Table, frozen=True, tag_field="distribution"):
 
 
 class Uniform(_Distribution, frozen=True, kw_only=True, tag="uniform"):
-    """Every value from `lower` to `upper` is equally likely; by default the whole domain."""
+    """Every value from `lower` to `upper` is equally likely. By default these are the ends of the
+    domain.
+    """
 
     lower: float | None = None
     upper: float | None = None
 
 
 class Normal(_Distribution, frozen=True, kw_only=True, tag="normal"):
-    """A normal distribution with `mean`, by default the original, and standard deviation
-    `deviation`, cut off at the ends of the domain.
+    """The characteristic has a normal distribution, cut off at the ends of the domain. `deviation`
+    is the standard deviation. `mean` is by default the original value of the characteristic.
     """
 
     deviation: PositiveNumber
@@ -121,8 +128,8 @@ class Normal(_Distribution, frozen=True, kw_only=True, tag="normal"):
 
 
 class Triangular(_Distribution, frozen=True, kw_only=True, tag="triangular"):
-    """A triangular distribution from `lower` to `upper`, by default the domain, with its peak at
-    `mode`, by default the original.
+    """The characteristic has a triangular distribution from `lower` to `upper`, by default the ends
+    of the domain. The peak is at `mode`, by default the original value of the characteristic.
     """
 
     mode: float | None = None
@@ -131,10 +138,9 @@ class Triangular(_Distribution, frozen=True, kw_only=True, tag="triangular"):
 
 
 class Lognormal(_Distribution, frozen=True, kw_only=True, tag="lognormal"):
-    """A lognormal distribution with `median`, by default the original, cut off at the ends of the
-    domain.
-
-    `sigma` [-] is the standard deviation of the value's logarithm.
+    """The characteristic has a lognormal distribution, cut off at the ends of the domain. `median`
+    is by default the original value of the characteristic. `sigma` [-] is the standard deviation of
+    the value's logarithm.
     """
 
     sigma: PositiveNumber
@@ -142,7 +148,9 @@ class Lognormal(_Distribution, frozen=True, kw_only=True, tag="lognormal"):
 
 
 class Fixed(_Distribution, frozen=True, kw_only=True, tag="fixed"):
-    """The characteristic always has `value`, by default the original."""
+    """The characteristic has the same value in all vehicles: `value`, by default its original
+    value.
+    """
 
     value: float | None = None
 
@@ -194,12 +202,14 @@ def _check_distribution(key: str, row: Domain, distribution: Distribution) -> No
 
 
 class Constraint(Table, frozen=True, kw_only=True):
-    """The bounds `at_least` and `at_most` of a weighted sum of characteristics.
+    """A constraint bounds a weighted sum of characteristics, from `at_least` to `at_most`.
 
-    `sum` holds a weight for each characteristic in its unit. `unit`, the unit of the sum and its
-    bounds, is the unit of a characteristic or "-"; it may be omitted if all characteristics of the
-    sum have the same unit. `meaning` explains the constraint and names its source. It holds in the
-    `tests` of these names alone, by default in all.
+    - `sum` has a weight for each characteristic of the sum.
+    - `unit` is the unit of the sum and of its bounds: the unit of a characteristic, or "-". The
+      unit may be omitted if all characteristics of the sum have the same unit.
+    - `meaning` explains the constraint and names its source.
+    - `tests` names the tests in which the constraint holds. By default the constraint holds in all
+      tests.
     """
 
     sum: Annotated[dict[str, float], Meta(min_length=1)]
@@ -307,8 +317,8 @@ FORMS = (
 
 
 class Limit(Table, frozen=True, kw_only=True):
-    """The values that a characteristic may take, in its unit: `at_least`, `at_most`, or both;
-    `source` says who demands it.
+    """A limit states which values a characteristic may take, in its unit: `at_least`, `at_most`, or
+    both. `source` says who demands this limit.
     """
 
     at_least: float | None = None
@@ -329,8 +339,8 @@ class Limit(Table, frozen=True, kw_only=True):
 
 
 class UnmeasuredValue(Table, frozen=True, kw_only=True):
-    """The `value` of a characteristic of a vehicle in which it was not measured, in its unit;
-    `source` says where the value comes from, or that it is an assumption.
+    """The `value`, in its unit, that `permit` assumes of a characteristic that nobody measured in a
+    car. `source` says where this value comes from, or that it is an assumption.
     """
 
     value: float

@@ -31,12 +31,15 @@ BY_EXCESS = "impact_excess >"
 
 
 class ModelTable(Table, frozen=True, kw_only=True):
-    """A `model` by its name, or by `package.module:Name`, and its `parameters`.
+    """A table with a `model` and its `parameters`. The model is a shipped name, or a class as
+    `package.module:Name`.
 
-    An ADS of the `kind` `traci` is a controller written for SUMO's TraCI; an ADS of the kind `fmu`
-    is an FMU, named by its path: `inputs` and `outputs` are the FMU's variables by the quantity
-    they receive or return. `files` are data files, or folders of them, that a model of your own
-    reads, relative to the study's file.
+    - `kind` says what a driving system is: "traci" is a controller written for SUMO's TraCI, and
+      "fmu" is an FMU, whose path is the `model`.
+    - `inputs` and `outputs` name the variables of an FMU, by the quantity that a variable receives
+      or returns.
+    - `files` are data files, or folders of data files, that a model of your own reads. Their paths
+      are relative to the study's file.
     """
 
     model: str
@@ -61,12 +64,16 @@ says another [m].
 
 
 class AxisTable(Table, frozen=True, kw_only=True):
-    """A parameter of encounters: the values that its test drives, `at`, and the range in which any
-    value may occur, from `lower` to `upper`. A list is short for `at`.
+    """An axis is a parameter of encounters, such as a speed. A list in place of this table gives
+    only the values of `at`.
 
-    The range is by default that of `at`, or without `at` the widest that the scenario's class
-    declares. `original` is where the original vehicle drives in a search, by default the first of
-    `at`, else the test's own value. Without `at` a test drives at its own value.
+    - `at` lists the values with which a test is driven. Without `at`, a test is driven with the
+      value among its `parameters`, or with the default of the scenario's class.
+    - `lower` and `upper` are the ends of the range in which any value may occur. By default the
+      range extends over the values of `at`, or, without `at`, over the widest range that the
+      scenario's class declares.
+    - `original` is the value at which the original vehicle drives in a search. By default this
+      value is the first value of `at`; without `at`, the value with which the test is driven.
     """
 
     at: list[Any] = []
@@ -101,14 +108,18 @@ Axes = dict[str, Annotated[list[Any], Meta(min_length=1)] | AxisTable]
 
 
 class ScenarioTable(ModelTable, frozen=True, kw_only=True):
-    """The scenario: its `model` and `parameters`; `over` are axes of its encounters, in a matrix of
-    each test that does not state them: parameters of the scenario or of the weather.
+    """The table [scenario] describes the encounter: its `model` (name of the scenario) and the
+    scenario's `parameters`.
 
-    In a study with ranges of encounters, the original vehicle drives in the encounter of each
-    variant, too. The encounter counts only if the original vehicle keeps at least `margin` [m]
-    between bodies: in any other, a failure says nothing about the variant. Without a margin all
-    encounters count. A simulator of the user's own that is not deterministic simulates each setting
-    `repeats` times: the share of unsafe runs, the worst run, and means of metrics count.
+    - `over` has axes (parameters of the scenario or of the weather). A matrix uses these axes for
+      each test that does not state the axis itself.
+    - `margin` [m] is for studies with ranges of encounters. The original vehicle drives in the
+      encounter of each changed vehicle, too. An encounter counts only if the original vehicle keeps
+      at least this clearance between bodies. Where the original vehicle fails, a failure of the
+      changed vehicle says nothing about the change.
+    - `repeats` is for simulators of your own whose runs differ: each vehicle is simulated this
+      number of times. The answers use the share of unsafe runs, the worst run, and the means of
+      metrics.
     """
 
     over: Annotated[Axes, ORDERED] = {}
@@ -117,13 +128,16 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
 
 
 class Weather(Table, frozen=True, kw_only=True):
-    """Weather as data: its `name`, and its effects on the road and on the sensors.
+    """A weather has a `name`, and effects on the road and on the sensors.
 
-    `road_friction` and `visibility` are factors relative to the dry, clear case [-]. `water` is its
-    depth on the road [mm], whose effect the vehicle `worn` computes: it takes `road_friction` as
-    the grip of the same road when dry. `recognition_delay` is the additional time that the sensors
-    need to recognise a road user [s], for every ADS; the reaction time of an ADS is one of its
-    parameters. `light` is a label.
+    - `road_friction` and `visibility` [-] are factors relative to dry and clear weather.
+    - `water` [mm] is the depth of the water on the road. Only the vehicle `worn` computes the
+      effect of water, and takes `road_friction` for the grip of the same road when dry.
+    - `recognition_delay` [s] is the additional time that the sensors need to recognise a road user.
+      The delay is the same for every driving system. The reaction time is a parameter of the
+      driving system.
+    - `light` says whether it is day or night. Answers state the light, and no simulation depends on
+      it.
     """
 
     name: str
@@ -180,12 +194,14 @@ def _widest(domains: Sequence[Domain]) -> Domain:
 
 
 class MatrixTest(Table, frozen=True, kw_only=True):
-    """A test of a matrix: its `name`, and a scenario at every combination of the values of the axes
-    in `over`, in each of the `weathers`.
+    """A test of the matrix has a `name`, and one or more test cases. The test has a test case for
+    every combination of the values of its axes in `over`, in each of its `weathers`.
 
-    `parameters` are added to those of the study's scenario; a test with a `model` of its own has
-    only its own parameters. A weather is a name or a table. An impact is allowed up to a relative
-    speed of `allowed_impact_speed` [km/h], by which the metric `impact_excess` counts.
+    - `model` is the name of another scenario. A test with a `model` has only its own `parameters`.
+    - `parameters` are added to those of the study's scenario, if the test has no `model`.
+    - `weathers` are names of shipped weathers, or tables with weathers of your own.
+    - `allowed_impact_speed` [km/h] is the relative speed up to which an impact is allowed. The
+      metric `impact_excess` is the impact speed minus this allowed speed.
     """
 
     name: Annotated[str, Meta(min_length=1)]
@@ -207,10 +223,11 @@ class MatrixTest(Table, frozen=True, kw_only=True):
 
 
 class MatrixTable(Table, frozen=True, kw_only=True):
-    """The `tests` at whose points every setting is simulated.
+    """The table [matrix] has the `tests` in which every vehicle is simulated.
 
-    `aggregate` says at which point a setting counts: `worst` at that with the lowest safety degree,
-    `drac >` at that with the largest value of this metric, `ttc_min <` with the smallest.
+    `aggregate` says which test case gives the result of a vehicle. With `worst`, this test case is
+    the one with the lowest safety degree. With `drac >` it is the test case with the largest value
+    of the metric `drac`, and with `ttc_min <` the test case with the smallest `ttc_min`.
     """
 
     tests: Annotated[list[MatrixTest], Meta(min_length=1)]

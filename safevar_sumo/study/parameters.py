@@ -24,10 +24,11 @@ _hints_of = lru_cache(get_type_hints)
 
 
 class FreeParameter(Table, frozen=True, kw_only=True):
-    """A parameter that may change: its bounds `lower` and `upper` in `unit`, and its `meaning`.
+    """A parameter that a repair or a search may change: its bounds `lower` and `upper` in `unit`,
+    and its `meaning`.
 
-    The search measures distances of values as differences, or with `log` as ratios, for positive
-    quantities of unknown magnitude.
+    The search measures how far a value is from another by their difference. With `log = true`, the
+    search uses their ratio, which suits positive quantities of unknown magnitude.
     """
 
     lower: float

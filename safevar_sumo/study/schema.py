@@ -63,11 +63,13 @@ OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
 
 
 class VehicleTable(Table, frozen=True, kw_only=True):
-    """The vehicle under test: its `model`, the model's `parameters`, and the `characteristics` that
-    vary; false in place of one leaves out that of the study that is extended.
+    """The table [vehicle] describes the vehicle under test.
 
-    `files` are data files, or folders of them, that a model of your own reads, relative to the
-    study's file.
+    - `model` is the name of the vehicle's model, and `parameters` are the parameters of this model.
+    - `characteristics` are the properties of the vehicle that a search changes, by name. The value
+      false removes a characteristic that the study inherits from the study named by `extends`.
+    - `files` are data files, or folders of data files, that a vehicle model of your own reads.
+      Their paths are relative to the study's file.
     """
 
     model: str = ""
@@ -77,12 +79,14 @@ class VehicleTable(Table, frozen=True, kw_only=True):
 
 
 class MetricsTable(Table, frozen=True, kw_only=True):
-    """Thresholds of the safety metrics.
+    """The table [metrics] sets thresholds of the safety metrics, and adds metrics.
 
-    `ttc_threshold` is TTC* [s]; `sampling_interval` [s] is the time between two samples that TET,
-    TIT and aveDece are computed from (a whole multiple of the simulation's step; by default the
-    step). `also` names further metrics: metrics of the package, such as `ttc_min`, or users'
-    metrics as `package.module:Name`.
+    - `ttc_threshold` [s] is the threshold TTC* of the time to collision.
+    - `sampling_interval` [s] is the time between two samples from which the metrics TET, TIT and
+      aveDece are computed. This time is a whole multiple of the simulation's step, and by default
+      the step.
+    - `also` names further metrics: metrics of the package, such as `ttc_min`, or metrics of your
+      own as `package.module:Name`.
     """
 
     ttc_threshold: PositiveNumber
@@ -95,15 +99,20 @@ class MetricsTable(Table, frozen=True, kw_only=True):
 
 
 class SearchTable(Table, frozen=True, kw_only=True):
-    """The search: `runs` runs of each of the `algorithms`, each with `evaluations` simulations, in
-    generations of `population`; `seed` is the seed of all random numbers.
+    """The table [search] says how algorithms search for unsafe vehicles.
 
-    A batch of simulations longer than `time_limit` [s] counts as hung. A setting on which a
-    simulator of the user's own fails stops the study, or with `failed` = "skip" is infeasible. The
-    search minimises `objectives`, and drives metrics in their unsafe direction. `reference_point`
-    is each coordinate of the hypervolume's reference point, for objectives normalised to 0..1 [-].
-    `parameters` hold the parameters of algorithms by name or label; a file has them in tables such
-    as [search.nsga2].
+    - Each of the `algorithms` has `runs` runs. Each run has `evaluations` simulations, in
+      generations of `population` vehicles.
+    - `seed` is the seed of all random numbers of the search.
+    - `time_limit` [s] is the time after which a batch of simulations counts as hung.
+    - `failed` is for simulators of your own: with "stop", a vehicle whose simulation fails ends the
+      study; with "skip", this vehicle counts as infeasible.
+    - `objectives` are what the search minimises. For a metric among the objectives, the search
+      looks for its most dangerous values.
+    - `reference_point` [-] is the coordinate, in every dimension, of the reference point from which
+      the hypervolume is computed. Objectives are normalised to 0..1 for this purpose.
+    - `parameters` are the parameters of the algorithms, by the algorithm's name or label. A file
+      states these parameters in tables such as [search.nsga2].
     """
 
     algorithms: Annotated[list[str], Meta(min_length=1), WITHOUT_EFFECT]
@@ -139,8 +148,12 @@ def label_of(algorithm: str) -> str:
 
 
 class UnsafeTable(Table, frozen=True, kw_only=True):
-    """What a study calls unsafe, unless `--unsafe` says otherwise: a `criterion` as of that option,
-    its `source`, such as a regulation, and the parts of this source that are `not_simulated`.
+    """The table [unsafe] says which vehicles count as unsafe, if a command has no option
+    `--unsafe`.
+
+    - `criterion` is written like the value of the option `--unsafe`, such as "collision".
+    - `source` names where the criterion comes from, such as a regulation.
+    - `not_simulated` lists the parts of this source that no test of the study simulates.
     """
 
     criterion: str = ""
@@ -149,12 +162,16 @@ class UnsafeTable(Table, frozen=True, kw_only=True):
 
 
 class RepairTable(Table, frozen=True, kw_only=True):
-    """What a repair of the ADS may change and has to keep.
+    """The table [repair] says what a repair of the driving system may change, and what a repair has
+    to keep.
 
-    `parameters` may change, by name; a file has them directly under [repair]. Without any, those
-    that come with a shipped ADS may change. `promise` holds limits by characteristic that the user
-    promises to keep, or is "all" for the whole domain; by default the study's limits. `benign` are
-    tests in which nobody needs to brake.
+    - `parameters` are the parameters that a repair may change, by name. A file states these
+      parameters directly under [repair]. By default a repair may change the parameters that a
+      shipped driving system names.
+    - `promise` has the limits of wear, by characteristic, within which a repaired vehicle must be
+      safe. The value "all" means the whole domain (range of values). By default the limits are
+      those of the table [limits].
+    - `benign` are tests in which nobody needs to brake.
     """
 
     parameters: dict[str, FreeParameter] = {}
@@ -184,22 +201,30 @@ class Origin(Table, frozen=True, kw_only=True):
 class Study(Encounters, frozen=True, kw_only=True):
     """A complete study, as in its TOML file; `load_study` reads one.
 
-    `title` is its heading, `weather` a shipped weather by its name, or a table; `matrix` are the
-    test points at which the study is simulated, if there are several; `step_length` is the
-    simulation's time step [s], by default the time step in the network's options; `published` are
-    the original vehicle's metrics in the published study, by name, as far as known; `repeatability`
-    are standard deviations of repeats of one setting in the published study; `spread` are sets of
-    values of parameters, by their keys in the file, such as `ads.parameters.corridor`, that fit the
-    published data equally well, a list for each parameter, the study's own value first;
-    `model_error` is the model's further error, by metric, for a vehicle that differs from the
-    original by the full width of a domain; `variation` states how characteristics vary in the
-    world, by name: uniformly by default; `constraints` are conditions that the characteristics of
-    one vehicle satisfy together; `limits` are the values, by name, up to which characteristics may
-    wear in service; `unmeasured` are the values, by name, of characteristics that were not measured
-    in a vehicle, each a number or a table: a study that extends this one does not inherit them;
-    `repair` states what a repair of the ADS may change; `encounters` says what vehicles meet: the
-    listed `tests`, or with `ranges` any encounter in the ranges of the axes, beside the vehicle;
-    `unsafe` is what the study calls so.
+    - `name` and `title` are the study's name and its heading.
+    - `weather` is the name of a shipped weather, or a table with a weather of your own.
+    - `matrix` has the tests in which the study simulates every vehicle, if the study has several.
+    - `encounters` says what vehicles meet: "tests" means the listed tests, and "ranges" means any
+      encounter within the ranges of the axes (parameters of encounters).
+    - `step_length` [s] is the simulation's time step. By default the time step is that of the
+      network's options.
+    - `published` has the metrics of the original vehicle in the published study, by name.
+    - `repeatability` has, for each metric, the standard deviation between repeats of one vehicle in
+      the published study.
+    - `spread` has parameter sets that fit the published data equally well: for each parameter a
+      list of values, of which the first is the study's own. A parameter is named by its key in the
+      file, such as `ads.parameters.corridor`.
+    - `model_error` is the further error of the vehicle model, by metric, for a vehicle that differs
+      from the original vehicle by the full width of a domain.
+    - `variation` states how characteristics vary between vehicles in the world, by name. By default
+      all values of a domain are equally likely.
+    - `constraints` are conditions that the characteristics of one vehicle satisfy together.
+    - `limits` are the values, by name, up to which characteristics may wear in service.
+    - `unmeasured` has the values, by name, that `permit` assumes of characteristics that nobody
+      measured in a car. Each value is a number or a table. A study that extends this study does not
+      inherit the table.
+    - `repair` states what a repair of the driving system may change.
+    - `unsafe` states which vehicles the study calls unsafe.
     """
 
     # A key without the mark WITHOUT_EFFECT is part of the identity of results.
