@@ -72,7 +72,7 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     distance = v rt + max(v_rel^2 / (2 b), v^2 / (2 b) - u^2 / (2 b_u)) + margin, with speed v and
     deceleration b of the vehicle, u and b_u of the obstacle, their closing speed v_rel, and
     `response_time` rt; b is `braking_share` of the original vehicle's greatest deceleration. After
-    braking it never accelerates again.
+    braking, the system never accelerates again.
 
     The system warns its driver while it brakes, and while the time to collision with an obstacle in
     its way (gap / closing speed) is below `warning_time`. The simulated driver does not react to
@@ -85,18 +85,20 @@ class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     response_time
         Response time assumed in planning [s].
     braking_share
-        Share of the original vehicle's greatest deceleration with which it plans to brake [-].
+        Share of the original vehicle's greatest deceleration with which the system plans to brake
+        [-].
     margin
         Gap to keep at the stop [m].
     partial_share, partial_time
         Pedal of the partial stage [-], and time by which this stage precedes the full stage [s].
     corridor
-        Half the width of the corridor that it watches [m].
+        Half the width of the corridor that the driving system watches [m].
     reach
         Range of its sensors in clear weather [m].
     warning_time
-        Time to collision at which it warns [s]; with 0 it warns only while it brakes. The default
-        is an assumption: Euro NCAP requires a warning by 1.7 s, and 0.3 s allow for late sensors.
+        Time to collision at which the system warns [s]; with 0 the system warns only while it
+        brakes. The default is an assumption: Euro NCAP requires a warning by 1.7 s, and 0.3 s allow
+        for late sensors.
 
     Notes
     -----
@@ -244,8 +246,8 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     emergency braking; then stops with a target acceleration, reached with a target jerk.
 
     distance = v t_response + v^2 / (2 a_ego_min) - u^2 / (2 a_obj_min) +
-    longitudinal_offset_margin, with the speeds v and u of vehicle and obstacle. Once it has decided
-    to brake, it brakes until it stands.
+    longitudinal_offset_margin, with the speeds v and u of vehicle and obstacle. Once the system has
+    decided to brake, the system brakes until the vehicle stands.
 
     Parameters
     ----------
@@ -261,7 +263,7 @@ class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     command_delay
         Time from the decision to the first command [s]: an assumption, two cycles of 10 Hz.
     corridor
-        Half the width of the corridor that it watches [m].
+        Half the width of the corridor that the driving system watches [m].
 
     Notes
     -----

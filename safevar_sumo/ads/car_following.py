@@ -84,7 +84,7 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
     headway, standing_gap
         Desired time headway [s], and additional gap [m].
     corridor
-        Half the width of the corridor that it watches [m].
+        Half the width of the corridor that the driving system watches [m].
     """
 
     def acceleration_at(
@@ -131,7 +131,7 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
     acceleration, deceleration
         a, b [m/s^2].
     corridor
-        Half the width of the corridor that it watches [m].
+        Half the width of the corridor that the driving system watches [m].
     """
 
     tau_parameter = "headway"
@@ -162,8 +162,8 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
 class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """SUMO's default model (Krauss 1998; `MSCFModel_Krauss`).
 
-    The model never drives faster than a speed from which the original vehicle can stop behind the
-    obstacle after a reaction time.
+    The model never drives so fast that the original vehicle could not stop before an obstacle ahead
+    (after the reaction time, with the planned deceleration).
 
     Parameters
     ----------

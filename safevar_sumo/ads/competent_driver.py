@@ -62,18 +62,19 @@ class _Perceiving(NamedTuple):
 class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     """The competent and careful human driver of UN R157, annex 4, appendix 3 (longitudinal part).
 
-    Holds the speed with which it began, and so the gap to a steady leader; perceives a danger,
-    reacts, and brakes with up to 0.774 g. The danger is
+    The driver holds the initial speed, and so keeps the gap to a leader of the same speed. When the
+    driver perceives a danger, the driver reacts, and brakes with up to 0.774 g. A danger is
 
-    - somebody who enters the way, stands or drives steadily in it, at a TTC below 2 s; towards a
-      standing car this is a time headway of 2 s; a car that cuts in is a danger wherever the
-      vehicle will meet it, also beside;
-    - a leader that brakes harder than `leader_braking`, whatever the TTC. Below 5 m/s^2 the
-      regulation names no danger: by the letter the driver does not react while the leader brakes.
+    - somebody who enters the way, or stands or drives steadily in the way, at a time to collision
+      (TTC) below 2 s; towards a standing car this TTC is a time headway of 2 s; a car that cuts in
+      is a danger wherever the vehicle will meet this car, also beside the vehicle;
+    - a leader that brakes harder than `leader_braking`, whatever the TTC. UN R157 names no danger
+      if the leader brakes with less than 5 m/s^2, so by default the driver does not react to such
+      braking.
 
-    While it reacts it releases the accelerator, and it does not press it again while the cause of
-    the danger blocks its way: after a stop it waits until the way is clear, and it does not follow
-    a leader that drives on after braking.
+    While the driver reacts, the driver releases the accelerator. The driver does not press the
+    accelerator again while the cause of the danger blocks the way. After a stop, the driver waits
+    until the way is clear, and does not follow a leader that drives on after braking.
 
     Parameters
     ----------
@@ -82,19 +83,21 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     critical_ttc, reaction_time
         Time to collision that counts as a danger, and reaction time before braking [s].
     stray, perception_time
-        An obstacle that enters the way is perceived `perception_time` after it has moved `stray`
-        from its first lateral position [m, s]; one that a leader reveals when he leaves, the same
-        time after the leader has.
+        The driver perceives an obstacle that enters the way `perception_time` after this obstacle
+        has moved `stray` from its first lateral position [m, s]. If a leader leaves the way and
+        reveals an obstacle, the driver perceives this obstacle `perception_time` after the leader
+        has moved `stray`.
     leader_braking
-        Deceleration of a leader above which its braking is a danger [m/s^2], perceived
-        `perception_time` after it begins; 5 by the letter of the regulation, 0.5 for any braking.
+        Deceleration of a leader above which the braking is a danger [m/s^2], which the driver
+        perceives `perception_time` after the braking begins; 5 by the letter of the regulation, 0.5
+        for any braking.
     lets_go
-        Deceleration with the accelerator released, while it reacts [m/s^2]; a vehicle that coasts
-        with less is braked.
+        Deceleration with the accelerator released, while the driver reacts [m/s^2]; the driver
+        brakes a vehicle that coasts with less.
     corridor
-        Half the width of the corridor that it watches [m].
+        Half the width of the corridor that the driving system watches [m].
     start_throttle
-        Throttle in the run's first steps, one value per step, until it sees a danger [-].
+        Throttle in the run's first steps, one value per step, until the driver sees a danger [-].
     """
 
     critical_ttc: PositiveParameter = 2.0

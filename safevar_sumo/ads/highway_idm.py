@@ -12,18 +12,19 @@ ROAD_LENGTH = 10_000.0
 
 
 class HighwayIdm(ScalarAds):
-    """Drives with the acceleration of highway-env's IDMVehicle behind whoever is in the way, else
-    on a free road.
+    """Drives with the acceleration of `IDMVehicle` in the library highway-env: behind an obstacle
+    in the way, or on a free road.
 
-    The library's own numbers count: at most 6 m/s^2, comfortably 3 and -5 m/s^2, a headway of 1.5 s
-    and a gap of 5 m at standstill. Needs the extra `highway-env`.
+    The driver has the numbers of the library highway-env: an acceleration of at most 6 m/s^2
+    (comfortable: 3 and -5 m/s^2), a headway of 1.5 s and a gap of 5 m at standstill. The driver
+    needs the extra `highway-env`.
 
     Parameters
     ----------
     target_speed
-        The speed that it wishes [m/s], by default the initial speed.
+        The speed that the driver wishes [m/s], by default the initial speed.
     corridor
-        Half the width of the corridor that it watches [m].
+        Half the width of the corridor that the driving system watches [m].
     """
 
     def __init__(

@@ -22,13 +22,13 @@ MOST = 1000.0
 
 
 class AdRss(ScalarAds):
-    """Holds its speed until ad-rss-lib demands longitudinal braking, and then brakes fully as long
-    as it does. The system does not press the accelerator again, and rolls out with 1 m/s^2
-    while somebody is in its way.
+    """Holds its speed until ad-rss-lib demands longitudinal braking, and then brakes fully while
+    the library demands braking. Afterwards the system does not press the accelerator again. While
+    somebody is in its way, the system rolls out with 1 m/s^2.
 
     The library applies the rule of responsibility-sensitive safety (Shalev-Shwartz, Shammah,
-    Shashua 2017) to the situation "same direction, the ego vehicle behind". Needs the extra
-    `ad-rss`. Defaults are assumptions.
+    Shashua 2017) to the situation "same direction, the ego vehicle behind". The system needs the
+    extra `ad-rss`. The defaults of its parameters are assumptions.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class AdRss(ScalarAds):
     cruise_speed
         Speed to hold [m/s], by default the initial speed.
     corridor
-        Half the width of the corridor that it watches [m].
+        Half the width of the corridor that the driving system watches [m].
     """
 
     def __init__(

@@ -239,8 +239,8 @@ class _RailsMemory(NamedTuple):
 class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """World On Rails (Chen, Koltun, Kraehenbuehl 2021): a vision policy at 20 Hz.
 
-    The system brakes fully for a near obstacle in its corridor. Otherwise the system opens the
-    throttle up to its speed limit.
+    The system brakes fully for a near obstacle in its corridor. If no obstacle is near in its
+    corridor, the system opens the throttle up to its speed limit.
 
     Parameters
     ----------

@@ -33,17 +33,17 @@ GAP_ROUNDING = 1e-6
 
 
 class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
-    """Brakes fully as soon as it approaches an obstacle that is in its way or will be there when
-    the vehicle arrives: the best that a driver can do.
+    """Brakes fully as soon as the vehicle approaches an obstacle that is in its way, or will be
+    when the vehicle arrives: the best that a driver can do.
 
     Parameters
     ----------
     cruise_speed
         Speed to hold [m/s], by default the initial speed.
     corridor
-        Half the width of the corridor that it watches [m].
+        Half the width of the corridor that the driving system watches [m].
     start_throttle
-        Throttle in the run's first steps, one value per step, until it brakes [-].
+        Throttle in the run's first steps, one value per step, until the driver brakes [-].
     """
 
     start_throttle: StartThrottle = ()
@@ -61,13 +61,14 @@ class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
 class R157(ReferenceDriver, frozen=True, kw_only=True):
     """An automated lane keeping system that does what UN R157, 5.2.5, demands, and no more.
 
-    The system reacts to who enters its way, and to who stands or drives steadily in it, at a TTC
-    below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s, with the speeds v and u of the vehicle and the
-    obstacle, and brakes with 6 m/s^2 at once (5.2.5.2, which means it for cars that cut in). Behind
-    a leader that brakes, 5.2.5.1 counts: no collision if the time gap was at least 1 s + v / (100
-    km/h) s before, as far as the system has seen the leader. With this time gap, the system avoids
-    a collision if it brakes as the leader does. At a smaller gap the regulation demands nothing,
-    and the system does not react to the leader's braking.
+    The system reacts to an obstacle that enters its way, or stands or drives steadily in its way,
+    if the time to collision is below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s (v, u: speeds of the
+    vehicle and the obstacle). The system then brakes with 6 m/s^2 at once (5.2.5.2, which means
+    this for cars that cut in). If a leader brakes, the system must avoid a collision only if the
+    time gap before the braking was at least 1 s + v / (100 km/h) s (5.2.5.1). With this time gap,
+    the system avoids a collision if it brakes as hard as the leader. If the time gap to a braking
+    leader was smaller, UN R157 demands nothing, and the system does not react to the leader's
+    braking.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
     deceleration, reaction_time, margin
         6 m/s^2, 0.35 s and 0.1 s in the regulation.
     corridor
-        Half the width of the corridor that it watches [m].
+        Half the width of the corridor that the driving system watches [m].
     """
 
     deceleration: PositiveParameter = 6.0
@@ -121,9 +122,8 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
 class Rss(ReferenceDriver, frozen=True, kw_only=True):
     """Responsibility-sensitive safety (Shalev-Shwartz, Shammah, Shashua 2017), longitudinal part.
 
-    A gap below the safe distance is a danger, to which it reacts and brakes. safe distance = v rt +
-    a rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and
-    leader.
+    The driver reacts to a gap below the safe distance, and brakes. safe distance = v rt + a rt^2 /
+    2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and leader.
 
     Parameters
     ----------
@@ -132,12 +132,12 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
     reaction_time
         rt [s].
     acceleration, deceleration, leader_deceleration
-        Acceleration a while it reacts, decelerations b and b_u of its own and of the leader's
-        braking, with which it plans [m/s^2].
+        Acceleration a of the vehicle while the driver reacts, decelerations b and b_u of the
+        vehicle's and of the leader's braking, with which the driver plans [m/s^2].
     braking
-        Deceleration with which it brakes, by default 0.774 g [m/s^2].
+        Deceleration with which the driver brakes, by default 0.774 g [m/s^2].
     corridor
-        Half the width of the corridor that it watches [m].
+        Half the width of the corridor that the driving system watches [m].
     """
 
     reaction_time: NonNegativeParameter = 0.75
@@ -192,7 +192,7 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     margin
         Added to the safe distance and subtracted from the gap [m].
     corridor
-        Half the width of the corridor that it watches [m].
+        Half the width of the corridor that the driving system watches [m].
     """
 
     reaction_time: NonNegativeParameter = 0.75

@@ -20,8 +20,8 @@ from safevar_sumo.study import ORIGINAL_DEGREE
 class RandomSearch(
     Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 ):
-    """Samples uniformly in the domains; the result is the non-dominated archive over all
-    evaluations.
+    """Samples vehicles uniformly in the domains; the result is the non-dominated archive of all
+    simulations.
     """
 
     def search(self, problem: Problem, rng: Generator) -> Search:
@@ -45,20 +45,20 @@ PositiveCount = Annotated[int, Meta(ge=1, le=1_000_000)]
 class SafeFuzzer(
     Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 ):
-    """Changes a few characteristics of the original vehicle, in ranges that narrow towards less
-    safe settings.
+    """Changes a few characteristics of the original vehicle, to values in ranges that become
+    narrower around less safe vehicles.
 
-    A setting's score (`_scores`) compares it with the others of its generation, and does not change
-    later.
+    The score of a vehicle (`_scores`) compares the vehicle with the others of its generation, and
+    does not change later.
 
     Parameters
     ----------
     generation
-        Number of settings in a generation.
+        Number of vehicles in a generation.
     kept
-        Number of settings in the result: those with the best scores.
+        Number of vehicles in the result: those with the best scores.
     warm_up
-        Number of evaluations before ranges are narrowed or a generation must improve.
+        Number of simulations before ranges become narrower or a generation must improve.
     generations_between_updates, generations_without_improvement
         Number of generations between two updates of the ranges, and number without a new lowest
         score after which the search ends.

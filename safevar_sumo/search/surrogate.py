@@ -21,14 +21,19 @@ from safevar_sumo.search.genetic import Nsga2
 
 
 class Surrogate(Nsga2, frozen=True, kw_only=True):
-    """NSGA-II on the prediction of models; simulates its best and its most uncertain settings.
+    """NSGA-II on the predictions of models: SUMO simulates the best and the most uncertain
+    vehicles.
 
-    The first settings, as many as a population, change from one to all characteristics. In each
-    round, models learn from all settings that were simulated, and NSGA-II, with the parameters of
-    `nsga2`, searches their prediction: 1,500 settings in generations of 100. Some of the
-    new settings are simulated: 10, and a tenth of the number of known ones. Four in five of them
-    are the best by crowding distance, the others those with the most uncertain prediction. The
-    result is the non-dominated archive over all evaluations.
+    The search begins with one population of vehicles, in which from one to all characteristics are
+    changed. In each round, 20 ridge regressions (weight 0.1) learn the metrics, each from a
+    bootstrap sample of all simulated vehicles; an undefined metric is learned as that of the
+    original vehicle. The prediction for a vehicle is the mean of the regressions, and the
+    uncertainty of a prediction is the standard deviation of the predicted safety degrees. NSGA-II,
+    with the parameters of `nsga2`, searches the predictions (1,500 vehicles in generations of 100),
+    from all non-dominated simulated vehicles and 100 sampled vehicles. If N vehicles were simulated
+    before, the round simulates 10 + N / 10 of the new non-dominated vehicles. Four fifths of these
+    vehicles have the best crowding distance, the others the most uncertain prediction. The result
+    is the non-dominated archive of all simulations.
     """
 
     def search(

@@ -82,7 +82,7 @@ class _Prepared(NamedTuple):
 
 
 class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The vehicle of the studies sun and rain.
+    """The vehicle of the studies `sun` and `rain`: CARLA's LincolnMkz2017.
 
     Parameters
     ----------

@@ -112,7 +112,7 @@ class LgsvlState(NamedTuple):
 
 
 class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The vehicle of the study lgsvl.
+    """The vehicle of the study `lgsvl`.
 
     Parameters
     ----------

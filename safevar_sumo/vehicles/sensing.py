@@ -64,7 +64,8 @@ class SumoVehicle(
 ):
     """A SUMO vehicle type: greatest accelerations, top speed, and delays of sensors and actuators.
 
-    `tau` is SUMO's: the time headway of a driver who is one of SUMO's car-following models.
+    The characteristic `tau` is the time headway that SUMO's car-following models keep, if one of
+    these models drives.
 
     Parameters
     ----------
