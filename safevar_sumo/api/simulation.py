@@ -187,9 +187,7 @@ class Simulation:
     @property
     def metrics(self) -> dict[str, float]:
         """Safety metrics by name, in the units that `list` prints; NaN where undefined."""
-        return {
-            name: float(values[0]) for name, values in self.evaluation.metrics.items()
-        }
+        return self.evaluation.first_metrics
 
     @property
     def objectives(self) -> dict[str, float]:

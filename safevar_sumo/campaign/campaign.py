@@ -245,8 +245,8 @@ def choose_sample(
     allows, and others that the study's seed draws.
     """
     solutions = Evaluations.concatenate([run.solutions for run in runs])
-    metrics = {name: float(values[0]) for name, values in original.metrics.items()}
-    rows = np.flatnonzero(Unsafe.default(metrics, solutions.outcome).of(solutions))
+    criterion = Unsafe.default(original.first_metrics, solutions.outcome)
+    rows = np.flatnonzero(criterion.of(solutions))
     rows = rows[np.unique(solutions.settings[rows], axis=0, return_index=True)[1]]
 
     rng = default_rng(study.search.seed)
@@ -292,9 +292,12 @@ def journal_progress(
         readers.append(JournalReader(file, study.search.evaluations))
 
     def show(ended: Sequence[int]) -> None:
-        evaluations = sum(reader.asked() for reader in readers)
-        total = evaluations + sum(reader.left for reader in readers)
-        finished = sum(reader.is_finished for reader in readers)
+        evaluations = remaining = finished = 0
+        for reader in readers:
+            evaluations += reader.asked()
+            remaining += reader.left
+            finished += reader.is_finished
+        total = evaluations + remaining
         progress(f"{study.name}: {finished} of {len(keys)} runs", evaluations, total)
 
     return show

@@ -300,8 +300,7 @@ class Unsafe:
             If no vehicle can be unsafe by this criterion.
         """
         outcomes = np.concatenate([original.outcome, evaluations.outcome])
-        metrics = {name: float(values[0]) for name, values in original.metrics.items()}
-        unsafe = cls.default(metrics, outcomes)
+        unsafe = cls.default(original.first_metrics, outcomes)
         if unsafe == cls() and not (outcomes == COLLISION).any():
             raise InputError(
                 "unsafe",

@@ -48,15 +48,15 @@ def find_boundaries(
             + (high - low)[:, np.newaxis] * np.arange(number + 1) / number
         )
         shares[:, -1] = high  # without a rounding error
-        inner = on_lines(starts, ends, shares[:, 1:-1])
-        tested = are_unsafe(inner.reshape(-1, starts.shape[1])).reshape(
+        bounds = on_lines(starts, ends, shares[:, 1:-1])
+        tested = are_unsafe(bounds.reshape(-1, starts.shape[1])).reshape(
             len(lines), number - 1
         )
         # Of these parts the one below the first unsafe bound is left.
         is_unsafe = np.column_stack([tested, np.ones(len(lines), dtype=bool)])
-        first = np.argmax(is_unsafe, axis=1)
-        low = shares[lines, first]
-        high = shares[lines, first + 1]
+        first_unsafe = np.argmax(is_unsafe, axis=1)
+        low = shares[lines, first_unsafe]
+        high = shares[lines, first_unsafe + 1]
     safe = on_lines(starts, ends, low[:, np.newaxis])[:, 0]
     unsafe = on_lines(starts, ends, high[:, np.newaxis])[:, 0]
     return Boundaries(low, high, safe, unsafe)

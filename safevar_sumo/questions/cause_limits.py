@@ -105,19 +105,19 @@ def find_cause_limits(
     return [
         Limits(
             boundary=dict(
-                zip(cause.changes, limits[first, flags].tolist(), strict=True)
+                zip(cause.changes, limits[line, flags].tolist(), strict=True)
             ),
             single_boundary=dict(
                 zip(
                     cause.changes,
-                    np.diagonal(limits[first + 1 : stop, flags]).tolist(),
+                    np.diagonal(limits[line + 1 : stop, flags]).tolist(),
                     strict=True,
                 )
             ),
-            fraction=float(shares[first]) if cause.changes else 0.0,
-            end=states[first],
+            fraction=float(shares[line]) if cause.changes else 0.0,
+            end=states[line],
         )
-        for cause, flags, (first, stop) in zip(
+        for cause, flags, (line, stop) in zip(
             causes, is_changed, pairwise(first_lines), strict=True
         )
     ]
@@ -140,7 +140,7 @@ def _first_unsafe_shares(
     share, it gives the state `NOT_SIMULATED`.
     """
     # The first unsafe share of each line.
-    found = find_boundaries(
+    boundaries = find_boundaries(
         starts,
         ends,
         lambda rows: unsafe.of(evaluator.evaluate(rows, BOUNDARIES)),
@@ -149,11 +149,15 @@ def _first_unsafe_shares(
     )
 
     # What ends the line on the safe side.
-    is_valid = evaluator.evaluate(found.safe, BOUNDARIES).valid
-    is_at_threshold = (found.safe_shares == lowest) & (lowest > 0)
+    is_valid = evaluator.evaluate(boundaries.safe, BOUNDARIES).valid
+    is_at_threshold = (boundaries.safe_shares == lowest) & (lowest > 0)
     states = np.select(
-        [is_at_threshold, is_valid | (found.safe_shares == lowest)],
+        [is_at_threshold, is_valid | (boundaries.safe_shares == lowest)],
         [BoundaryState.FILTER, BoundaryState.SAFE],
         BoundaryState.NOT_SIMULATED,
     )
-    return found.unsafe_shares, found.unsafe, [BoundaryState(state) for state in states]
+    return (
+        boundaries.unsafe_shares,
+        boundaries.unsafe,
+        [*map(BoundaryState, states)],
+    )

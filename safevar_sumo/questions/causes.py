@@ -158,10 +158,12 @@ def select_affordable_rows(
     if costs.sum() <= max_evaluations:
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.seed).permutation(len(settings))
-    least = int(
+    smallest_number = int(
         evaluator.left is not None and len(evaluator.characteristics) < max_evaluations
     )
-    number = max(least, np.count_nonzero(np.cumsum(costs[order]) <= max_evaluations))
+    number = max(
+        smallest_number, np.count_nonzero(np.cumsum(costs[order]) <= max_evaluations)
+    )
     return sorted(order[:number].tolist())
 
 
@@ -236,7 +238,7 @@ def directions(
     return tuple(texts)
 
 
-def _kinds_of(
+def kinds_of(
     characteristics: CharacteristicSet, causes: Sequence[Cause]
 ) -> set[tuple[str, ...]]:
     """The causes without the sizes of their changes."""
@@ -256,7 +258,7 @@ def count_distinct_causes(
     """
     counts = Counter[tuple[str, ...]]()
     for group in causes:
-        counts.update(_kinds_of(characteristics, group))
+        counts.update(kinds_of(characteristics, group))
     order = sorted(counts, key=lambda key: (-counts[key], len(key), key))
     rows = [(key, counts[key], counts[key] / len(causes)) for key in order]
     return pd.DataFrame(rows, columns=["cause", "failures", "share"])
@@ -290,17 +292,19 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     rows = settings.to_numpy(dtype=float)
     causes = find_minimal_causes(evaluator, rows, case.unsafe, price)
     kinds = pd.Series(
-        [_kinds_of(evaluator.characteristics, group) for group in causes],
+        [kinds_of(evaluator.characteristics, group) for group in causes],
         settings.index,
         name="kind",
     )
-    each = examined.merge(settings.join(kinds.explode())).dropna(subset="kind")
+    causes_of_solutions = examined.merge(settings.join(kinds.explode())).dropna(
+        subset="kind"
+    )
 
     # How many of each run.
     counted = {
         "failures": failures,
         "examined": examined,
-        "causes": each[[*keys, "kind"]].drop_duplicates(),
+        "causes": causes_of_solutions[[*keys, "kind"]].drop_duplicates(),
     }
     frame = pd.DataFrame(
         {name: rows.groupby(keys).size() for name, rows in counted.items()},

@@ -111,8 +111,8 @@ class Failure(NamedTuple):
 def describe(
     model: Model,
     settings: Mapping[str, FloatArray],
-    within: Box | None = None,
-    only: Mapping[str, str] = MappingProxyType({}),
+    box: Box | None = None,
+    single_names: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Failure]:
     """How unsafe settings of a model fail at their worst points, by the same names.
 
@@ -129,7 +129,7 @@ def describe(
         members = model.characteristics
         rows = np.array(
             [
-                as_printed(members, setting, further, within, only.get(name, ""))
+                as_printed(members, setting, further, box, single_names.get(name, ""))
                 for name, setting in waiting.items()
             ]
         )
@@ -141,18 +141,20 @@ def describe(
 
 
 def values_as_printed(
-    model: Model, vehicles: Sequence[NamedValues], only: Sequence[str] = ()
+    model: Model, vehicles: Sequence[NamedValues], single_names: Sequence[str] = ()
 ) -> list[NamedValues]:
     """Values of unsafe vehicles, all else as in the original, as `describe` prints them; as they
     are where it prints none, and but for one characteristic of each if `only` names them.
     """
     members = model.characteristics
     settings = {
-        str(row): members.setting(one, beyond=True) for row, one in enumerate(vehicles)
+        str(row): members.setting(vehicle, beyond=True)
+        for row, vehicle in enumerate(vehicles)
     }
-    printed = describe(model, settings, only=dict(zip(settings, only, strict=False)))
+    names = dict(zip(settings, single_names, strict=False))
+    printed = describe(model, settings, single_names=names)
     settings |= {name: failure.setting for name, failure in printed.items()}
-    return [members.named(one) for one in settings.values()]
+    return [*map(members.named, settings.values())]
 
 
 def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
@@ -194,8 +196,8 @@ def as_printed(
     members: CharacteristicSet,
     setting: FloatArray,
     further: int,
-    within: Box | None = None,
-    only: str = "",
+    box: Box | None = None,
+    single_name: str = "",
 ) -> FloatArray:
     """A setting with its values, or `only` one, rounded to the digits of limits and some further
     ones: the vehicle's away from the original, those of the encounter to the nearest.
@@ -205,12 +207,15 @@ def as_printed(
         value = setting[column]
         lower = item.lower
         upper = item.upper
-        if within is not None and within.lower[column] <= value <= within.upper[column]:
-            lower = within.lower[column]
-            upper = within.upper[column]
-        if value not in (item.original, lower, upper) and only in ("", item.name):
+        if box is not None and box.lower[column] <= value <= box.upper[column]:
+            lower = box.lower[column]
+            upper = box.upper[column]
+        if value not in (item.original, lower, upper) and single_name in (
+            "",
+            item.name,
+        ):
             scale = 10.0 ** (item.digits + further)
-            away = (
+            round_away = (
                 np.round
                 if item.is_scenario
                 else np.ceil
@@ -219,7 +224,7 @@ def as_printed(
             )
             # What is a rounding error of the scaled value is none of the value.
             printed[column] = min(
-                max(away(np.round(value * scale, 6)) / scale, lower), upper
+                max(round_away(np.round(value * scale, 6)) / scale, lower), upper
             )
     return printed
 
@@ -274,7 +279,7 @@ def _command(
     words = [system.command, members.options(setting)]
     words += [f"--set {name}={value!r}" for name, value in axes.items()]
     words += [f"--fit {model.fit}"] * (model.fit > 0)
-    return " ".join(word for word in words if word)
+    return " ".join(filter(None, words))
 
 
 def place_of(
@@ -293,7 +298,7 @@ def place_of(
     # The weather has a name of its own, if there is more than one.
     for name in ("weather", PHASE):
         numbers.pop(name, None)
-    if len({one.weather.name for one in points}) > 1:
+    if len({other_point.weather.name for other_point in points}) > 1:
         numbers["weather"] = point.weather.name
     texts = texts_of(point, numbers)
     speed = texts.pop(SPEED_DIMENSION, "")
@@ -322,5 +327,5 @@ def _event_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool) -> str:
     if unsafe.bound is not None:
         return f"has {unsafe.bound}"
     measured = FROM_CENTRES if unsafe.contact and unsafe.degree else ""
-    least = f"{unsafe.degree or unsafe.distance:.3g} m{measured}"
-    return f"keeps less than {least} from {scenario.obstacle()}"
+    clearance = f"{unsafe.degree or unsafe.distance:.3g} m{measured}"
+    return f"keeps less than {clearance} from {scenario.obstacle()}"

@@ -164,8 +164,8 @@ class Evaluator:
         expected = sum(settings.values())
         if self.account.is_question:
             account = self.account
-            needed = (least + MEASURED * self.system.mover.takes_long) * self._each
-            account.require(account.spent + needed)
+            number = least + MEASURED * self.system.mover.takes_long
+            account.require(account.spent + number * self._each)
             if self.system.mover.takes_long:
                 if account.asked is not None:
                     self._pool.spare = spare(account.asked, account.least)

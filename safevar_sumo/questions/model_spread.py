@@ -141,10 +141,14 @@ def evaluate_sets(
     if point:
         study = at_point(study, point)
     systems = []
-    for k, other in enumerate(studies_of_sets(study)):
+    for k, fitted_study in enumerate(studies_of_sets(study)):
         called = f"{study.source}: spread: set {k}" if k else study.source
         systems.append(
-            assemble(replace(other, origin=replace(other.origin, called=called)))
+            assemble(
+                replace(
+                    fitted_study, origin=replace(fitted_study.origin, called=called)
+                )
+            )
         )
     return [drive_and_score(system, settings) for system in systems]
 

@@ -175,7 +175,7 @@ def models_of(
     """
     in_fits = replace(unsafe, keep=0.0)
     members = [Model(0, evaluator, unsafe)]
-    left_out = []
+    unsafe_models = []
     for number, fitted in enumerate(other_sets(evaluator.study, fits), 1):
         model = Model(number, evaluator.for_study(fitted, verified=0), in_fits)
         if with_unsafe_originals:
@@ -186,10 +186,10 @@ def models_of(
             "original with each parameter set",
         )
         if unsafe.of(original)[0] or not original.valid[0]:
-            left_out.append(model._replace(unsafe=unsafe))
+            unsafe_models.append(model._replace(unsafe=unsafe))
         else:
             members.append(model)
-    return Models(tuple(members), tuple(left_out))
+    return Models(tuple(members), tuple(unsafe_models))
 
 
 def fit_names(fits: Sequence[int]) -> str:

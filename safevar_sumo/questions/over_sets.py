@@ -130,12 +130,12 @@ class SharesOverSets(NamedTuple):
         if np.isnan(shares).all():
             yield ONE_SET
             return
-        least, greatest = map(
+        smallest, greatest = map(
             self._in_words, (np.nanargmin(shares), np.nanargmax(shares))
         )
-        template = SAME_SHARE if least == greatest else SHARES
+        template = SAME_SHARE if smallest == greatest else SHARES
         sets = len(shares)
-        yield template.fill(least=least, greatest=greatest, sets=sets, most=VEHICLES)
+        yield template.fill(least=smallest, greatest=greatest, sets=sets, most=VEHICLES)
 
     def _in_words(self, number: np.intp) -> str:
         """The share of all vehicles with a set, and its number if no other interval overlaps."""

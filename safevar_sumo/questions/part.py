@@ -180,7 +180,7 @@ def _ranges_up_to(study: Study, name: str, high: float) -> Study:
         return domain is None or domain.lower < high
 
     if study.tests:
-        study = study.with_tests([test for test in study.tests if begins_below(test)])
+        study = study.with_tests([*filter(begins_below, study.tests)])
     return study.mapped(cut)
 
 

@@ -154,12 +154,15 @@ def assess_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataF
         study = (
             at_point(evaluator.study, point.name) if system.matrix else evaluator.study
         )
-        here = evaluator.for_study(study)
-        settings = here.characteristics.of_others(
+        local_evaluator = evaluator.for_study(study)
+        settings = local_evaluator.characteristics.of_others(
             system.characteristics, collisions.settings[rows]
         )
         verdicts.loc[rows, drivers] = _assess_at_point(
-            here, here.system.at(here.system.points[0]), settings, drivers
+            local_evaluator,
+            local_evaluator.system.at(local_evaluator.system.points[0]),
+            settings,
+            drivers,
         )
         verdicts.loc[rows, "point"] = point.name
     return verdicts

@@ -119,9 +119,9 @@ class Account:
                 "a larger number",
             )
 
-    def require(self, least: int) -> None:
+    def require(self, minimum: int) -> None:
         """Refuse fewer simulations than the least number for an answer."""
-        self.least = least
+        self.least = minimum
         self._refuse_few(self.asked)
 
     def _refuse_few(self, number: int | None) -> None:

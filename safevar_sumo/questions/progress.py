@@ -61,9 +61,9 @@ class Phases:
         self._waiting -= simulations
         self._show()
 
-    def say(self, what: str, done: int, total: int) -> None:
+    def say(self, text: str, number: int, total: int) -> None:
         """Show something that is no simulation."""
-        self._show_whole(what, *self._counts())
+        self._show_whole(text, *self._counts())
 
     @contextmanager
     def stage(

@@ -21,8 +21,11 @@ def points_of_tests(
     """The tests of a study, each with its points; all points of one without tests of its own."""
     if not study.tests:
         return [(None, points)]
-    rest = iter(points)
-    return [(test, [*islice(rest, len(study.points_of(test)))]) for test in study.tests]
+    remaining_points = iter(points)
+    return [
+        (test, [*islice(remaining_points, len(study.points_of(test)))])
+        for test in study.tests
+    ]
 
 
 def moving_axes(
@@ -32,16 +35,19 @@ def moving_axes(
     value, or with a single value as far as is legal; none where encounters are ranges.
     """
     searchable = {} if study.ranges else searchable_in(points[0].scenario)
-    return {
-        name: Domain(
-            unit=searchable[name].unit,
+    axes = dict[str, Domain]()
+    for name, values in study.lists_of(test).items():
+        legal = searchable.get(name)
+        if legal is None or not are_numbers(values):
+            continue
+        ends = values if len(values) > 1 else (legal.lower, legal.upper)
+        axes[name] = Domain(
+            unit=legal.unit,
             original=float(values[0]),
-            lower=float(min(values) if len(values) > 1 else searchable[name].lower),
-            upper=float(max(values) if len(values) > 1 else searchable[name].upper),
+            lower=float(min(ends)),
+            upper=float(max(ends)),
         )
-        for name, values in study.lists_of(test).items()
-        if name in searchable and are_numbers(values)
-    }
+    return axes
 
 
 def scope_of(study: Study, *, between: bool = True) -> str:

@@ -31,8 +31,8 @@ class Verdict(str):
 
     def __new__(cls, sentences: Iterable[Sentence]) -> Verdict:
         """The text of sentences, sorted by kind; one without text is left out."""
-        said = [sentence for sentence in sentences if sentence.text]
-        said.sort(key=lambda sentence: KINDS.index(sentence.kind))
-        verdict = super().__new__(cls, " ".join(text for _, text in said))
-        verdict.sentences = said
+        kept_sentences = [sentence for sentence in sentences if sentence.text]
+        kept_sentences.sort(key=lambda sentence: KINDS.index(sentence.kind))
+        verdict = super().__new__(cls, " ".join(text for _, text in kept_sentences))
+        verdict.sentences = kept_sentences
         return verdict

@@ -53,10 +53,10 @@ def collision_in_words(closing_speed: float, own_speed: float, digits: int = 2) 
     """How a vehicle collides [m/s], such as `collides at 3.17 m/s`; with its own speed if that is
     another one, as the struck body moves along the lane.
     """
-    closing, own = (f"{speed:.{digits}f}" for speed in (closing_speed, own_speed))
-    if closing == own:
+    closing, driven = (f"{speed:.{digits}f}" for speed in (closing_speed, own_speed))
+    if closing == driven:
         return f"collides at {closing} m/s"
-    return f"collides at a closing speed of {closing} m/s (own speed {own} m/s)"
+    return f"collides at a closing speed of {closing} m/s (own speed {driven} m/s)"
 
 
 def change_texts(
@@ -155,8 +155,8 @@ def replay_command(subject: str, point: str = "") -> str:
 
 def join_phrases(phrases: Iterable[str], conjunction: str = "and") -> str:
     """Phrases of a sentence as a list: `a, b and c`."""
-    *beginning, last = phrases
-    return f"{', '.join(beginning)} {conjunction} {last}" if beginning else last
+    *beginning, ending = phrases
+    return f"{', '.join(beginning)} {conjunction} {ending}" if beginning else ending
 
 
 def count_in_words(count: float, total: int) -> str:
@@ -219,7 +219,7 @@ def two_decimals(value: float | None) -> str:
     )  # -0.0 + 0.0 is 0.0
 
 
-def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
+def counted_in_words(study: Study, omissions: int | None = None) -> list[str]:
     """What a vehicle of a study whose encounters are ranges meets, and how many encounters do not
     count, in a sentence; empty for any other study.
     """
@@ -230,8 +230,8 @@ def counted_in_words(study: Study, left_out: int | None = None) -> list[str]:
         f"Each vehicle meets an encounter of its own, with its own values of {axes}.",
         *demanded_in_words(study),
     ]
-    if left_out:
-        sentences.append(f"{left_out:,} encounters do not count and were left out.")
+    if omissions:
+        sentences.append(f"{omissions:,} encounters do not count and were left out.")
     return sentences
 
 

@@ -133,6 +133,11 @@ class Evaluations:
             )
         return rounds
 
+    @property
+    def first_metrics(self) -> dict[str, float]:
+        """The metrics of the first setting."""
+        return {name: float(values[0]) for name, values in self.metrics.items()}
+
     def take(
         self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray
     ) -> Evaluations:

@@ -284,7 +284,7 @@ def _files_of_user(
     modules = [
         text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]
     ]
-    folders = [folder for folder in (*places, os.getcwd(), *sys.path) if folder]
+    folders = [*filter(None, (*places, os.getcwd(), *sys.path))]
     for path in code_files(modules, places):
         folder = max(filter(path.is_relative_to, folders), key=len)
         paths[path.relative_to(folder).as_posix()] = path
@@ -376,17 +376,21 @@ def verify(
     parts = _not_compared(description, studies.values())
     if counts[UNCHECKED]:
         parts.append("how many simulations had which outcome (--search compares it)")
-    said = [f"{count_in_words(counts[SAME], number)} claims of the pack are confirmed."]
+    sentences = [
+        f"{count_in_words(counts[SAME], number)} claims of the pack are confirmed."
+    ]
     if counts[DIFFERS]:
-        said.append(f"{counts[DIFFERS]} of the {number} claims differ.")
+        sentences.append(f"{counts[DIFFERS]} of the {number} claims differ.")
     if counts[CANNOT]:
-        said.append(f"{counts[CANNOT]} of the {number} claims cannot be computed here.")
+        sentences.append(
+            f"{counts[CANNOT]} of the {number} claims cannot be computed here."
+        )
     if parts:
-        said.append(f"These parts were not compared: {'; '.join(parts)}.")
+        sentences.append(f"These parts were not compared: {'; '.join(parts)}.")
     return Answer(
         question="verify",
         study=next(iter(studies.values())).case.study,
-        verdict=Verdict(Sentence("answer", text) for text in said),
+        verdict=Verdict(Sentence("answer", text) for text in sentences),
         numbers={
             "passed": counts[SAME] + counts[UNCHECKED] == number,
             "sha256": digest_of(path),

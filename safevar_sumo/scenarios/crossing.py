@@ -251,10 +251,10 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def obstacle(self) -> str:
         """The target, and where it comes from."""
         target = f"a {self.parameter('target')}".replace("a adult", "an adult")
-        who = "who" if self.is_on_foot else "that"
+        pronoun = "who" if self.is_on_foot else "that"
         if self.parameter("hidden"):
-            return f"{target} {who} comes out from behind a parked car"
-        return f"{target} {who} crosses from the {self.parameter('side')} side"
+            return f"{target} {pronoun} comes out from behind a parked car"
+        return f"{target} {pronoun} crosses from the {self.parameter('side')} side"
 
     @property
     def is_on_foot(self) -> bool:

@@ -122,11 +122,14 @@ class Frame(NamedTuple):
             )
         return start
 
-    def point(self, along: Quantity, left: Quantity) -> Coordinates:
+    def point(self, along: Quantity, sideways: Quantity) -> Coordinates:
         """The point, or the points, at these distances along the lane and to its left [m]."""
         x, y = self.origin
         dir_x, dir_y = self.direction
-        return x + along * dir_x - left * dir_y, y + along * dir_y + left * dir_x
+        return (
+            x + along * dir_x - sideways * dir_y,
+            y + along * dir_y + sideways * dir_x,
+        )
 
 
 class Roads(Protocol):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import starmap
 from typing import Annotated, Any
 
 import msgspec
@@ -227,7 +228,7 @@ class Constraint(Table, frozen=True, kw_only=True):
     @property
     def quantity(self) -> str:
         """The sum in words, such as `mass - 2 radius`."""
-        text = " ".join(_term(name, weight) for name, weight in self.sum.items())
+        text = " ".join(starmap(_term, self.sum.items()))
         # The first term has its sign without a space.
         return re.sub("^- ", "-", text.removeprefix("+ "))
 

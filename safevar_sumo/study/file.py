@@ -148,7 +148,7 @@ def plain_values(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: plain_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain_values(item) for item in value]
+        return [*map(plain_values, value)]
     if hasattr(value, "to_dict") and all(isinstance(name, str) for name in value.index):
         return plain_values(value.to_dict())
     if hasattr(value, "tolist"):
@@ -216,11 +216,11 @@ def _with_parameters(
     if not isinstance(table, dict) or not isinstance(table.get("parameters", {}), dict):
         return tables
 
-    moved = {**table, "parameters": dict(table.get("parameters", {}))}
+    nested_table = {**table, "parameters": dict(table.get("parameters", {}))}
     for key, value in table.items():
         if isinstance(value, dict) and key not in record.__struct_fields__:
-            moved["parameters"][key] = moved.pop(key)
-    return {**tables, name: moved}
+            nested_table["parameters"][key] = nested_table.pop(key)
+    return {**tables, name: nested_table}
 
 
 def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:

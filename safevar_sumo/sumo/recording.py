@@ -281,14 +281,14 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
             links = api.lane.getLinks(lanes[-1])
         lanes.append(next_lane)
 
-    shapes = [api.lane.getShape(lane) for lane in lanes]
+    shapes = [*map(api.lane.getShape, lanes)]
     if api.vehicle.getLateralLanePosition(vut) or any(
         len(shape) != 2 for shape in shapes
     ):
         return None
     starts, ends = np.array(shapes, dtype=float).transpose(1, 0, 2)
     vector = ends - starts
-    lengths = np.array([api.lane.getLength(lane) for lane in lanes], dtype=float)
+    lengths = np.array([*map(api.lane.getLength, lanes)], dtype=float)
     shape_length = np.sqrt((vector * vector).sum(axis=1))
     direction = vector / shape_length[:, np.newaxis]
     largest_turn = np.abs(direction - direction[0]).max()

@@ -110,7 +110,7 @@ class TrafficWorld(SumoWorld):
         self._move_person = function_of(api, "person", "moveToXY")
         self._move_vehicle = function_of(api, "vehicle", "moveToXY")
         self._set_previous_speed = function_of(api, "vehicle", "setPreviousSpeed")
-        self._routes = [api.vehicle.getRoute(id_) for id_ in self.ids(VUT)]
+        self._routes = [*map(api.vehicle.getRoute, self.ids(VUT))]
         self._edges = [str(route[0]) for route in self._routes]
         """The edges on which the vehicles under test depart."""
 

@@ -74,7 +74,7 @@ class Characteristic:
         counterpart = ""
         if self.counterpart:
             counterpart = f"counterpart: {self.counterpart}"
-        return "; ".join(text for text in (self.meaning, counterpart) if text)
+        return "; ".join(filter(None, (self.meaning, counterpart)))
 
     @property
     def is_for_workshop(self) -> bool:

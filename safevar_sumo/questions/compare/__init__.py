@@ -145,9 +145,9 @@ def compare(
     second = evaluator.for_study(in_order_of(study, study_in(other)))
     evaluators = (evaluator, second)
     with about("limits"):
-        within = limits_of(limits, study.domains)
-    common = CommonDomain.of(evaluators, within)
-    originals = [side.evaluate_original() for side in evaluators]
+        restriction = limits_of(limits, study.domains)
+    common = CommonDomain.of(evaluators, restriction)
+    originals = [evaluator.evaluate_original(), second.evaluate_original()]
     criteria = _criteria((subject, other), evaluators, originals, unsafe, margin)
 
     # The same settings in both.
@@ -165,7 +165,7 @@ def compare(
     )
 
     # What differs: settings, limits, the original vehicles, safety degrees.
-    alone = limits_of_both(evaluators, criteria, within, at_tests=at_tests)
+    alone = limits_of_both(evaluators, criteria, restriction, at_tests=at_tests)
     of_originals, of_new_cars = compare_originals(evaluators, originals, criteria)
     differences = [
         *of_new_cars,
@@ -174,12 +174,13 @@ def compare(
         *compare_values(tested.p, tested.a12),
     ]
     lacks = [*missing_in_words(*evaluators, titles)]
+    number_of_better = sum(difference.is_better for difference in differences)
     decision, why = _decide(differences, titles, of_originals, lacks)
     numbers: JsonObject = {
         **({"driven": False} if second.no_verdict else {}),
         "decision": decision.lower(),
-        "better_in": sum(one.is_better for one in differences),
-        "worse_in": sum(not one.is_better for one in differences),
+        "better_in": number_of_better,
+        "worse_in": len(differences) - number_of_better,
         "unsafe": str(criteria[0]),
         "margin": criteria[0].keep,
         "settings": sum(counts.values()),
@@ -240,8 +241,8 @@ def _criteria(
         keeping_distance(side, side.checked(criterion), margin, is_stated=is_stated)
         for side in evaluators
     ]
-    keep = max(one.keep for one in of_sides)
-    return [replace(one, keep=keep) for one in of_sides]
+    keep = max(criterion.keep for criterion in of_sides)
+    return [replace(criterion, keep=keep) for criterion in of_sides]
 
 
 def _default_criterion(
@@ -269,12 +270,16 @@ def _settings_frame(
     frame, settings, runs = pairs
     of_pairs = table_of_pairs(frame["solution"], runs, criteria)
     values = {name: settings[0][:, column] for column, name in enumerate(names)}
-    moved = {
+    values_in_b = {
         f"b_{names[column]}": settings[1][:, column]
         for column in np.flatnonzero(common.shift).tolist()
     }
     return pd.concat(
-        [frame.drop(columns="solution"), of_pairs, pd.DataFrame({**values, **moved})],
+        [
+            frame.drop(columns="solution"),
+            of_pairs,
+            pd.DataFrame({**values, **values_in_b}),
+        ],
         axis=1,
     )
 
@@ -356,11 +361,11 @@ def _decide(
     a person to decide; so is every change whose needless braking was not measured. Where one side
     `lacks` what the other is simulated in, only a new collision decides.
     """
-    in_order = sorted(differences, key=lambda one: -one.weight)
-    worse = [one for one in in_order if not one.is_better]
-    better = [one for one in in_order if one.is_better]
-    worst = max((one.weight for one in worse), default=COMFORT)
-    best = max((one.weight for one in better), default=COMFORT)
+    in_order = sorted(differences, key=lambda difference: -difference.weight)
+    worse = [difference for difference in in_order if not difference.is_better]
+    better = [difference for difference in in_order if difference.is_better]
+    worst = worse[0].weight if worse else COMFORT
+    best = better[0].weight if better else COMFORT
     brakes_elsewhere = of_originals["metres_earlier"] or of_originals["metres_later"]
     is_unknown = not of_originals["benign_scenes"] and (better or brakes_elsewhere)
     decision = DECIDE
@@ -378,8 +383,8 @@ def _decide(
         decision = RELEASE
         template = words.BETTER if better else words.ALIKE
     safe = "safer than" if better else "as safe as"
-    shown = [*worse[: MAX_REASONS - bool(better)], *better][:MAX_REASONS]
-    reasons = [one.template.fill(**one.values, **titles) for one in shown]
+    leading = [*worse[: MAX_REASONS - bool(better)], *better][:MAX_REASONS]
+    reasons = [reason.template.fill(**reason.values, **titles) for reason in leading]
     sentences = [template.fill(safe=safe, **titles), *lacks]
     return decision, [*sentences, *dict.fromkeys(reasons)]
 

@@ -52,13 +52,13 @@ def cases_of(side: Evaluator) -> Iterator[tuple[str, Point, TestCase]]:
             yield (test.name if test else model), point, case
 
 
-def missing_parts(side: Evaluator, other: Evaluator) -> list[str]:
+def missing_parts(side: Evaluator, reference: Evaluator) -> list[str]:
     """What the other system is simulated in and this one is not, as phrases."""
     parts = [
-        *_missing_cases(side, other),
-        *_missing_ranges(side, other),
-        *_excluded(side.study, other.study),
-        *_missing_sets(side.study, other.study),
+        *_missing_cases(side, reference),
+        *_missing_ranges(side, reference),
+        *_excluded(side.study, reference.study),
+        *_missing_sets(side.study, reference.study),
     ]
     return [*dict.fromkeys(parts)]
 
@@ -67,23 +67,27 @@ def missing_in_words(
     a: Evaluator, b: Evaluator, titles: Mapping[str, str]
 ) -> Iterator[Sentence]:
     """What each of two systems lacks: `Version b lacks the test CCRs, which a has.`"""
-    for side, other, names in ((a, b, "ab"), (b, a, "ba")):
-        parts = missing_parts(side, other)
+    for side, reference, names in ((a, b, "ab"), (b, a, "ba")):
+        parts = missing_parts(side, reference)
         if len(parts) > MAX_PARTS_NAMED:
             parts[MAX_PARTS_NAMED:] = [f"{len(parts) - MAX_PARTS_NAMED} more"]
         if parts:
-            version, another = map(titles.__getitem__, names)
-            yield LACKS.fill(version=version, parts=join_phrases(parts), other=another)
+            version, reference_title = map(titles.__getitem__, names)
+            yield LACKS.fill(
+                version=version, parts=join_phrases(parts), other=reference_title
+            )
 
 
-def _missing_cases(side: Evaluator, other: Evaluator) -> Iterator[str]:
+def _missing_cases(side: Evaluator, reference: Evaluator) -> Iterator[str]:
     tests, _, cases = zip(*cases_of(side), strict=True)
     weathers = {case.weather for case in cases}
-    for test, point, case in cases_of(other):
+    for test, point, case in cases_of(reference):
         in_weathers = (case._replace(weather=weather) for weather in weathers)
         if case in cases:
             continue
-        if case.weather not in weathers and any(same in cases for same in in_weathers):
+        if case.weather not in weathers and any(
+            variant in cases for variant in in_weathers
+        ):
             yield f"the weather {case.weather.name}"
         elif test in tests and point.name:
             yield f"the test case ({point.name})"
@@ -91,14 +95,14 @@ def _missing_cases(side: Evaluator, other: Evaluator) -> Iterator[str]:
             yield f"the test {test}"
 
 
-def _missing_ranges(side: Evaluator, other: Evaluator) -> Iterator[str]:
+def _missing_ranges(side: Evaluator, reference: Evaluator) -> Iterator[str]:
     tests = points_of_tests(side.study, side.system.points)
     by_name = {test and test.name: side.study.ranges_of(test) for test, _ in tests}
-    for test, _ in points_of_tests(other.study, other.system.points):
+    for test, _ in points_of_tests(reference.study, reference.system.points):
         # Those of all tests, where none has this name.
-        own = by_name.get(test and test.name, side.study.ranges)
-        for name, domain in other.study.ranges_of(test).items():
-            narrower = own.get(name)
+        ranges = by_name.get(test and test.name, side.study.ranges)
+        for name, domain in reference.study.ranges_of(test).items():
+            narrower = ranges.get(name)
             if (
                 narrower is None
                 or narrower.lower > domain.lower
@@ -108,27 +112,31 @@ def _missing_ranges(side: Evaluator, other: Evaluator) -> Iterator[str]:
                 yield f"the range of {name} from {domain.lower:g} to {domain.upper:g}{where}"
 
 
-def _excluded(study: Study, other: Study) -> Iterator[str]:
+def _excluded(study: Study, reference: Study) -> Iterator[str]:
     """What a constraint or the margin of the original vehicle excludes in one study alone."""
-    for one in study.constraints:
-        low, high = one.ends
+    for constraint in study.constraints:
+        low, high = constraint.ends
         if not any(
-            (own.sum, own.tests) == (one.sum, one.tests)
-            and low <= own.ends[0]
-            and own.ends[1] <= high
-            for own in other.constraints
+            (counterpart.sum, counterpart.tests) == (constraint.sum, constraint.tests)
+            and low <= counterpart.ends[0]
+            and counterpart.ends[1] <= high
+            for counterpart in reference.constraints
         ):
-            yield f"the vehicles that its constraint on {one.quantity} excludes"
+            yield f"the vehicles that its constraint on {constraint.quantity} excludes"
     margin = study.scenario.margin
-    others = other.scenario.margin
-    if study.ranges and margin is not None and (others is None or margin > others):
+    reference_margin = reference.scenario.margin
+    if (
+        study.ranges
+        and margin is not None
+        and (reference_margin is None or margin > reference_margin)
+    ):
         yield f"the encounters in which its original vehicle keeps less than {margin:g} m"
 
 
-def _missing_sets(study: Study, other: Study) -> Iterator[str]:
-    missing = _sets_of_vehicle(other) - _sets_of_vehicle(study)
-    if missing:
-        yield number_of(len(missing), "parameter set")
+def _missing_sets(study: Study, reference: Study) -> Iterator[str]:
+    sets = _sets_of_vehicle(reference) - _sets_of_vehicle(study)
+    if sets:
+        yield number_of(len(sets), "parameter set")
 
 
 def _sets_of_vehicle(study: Study) -> set[tuple[tuple[str, float], ...]]:

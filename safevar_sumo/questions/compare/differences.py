@@ -85,24 +85,27 @@ def summary_of(
     numbers: JsonObject, pairs: pd.DataFrame, titles: Mapping[str, str]
 ) -> pd.DataFrame:
     """The table of what is compared: the new car, changed cars, needless braking, and limits."""
-    both = numbers["both"]
+    number_in_both = numbers["both"]
     values: JsonObject = {
         "safety degree of the original vehicle [m, or -m/s after a collision]": [
-            numbers[f"{side}_degree"] for side in SIDES
+            numbers["a_degree"],
+            numbers["b_degree"],
         ],
         f"unsafe vehicles of {numbers['settings']} changed vehicles": [
-            numbers[f"only_{side}_unsafe"] + both for side in SIDES
+            numbers["only_a_unsafe"] + number_in_both,
+            numbers["only_b_unsafe"] + number_in_both,
         ],
         "mean safety degree of the changed vehicles": pairs[[*SIDES]].mean(),
         f"scenes with needless braking, of {numbers['benign_scenes']} benign scenes": [
-            numbers[f"{side}_needless_braking"] for side in SIDES
+            numbers["a_needless_braking"],
+            numbers["b_needless_braking"],
         ],
         "characteristics with the narrower limit": [
             numbers["limits_grown"],
             numbers["limits_shrunk"],
         ],
     }
-    rows = [(what, *of_sides) for what, of_sides in values.items()]
+    rows = [(quantity, *of_sides) for quantity, of_sides in values.items()]
     columns = SUMMARY_COLUMNS | {
         side: SUMMARY_COLUMNS[side]._replace(head=title)
         for side, title in titles.items()
@@ -112,13 +115,13 @@ def summary_of(
 
 def compare_counts(counts: Mapping[str, int]) -> Iterator[Difference]:
     """The settings that are unsafe in one system only."""
-    for template, only, rest, is_better in (
+    for template, name, complement, is_better in (
         (words.SAFE_NOW, "only_a_unsafe", "both", True),
         (words.UNSAFE_NOW, "only_b_unsafe", "neither", False),
     ):
-        number = counts[only]
+        number = counts[name]
         values = {
-            "count": count_in_words(number, number + counts[rest]),
+            "count": count_in_words(number, number + counts[complement]),
             "are": "is" if number == 1 else "are",
         }
         if number:
@@ -143,13 +146,13 @@ def limits_of_both(
     """The table of limits alone with the study's own set, as in `tolerance`, within the user's
     limits; no interval where the original is unsafe.
     """
-    asked = [
+    requests = [
         _asked_alone(side, unsafe, at_tests=at_tests)
         for side, unsafe in zip(evaluators, criteria, strict=True)
     ]
     # Few simulations search both alike: what the first one takes does not shrink the second.
-    effort = min((one.effort for one in asked), key=lambda effort: effort.own)
-    alone = [_safe_alone(one._replace(effort=effort)) for one in asked]
+    effort = min(requests, key=lambda request: request.effort.own).effort
+    alone = [_safe_alone(request._replace(effort=effort)) for request in requests]
     rows = []
     vehicles = [side.characteristics.vehicle for side in evaluators]
     for a, b, *safe in zip(*vehicles, *alone, strict=True):
@@ -176,12 +179,12 @@ def _asked_alone(evaluator: Evaluator, unsafe: Unsafe, *, at_tests: bool) -> Ask
     return asked_of(models, unsafe, columns, {}, at_tests=at_tests)
 
 
-def _safe_alone(asked: Asked) -> list[Interval | None]:
+def _safe_alone(request: Asked) -> list[Interval | None]:
     """What is safe of each characteristic alone, rounded inwards; None if the original is not."""
-    own, members = asked.oracle.own, asked.oracle.vehicle.members
-    if own.are_unsafe(own.characteristics.original_settings, "original vehicle")[0]:
+    model, members = request.oracle.own, request.oracle.vehicle.members
+    if model.are_unsafe(model.characteristics.original_settings, "original vehicle")[0]:
         return [None] * len(members)
-    alone = alone_with_own_set(asked, Alone(asked.lower, asked.upper))
+    alone = alone_with_own_set(request, Alone(request.lower, request.upper))
     ends = zip(alone.lower.tolist(), alone.upper.tolist(), strict=True)
     return [item.rounded_inwards(end) for item, end in zip(members, ends, strict=True)]
 
@@ -243,10 +246,10 @@ def compare_originals(
     if in_a != in_b:
         template = words.ORIGINAL_UNSAFE if in_b else words.ORIGINAL_SAFE
         differences.append(Difference(template, {}, is_better=in_a))
-    before, after, scenes = braking.values()
-    if before != after:
-        values = {"before": before, "after": after, "scenes": scenes}
-        is_better = after < before
+    count_in_a, count_in_b, scenes = braking.values()
+    if count_in_a != count_in_b:
+        values = {"before": count_in_a, "after": count_in_b, "scenes": scenes}
+        is_better = count_in_b < count_in_a
         differences.append(
             Difference(words.NEEDLESS_BRAKING, values, is_better, COMFORT)
         )
@@ -258,7 +261,7 @@ def _new_collisions(evaluators: Sequence[Evaluator]) -> Iterator[Difference]:
     if there is one. Test cases that A lacks show nothing about a change.
     """
     # Collisions of both original vehicles, by test case.
-    of_a, of_b = (_collisions_of_original(side) for side in evaluators)
+    of_a, of_b = map(_collisions_of_original, evaluators)
     cases_of_collisions = [case for case, _, _ in of_a]
     cases_of_a = [case for _, _, case in cases_of(evaluators[0])]
 
@@ -314,12 +317,14 @@ def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
         for side in (a, b)
     ]
     scenes = benign_scenes(a.study, systems[0])
-    brakes = [needless_braking(system, scenes) for system in systems]
-    counts = [sum(of_side) if of_side else None for of_side in brakes]
+    counts = []
+    for system in systems:
+        brakes = needless_braking(system, scenes)
+        counts.append(sum(brakes) if brakes else None)
     return {
         "a_needless_braking": counts[0],
         "b_needless_braking": counts[1],
-        "benign_scenes": len(brakes[0]),
+        "benign_scenes": len(brakes),
     }
 
 

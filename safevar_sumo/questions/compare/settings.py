@@ -63,14 +63,9 @@ class Pairs(NamedTuple):
     def joined(cls, groups: Sequence[Pairs]) -> Pairs:
         """All pairs of some groups, in their order."""
         frames, settings, runs = zip(*groups, strict=True)
-        joined = [
-            Evaluations.concatenate(of_side) for of_side in zip(*runs, strict=True)
-        ]
-        return cls(
-            pd.concat(frames, ignore_index=True),
-            np.concatenate(settings, axis=1),
-            joined,
-        )
+        frame = pd.concat(frames, ignore_index=True)
+        joined = [*map(Evaluations.concatenate, zip(*runs, strict=True))]
+        return cls(frame, np.concatenate(settings, axis=1), joined)
 
     @property
     def are_valid(self) -> BoolArray:
@@ -126,11 +121,10 @@ class CommonDomain(NamedTuple):
         with about(second.source):
             check_limits(second.domains, limits, "limits: ")
         shift = np.where(a.of_vehicle, b.original - a.original, 0.0)
-        domains = [side.study.domains for side in evaluators]
         ends = np.array(
             [
-                [within(limits, name, of_study[name]) for name in a.names]
-                for of_study in domains
+                [within(limits, name, side.study.domains[name]) for name in a.names]
+                for side in evaluators
             ]
         )
 
@@ -178,7 +172,7 @@ class CommonDomain(NamedTuple):
     def evaluate(self, settings: FloatArray) -> list[Evaluations]:
         """Evaluate settings, shape (2, M, n), in both systems."""
         pairs = zip(self.evaluators, settings, strict=True)
-        return [side.evaluate(own, BOTH_STAGE) for side, own in pairs]
+        return [side.evaluate(of_side, BOTH_STAGE) for side, of_side in pairs]
 
 
 def within(limits: Mapping[str, Limit], name: str, domain: Domain) -> Interval:
@@ -241,14 +235,18 @@ def pairs_of(
     for side, case in zip("ab", subjects, strict=True):
         if not isinstance(case, Case):
             continue
-        own = case.solutions[names].to_numpy(float)
-        both = (own, common.as_in_b(own)) if side == "a" else (common.as_in_a(own), own)
-        settings = np.stack(both)
+        solutions = case.solutions[names].to_numpy(float)
+        of_sides = (
+            (solutions, common.as_in_b(solutions))
+            if side == "a"
+            else (common.as_in_a(solutions), solutions)
+        )
+        settings = np.stack(of_sides)
         is_inside = common.holds(settings)
-        kept = [
+        run_columns = [
             name for name in RUN_COLUMNS if name in case.solutions and case.has_runs
         ]
-        frame = case.solutions[kept].assign(
+        frame = case.solutions[run_columns].assign(
             source=side, solution=list(map(str, handles_of(case.solutions)))
         )
         outside += int(np.count_nonzero(~is_inside))
@@ -276,12 +274,12 @@ def _draw_on_lines(
     shares = np.full(len(ends), 0.5)
     step = 0.5
     rounds = list[Pairs]()
-    left = samples if len(ends) else 0
+    budget = samples if len(ends) else 0
 
     # On each line, halve the step towards where one of them begins to fail.
-    while left and len(rounds) < ROUNDS:
-        lines = np.arange(min(len(ends), left))
-        left -= len(lines)
+    while budget and len(rounds) < ROUNDS:
+        lines = np.arange(min(len(ends), budget))
+        budget -= len(lines)
         share = shares[lines, np.newaxis]
         settings = common.in_both(starts[lines] + share * (ends - starts)[lines])
         runs = common.evaluate(settings)
@@ -308,10 +306,10 @@ def _common_sample(common: CommonDomain, number: int) -> FloatArray:
         settings = lower + sobol_points(number * factor, len(lower), 0) * (
             upper - lower
         )
-        both = common.in_both(settings)
+        of_sides = common.in_both(settings)
         is_feasible = [
             side.region.feasible(values)
-            for side, values in zip(common.evaluators, both, strict=True)
+            for side, values in zip(common.evaluators, of_sides, strict=True)
         ]
         settings = settings[is_feasible[0] & is_feasible[1]]
         if len(settings) >= number or factor >= MAX_FACTOR:

@@ -174,10 +174,10 @@ def explain(
         [causes[row] if is_caused else [] for row in rows] for rows in (reasons, sample)
     )
     changed = evaluator.characteristics.changed(runs.settings[sample])
-    needed = count_needed(
+    necessity = count_needed(
         evaluator.characteristics, changed, of_sample, len(population.rows)
     )
-    needed = needed if is_caused else needed.head(0)
+    necessity = necessity if is_caused else necessity.head(0)
 
     # What reference drivers avoid.
     has_drivers = has_reference_drivers(evaluator)
@@ -200,7 +200,7 @@ def explain(
         "solutions": tabulate(
             "The failures that were examined one by one", SOLUTION_COLUMNS, solutions
         ),
-        **statistics_tables(needed, len(sample), verdicts, collisions, distinct),
+        **statistics_tables(necessity, len(sample), verdicts, collisions, distinct),
     }
     numbers = {
         **_counts(population, subject, len(sample), len(solutions)),
@@ -210,11 +210,11 @@ def explain(
     leading = failure_sentences(evaluator, population, tables["causes"], len(sample))
     if smallest is not None:
         leading = smallest_sentences(smallest, evaluator, population.unsafe)
-    others = other_sentences(study, population, complete, verdicts)
+    notes = other_sentences(study, population, complete, verdicts)
     return Answer(
         question="explain",
         study=study,
-        verdict=Verdict([*leading, *others]),
+        verdict=Verdict([*leading, *notes]),
         numbers=numbers,
         tables=tables,
         draw=draw_staircase if smallest is not None else draw_needed,
@@ -250,19 +250,19 @@ def _counts(
     over_sets = population.over_sets
     failures = population.unsafe.number(runs)
     share = failures / max(len(runs), 1)
-    left_out = 0
+    omissions = 0
     if (
         isinstance(subject, Case)
         and not subject.study.origin.point
         and not runs.collided.any()
     ):
-        left_out = int(are_collisions(subject.evaluations).sum())
+        omissions = int(are_collisions(subject.evaluations).sum())
     return {
         "unsafe": str(population.unsafe),
         "settings": len(runs),
         "failures": failures,
         "other_outcomes": population.otherwise,
-        "left_out": left_out,
+        "left_out": omissions,
         "by_set": None if over_sets is None else over_sets.of_all(share),
         INTERVALS: None if over_sets is None else over_sets.numbers[INTERVALS],
         "original_outcome": str(original.outcome[0]),
@@ -303,7 +303,7 @@ def draw_needed(answer: Answer) -> Figure:
     figure, ((axis,),) = new_figure(
         f"{answer.study.name}: which changed characteristics are necessary", 1, 1, size
     )
-    names = [escape_dollars(name) for name in frame["characteristic"]]
+    names = [*map(escape_dollars, frame["characteristic"])]
     for column, label, colour, height in (
         ("changed", "changed by the search", GREY, 0.8),
         ("in_some", "part of some minimal cause", SKY_BLUE, 0.5),

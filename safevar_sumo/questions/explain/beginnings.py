@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain, repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -56,32 +57,31 @@ def find_beginnings(
     unless both are minimal at the ends.
     """
     members = evaluator.characteristics
-    pending, *others = (
-        [(cause, step.share) for cause in step.causes] for step in steps
+    pending, *nearer_steps = (
+        [*zip(step.causes, repeat(step.share), strict=False)] for step in steps
     )
-    known = [cause for cause, _ in pending]
-    pending += _smallest(
-        members, known, [placed for nearer in others for placed in nearer]
-    )
+    nearer = [*chain.from_iterable(nearer_steps)]
+    pending += _smallest(members, steps[0].causes, nearer)
     beginnings = list[Beginning]()
     while pending:
-        begun, smaller = _begin(evaluator, unsafe, pending)
-        beginnings += begun
-        pending = _smallest(members, [one.cause for one in beginnings], smaller)
+        new_beginnings, smaller = _begin(evaluator, unsafe, pending)
+        beginnings += new_beginnings
+        causes = [beginning.cause for beginning in beginnings]
+        pending = _smallest(members, causes, smaller)
     return beginnings
 
 
 def _smallest(
     members: CharacteristicSet,
-    known: Sequence[Cause],
-    others: Sequence[tuple[Cause, float]],
+    references: Sequence[Cause],
+    candidates: Sequence[tuple[Cause, float]],
 ) -> list[tuple[Cause, float]]:
     """Those of other causes that contain no known one, nor a smaller one of them."""
-    kinds = [{*directions(members, cause.changes)} for cause in known]
+    kinds = [{*directions(members, cause.changes)} for cause in references]
     smallest = list[tuple[Cause, float]]()
-    for placed in sorted(others, key=lambda placed: len(placed[0].changes)):
+    for placed in sorted(candidates, key=lambda placed: len(placed[0].changes)):
         kind = {*directions(members, placed[0].changes)}
-        if not any(one <= kind for one in kinds):
+        if not any(smaller_kind <= kind for smaller_kind in kinds):
             kinds.append(kind)
             smallest.append(placed)
     return smallest
@@ -94,7 +94,8 @@ def _begin(
     # Of few simulations half are left for the neighbours and the other parameter sets.
     is_free = evaluator.left is None
     steps = STEPS if is_free else COARSE_STEPS
-    prices = np.cumsum([steps + 2 ** len(cause.changes) for cause, _ in placed])
+    causes = [cause for cause, _ in placed]
+    prices = np.cumsum([steps + 2 ** len(cause.changes) for cause in causes])
     number = int(np.count_nonzero(prices <= evaluator.at_most(int(prices[-1]), 2)))
     beginnings = [
         Beginning(cause, share if share < 1 else np.nan, cause.changes, np.nan)
@@ -105,7 +106,7 @@ def _begin(
 
     # Lines from the original to the ends of the domain, shape (K, steps, n).
     members = evaluator.characteristics
-    values = settings_of(members, [cause for cause, _ in placed[:number]])
+    values = settings_of(members, causes[:number])
     starts = members.with_original_vehicle(values)
     ends = np.select(
         [values > starts, values < starts], [members.upper, members.lower], starts
@@ -119,34 +120,32 @@ def _begin(
     def smaller_causes(settings: FloatArray) -> list[list[Cause]]:
         """The causes with fewer changes of each of several unsafe settings."""
         groups = find_minimal_causes(evaluator, settings, unsafe)
-        whole = members.number_changed(settings).tolist()
+        sizes = members.number_changed(settings).tolist()
         return [
             [cause for cause in group if len(cause.changes) < size]
-            for group, size in zip(groups, whole, strict=True)
+            for group, size in zip(groups, sizes, strict=True)
         ]
 
     # Where each is unsafe first. If fewer of its changes are unsafe there, it is a cause later.
-    first = is_unsafe.argmax(axis=1)
-    groups = smaller_causes(settings[range(number), first])
+    first_unsafe = is_unsafe.argmax(axis=1)
+    groups = smaller_causes(settings[range(number), first_unsafe])
     smaller = list[tuple[Cause, float]]()
-    for row, (group, at) in enumerate(zip(groups, first.tolist(), strict=True)):
+    for row, (group, at) in enumerate(zip(groups, first_unsafe.tolist(), strict=True)):
         smaller += [(cause, float(shares[at])) for cause in group]
         if group and not is_free:
             continue
         if group:
             (unsafe_at,) = np.nonzero(is_unsafe[row])
-            are_causes = [
-                not fewer for fewer in smaller_causes(settings[row, unsafe_at])
-            ]
-            at = unsafe_at[are_causes][0]
+            subcauses = smaller_causes(settings[row, unsafe_at])
+            at = unsafe_at[subcauses.index([])]
 
         # The values there, and where it is safe again.
-        cause = placed[row][0]
+        cause = causes[row]
         named = members.named(settings[row, at])
         # What is a rounding error of the share is none of the value.
         boundary = {name: float(f"{named[name]:.12g}") for name in cause.changes}
-        again = shares[at + 1 :][is_safe[row, at + 1 :]]
+        safe_shares = shares[at + 1 :][is_safe[row, at + 1 :]]
         beginnings[row] = Beginning(
-            cause, float(shares[at]), boundary, min(again, default=np.nan)
+            cause, float(shares[at]), boundary, min(safe_shares, default=np.nan)
         )
     return beginnings, smaller

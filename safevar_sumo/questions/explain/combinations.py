@@ -8,7 +8,7 @@ Nothing is inferred from other combinations, as a further change may make a vehi
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations, product, takewhile
+from itertools import chain, combinations, compress, product, takewhile
 from math import comb
 from typing import NamedTuple
 
@@ -65,10 +65,10 @@ class Enumeration(NamedTuple):
     def complete_up_to(self) -> int:
         """The largest size up to which all combinations were simulated."""
         sizes = range(1, len(self.existing) + 1)
-        whole = takewhile(
+        complete_sizes = takewhile(
             lambda size: self.simulated[size] == self.existing[size], sizes
         )
-        return len([*whole])
+        return len([*complete_sizes])
 
     @property
     def size(self) -> int:
@@ -78,7 +78,7 @@ class Enumeration(NamedTuple):
     @property
     def fewest(self) -> list[Cause]:
         """The causes with the fewest changes."""
-        return [one for one in self.causes if len(one.changes) == self.size]
+        return [cause for cause in self.causes if len(cause.changes) == self.size]
 
 
 def enumerate_causes(
@@ -116,28 +116,33 @@ def enumerate_causes(
         is_cut = comb(len(columns), size) * 2**size > MAX_COMBINATIONS
         if is_cut:
             break
-        every = [*_of_size(changes, size)]
-        is_feasible = evaluator.region.feasible(_settings(members, every)).tolist()
-        feasible = [each for each, flag in zip(every, is_feasible, strict=True) if flag]
-        larger = {each for each in feasible if any(one <= each for one in unsafe_ones)}
-        candidates = [each for each in feasible if each not in larger]
+        of_size = [*_of_size(changes, size)]
+        is_feasible = evaluator.region.feasible(_settings(members, of_size)).tolist()
+        candidates = list[Combination]()
+        larger = list[Combination]()
+        for combination in compress(of_size, is_feasible):
+            group = candidates
+            if any(smaller <= combination for smaller in unsafe_ones):
+                group = larger
+            group.append(combination)
         is_cut = len(candidates) > room
         if is_cut and (only_fewest or not room):
             break
 
         # Those whose single changes are worst come first.
-        candidates.sort(key=lambda each: sum(effects[change] for change in each))
+        candidates.sort(
+            key=lambda combination: sum(effects[change] for change in combination)
+        )
         chosen = candidates[:room]
         room -= len(chosen)
         existing[size] = len(candidates)
         simulated[size] = len(chosen)
-        containing[size] = [each for each in feasible if each in larger]
-        left, as_causes = _robustness(evaluator, unsafe, chosen)
+        containing[size] = larger
+        robustness, as_causes = _robustness(evaluator, unsafe, chosen)
         if size == 1:
-            effects |= {
-                change: value for (change,), value in zip(chosen, left, strict=True)
-            }
-        for index in np.flatnonzero(left < 0).tolist():
+            single_changes = chain.from_iterable(chosen)
+            effects |= zip(single_changes, robustness, strict=True)
+        for index in np.flatnonzero(robustness < 0).tolist():
             causes.append(as_causes[index])
             unsafe_ones.append(chosen[index])
         if is_cut:
@@ -146,14 +151,14 @@ def enumerate_causes(
 
 
 def count_cures(
-    evaluator: Evaluator, unsafe: Unsafe, found: Enumeration, limit: int
+    evaluator: Evaluator, unsafe: Unsafe, enumeration: Enumeration, limit: int
 ) -> dict[int, int]:
     """How many of the combinations that contain a smaller cause are safe, by their size; only of
     the sizes that are simulated as a whole with at most `limit` settings.
     """
     cures = dict[int, int]()
     room = limit // (1 + len(evaluator.critical_encounters))
-    for size, containing in found.containing.items():
+    for size, containing in enumeration.containing.items():
         room -= len(containing)
         if room < 0:
             break
@@ -174,12 +179,18 @@ def staircase(
     """
     steps = [at_ends]
     encounters = 1 + len(evaluator.critical_encounters)
-    fewer = encounters * sum(
+    least_price = encounters * sum(
         number for size, number in at_ends.simulated.items() if size < at_ends.size
     )
-    for rest, share in zip(range(len(SHARES) - 2, -1, -1), SHARES[1:], strict=True):
-        most = limit - rest * fewer if at_ends.causes else limit // (rest + 1)
-        step = enumerate_causes(evaluator, unsafe, most, share, only_fewest=True)
+    for remaining_shares, share in zip(
+        range(len(SHARES) - 2, -1, -1), SHARES[1:], strict=True
+    ):
+        budget = (
+            limit - remaining_shares * least_price
+            if at_ends.causes
+            else limit // (remaining_shares + 1)
+        )
+        step = enumerate_causes(evaluator, unsafe, budget, share, only_fewest=True)
         if not step.tried:
             break
         limit -= step.tried * encounters
@@ -189,12 +200,15 @@ def staircase(
 
 def _changes(members: CharacteristicSet, share: float) -> list[Change]:
     """The changes of one characteristic."""
-    return [
-        (column, end if share == 1 else item.original + share * (end - item.original))
-        for column, item in enumerate(members)
-        for end in (item.lower, item.upper)
-        if not item.is_scenario and end != item.original
-    ]
+    changes = list[Change]()
+    for column, item in enumerate(members.vehicle):
+        for end in (item.lower, item.upper):
+            value = end
+            if share < 1:
+                value = item.original + share * (end - item.original)
+            if end != item.original:
+                changes.append((column, value))
+    return changes
 
 
 def _of_size(changes: list[Change], size: int) -> Iterator[Combination]:

@@ -17,8 +17,8 @@ from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.causes import (
     Cause,
     count_distinct_causes,
-    directions,
     find_minimal_causes,
+    kinds_of,
     largest_complete,
     select_affordable_rows,
 )
@@ -107,7 +107,7 @@ def gather_failures(
         If the criterion or a handle cannot be read, or a handle is no solution of the results.
     """
     # Settings of the study's domain, or solutions of the results.
-    named = [SolutionId.parse(text) for text in solutions]
+    named = [*map(SolutionId.parse, solutions)]
     original = evaluator.evaluate_original()
     if isinstance(subject, Study):
         if named:
@@ -130,10 +130,10 @@ def gather_failures(
     is_other = (evaluations.outcome != recorded) & (recorded != UNKNOWN)
 
     # Settings without a valid encounter do not count.
-    left_out = 0
+    omissions = 0
     over_sets = None
     if isinstance(subject, Study):
-        left_out = int(evaluations.infeasible.sum())
+        omissions = int(evaluations.infeasible.sum())
         counts = np.flatnonzero(~evaluations.infeasible)
         evaluations = evaluations.take(counts)
         names = [names[row] for row in counts]
@@ -148,7 +148,7 @@ def gather_failures(
         if named
         else np.flatnonzero(unsafe.of(evaluations)).tolist()
     )
-    counted = bool(named), int(is_other.sum()), left_out, over_sets
+    counted = bool(named), int(is_other.sum()), omissions, over_sets
     return Population(original, evaluations, names, unsafe, rows, *counted)
 
 
@@ -164,10 +164,10 @@ def _drawn_from(study: Study, evaluator: Evaluator) -> Candidates:
     number = min(SAMPLED_SETTINGS, max(affordable, LEAST_SAMPLED_SETTINGS))
     # Of few simulations most are for the causes of what fails here.
     number = evaluator.at_most(number, 8)
-    drawn = VariationModel(study).draw(
+    sampled_settings = VariationModel(study).draw(
         number, default_rng(study.search.seed), filtered=True
     )
-    settings = evaluator.characteristics.filter(drawn)
+    settings = evaluator.characteristics.filter(sampled_settings)
     names = [f"drawn:{row}" for row in range(len(settings))]
     return settings, names, np.full(len(settings), UNKNOWN)
 
@@ -235,10 +235,7 @@ def choose_failures(
 
     # For each distinct cause that is missing, the simplest failure that has it.
     members = evaluator.characteristics
-    kinds = {
-        row: {directions(members, cause.changes) for cause in group}
-        for row, group in causes.items()
-    }
+    kinds = {row: kinds_of(members, group) for row, group in causes.items()}
     of_sample = [causes[row] for row in sample]
     for kind in count_distinct_causes(members, of_sample)["cause"]:
         if len(reasons) < top and not any(kind in kinds[row] for row in reasons):
@@ -255,9 +252,8 @@ def _failures_that_matter(population: Population) -> Reasons:
     reasons = Reasons()
     failures = population.evaluations.take(population.rows)
     for choice, reason in REASONS.items() if population.rows else ():
-        order = np.lexsort(
-            [failures.column(name) for name in reversed(CHOICES[choice])]
-        )
+        columns = map(failures.column, reversed(CHOICES[choice]))
+        order = np.lexsort([*columns])
         row = population.rows[order[0]]
         reasons[row] = f"{reasons[row]}; {reason}" if row in reasons else reason
     return reasons
@@ -277,15 +273,15 @@ def compare_at_points(
     originals = system.characteristics.with_original_vehicle(settings)
     results = simulate_all_points(system, np.concatenate([originals, settings]))
     at_points = [result.evaluations for result in results]
-    is_unsafe = np.stack([unsafe.of(evaluations) for evaluations in at_points])
+    is_unsafe = np.stack([*map(unsafe.of, at_points)])
     worst = worst_points(system, at_points)
 
     # In words, at the worst point.
     comparisons = []
     for original, vehicle in enumerate(range(len(settings), len(worst))):
         result = results[worst[vehicle]]
-        both = result.evaluations.take([original, vehicle])
-        runs = zip(both.outcome.tolist(), both.f_safe.tolist(), strict=True)
+        pair = result.evaluations.take([original, vehicle])
+        runs = zip(pair.outcome.tolist(), pair.f_safe.tolist(), strict=True)
         endings = [ending_in_words(*run, system.contact) for run in runs]
         sentence = words.AT_POINT.fill(
             point=result.point.name or "of the study",

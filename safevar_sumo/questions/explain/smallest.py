@@ -200,13 +200,13 @@ def draw_staircase(answer: Answer) -> Figure:
             text = f"none of {row['tried']:,}\ncombinations\nis unsafe"
             axis.text(share, 1.1, text, fontsize=size, ha="center")
             continue
-        cause, *others = row["causes"]
+        cause, *alternatives = row["causes"]
         if cause == named:
             continue
         named = cause
         text = cause.replace(", ", "\n")
-        if others:
-            text += f"\n(1 of {len(others) + 1})"
+        if alternatives:
+            text += f"\n(1 of {len(alternatives) + 1})"
         axis.annotate(
             escape_dollars(text),
             (share, row["fewest"]),
@@ -229,21 +229,23 @@ def _table(
 ) -> pd.DataFrame:
     """A row of `SMALLEST_COLUMNS` for each cause, the most robust first."""
     beginnings = find_beginnings(evaluator, unsafe, steps)
-    causes = [one.cause for one in beginnings]
-    robust, holds, tried = sureness(evaluator, causes, unsafe, fits)
+    causes = [beginning.cause for beginning in beginnings]
+    robust, holds, number_of_sets = sureness(evaluator, causes, unsafe, fits)
     rows = [
         {
-            **one.cause._asdict(),
-            "causes": one.cause.changes,
-            "size": len(one.cause.changes),
-            "begins_at": one.share,
-            "boundary": one.boundary,
-            "safe_again": one.safe_again,
-            "holds": held,
-            "fits": tried,
+            **beginning.cause._asdict(),
+            "causes": beginning.cause.changes,
+            "size": len(beginning.cause.changes),
+            "begins_at": beginning.share,
+            "boundary": beginning.boundary,
+            "safe_again": beginning.safe_again,
+            "holds": sets_with_cause,
+            "fits": number_of_sets,
             "robust_share": share,
         }
-        for one, held, share in zip(beginnings, holds, robust.tolist(), strict=True)
+        for beginning, sets_with_cause, share in zip(
+            beginnings, holds, robust.tolist(), strict=True
+        )
     ]
     frame = pd.DataFrame(rows, columns=[*SMALLEST_COLUMNS])
     in_order = frame.astype({"holds": "Int64", "fits": "Int64"}).sort_values(

@@ -241,7 +241,7 @@ def causes_table(
 
     # How robust each cause is, and with how many parameter sets it is one.
     causes = [cause for group in causes_of for cause in group]
-    robust, holds, tried = sureness(evaluator, causes, unsafe, fits)
+    robust, holds, number_of_sets = sureness(evaluator, causes, unsafe, fits)
 
     # How far it may be scaled back, and whether it is a cause in the original encounter.
     limits = find_cause_limits(evaluator, causes, unsafe)
@@ -257,11 +257,11 @@ def causes_table(
     # How many failures have a cause with the same directions; robust causes come first.
     share_of = dict(zip(distinct["cause"], distinct["share"], strict=True))
     kinds = [directions(evaluator.characteristics, cause.changes) for cause in causes]
-    none = 0.0 if share_of else np.nan  # without a sample, no share is known
-    shares = [share_of.get(kind, none) for kind in kinds]
+    default_share = 0.0 if share_of else np.nan  # without a sample, no share is known
+    shares = [share_of.get(kind, default_share) for kind in kinds]
     is_robust = robust >= MIN_ROBUST_SHARE
     order = np.lexsort([-robust, -np.where(is_robust, shares, 0.0), ~is_robust])
-    solution_of = np.repeat(range(len(solutions)), [len(group) for group in causes_of])
+    solution_of = np.repeat(range(len(solutions)), [*map(len, causes_of)])
     rows = [
         {
             **solutions[["solution", "avoided_by"]].iloc[solution_of[index]],
@@ -273,17 +273,16 @@ def causes_table(
             "share": shares[index],
             "robust_share": robust[index],
             "holds": holds[index],
-            "fits": tried,
+            "fits": number_of_sets,
         }
         for index in order.tolist()
     ]
     frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype(
         {"holds": "Int64", "fits": "Int64"}
     )
-    omitted = () if study.ranges else OF_ENCOUNTER
-    columns = {
-        name: column for name, column in CAUSE_COLUMNS.items() if name not in omitted
-    }
+    columns = {**CAUSE_COLUMNS}
+    for name in () if study.ranges else OF_ENCOUNTER:
+        del columns[name]
     table = tabulate(
         "Minimal causes: smallest sets of changes that are unsafe",
         columns,
@@ -306,11 +305,13 @@ def printed_limits(
     printed = values_as_printed(model, exact)
 
     # An encounter is rounded only where the whole changes are unsafe in it, too.
-    whole = [
+    full_changes = [
         values | cause.changes for values, cause in zip(printed, causes, strict=True)
     ]
     members = model.characteristics
-    settings = np.array([members.setting(one, beyond=True) for one in whole])
+    settings = np.array(
+        [members.setting(values, beyond=True) for values in full_changes]
+    )
     is_unsafe = model.are_unsafe(settings.reshape(-1, len(members)), BOUNDARIES)
     printed = [
         rounded if fails else rounded | values
@@ -318,18 +319,20 @@ def printed_limits(
     ]
 
     # Each change alone at its boundary, with the others as they are, in the printed encounter.
-    alone = [
-        values | cause.changes | {name: value}
-        for values, (cause, limit) in zip(printed, pairs, strict=True)
-        for name, value in limit.single_boundary.items()
-    ]
-    names = [name for limit in limits for name in limit.single_boundary]
-    found = iter(values_as_printed(model, alone, names))
+    alone = list[NamedValues]()
+    names = list[str]()
+    for values, (cause, limit) in zip(printed, pairs, strict=True):
+        for name, value in limit.single_boundary.items():
+            alone.append(values | cause.changes | {name: value})
+            names.append(name)
+    single_values = iter(values_as_printed(model, alone, names))
     return [
         {
             "encounter": {name: values[name] for name in cause.encounter},
             "boundary": {name: values[name] for name in cause.changes},
-            "single_boundary": {name: next(found)[name] for name in cause.changes},
+            "single_boundary": {
+                name: next(single_values)[name] for name in cause.changes
+            },
         }
         for values, cause in zip(printed, causes, strict=True)
     ]
@@ -359,7 +362,7 @@ def sureness(
 
 
 def statistics_tables(
-    needed: pd.DataFrame,
+    necessity: pd.DataFrame,
     failures: int,
     verdicts: pd.DataFrame,
     collisions: int,
@@ -372,7 +375,7 @@ def statistics_tables(
             f" {number_of(failures, 'failure')}",
             CHARACTERISTIC_COLUMNS,
             # Of one failure every share is 0 or 1.
-            needed if failures > 1 else needed.head(0),
+            necessity if failures > 1 else necessity.head(0),
         ),
         "drivers": tabulate(
             "What other drivers would have avoided in the same vehicle:"

@@ -91,8 +91,8 @@ def _leading_of_study(
     share = leading["begins_at"]
     templates = words.ON_THE_WAY if share < 1 else words.AT_ENDS
     yield _enough(templates, members, unsafe, leading["boundary"], share)
-    if others := len(fewest) - 1:
-        yield words.OTHERS.fill(causes=number_of(others, "further cause"))
+    if number_of_others := len(fewest) - 1:
+        yield words.OTHERS.fill(causes=number_of(number_of_others, "further cause"))
 
     # How sure they are.
     if pd.notna(leading["safe_again"]):

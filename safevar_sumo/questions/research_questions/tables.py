@@ -46,11 +46,11 @@ class PaperTable(NamedTuple):
     def of(cls, name: str, compute: Compute) -> PaperTable:
         """A table as the file has it."""
         table = DATA["tables"][name]
-        known = DATA["columns"] | table.get("own", {})
+        definitions = DATA["columns"] | table.get("own", {})
         return cls(
             table["title"],
             compute,
-            columns_from({key: known[key] for key in table["columns"]}),
+            columns_from({key: definitions[key] for key in table["columns"]}),
             Wide(**table["wide"]) if "wide" in table else None,
         )
 

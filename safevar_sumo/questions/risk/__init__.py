@@ -157,15 +157,15 @@ def risk(
     }
 
     # In words.
-    left_out = int(evaluations.infeasible.sum())
-    sentences = _share_in_words(study, criterion, numbers, samples - total - left_out)
+    omissions = int(evaluations.infeasible.sum())
+    sentences = _share_in_words(study, criterion, numbers, samples - total - omissions)
     if not has_design and total < LEAST_VEHICLES:
         sentences.append(words.UNKNOWN_INFLUENCE.fill(least=LEAST_VEHICLES))
     else:
         names = {item.name: item.short_name for item in evaluator.characteristics}
         sentences += influence_in_words(table, failures, confidence, names)
     sentences += over_sets.sentences()
-    counted = counted_in_words(study, left_out)
+    counted = counted_in_words(study, omissions)
     sentences += notes_on(criterion, *counted, *constraints_in_words(study))
     table.attrs["lead_rows"] = range(min(MAX_DECIDING, len(table)))
     has_shares = table.drop(columns="characteristic").notna().any(axis=None)
@@ -186,15 +186,15 @@ def _share_in_words(
 
     Clopper and Pearson's upper end of 0 of n is 1 - ((1 - confidence) / 2)^(1 / n).
     """
-    said = [words.SHARE, words.SAMPLED, words.NO_PROBABILITY]
+    templates = [words.SHARE, words.SAMPLED, words.NO_PROBABILITY]
     if study.variation:
-        said = [words.PROBABILITY, words.SAMPLED]
+        templates = [words.PROBABILITY, words.SAMPLED]
     confidence = numbers["confidence"]
-    needed = math.ceil(math.log((1 - confidence) / 2) / math.log1p(-RARE))
+    needed_samples = math.ceil(math.log((1 - confidence) / 2) / math.log1p(-RARE))
     if not numbers["failures"]:
-        said.append(words.BOUND)
-        said += [words.NEEDED] * (numbers["samples"] < needed)
-    said += [words.NOT_SIMULATED] * bool(failed)
+        templates.append(words.BOUND)
+        templates += [words.NEEDED] * (numbers["samples"] < needed_samples)
+    templates += [words.NOT_SIMULATED] * bool(failed)
 
     slots = {
         "count": count_in_words(numbers["failures"], numbers["samples"]),
@@ -206,10 +206,10 @@ def _share_in_words(
         "high": percentage(numbers["interval"][1]),
         "confidence": 100 * confidence,
         "rare": percentage(RARE),
-        "needed": needed,
+        "needed": needed_samples,
         "failed": number_of(failed, "vehicle"),
     }
-    return [template.fill(**slots) for template in said]
+    return [template.fill(**slots) for template in templates]
 
 
 def influence_in_words(

@@ -139,9 +139,13 @@ def rules(
     over_sets = SharesOverSets.of(evaluator, criterion, vehicles, groups)
     rows = []
     for number, box in enumerate(boxes, 1):
-        own = shares(box, testing.settings, unsafe_in_test)
+        own_shares = shares(box, testing.settings, unsafe_in_test)
         rows.append(
-            (conditions(box, characteristics), *own, *over_sets.ends(number, own[:3]))
+            (
+                conditions(box, characteristics),
+                *own_shares,
+                *over_sets.ends(number, own_shares[:3]),
+            )
         )
     frame = pd.DataFrame(rows, columns=[*COLUMNS])
     frame = frame.sort_values("coverage", ascending=False, kind="stable")
