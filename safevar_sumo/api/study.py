@@ -253,7 +253,7 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
         name: value for name, value in numbers.items() if value is not None
     }
     if algorithms is not None:
-        names = [name.strip() for name in algorithms.split(",")]
+        names = map(str.strip, algorithms.split(","))
         changes["algorithms"] = [search.labels.get(name, name) for name in names]
     return replace_in(study, search=replace_in(search, **changes))
 
@@ -345,7 +345,11 @@ def summarise(results: Results) -> Answer:
             "results of the command `study`",
         )
 
-    finished = Counter(name for name, _ in results.finished)
+    metrics = {
+        metric.name: Column(metric.unit, "mean over solutions", ".2f", is_detail=True)
+        for metric in case.scoring.metrics
+    }
+    finished = case.run_counts
     rows = []
     for name in study.search.labels:
         simulated, solutions = (
@@ -355,17 +359,13 @@ def summarise(results: Results) -> Answer:
         outcomes = Counter(simulated["outcome"])
         feasible = simulated[case.scoring.feasible_rows(simulated)]
         counts = outcomes[Outcome.INVALID_TEST], outcomes[Outcome.SIMULATOR_ERROR]
-        means = solutions[[metric.name for metric in case.scoring.metrics]].mean()
+        means = solutions[[*metrics]].mean()
         collisions = int(are_collisions(feasible).sum())
         ends = (collisions, *counts, feasible["f_safe"].min(), len(solutions))
         rows.append(
             (name, finished[name], study.search.runs, len(simulated), *ends, *means)
         )
 
-    metrics = {
-        metric.name: Column(metric.unit, "mean over solutions", ".2f", is_detail=True)
-        for metric in case.scoring.metrics
-    }
     table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))
     tables = {"algorithms": table}
 

@@ -127,7 +127,7 @@ class Legal(NamedTuple):
 
     lowest: float = -INFINITY
     highest: float = INFINITY
-    above: bool = False
+    is_open: bool = False
     infinite: bool = False
     undefined: bool = False
     scalar: bool = False
@@ -137,7 +137,7 @@ class Legal(NamedTuple):
     def __str__(self) -> str:
         if self.kinds == "b":
             return "truth values"
-        begin = "above" if self.above else "from"
+        begin = "above" if self.is_open else "from"
         text = f"numbers {begin} {self.lowest:g} to {self.highest:g}"
         if self.infinite:
             return text
@@ -146,7 +146,7 @@ class Legal(NamedTuple):
     def holds(self, numbers: FloatArray) -> BoolArray:
         """Which numbers are legal."""
         is_legal = numbers >= self.lowest
-        if self.above:
+        if self.is_open:
             is_legal = numbers > self.lowest
         is_legal &= (numbers <= self.highest) & (self.infinite | np.isfinite(numbers))
         return is_legal | (self.undefined & np.isnan(numbers))
@@ -154,7 +154,7 @@ class Legal(NamedTuple):
 
 FINITE, POSITIVE, SHARE, TRUTH = (
     Legal(),
-    Legal(0.0, above=True),
+    Legal(0.0, is_open=True),
     Legal(0.0, 1.0),
     Legal(kinds="b"),
 )

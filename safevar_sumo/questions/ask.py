@@ -133,7 +133,7 @@ class Question:
     def __call__(
         self,
         source: StudyLike | Results | None = None,
-        *others: StudyLike | Results,
+        *further_sources: StudyLike | Results,
         point: PointName = None,
         ranges: bool = False,
         up_to: UpTo = None,
@@ -188,7 +188,7 @@ class Question:
             raise TypeError(
                 f"{self.name}() got an unexpected keyword argument {name!r}"
             )
-        if source is None or len(others) != len(self.others):
+        if source is None or len(further_sources) != len(self.others):
             names = ["source", *self.others]
             raise InputError(f"{self.name}()", f"takes exactly {' and '.join(names)}")
         values = {name: options[name].check(value) for name, value in values.items()}
@@ -205,12 +205,12 @@ class Question:
 
         # What it is about, as studies, results or files.
         cuts = {"point": point, "up_to": cut}
-        names = [_name(source), *map(_name, others)]
+        names = [_name(source), *map(_name, further_sources)]
         command = self.command_line(names, cuts, values, ["--ranges"] * ranges)
         how = {"pool": pool, "jobs": jobs, "simulations": simulations}
         how |= {"cluster": cluster, "as_it_is_now": as_it_is_now}
         subjects: list[Any] = [subject_of(source)]
-        for further, is_file in zip(others, self.others.values(), strict=True):
+        for further, is_file in zip(further_sources, self.others.values(), strict=True):
             subjects.append(Path(str(further)) if is_file else subject_of(further))
         with keep_simulations(command, fresh=fresh):
             # A rough answer, which comes much earlier, may be shown before the answer.

@@ -24,7 +24,7 @@ from safevar_sumo.records import (
     NamedValues,
     Outcome,
 )
-from safevar_sumo.results import failure_lines, folders_of, load_runs
+from safevar_sumo.results import RunName, failure_lines, folders_of, load_runs
 from safevar_sumo.scenarios import weather_of
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE, Origin, Study, Weather
 from safevar_sumo.vehicles import CharacteristicSet
@@ -75,7 +75,7 @@ class Case:
     original: NamedValues
     solutions: pd.DataFrame
     evaluations: pd.DataFrame
-    finished_runs: tuple[tuple[str, int], ...]
+    finished_runs: tuple[RunName, ...]
     has_runs: bool = True
     failures: tuple[tuple[str, str], ...] = ()
     scoring: Scoring = PUBLISHED_SCORING
@@ -222,11 +222,16 @@ class Case:
         return sorted(run for name, run in self.finished_runs if name == algorithm)
 
     @property
+    def run_counts(self) -> Counter[str]:
+        """The number of finished runs of each algorithm."""
+        return Counter(algorithm for algorithm, _ in self.finished_runs)
+
+    @property
     def shortfall(self) -> str:
         """Note on unfinished runs, for the readers of every answer about the solutions; empty if
         there are none.
         """
-        finished = Counter(algorithm for algorithm, _ in self.finished_runs)
+        finished = self.run_counts
         planned = self.study.search.runs
         unfinished = []
         for name in self.study.search.labels:
@@ -338,7 +343,7 @@ def build_case(
     original: JsonObject,
     solutions: pd.DataFrame,
     evaluations: pd.DataFrame,
-    finished: Sequence[tuple[str, int]],
+    finished: Sequence[RunName],
     scoring: Scoring = PUBLISHED_SCORING,
     **facts: Any,
 ) -> Case:

@@ -102,25 +102,21 @@ def find_cause_limits(
 
     # The limits of each cause, from its lines.
     first_lines = np.cumsum([0, *line_counts])
-    return [
-        Limits(
-            boundary=dict(
-                zip(cause.changes, limits[line, flags].tolist(), strict=True)
-            ),
-            single_boundary=dict(
-                zip(
-                    cause.changes,
-                    np.diagonal(limits[line + 1 : stop, flags]).tolist(),
-                    strict=True,
-                )
-            ),
-            fraction=float(shares[line]) if cause.changes else 0.0,
-            end=states[line],
+    limits_of_causes = []
+    for cause, flags, (line, stop) in zip(
+        causes, is_changed, pairwise(first_lines), strict=True
+    ):
+        values = limits[line, flags].tolist()
+        single_values = np.diagonal(limits[line + 1 : stop, flags]).tolist()
+        limits_of_causes.append(
+            Limits(
+                boundary=dict(zip(cause.changes, values, strict=True)),
+                single_boundary=dict(zip(cause.changes, single_values, strict=True)),
+                fraction=float(shares[line]) if cause.changes else 0.0,
+                end=states[line],
+            )
         )
-        for cause, flags, (line, stop) in zip(
-            causes, is_changed, pairwise(first_lines), strict=True
-        )
-    ]
+    return limits_of_causes
 
 
 def _first_unsafe_shares(

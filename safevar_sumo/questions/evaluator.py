@@ -168,7 +168,7 @@ class Evaluator:
             account.require(account.spent + number * self._each)
             if self.system.mover.takes_long:
                 if account.asked is not None:
-                    self._pool.spare = spare(account.asked, account.least)
+                    self._pool.spare = spare(account.asked, account.minimum)
                 check_simulator(self.study, self._pool)
             seconds = seconds_of_simulation(self.study, self.system, self._pool)
             self.account.open(expected * self._each, seconds, self._pool.checked)

@@ -72,14 +72,12 @@ def compute_model_spreads(
     """
     evaluations = evaluate_sets(study, settings, point)
     collisions = np.sum([prediction.collided for prediction in evaluations], axis=0)
-    return [
-        ModelSpread(
-            len(evaluations), finite_or_none(low), finite_or_none(high), int(count)
-        )
-        for low, high, count in zip(
-            *band_of(study, evaluations), collisions, strict=True
-        )
-    ]
+    spreads = []
+    ends = band_of(study, evaluations)
+    for low, high, count in zip(*ends, collisions.tolist(), strict=True):
+        band = finite_or_none(low), finite_or_none(high)
+        spreads.append(ModelSpread(len(evaluations), *band, count))
+    return spreads
 
 
 def band_of(
@@ -140,17 +138,13 @@ def evaluate_sets(
     """
     if point:
         study = at_point(study, point)
-    systems = []
+    evaluations = []
     for k, fitted_study in enumerate(studies_of_sets(study)):
         called = f"{study.source}: spread: set {k}" if k else study.source
-        systems.append(
-            assemble(
-                replace(
-                    fitted_study, origin=replace(fitted_study.origin, called=called)
-                )
-            )
-        )
-    return [drive_and_score(system, settings) for system in systems]
+        origin = replace(fitted_study.origin, called=called)
+        system = assemble(replace(fitted_study, origin=origin))
+        evaluations.append(drive_and_score(system, settings))
+    return evaluations
 
 
 def studies_of_sets(study: Study) -> list[Study]:
@@ -170,19 +164,12 @@ def studies_of_sets(study: Study) -> list[Study]:
 
     # Parameters outside the sets keep their values.
     outside_names = parameters_outside_sets(study)
-    sets = {
-        key: values[1:]
-        for key, values in study.spread.items()
-        if key not in outside_names
-    }
-    number = len(next(iter(study.spread.values()))) - 1
-    return [
-        study,
-        *(
-            with_values(study, {key: sets[key][k] for key in sets})
-            for k in range(number)
-        ),
-    ]
+    names = [key for key in study.spread if key not in outside_names]
+    studies = [study]
+    for k in range(1, len(next(iter(study.spread.values())))):
+        values = {key: study.spread[key][k] for key in names}
+        studies.append(with_values(study, values))
+    return studies
 
 
 def other_sets(study: Study, fits: int | None) -> list[Study]:

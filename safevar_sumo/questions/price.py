@@ -66,7 +66,7 @@ class Account:
         Whether a question asks, which says first what it costs.
     most
         The largest number of simulations; None if there is none.
-    spent, least
+    spent, minimum
         Simulations so far; the least number for an answer.
     effort
         How much is searched, as a share of what is usual.
@@ -81,7 +81,7 @@ class Account:
     is_question: bool = False
     most: int | None = None
     spent: int = 0
-    least: int = 0
+    minimum: int = 0
     effort: float = 1.0
     measure: str = ""
     undefined: int = 0
@@ -121,16 +121,16 @@ class Account:
 
     def require(self, minimum: int) -> None:
         """Refuse fewer simulations than the least number for an answer."""
-        self.least = minimum
+        self.minimum = minimum
         self._refuse_few(self.asked)
 
     def _refuse_few(self, number: int | None) -> None:
         """Refuse a number of simulations below the least one."""
-        if number is not None and number < self.least:
+        if number is not None and number < self.minimum:
             raise InputError(
                 "simulations",
-                f"{number:,} do not suffice: an answer takes at least {self.least:,}",
-                f"{self.least} or more",
+                f"{number:,} do not suffice: an answer takes at least {self.minimum:,}",
+                f"{self.minimum} or more",
             )
 
     def open(self, expected: float, seconds: float | None, checked: int = 0) -> None:
@@ -142,7 +142,7 @@ class Account:
         # A number that is stated holds for all: the check, and what is repeated at the end.
         parts = 0
         if self.asked is not None and seconds is not None:
-            parts = sum(spare(self.asked, self.least))
+            parts = sum(spare(self.asked, self.minimum))
         self.most = self.asked
         if self.asked is not None and self.asked >= expected + parts:
             self.most = None
@@ -154,7 +154,7 @@ class Account:
         longest = LONGEST / self.questions
         if self.asked is None and expected * seconds > longest:
             self.most = round_down(longest / seconds)
-            parts = sum(spare(self.most, self.least))
+            parts = sum(spare(self.most, self.minimum))
         if self.most is not None:
             self.spent += parts
         words = _price(expected, seconds)

@@ -13,7 +13,12 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
 from safevar_sumo.records import JsonObject
-from safevar_sumo.results import MANIFEST, manifest_differences, read_manifest
+from safevar_sumo.results import (
+    MANIFEST,
+    RunName,
+    manifest_differences,
+    read_manifest,
+)
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import Study, StudyLike, study_names
 from safevar_sumo.study.file import ENDED_STUDIES
@@ -73,7 +78,7 @@ class Results:
         return self.case.evaluations
 
     @property
-    def finished(self) -> tuple[tuple[str, int], ...]:
+    def finished(self) -> tuple[RunName, ...]:
         """Algorithm and number of every finished run."""
         return self.case.finished_runs
 

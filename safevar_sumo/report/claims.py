@@ -52,6 +52,7 @@ from safevar_sumo.report.texts import answer_about, completed, parse_question
 from safevar_sumo.results import (
     MANIFEST,
     SOLUTIONS,
+    RunName,
     changed_values,
     evaluations_frame,
     in_order,
@@ -448,9 +449,7 @@ def count_outcomes(case: Case) -> dict[str, int]:
     }
 
 
-def count_solutions(
-    solutions: pd.DataFrame, runs: Sequence[tuple[str, int]]
-) -> list[int]:
+def count_solutions(solutions: pd.DataFrame, runs: Sequence[RunName]) -> list[int]:
     """The numbers of solutions of each run, of all, and of different ones: a run may return a
     setting twice.
     """

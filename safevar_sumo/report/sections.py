@@ -215,10 +215,9 @@ def _search(study: ReportedStudy) -> str:
     versions = ", ".join(f"{name} {value}" for name, value in study.versions.items())
     if not case.has_runs:
         return f"The {len(case.solutions):,} solutions were imported ({versions})."
-    runs = Counter(algorithm for algorithm, _ in case.finished_runs)
     names = [
         f"{case.title_of(name)} ({number_of(count, 'run')})"
-        for name, count in runs.items()
+        for name, count in case.run_counts.items()
     ]
     return (
         f"The search algorithms are {', '.join(names) or 'without a finished run'}, with at most"

@@ -36,6 +36,7 @@ from safevar_sumo.results.manifest import (
 from safevar_sumo.results.store import (
     UNKNOWN as UNKNOWN,
     ResultsDirectory as ResultsDirectory,
+    RunName as RunName,
     evaluations_frame as evaluations_frame,
     in_order as in_order,
     record as record,

@@ -18,6 +18,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.results.journal import read_journal
 from safevar_sumo.results.manifest import read_manifest
 from safevar_sumo.results.store import (
+    RunName,
     evaluations_frame,
     read_imported,
     solutions_frame,
@@ -67,7 +68,7 @@ class StoredResults(NamedTuple):
     manifest: JsonObject
     evaluations: pd.DataFrame
     solutions: pd.DataFrame
-    finished: tuple[tuple[str, int], ...] = ()
+    finished: tuple[RunName, ...] = ()
     failures: tuple[tuple[str, str], ...] = ()
 
 

@@ -44,7 +44,9 @@ from safevar_sumo.study import Study, convert_table, label_of, tables_of
 if TYPE_CHECKING:
     import pandas as pd
 
-RunKeyT = TypeVar("RunKeyT", bound=tuple[str, int])
+RunName = tuple[str, int]
+"""An algorithm, and the number of a run."""
+RunKeyT = TypeVar("RunKeyT", bound=RunName)
 """The key of a run: its algorithm and number."""
 
 
@@ -171,7 +173,7 @@ class ResultsDirectory:
 
 def stored_journals(
     directory: Path, manifest: JsonObject
-) -> Iterator[tuple[tuple[str, int], Path, JsonObject]]:
+) -> Iterator[tuple[RunName, Path, JsonObject]]:
     """The journals that exist of a manifest's study: the algorithm and number of each run, its
     file, and the head that the file must have.
     """
@@ -189,7 +191,7 @@ def stored_journals(
 
 def solutions_frame(
     characteristics: Collection[str],
-    solutions: Iterable[tuple[tuple[str, int], Evaluations]],
+    solutions: Iterable[tuple[RunName, Evaluations]],
 ) -> pd.DataFrame:
     """One row per solution of every run, in a fixed order; columns as in `evaluations_frame`."""
     return in_order(evaluations_frame(characteristics, solutions), characteristics)
@@ -203,7 +205,7 @@ def in_order(solutions: pd.DataFrame, characteristics: Collection[str]) -> pd.Da
 
 def evaluations_frame(
     characteristics: Collection[str],
-    runs: Iterable[tuple[tuple[str, int], Evaluations]],
+    runs: Iterable[tuple[RunName, Evaluations]],
 ) -> pd.DataFrame:
     """One row per evaluation.
 

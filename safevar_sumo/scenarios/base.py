@@ -122,12 +122,12 @@ def check_fields(code: UserCode, scenario: Any, **further: Legal) -> None:
             "an object with the attribute network, a folder's name or path",
         )
     legal = {
-        "duration": Legal(0.0, MAX_DURATION, above=True),
+        "duration": Legal(0.0, MAX_DURATION, is_open=True),
         "grade": Legal(-MAX_GRADE, MAX_GRADE),
         **further,
     }
     if scenario.test_speed is not None:
-        legal["test_speed"] = Legal(0.0, MAX_TEST_SPEED, above=True)
+        legal["test_speed"] = Legal(0.0, MAX_TEST_SPEED, is_open=True)
     Returned((legal,)).check(code, "__init__", scenario, ())
 
 

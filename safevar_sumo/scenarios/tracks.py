@@ -193,8 +193,8 @@ def check_tracks(
 
 LEGAL_FIELDS = {
     "start_speed": Legal(0.0, MAX_TEST_SPEED),
-    "vut_length": Legal(0.0, MAX_LENGTH, above=True),
-    "vut_width": Legal(0.0, MAX_LENGTH, above=True),
+    "vut_length": Legal(0.0, MAX_LENGTH, is_open=True),
+    "vut_width": Legal(0.0, MAX_LENGTH, is_open=True),
     "sensor_setback": Legal(0.0, MAX_LENGTH),
 }
 """Legal numbers of a user's scenario of tracks, besides those of every scenario."""

@@ -148,12 +148,12 @@ class Scenes:
         """Why SUMO must simulate one of the points, in a copy of the network for each vehicle; ""
         if scenes suffice.
         """
-        scenes = (
-            self.of(point.scenario)
-            for point in points
-            if isinstance(point.scenario, WorldScenario)
-        )
-        return next((scene for scene in scenes if isinstance(scene, str)), "")
+        for point in points:
+            if isinstance(point.scenario, WorldScenario):
+                scene = self.of(point.scenario)
+                if isinstance(scene, str):
+                    return scene
+        return ""
 
 
 def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
@@ -282,9 +282,7 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
         lanes.append(next_lane)
 
     shapes = [*map(api.lane.getShape, lanes)]
-    if api.vehicle.getLateralLanePosition(vut) or any(
-        len(shape) != 2 for shape in shapes
-    ):
+    if api.vehicle.getLateralLanePosition(vut) or {*map(len, shapes)} != {2}:
         return None
     starts, ends = np.array(shapes, dtype=float).transpose(1, 0, 2)
     vector = ends - starts

@@ -350,10 +350,8 @@ def joined(
         return np.where(number, total / np.maximum(number, 1), np.nan)
 
     outcomes = evaluations.outcome.reshape(repeats, n)
-    rank = {str(name): number for number, name in enumerate(SEVERITY)}
-    severity = np.reshape(
-        [rank[name] for name in evaluations.outcome.tolist()], (repeats, n)
-    )
+    ranks = map([*map(str, SEVERITY)].index, evaluations.outcome.tolist())
+    severity = np.reshape([*ranks], (repeats, n))
     degrees = evaluations.f_safe.reshape(repeats, n)
     worst = np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)
     metrics = {name: mean(values) for name, values in evaluations.metrics.items()}
@@ -367,10 +365,8 @@ def joined(
     rounds = dict[str, FloatArray]()
     for name, values in evaluations.metrics.items():
         if name not in means_alone:
-            rounds |= {
-                f"{name}_{k + 1}": row
-                for k, row in enumerate(values.reshape(repeats, n))
-            }
+            for number, row in enumerate(values.reshape(repeats, n), 1):
+                rounds[f"{name}_{number}"] = row
     return replace(
         evaluations.take(columns),
         outcome=outcomes[np.argmin(severity, axis=0), columns],

@@ -22,6 +22,8 @@ from safevar_sumo.questions.explain.combinations import Enumeration
 from safevar_sumo.records import FloatArray, NamedValues
 from safevar_sumo.vehicles import CharacteristicSet
 
+PlacedCause = tuple[Cause, float]
+"""A cause, and its share of the way to the ends."""
 STEPS, COARSE_STEPS = 100, 20
 """Parts of the way to the ends, and where few simulations are allowed."""
 
@@ -74,11 +76,11 @@ def find_beginnings(
 def _smallest(
     members: CharacteristicSet,
     references: Sequence[Cause],
-    candidates: Sequence[tuple[Cause, float]],
-) -> list[tuple[Cause, float]]:
+    candidates: Sequence[PlacedCause],
+) -> list[PlacedCause]:
     """Those of other causes that contain no known one, nor a smaller one of them."""
     kinds = [{*directions(members, cause.changes)} for cause in references]
-    smallest = list[tuple[Cause, float]]()
+    smallest = list[PlacedCause]()
     for placed in sorted(candidates, key=lambda placed: len(placed[0].changes)):
         kind = {*directions(members, placed[0].changes)}
         if not any(smaller_kind <= kind for smaller_kind in kinds):
@@ -88,8 +90,8 @@ def _smallest(
 
 
 def _begin(
-    evaluator: Evaluator, unsafe: Unsafe, placed: Sequence[tuple[Cause, float]]
-) -> tuple[list[Beginning], list[tuple[Cause, float]]]:
+    evaluator: Evaluator, unsafe: Unsafe, placed: Sequence[PlacedCause]
+) -> tuple[list[Beginning], list[PlacedCause]]:
     """Where causes begin, and smaller causes that are unsafe there."""
     # Of few simulations half are left for the neighbours and the other parameter sets.
     is_free = evaluator.left is None
@@ -129,7 +131,7 @@ def _begin(
     # Where each is unsafe first. If fewer of its changes are unsafe there, it is a cause later.
     first_unsafe = is_unsafe.argmax(axis=1)
     groups = smaller_causes(settings[range(number), first_unsafe])
-    smaller = list[tuple[Cause, float]]()
+    smaller = list[PlacedCause]()
     for row, (group, at) in enumerate(zip(groups, first_unsafe.tolist(), strict=True)):
         smaller += [(cause, float(shares[at])) for cause in group]
         if group and not is_free:

@@ -312,7 +312,7 @@ def _test_original(
             runs = test.n1
         else:
             test = compare_samples(values, originals.dropna())
-            runs = _finished_runs(case, algorithm)
+            runs = case.run_counts[algorithm]
         # Below 0.5, the solutions are more unsafe than the original.
         test = test.oriented(larger_is_better=not metric.more_is_unsafe)
         row = {"algorithm": algorithm, "metric": metric.name, "runs": runs}
@@ -341,16 +341,11 @@ def _test_opponents(
             continue
         test = compare_samples(values, samples.get((baseline, metric), ()))
         test = test.oriented(larger_is_better=more_is_better)
-        runs = _finished_runs(case, algorithm), _finished_runs(case, baseline)
+        runs = case.run_counts[algorithm], case.run_counts[baseline]
         is_enough = not case.has_runs or can_be_significant("RQ2", *runs, choices.alpha)
         row = {"algorithm": algorithm, "baseline": baseline, "metric": metric}
         rows.append({**row, **test._asdict(), "enough_runs": is_enough})
     return rows
-
-
-def _finished_runs(case: Case, algorithm: str) -> int:
-    """The number of an algorithm's finished runs."""
-    return sum(name == algorithm for name, _ in case.finished_runs)
 
 
 def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
@@ -418,7 +413,7 @@ def describe_runs_without_solutions(case: Case) -> str:
     texts = []
     for name in case.algorithms:
         count = runs_with_solutions.get(name, 0)
-        runs = _finished_runs(case, name)
+        runs = case.run_counts[name]
         if count < runs:
             texts.append(f"{case.title_of(name)} {count} of {runs}")
     if not texts:

@@ -14,6 +14,7 @@ import pandas as pd
 
 from safevar_sumo.questions.case import Case, UnanswerableError
 from safevar_sumo.records import FloatArray
+from safevar_sumo.results import RunName
 
 MORE_IS_BETTER = {"igd_plus": False, "hypervolume": True, "igd": False}
 INDICATOR_TITLES = {"igd_plus": "IGD+", "hypervolume": "HV", "igd": "IGD"}
@@ -106,12 +107,12 @@ def compute_indicators(case: Case) -> pd.DataFrame:
 
 def frames_of_runs(
     case: Case, frame: pd.DataFrame
-) -> list[tuple[tuple[str, int], pd.DataFrame]]:
+) -> list[tuple[RunName, pd.DataFrame]]:
     """The finished runs, each with its rows, in the study's order of algorithms; raises
     UnanswerableError if none of them has rows.
     """
     groups = dict(list(frame.groupby(["algorithm", "run"])))
-    runs = list[tuple[str, int]]()
+    runs = list[RunName]()
     for algorithm in case.algorithms:
         runs += product([algorithm], case.runs_of(algorithm))
     if not runs:
