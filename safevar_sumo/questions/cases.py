@@ -220,7 +220,7 @@ def search_side_by_side(
                 results[number] = end.value
         if not generations:
             break
-        ends = np.cumsum([*map(len, generations.values())])[:-1]
+        ends = np.cumsum(list(map(len, generations.values())))[:-1]
         robustness = judge(np.concatenate([*generations.values()]))
         parts = np.split(robustness, ends)
         judged = dict(zip(generations, parts, strict=True))

@@ -155,5 +155,5 @@ def _first_unsafe_shares(
     return (
         boundaries.unsafe_shares,
         boundaries.unsafe,
-        [*map(BoundaryState, states)],
+        list(map(BoundaryState, states)),
     )

@@ -8,7 +8,7 @@ inferred: all subsets are simulated, size by size, except those that contain a c
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import combinations, islice, takewhile
 from math import comb
 from typing import NamedTuple
@@ -64,10 +64,10 @@ def find_minimal_causes(
     changed = [np.flatnonzero(flags).tolist() for flags in is_changed]
     originals = members.with_original_vehicle(settings)
     causes = [dict[frozenset[int], Cause]() for _ in settings]
-    complete = largest_complete([*map(len, changed)], limit)
+    complete = largest_complete(list(map(len, changed)), limit)
 
     # Subsets by size, those of all settings together, without those that contain a cause.
-    expected = _count_subsets([*map(len, changed)], complete)
+    expected = _count_subsets(list(map(len, changed)), complete)
     with evaluator.phases.stage(SUBSETS, expected):
         for size in range(max(map(len, changed), default=0) + 1):
             number = sum(
@@ -81,13 +81,7 @@ def find_minimal_causes(
                 and number > evaluator.left
             ):
                 break
-            subsets = (
-                (row, list(columns))
-                for row, of_row in enumerate(causes)
-                if size <= complete or not of_row
-                for columns in combinations(changed[row], size)
-                if not any(cause.issubset(columns) for cause in of_row)
-            )
+            subsets = _subsets(changed, causes, size, is_complete=size <= complete)
             while chunk := list(islice(subsets, MAX_SUBSETS)):
                 partial_settings = originals[[row for row, _ in chunk]]
                 for partial, (row, columns) in zip(
@@ -103,10 +97,27 @@ def find_minimal_causes(
                         {members.names[column]: values[column] for column in columns},
                         str(evaluations.outcome[index]),
                         float(evaluations.f_safe[index]),
-                        members.scenario.named(settings[row, ~members.of_vehicle]),
+                        members.encounter_of(settings[row]),
                         float(of_runs[index]),
                     )
     return [[*of_row.values()] for of_row in causes]
+
+
+def _subsets(
+    changed: Sequence[Sequence[int]],
+    causes: Sequence[Collection[frozenset[int]]],
+    size: int,
+    *,
+    is_complete: bool,
+) -> Iterator[tuple[int, list[int]]]:
+    """The rows and the changed columns of all subsets of a size that contain no cause; unless the
+    size is complete, only of rows without a cause.
+    """
+    for row, of_row in enumerate(causes):
+        if is_complete or not of_row:
+            for columns in combinations(changed[row], size):
+                if not any(cause.issubset(columns) for cause in of_row):
+                    yield row, list(columns)
 
 
 def largest_complete(numbers: Sequence[int], limit: int) -> int:

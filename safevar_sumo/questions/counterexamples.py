@@ -154,7 +154,7 @@ def values_as_printed(
     names = dict(zip(settings, single_names, strict=False))
     printed = describe(model, settings, single_names=names)
     settings |= {name: failure.setting for name, failure in printed.items()}
-    return [*map(members.named, settings.values())]
+    return list(map(members.named, settings.values()))
 
 
 def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
@@ -240,7 +240,7 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     failures = dict[int, Failure]()
     for row in np.flatnonzero(is_unsafe).tolist():
         point = points[runs.points[row]]
-        values = members.scenario.named(settings[row, ~members.of_vehicle])
+        values = members.encounter_of(settings[row])
         scenario = encounter(point, values).scenario
         breach = model.unsafe.breach_in_words(runs.take(np.array([row])))
         collided = bool(runs.collided[row])
@@ -310,14 +310,13 @@ def place_of(
 
 def texts_of(point: Point, values: JsonObject) -> dict[str, str]:
     """Values of an encounter at a point, by name, as they are printed."""
-    return {
-        name: (
-            f"{value:{EXACT}}{unit_text(unit_of(point.scenario, name))}"
-            if isinstance(value, int | float)
-            else str(value)
-        )
-        for name, value in values.items()
-    }
+    texts = dict[str, str]()
+    for name, value in values.items():
+        texts[name] = str(value)
+        if isinstance(value, int | float):
+            unit = unit_text(unit_of(point.scenario, name))
+            texts[name] = f"{value:{EXACT}}{unit}"
+    return texts
 
 
 def _event_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool) -> str:

@@ -30,15 +30,23 @@ settings.
 SETTING_COLUMNS: Columns = {
     "solution": "handle of the solution",
     "unsafe_in": f"systems in which the setting is unsafe: {', '.join(UNSAFE_IN)}",
+    **{
+        f"{side}_{name}": column
+        for side in SIDES
+        for name, column in (
+            ("outcome", Column("", f"how the simulation ends in {side.upper()}")),
+            (
+                "degree",
+                Column(
+                    "m",
+                    f"safety degree in {side.upper()}; in -m/s on a collision",
+                    ".2f",
+                ),
+            ),
+        )
+    },
 }
-for side in SIDES:
-    SETTING_COLUMNS |= {
-        f"{side}_outcome": Column("", f"how the simulation ends in {side.upper()}"),
-        f"{side}_degree": Column(
-            "m", f"safety degree in {side.upper()}; in -m/s on a collision", ".2f"
-        ),
-    }
-ENDS = [*SETTING_COLUMNS][2:]
+ENDS = [name for name in SETTING_COLUMNS if name.startswith(("a_", "b_"))]
 
 
 def table_of_pairs(

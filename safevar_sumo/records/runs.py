@@ -95,12 +95,11 @@ class Trace:
 
     def of(self, vehicles: slice | IntArray) -> Trace:
         """The trace of some of the vehicles."""
-        matrices = {
-            name: value for name, value in vars(self).items() if np.ndim(value) == 2
-        }
-        return replace(
-            self, **{name: value[:, vehicles] for name, value in matrices.items()}
-        )
+        columns = {}
+        for name, value in vars(self).items():
+            if np.ndim(value) == 2:
+                columns[name] = value[:, vehicles]
+        return replace(self, **columns)
 
 
 QUANTITIES: Mapping[str, tuple[str, ...]] = {

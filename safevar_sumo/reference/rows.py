@@ -113,8 +113,8 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
             f"is not CSV: {str(error).splitlines()[0]}",
             "a CSV file with a header and rows",
         ) from None
-    names = [*map(str, table)]
-    plain_names = [*map(_plain_name, names)]
+    names = list(map(str, table))
+    plain_names = list(map(_plain_name, names))
     by_plain_name = dict(zip(plain_names, names, strict=True))
     columns = {}
     for name in characteristics.names:

@@ -148,7 +148,7 @@ def plain_values(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: plain_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [*map(plain_values, value)]
+        return list(map(plain_values, value))
     if hasattr(value, "to_dict") and all(isinstance(name, str) for name in value.index):
         return plain_values(value.to_dict())
     if hasattr(value, "tolist"):

@@ -344,7 +344,7 @@ def _without_defaults(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _without_defaults(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [*map(_without_defaults, value)]
+        return list(map(_without_defaults, value))
     if not isinstance(value, Table):
         return value
     config = value.__struct_config__

@@ -78,7 +78,7 @@ class Body(NamedTuple):
         (M,).
         """
         columns = map(itemgetter, range(len(cls._fields)))
-        return cls._make(np.array([*map(column, bodies)]) for column in columns)
+        return cls._make(np.array(list(map(column, bodies))) for column in columns)
 
 
 class BodyPairs(NamedTuple):

@@ -124,7 +124,7 @@ def drive_and_score(
     if len(settings) > size:
         batches = np.split(settings, range(size, len(settings), size))
         score_batch = partial(drive_and_score, system, with_originals=with_originals)
-        return Evaluations.concatenate([*map(score_batch, batches)])
+        return Evaluations.concatenate(list(map(score_batch, batches)))
 
     vehicles = settings
     if takes_pairs:

@@ -281,12 +281,12 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
             links = api.lane.getLinks(lanes[-1])
         lanes.append(next_lane)
 
-    shapes = [*map(api.lane.getShape, lanes)]
+    shapes = list(map(api.lane.getShape, lanes))
     if api.vehicle.getLateralLanePosition(vut) or {*map(len, shapes)} != {2}:
         return None
     starts, ends = np.array(shapes, dtype=float).transpose(1, 0, 2)
     vector = ends - starts
-    lengths = np.array([*map(api.lane.getLength, lanes)], dtype=float)
+    lengths = np.array(list(map(api.lane.getLength, lanes)), dtype=float)
     shape_length = np.sqrt((vector * vector).sum(axis=1))
     direction = vector / shape_length[:, np.newaxis]
     largest_turn = np.abs(direction - direction[0]).max()

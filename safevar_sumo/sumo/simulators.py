@@ -350,7 +350,7 @@ def joined(
         return np.where(number, total / np.maximum(number, 1), np.nan)
 
     outcomes = evaluations.outcome.reshape(repeats, n)
-    ranks = map([*map(str, SEVERITY)].index, evaluations.outcome.tolist())
+    ranks = map(list(map(str, SEVERITY)).index, evaluations.outcome.tolist())
     severity = np.reshape([*ranks], (repeats, n))
     degrees = evaluations.f_safe.reshape(repeats, n)
     worst = np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)

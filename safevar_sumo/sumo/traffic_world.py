@@ -110,7 +110,7 @@ class TrafficWorld(SumoWorld):
         self._move_person = function_of(api, "person", "moveToXY")
         self._move_vehicle = function_of(api, "vehicle", "moveToXY")
         self._set_previous_speed = function_of(api, "vehicle", "setPreviousSpeed")
-        self._routes = [*map(api.vehicle.getRoute, self.ids(VUT))]
+        self._routes = list(map(api.vehicle.getRoute, self.ids(VUT)))
         self._edges = [str(route[0]) for route in self._routes]
         """The edges on which the vehicles under test depart."""
 
@@ -211,8 +211,8 @@ class TrafficWorld(SumoWorld):
             get_position = self._get_position
             if actor.is_person:
                 get_position = self._get_person_position
-            expected = np.stack([*map(self._at_copies, (actor.x, actor.y))], axis=1)
-            actual = np.array([*map(get_position, actor.ids)])
+            expected = np.stack(list(map(self._at_copies, (actor.x, actor.y))), axis=1)
+            actual = np.array(list(map(get_position, actor.ids)))
             places[f"actor {actor.track.name!r}"] = expected, actual
         for name, (expected, actual) in places.items():
             distances = np.abs(actual - expected)

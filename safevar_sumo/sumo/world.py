@@ -108,8 +108,8 @@ class SumoWorld:
                 self._set(vehicletype.setTau, types.tau)
         emergency_decel = decel
         if keeps_drivers:
-            decel = np.array([*map(vehicletype.getDecel, ids)])
-            emergency_decel = np.array([*map(vehicletype.getEmergencyDecel, ids)])
+            decel = np.array(list(map(vehicletype.getDecel, ids)))
+            emergency_decel = np.array(list(map(vehicletype.getEmergencyDecel, ids)))
         self._set_decelerations(
             np.maximum(decel, INSERTION_DECELERATION),
             np.maximum(emergency_decel, INSERTION_DECELERATION),
@@ -172,8 +172,8 @@ class SumoWorld:
         self._speeds = self._speeds.copy()
         self._fronts = self._fronts.copy()
         copies = [*self.driving.values()]
-        self._speeds[copies] = [*map(self._get_speed, self.driving)]
-        self._fronts[copies] = [*map(self._get_position, self.driving)]
+        self._speeds[copies] = list(map(self._get_speed, self.driving))
+        self._fronts[copies] = list(map(self._get_position, self.driving))
         return VehicleStates(self._fronts, self._speeds, self._hits(is_open))
 
     def _hits(self, is_open: BoolArray) -> dict[int, float]:
@@ -245,13 +245,13 @@ class SumoWorld:
     def vehicle_positions(self, actor: str) -> FloatArray:
         if actor == VUT:
             return self._fronts
-        return np.array([*map(self._get_position, self.ids(actor))])
+        return np.array(list(map(self._get_position, self.ids(actor))))
 
     def person_positions(self, actor: str) -> FloatArray:
         ids = self.ids(actor)
         copies = [*self.driving.values()]
         try:
-            positions = np.array([*map(self._get_person_position, ids)])
+            positions = np.array(list(map(self._get_person_position, ids)))
         # One of them has left the road.
         except self.api.TraCIException:
             positions = self._persons.get(actor, np.zeros((self.n, 2))).copy()

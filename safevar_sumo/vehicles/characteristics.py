@@ -9,7 +9,9 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import compress
 from numbers import Real
+from operator import attrgetter
 from typing import Any
 
 import msgspec
@@ -265,16 +267,12 @@ class CharacteristicSet:
     @cached_property
     def vehicle(self) -> CharacteristicSet:
         """The characteristics of the vehicle alone."""
-        return CharacteristicSet(
-            tuple(member for member in self.members if not member.is_scenario)
-        )
+        return CharacteristicSet(tuple(compress(self.members, self.of_vehicle)))
 
     @cached_property
     def scenario(self) -> CharacteristicSet:
         """The searched parameters of the scenario; empty in most studies."""
-        return CharacteristicSet(
-            tuple(member for member in self.members if member.is_scenario)
-        )
+        return CharacteristicSet(tuple(compress(self.members, ~self.of_vehicle)))
 
     @cached_property
     def of_vehicle(self) -> BoolArray:
@@ -325,16 +323,17 @@ class CharacteristicSet:
 
     def _column(self, attribute: str) -> FloatArray:
         """One attribute of all characteristics as a read-only array, shape (n,)."""
-        values = np.array(
-            [getattr(characteristic, attribute) for characteristic in self.members],
-            float,
-        )
+        values = np.array(list(map(attrgetter(attribute), self.members)), float)
         values.flags.writeable = False
         return values
 
     def named(self, setting: FloatArray) -> NamedValues:
         """The values of a setting, shape (n,), by name."""
         return dict(zip(self.names, setting.tolist(), strict=True))
+
+    def encounter_of(self, setting: FloatArray) -> NamedValues:
+        """The values of a setting's encounter, by name."""
+        return self.scenario.named(setting[~self.of_vehicle])
 
     def columns(self, settings: FloatArray) -> dict[str, FloatArray]:
         """The values of N settings, shape (N, n), by name, each of shape (N,)."""

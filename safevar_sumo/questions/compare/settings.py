@@ -64,7 +64,7 @@ class Pairs(NamedTuple):
         """All pairs of some groups, in their order."""
         frames, settings, runs = zip(*groups, strict=True)
         frame = pd.concat(frames, ignore_index=True)
-        joined = [*map(Evaluations.concatenate, zip(*runs, strict=True))]
+        joined = list(map(Evaluations.concatenate, zip(*runs, strict=True)))
         return cls(frame, np.concatenate(settings, axis=1), joined)
 
     @property

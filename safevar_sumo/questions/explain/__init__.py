@@ -170,9 +170,10 @@ def explain(
     reasons, sample, causes, complete = choose_failures(
         population, evaluator, limit, top
     )
-    of_chosen, of_sample = (
-        [causes[row] if is_caused else [] for row in rows] for rows in (reasons, sample)
-    )
+    if not is_caused:
+        causes = {row: [] for row in causes}
+    of_chosen = [causes[row] for row in reasons]
+    of_sample = [causes[row] for row in sample]
     changed = evaluator.characteristics.changed(runs.settings[sample])
     necessity = count_needed(
         evaluator.characteristics, changed, of_sample, len(population.rows)
@@ -303,7 +304,7 @@ def draw_needed(answer: Answer) -> Figure:
     figure, ((axis,),) = new_figure(
         f"{answer.study.name}: which changed characteristics are necessary", 1, 1, size
     )
-    names = [*map(escape_dollars, frame["characteristic"])]
+    names = list(map(escape_dollars, frame["characteristic"]))
     for column, label, colour, height in (
         ("changed", "changed by the search", GREY, 0.8),
         ("in_some", "part of some minimal cause", SKY_BLUE, 0.5),

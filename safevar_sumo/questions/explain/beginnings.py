@@ -123,10 +123,9 @@ def _begin(
         """The causes with fewer changes of each of several unsafe settings."""
         groups = find_minimal_causes(evaluator, settings, unsafe)
         sizes = members.number_changed(settings).tolist()
-        return [
-            [cause for cause in group if len(cause.changes) < size]
-            for group, size in zip(groups, sizes, strict=True)
-        ]
+        for group, size in zip(groups, sizes, strict=True):
+            group[:] = [cause for cause in group if len(cause.changes) < size]
+        return groups
 
     # Where each is unsafe first. If fewer of its changes are unsafe there, it is a cause later.
     first_unsafe = is_unsafe.argmax(axis=1)

@@ -242,21 +242,15 @@ def _robustness(
     runs = evaluator.evaluate_over_encounters(
         _settings(members, chosen), unsafe, COMBINATIONS
     )
-    causes = [
-        Cause(
-            changes={names[column]: value for column, value in sorted(combination)},
-            outcome=str(outcome),
-            safety_degree=float(degree),
-            encounter=members.scenario.named(setting[~members.of_vehicle]),
-            unsafe_runs=float(of_runs),
+    causes = []
+    unsafe_runs = unsafe.runs(runs).mean(axis=0)
+    facts = zip(runs.outcome, runs.f_safe, runs.settings, unsafe_runs, strict=True)
+    for combination, (outcome, degree, setting, of_runs) in zip(
+        chosen, facts, strict=True
+    ):
+        changes = {names[column]: value for column, value in sorted(combination)}
+        encounter = members.encounter_of(setting)
+        causes.append(
+            Cause(changes, str(outcome), float(degree), encounter, float(of_runs))
         )
-        for combination, outcome, degree, setting, of_runs in zip(
-            chosen,
-            runs.outcome,
-            runs.f_safe,
-            runs.settings,
-            unsafe.runs(runs).mean(axis=0),
-            strict=True,
-        )
-    ]
     return np.where(runs.valid, unsafe.robustness(runs), np.inf), causes

@@ -73,7 +73,7 @@ class Population(NamedTuple):
         The unsafe rows, or those that the user names.
     otherwise
         Number of rows with another outcome than in the results.
-    left_out
+    omissions
         Number of drawn settings in whose encounter the original vehicle does not keep its margin,
         which are no rows.
     over_sets
@@ -87,7 +87,7 @@ class Population(NamedTuple):
     rows: list[int]
     is_named: bool
     otherwise: int
-    left_out: int
+    omissions: int
     over_sets: SharesOverSets | None
 
 
@@ -107,7 +107,7 @@ def gather_failures(
         If the criterion or a handle cannot be read, or a handle is no solution of the results.
     """
     # Settings of the study's domain, or solutions of the results.
-    named = [*map(SolutionId.parse, solutions)]
+    named = list(map(SolutionId.parse, solutions))
     original = evaluator.evaluate_original()
     if isinstance(subject, Study):
         if named:
@@ -273,7 +273,7 @@ def compare_at_points(
     originals = system.characteristics.with_original_vehicle(settings)
     results = simulate_all_points(system, np.concatenate([originals, settings]))
     at_points = [result.evaluations for result in results]
-    is_unsafe = np.stack([*map(unsafe.of, at_points)])
+    is_unsafe = np.stack(list(map(unsafe.of, at_points)))
     worst = worst_points(system, at_points)
 
     # In words, at the worst point.

@@ -152,15 +152,10 @@ class Smallest(NamedTuple):
 
 def smallest_tables(smallest: Smallest | None) -> Frames:
     """The tables of causes and of the staircase; empty where the original itself is unsafe."""
-    rows = [
-        (
-            step.share,
-            step.size or None,
-            step.tried,
-            [", ".join(cause.changes) for cause in step.fewest],
-        )
-        for step in (smallest.steps if smallest else ())
-    ]
+    rows = []
+    for step in smallest.steps if smallest else ():
+        causes_in_words = [", ".join(cause.changes) for cause in step.fewest]
+        rows.append((step.share, step.size or None, step.tried, causes_in_words))
     title = (
         "How many changes are enough, with every change at the same share of the way to its"
         " end"

@@ -261,7 +261,7 @@ def causes_table(
     shares = [share_of.get(kind, default_share) for kind in kinds]
     is_robust = robust >= MIN_ROBUST_SHARE
     order = np.lexsort([-robust, -np.where(is_robust, shares, 0.0), ~is_robust])
-    solution_of = np.repeat(range(len(solutions)), [*map(len, causes_of)])
+    solution_of = np.repeat(range(len(solutions)), list(map(len, causes_of)))
     rows = [
         {
             **solutions[["solution", "avoided_by"]].iloc[solution_of[index]],
@@ -326,16 +326,17 @@ def printed_limits(
             alone.append(values | cause.changes | {name: value})
             names.append(name)
     single_values = iter(values_as_printed(model, alone, names))
-    return [
-        {
-            "encounter": {name: values[name] for name in cause.encounter},
-            "boundary": {name: values[name] for name in cause.changes},
-            "single_boundary": {
-                name: next(single_values)[name] for name in cause.changes
-            },
-        }
-        for values, cause in zip(printed, causes, strict=True)
-    ]
+    columns = []
+    for values, cause in zip(printed, causes, strict=True):
+        single_boundary = {name: next(single_values)[name] for name in cause.changes}
+        columns.append(
+            {
+                "encounter": {name: values[name] for name in cause.encounter},
+                "boundary": {name: values[name] for name in cause.changes},
+                "single_boundary": single_boundary,
+            }
+        )
+    return columns
 
 
 def sureness(

@@ -280,7 +280,7 @@ def other_sentences(
     notes = [unsafe.remark, *constraints_in_words(study)]
     if over_sets:
         yield from over_sets.sentences()
-        notes += counted_in_words(study, population.left_out)
+        notes += counted_in_words(study, population.omissions)
     yield from (Sentence("note", note) for note in notes)
 
 
