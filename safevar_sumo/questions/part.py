@@ -106,9 +106,9 @@ def study_up_to(study: Study, text: str) -> Study:
     name, value = _name_and_value(text)
     axes = dict.fromkeys(study.ranges)
     for test in study.tests:
-        axes |= {
-            axis: None for axis in study.axes_of(test) if _values(study, test, axis)
-        }
+        for axis in study.axes_of(test):
+            if _values(study, test, axis):
+                axes[axis] = None
     problem = f"study {study.name!r} does not vary {name!r}"
     if name and not axes:
         in_ranges = ", with --ranges" if name in study.axes else ""

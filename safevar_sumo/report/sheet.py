@@ -211,11 +211,12 @@ def _greatest_speed(
         return "", "The question about the greatest speed has no answer."
     span = speeds_of(study.case)
     assert span is not None
-    failing = [row["fails_at"] or {} for row in ranges if not row["kept"]]
-    speeds = [
-        math.ceil(at[SPEED_DIMENSION]) - 1 for at in failing if SPEED_DIMENSION in at
-    ]
-    greatest = min([*speed.tables["cars"]["up_to"].astype(float), *speeds])
+    speeds = speed.tables["cars"]["up_to"].astype(float).tolist()
+    for row in ranges:
+        place = row["fails_at"] or {}
+        if not row["kept"] and SPEED_DIMENSION in place:
+            speeds.append(math.ceil(place[SPEED_DIMENSION]) - 1)
+    greatest = min(speeds)
     if greatest >= span.low:
         return (
             f"{greatest:g} {span.unit} (simulated from {span.low:g} {span.unit} on)",

@@ -8,6 +8,7 @@ import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -264,16 +265,19 @@ def _check_lanes(
     file: Path, routes: Iterable[ElementTree.Element], roads: ElementTree.Element
 ) -> None:
     """Refuse a sloping or slippery road of the vehicle under test."""
-    names = " ".join(
-        route.get(name, "")
-        for route in routes
-        for name in ("edges", "from", "via", "to")
-    ).split()
-    edges = (edge for edge in roads.iter("edge") if edge.get("id") in names)
-    for lane in (lane for edge in edges for lane in edge.iter("lane")):
-        # A point is x,y or x,y,z.
-        points = (f"{point},0".split(",") for point in lane.get("shape", "").split())
-        heights = [float(z) for _, _, z, *_ in points]
+    names = set[str]()
+    for route, name in product(routes, ("edges", "from", "via", "to")):
+        names |= {*route.get(name, "").split()}
+    lanes = list[ElementTree.Element]()
+    for edge in roads.iter("edge"):
+        if edge.get("id") in names:
+            lanes += edge.iter("lane")
+    for lane in lanes:
+        heights = list[float]()
+        for point in lane.get("shape", "").split():
+            # A point is x,y or x,y,z.
+            _, _, z, *_ = f"{point},0".split(",")
+            heights.append(float(z))
         climb = max(heights, default=0.0) - min(heights, default=0.0)
         friction = float(lane.get("friction", 1))
         problem = (
