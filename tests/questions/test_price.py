@@ -226,7 +226,7 @@ def test_what_decides_is_said_from_enough_vehicles(rig: str) -> None:
 def test_what_takes_long_by_default_is_limited_and_said_first(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    account = Account(Phases(show_no_progress), least=2201)
+    account = Account(Phases(show_no_progress), minimum=2201)
     with pytest.raises(InputError, match="an answer takes at least 2,201"):
         account.open(10_000, 0.4)
     assert account.most == 2200
