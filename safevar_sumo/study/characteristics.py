@@ -62,9 +62,9 @@ class Domain(Table, frozen=True, kw_only=True):
 
 
 class Precision(Table, frozen=True, kw_only=True):
-    """How exactly a characteristic is measured. Two measurements of one vehicle may differ by
-    `value`, in the characteristic's unit. `source` says where this value comes from, or that it is
-    an assumption.
+    """A precision states how exactly a characteristic is measured. Two measurements of one vehicle
+    may differ by `value`, in the characteristic's unit. `source` says where this value comes from,
+    or that it is an assumption.
     """
 
     value: PositiveNumber
@@ -78,7 +78,7 @@ class CharacteristicTable(Domain, frozen=True, kw_only=True):
     - `meaning` describes the characteristic, and `short_name` is its name in sentences.
     - `counterpart` is the part of a real vehicle that sets the characteristic.
     - `measurement` says how a workshop measures the characteristic. If `workshop` is false,
-      `measurement` says who else measures it.
+      `measurement` says who else measures the characteristic.
     - `precision` says how exactly the characteristic is measured.
     - `remedy` says what to do with a vehicle beyond the limit of the characteristic.
     """

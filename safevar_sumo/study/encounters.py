@@ -31,15 +31,15 @@ BY_EXCESS = "impact_excess >"
 
 
 class ModelTable(Table, frozen=True, kw_only=True):
-    """A table with a `model` and its `parameters`. The model is a shipped name, or a class as
-    `package.module:Name`.
+    """The table [ads] names the driving system: its `model` and the model's `parameters`. The model
+    is a shipped name, or a class as `package.module:Name`.
 
-    - `kind` says what a driving system is: "traci" is a controller written for SUMO's TraCI, and
-      "fmu" is an FMU, whose path is the `model`.
+    - `kind` is "traci" for a controller that is written for SUMO's TraCI. `kind` is "fmu" for an
+      FMU, whose path is the `model`.
     - `inputs` and `outputs` name the variables of an FMU, by the quantity that a variable receives
       or returns.
-    - `files` are data files, or folders of data files, that a model of your own reads. Their paths
-      are relative to the study's file.
+    - `files` are data files, or folders of data files, that a driving system of your own reads. The
+      paths of `files` are relative to the study's file.
     """
 
     model: str
@@ -64,8 +64,8 @@ says another [m].
 
 
 class AxisTable(Table, frozen=True, kw_only=True):
-    """An axis is a parameter of encounters, such as a speed. A list in place of this table gives
-    only the values of `at`.
+    """An axis is a parameter of encounters, such as a speed. If a list stands in place of this
+    table, the list has the values of `at`.
 
     - `at` lists the values with which a test is driven. Without `at`, a test is driven with the
       value among its `parameters`, or with the default of the scenario's class.
@@ -115,8 +115,8 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
       each test that does not state the axis itself.
     - `margin` [m] is for studies with ranges of encounters. The original vehicle drives in the
       encounter of each changed vehicle, too. An encounter counts only if the original vehicle keeps
-      at least this clearance between bodies. Where the original vehicle fails, a failure of the
-      changed vehicle says nothing about the change.
+      at least `margin` between bodies. Where the original vehicle fails, a failure of the changed
+      vehicle says nothing about the change.
     - `repeats` is for simulators of your own whose runs differ: each vehicle is simulated this
       number of times. The answers use the share of unsafe runs, the worst run, and the means of
       metrics.
@@ -226,8 +226,9 @@ class MatrixTable(Table, frozen=True, kw_only=True):
     """The table [matrix] has the `tests` in which every vehicle is simulated.
 
     `aggregate` says which test case gives the result of a vehicle. With `worst`, this test case is
-    the one with the lowest safety degree. With `drac >` it is the test case with the largest value
-    of the metric `drac`, and with `ttc_min <` the test case with the smallest `ttc_min`.
+    the one with the lowest safety degree. With `drac >`, the result comes from the test case with
+    the largest value of the metric `drac`. With `ttc_min <`, the result comes from the test case
+    with the smallest value of the metric `ttc_min`.
     """
 
     tests: Annotated[list[MatrixTest], Meta(min_length=1)]

@@ -68,8 +68,8 @@ class VehicleTable(Table, frozen=True, kw_only=True):
     - `model` is the name of the vehicle's model, and `parameters` are the parameters of this model.
     - `characteristics` are the properties of the vehicle that a search changes, by name. The value
       false removes a characteristic that the study inherits from the study named by `extends`.
-    - `files` are data files, or folders of data files, that a vehicle model of your own reads.
-      Their paths are relative to the study's file.
+    - `files` are data files, or folders of data files, that a vehicle model of your own reads. The
+      paths of `files` are relative to the study's file.
     """
 
     model: str = ""
@@ -199,7 +199,7 @@ class Origin(Table, frozen=True, kw_only=True):
 
 
 class Study(Encounters, frozen=True, kw_only=True):
-    """A complete study, as in its TOML file; `load_study` reads one.
+    """A complete study, with the keys of its TOML file. `load_study` reads a study from its file.
 
     - `name` and `title` are the study's name and its heading.
     - `weather` is the name of a shipped weather, or a table with a weather of your own.
@@ -212,8 +212,8 @@ class Study(Encounters, frozen=True, kw_only=True):
     - `repeatability` has, for each metric, the standard deviation between repeats of one vehicle in
       the published study.
     - `spread` has parameter sets that fit the published data equally well: for each parameter a
-      list of values, of which the first is the study's own. A parameter is named by its key in the
-      file, such as `ads.parameters.corridor`.
+      list of values, of which the first is the value in the study. A parameter is named by its key
+      in the file, such as `ads.parameters.corridor`.
     - `model_error` is the further error of the vehicle model, by metric, for a vehicle that differs
       from the original vehicle by the full width of a domain.
     - `variation` states how characteristics vary between vehicles in the world, by name. By default
@@ -222,7 +222,7 @@ class Study(Encounters, frozen=True, kw_only=True):
     - `limits` are the values, by name, up to which characteristics may wear in service.
     - `unmeasured` has the values, by name, that `permit` assumes of characteristics that nobody
       measured in a car. Each value is a number or a table. A study that extends this study does not
-      inherit the table.
+      inherit the table [unmeasured].
     - `repair` states what a repair of the driving system may change.
     - `unsafe` states which vehicles the study calls unsafe.
     """

@@ -85,8 +85,8 @@ def repair(
     quick: bool = False,
 ) -> Answer:
     """Find the smallest change of the driving system's parameters that keeps worn vehicles safe.
-    You get the new values of these parameters, their price (the original vehicle brakes earlier,
-    or needlessly), and how the change was tested. Failures in results (DIR) within the promised
+    You get the new values, the price of the change (the original vehicle brakes earlier, or
+    needlessly), and how the change was tested. Failures in results (DIR) within the promised
     limits of wear become safe as well.
 
     Example: python -m safevar_sumo repair autoware_july --promise "brakeTorque >= 0.9"
