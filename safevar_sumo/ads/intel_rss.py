@@ -23,8 +23,9 @@ MOST = 1000.0
 
 class AdRss(ScalarAds):
     """Holds its speed until ad-rss-lib demands longitudinal braking, and then brakes fully while
-    the library demands braking. Afterwards the system does not press the accelerator again. While
-    somebody is in its way, the system rolls out with 1 m/s^2.
+    the library demands braking. Once the system has braked, the system does not press the
+    accelerator again. If the library demands no more braking while somebody is in the system's way,
+    the system rolls out with 1 m/s^2.
 
     The library applies the rule of responsibility-sensitive safety (Shalev-Shwartz, Shammah,
     Shashua 2017) to the situation "same direction, the ego vehicle behind". The system needs the

@@ -63,12 +63,12 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
 
     The system reacts to an obstacle that enters its way, or stands or drives steadily in its way,
     if the time to collision is below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s (v, u: speeds of the
-    vehicle and the obstacle). The system then brakes with 6 m/s^2 at once (5.2.5.2, which means
-    this for cars that cut in). If a leader brakes, the system must avoid a collision only if the
-    time gap before the braking was at least 1 s + v / (100 km/h) s (5.2.5.1). With this time gap,
-    the system avoids a collision if it brakes as hard as the leader. If the time gap to a braking
-    leader was smaller, UN R157 demands nothing, and the system does not react to the leader's
-    braking.
+    vehicle and the obstacle). The system then brakes with 6 m/s^2 at once. UN R157 states this time
+    to collision for cars that cut in (5.2.5.2). If a leader brakes, the system must avoid a
+    collision only if the time gap to the leader before the braking was at least 1 s + v / (100
+    km/h) s (5.2.5.1). Behind a leader at this time gap, a system that brakes as hard as the leader
+    avoids a collision. If the time gap to a braking leader was smaller, UN R157 demands nothing,
+    and the system does not react to the leader's braking.
 
     Parameters
     ----------

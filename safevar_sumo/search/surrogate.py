@@ -30,10 +30,11 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
     original vehicle. The prediction for a vehicle is the mean of the regressions, and the
     uncertainty of a prediction is the standard deviation of the predicted safety degrees. NSGA-II,
     with the parameters of `nsga2`, searches the predictions (1,500 vehicles in generations of 100),
-    from all non-dominated simulated vehicles and 100 sampled vehicles. If N vehicles were simulated
-    before, the round simulates 10 + N / 10 of the new non-dominated vehicles. Four fifths of these
-    vehicles have the best crowding distance, the others the most uncertain prediction. The result
-    is the non-dominated archive of all simulations.
+    from all non-dominated simulated vehicles and 100 sampled vehicles. If earlier rounds of the
+    search simulated N vehicles, a round simulates 10 + N / 10 new vehicles that are non-dominated
+    in the predictions. Four fifths of the vehicles of a round have the best crowding distance, one
+    fifth has the most uncertain prediction. The result is the non-dominated archive of all
+    simulations.
     """
 
     def search(
