@@ -64,9 +64,10 @@ SIMULATION_KEYS = (
     agreement=COLUMNS,
 )
 def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
-    """Compare the simulation with published vehicles and metrics (a CSV file), row by row. You get
-    the rank correlation, the mean error and the bias of each metric. Rows that cannot be
-    simulated, or whose values are outside the domains, are left out.
+    """Compare the simulation with published vehicles and metrics (a CSV file), row by row. For each
+    metric, you get the rank correlation, the mean error and the bias of the simulated values
+    against the published values. Rows that cannot be simulated, or whose values are outside the
+    domains, are left out.
 
     Example: python -m safevar_sumo validate rain published.csv
 

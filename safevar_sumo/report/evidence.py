@@ -95,9 +95,9 @@ def evidence(
     fresh: bool = False,
     simulations: Simulations = None,
 ) -> str:
-    """Pack results with their study, page and answers into one file, so that anybody can compute
-    every number again. `verify` computes the numbers again and reports each difference. The pack
-    does not contain the names of cars.
+    """Pack results with their study, page and answers into one file (an evidence pack), so that
+    anybody can compute every number again. `verify` computes the numbers again and reports each
+    difference. The evidence pack does not contain the names of cars.
 
     Example: python -m safevar_sumo evidence results/rain --out pack.zip
 
@@ -309,9 +309,9 @@ def verify(
     jobs: Jobs = None,
     progress: bool | Progress = False,
 ) -> Answer:
-    """Compute every claim of a pack of evidence again, and compare the result with the claim. The
+    """Compute every claim of an evidence pack again, and compare the result with the claim. The
     exit code is 0 if all claims are confirmed, and 1 if a claim differs. Exit code 2 means that the
-    pack is damaged or was written by another version.
+    evidence pack is damaged or was written by another version.
 
     Example: python -m safevar_sumo verify pack.zip
 

@@ -111,8 +111,8 @@ class _Distribution(Table, frozen=True, tag_field="distribution"):
 
 
 class Uniform(_Distribution, frozen=True, kw_only=True, tag="uniform"):
-    """Every value from `lower` to `upper` is equally likely. By default these are the ends of the
-    domain.
+    """Every value from `lower` to `upper` is equally likely. By default `lower` and `upper` are the
+    ends of the domain.
     """
 
     lower: float | None = None
@@ -209,8 +209,8 @@ class Constraint(Table, frozen=True, kw_only=True):
     - `unit` is the unit of the sum and of its bounds: the unit of a characteristic, or "-". The
       unit may be omitted if all characteristics of the sum have the same unit.
     - `meaning` explains the constraint and names its source.
-    - `tests` names the tests in which the constraint holds. By default the constraint holds in all
-      tests.
+    - `tests` names the tests in which the constraint applies. By default a constraint applies in
+      all tests.
     """
 
     sum: Annotated[dict[str, float], Meta(min_length=1)]

@@ -64,16 +64,17 @@ says another [m].
 
 
 class AxisTable(Table, frozen=True, kw_only=True):
-    """An axis is a parameter of encounters, such as a speed. If a list stands in place of this
-    table, the list has the values of `at`.
+    """An axis is a parameter of encounters, such as a speed. A list in place of an axis's table
+    gives only `at` (the tested values).
 
     - `at` lists the values with which a test is driven. Without `at`, a test is driven with the
       value among its `parameters`, or with the default of the scenario's class.
     - `lower` and `upper` are the ends of the range in which any value may occur. By default the
       range extends over the values of `at`, or, without `at`, over the widest range that the
       scenario's class declares.
-    - `original` is the value at which the original vehicle drives in a search. By default this
-      value is the first value of `at`; without `at`, the value with which the test is driven.
+    - `original` is the value at which the original vehicle drives in a search. By default
+      `original` is the first value of `at`. Without `at`, `original` is the value with which the
+      test is driven.
     """
 
     at: list[Any] = []

@@ -27,8 +27,9 @@ class FreeParameter(Table, frozen=True, kw_only=True):
     """A parameter that a repair or a search may change: its bounds `lower` and `upper` in `unit`,
     and its `meaning`.
 
-    The search measures how far a value is from another by their difference. With `log = true`, the
-    search uses their ratio, which suits positive quantities of unknown magnitude.
+    The search measures how far two values are apart by their difference. With `log = true`, the
+    search measures the ratio of the two values, which suits positive quantities of unknown
+    magnitude.
     """
 
     lower: float

@@ -83,8 +83,8 @@ class MetricsTable(Table, frozen=True, kw_only=True):
 
     - `ttc_threshold` [s] is the threshold TTC* of the time to collision.
     - `sampling_interval` [s] is the time between two samples from which the metrics TET, TIT and
-      aveDece are computed. This time is a whole multiple of the simulation's step, and by default
-      the step.
+      aveDece are computed. The sampling interval is a whole multiple of the simulation's time step.
+      By default the sampling interval is one time step.
     - `also` names further metrics: metrics of the package, such as `ttc_min`, or metrics of your
       own as `package.module:Name`.
     """
@@ -110,9 +110,9 @@ class SearchTable(Table, frozen=True, kw_only=True):
     - `objectives` are what the search minimises. For a metric among the objectives, the search
       looks for its most dangerous values.
     - `reference_point` [-] is the coordinate, in every dimension, of the reference point from which
-      the hypervolume is computed. Objectives are normalised to 0..1 for this purpose.
-    - `parameters` are the parameters of the algorithms, by the algorithm's name or label. A file
-      states these parameters in tables such as [search.nsga2].
+      the hypervolume is computed. For the hypervolume, objectives are normalised to 0..1.
+    - `parameters` are the parameters of the algorithms, by the algorithm's name or label. A study's
+      file states the parameters of an algorithm in tables such as [search.nsga2].
     """
 
     algorithms: Annotated[list[str], Meta(min_length=1), WITHOUT_EFFECT]
@@ -165,9 +165,9 @@ class RepairTable(Table, frozen=True, kw_only=True):
     """The table [repair] says what a repair of the driving system may change, and what a repair has
     to keep.
 
-    - `parameters` are the parameters that a repair may change, by name. A file states these
-      parameters directly under [repair]. By default a repair may change the parameters that a
-      shipped driving system names.
+    - `parameters` are the parameters that a repair may change, by name. A study's file states the
+      parameters of a repair directly under [repair]. By default a repair may change the parameters
+      that a shipped driving system names.
     - `promise` has the limits of wear, by characteristic, within which a repaired vehicle must be
       safe. The value "all" means the whole domain (range of values). By default the limits are
       those of the table [limits].
@@ -221,8 +221,8 @@ class Study(Encounters, frozen=True, kw_only=True):
     - `constraints` are conditions that the characteristics of one vehicle satisfy together.
     - `limits` are the values, by name, up to which characteristics may wear in service.
     - `unmeasured` has the values, by name, that `permit` assumes of characteristics that nobody
-      measured in a car. Each value is a number or a table. A study that extends this study does not
-      inherit the table [unmeasured].
+      measured in a car. Each assumed value is a number or a table. A study that extends this study
+      does not inherit the table [unmeasured].
     - `repair` states what a repair of the driving system may change.
     - `unsafe` states which vehicles the study calls unsafe.
     """

@@ -86,8 +86,8 @@ def repair(
 ) -> Answer:
     """Find the smallest change of the driving system's parameters that keeps worn vehicles safe.
     You get the new values, the price of the change (the original vehicle brakes earlier, or
-    needlessly), and how the change was tested. Failures in results (DIR) within the promised
-    limits of wear become safe as well.
+    needlessly), and how the change was tested. If you give results (DIR), the change also makes
+    safe the failures of these results within the limits of wear (--promise).
 
     Example: python -m safevar_sumo repair autoware_july --promise "brakeTorque >= 0.9"
 
