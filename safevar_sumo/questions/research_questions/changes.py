@@ -52,12 +52,13 @@ def critical_solutions(case: Case) -> pd.DataFrame:
     return solutions[solutions[SAFETY_DEGREE] < case.original_degrees(solutions)]
 
 
-def changes_of(case: Case, solutions: pd.DataFrame) -> FloatArray:
-    """Changes of the vehicle's n characteristics in M solutions, each in its unit: filtered minus
-    original value, the paper's v'' - v; shape (M, n).
+def changes_of(case: Case) -> FloatArray:
+    """Changes of the vehicle's n characteristics in the M critical solutions, each in its unit:
+    filtered minus original value, the paper's v'' - v; shape (M, n).
     """
     vehicle = case.characteristics.vehicle
-    return solutions[list(vehicle.names)].to_numpy(float) - vehicle.original
+    values = critical_solutions(case)[list(vehicle.names)].to_numpy(float)
+    return values - vehicle.original
 
 
 def change_numbers(case: Case) -> list[str]:
@@ -67,9 +68,8 @@ def change_numbers(case: Case) -> list[str]:
 
 def count_changes(case: Case) -> TextArray:
     """The number j of changed characteristics of each critical solution, "1".."n"."""
-    return np.asarray(
-        np.count_nonzero(changes_of(case, critical_solutions(case)), axis=1).astype(str)
-    )
+    counts = np.count_nonzero(changes_of(case), axis=1)
+    return np.asarray(counts.astype(str))
 
 
 def _means_by_change_count(
@@ -111,15 +111,14 @@ def rq32(case: Case) -> pd.DataFrame:
     Columns characteristic, j ("1".."n", "any"), percent (undefined without such a solution), rank
     (only for j = "any"; ties share the better rank and the next one is skipped).
     """
-    shares = (changes_of(case, critical_solutions(case)) != 0).astype(float)
+    shares = (changes_of(case) != 0).astype(float)
     keys = zip(case.characteristics.vehicle.names, strict=True)
     values = zip(keys, shares.T, strict=True)
     frame = _means_by_change_count(case, ["characteristic"], "percent", values)
     frame = frame.drop(columns="n")
     frame["percent"] *= 100
-    ranks = (
-        frame["percent"].where(frame["j"] == ANY).rank(method="min", ascending=False)
-    )
+    of_any = frame["percent"].where(frame["j"] == ANY)
+    ranks = of_any.rank(method="min", ascending=False)
     return frame.assign(rank=ranks.astype("Int64"))
 
 
@@ -130,7 +129,7 @@ def rq33(case: Case) -> pd.DataFrame:
     change relative to the original value, without sign), delta (mean signed change in the
     characteristic's unit), n (number of changes); pc and delta are undefined where n is 0.
     """
-    changes = changes_of(case, critical_solutions(case))
+    changes = changes_of(case)
     vehicle = case.characteristics.vehicle
     originals = vehicle.named(vehicle.original)
     values = {}
@@ -182,10 +181,8 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     frame = _means_by_change_count(case, ["quantity"], "value", values.items())
 
     # Relative to the original's values.
-    scale = (
-        frame["quantity"].map(SAFETY_SCALES).map(original).abs().replace(0.0, np.nan)
-    )
-    frame["percent"] = 100 * frame["value"] / scale
+    scales = frame["quantity"].map(SAFETY_SCALES).map(original)
+    frame["percent"] = 100 * frame["value"] / scales.abs().replace(0.0, np.nan)
     return frame
 
 
@@ -216,7 +213,7 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     equally frequent, those with the earlier characteristics in the study come first.
     """
     # Combinations of exactly so many characteristics.
-    is_changed = changes_of(case, critical_solutions(case)) != 0
+    is_changed = changes_of(case) != 0
     masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
     counts = Counter(tuple(np.flatnonzero(mask)) for mask in masks)
     in_order = sorted(counts.items(), key=lambda item: (-item[1], item[0]))

@@ -30,7 +30,6 @@ from safevar_sumo.questions.figures import (
 from safevar_sumo.questions.research_questions.changes import (
     ANY,
     changes_of,
-    critical_solutions,
     rq31,
     rq32,
 )
@@ -347,7 +346,7 @@ def _critical_changes(case: Case) -> FloatArray:
     """The changes of the critical solutions, shape (M, n); raises UnanswerableError if there are
     none.
     """
-    changes = changes_of(case, critical_solutions(case))
+    changes = changes_of(case)
     if not len(changes):
         raise UnanswerableError(
             case.name,
