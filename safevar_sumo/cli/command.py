@@ -82,12 +82,11 @@ class _Command(click.Command):
         meanings = {option.name: option.meaning for option in COMMON_OPTIONS}
         lines = []
         for title, names in COMMON_NAMES.items():
-            flags = [
-                options.pop(name).opts[0]
-                for name in names
-                if name in options
-                and str(options[name].help).startswith(meanings.get(name, ""))
-            ]
+            flags = list[str]()
+            for name in names:
+                meaning = meanings.get(name, "")
+                if name in options and str(options[name].help).startswith(meaning):
+                    flags.append(options.pop(name).opts[0])
             if flags:
                 lines.append((title, ", ".join(flags)))
         records = (option.get_help_record(ctx) for option in options.values())

@@ -61,13 +61,12 @@ class DrivingRobot:
     ) -> None:
         n = len(state.speed)
         size = n // len(points)
-        # Without a test the speed is None, which becomes NaN.
-        speeds = (
-            np.asarray(point.scenario.test_speed, dtype=float) for point in points
-        )
-        self._test_speed = np.concatenate(
-            [np.broadcast_to(speed, size) for speed in speeds]
-        )
+        speeds = []
+        for point in points:
+            # Without a test the speed is None, which becomes NaN.
+            speed = np.asarray(point.scenario.test_speed, dtype=float)
+            speeds.append(np.broadcast_to(speed, size))
+        self._test_speed = np.concatenate(speeds)
         self.has_test_speed: BoolArray = ~np.isnan(self._test_speed)
         """Which vehicles are in a scenario with a `test_speed`."""
         self._is_driving = self.has_test_speed.copy()
