@@ -95,8 +95,9 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
             "a directory on a disk that all workers share",
         )
     # Before: this worker may have other files. Afterwards: somebody may have edited them meanwhile.
-    refuse_changed_inputs(task.study, system_of(task.study), share.manifest)
-    with about(task.study.source), ExitStack() as stack:
+    study = task.study
+    refuse_changed_inputs(study, system_of(study), share.manifest)
+    with about(study.source), ExitStack() as stack:
         runs = [
             stack.enter_context(closing(_begin(task, share, key))) for key in share.keys
         ]
@@ -111,18 +112,18 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
                 evaluations = evaluate_settings(task, np.stack(settings))
                 for run, rows_of_run in groupby(range(len(rows)), owners.__getitem__):
                     run.receive(evaluations.take(list(rows_of_run)))
-                if task.study.search.failed == "skip":
-                    _refuse_failures(task.study, runs)
-        refuse_changed_inputs(task.study, system_of(task.study), share.manifest)
+                if study.search.failed == "skip":
+                    _refuse_failures(study, runs)
+        refuse_changed_inputs(study, system_of(study), share.manifest)
         try:
-            repeat_first_batch(task.study)
+            repeat_first_batch(study)
         except UserCodeError:
             # What the journals hold is not repeatable, and is not continued.
             for key in share.keys:
                 journal_file(share.directory, str(key)).unlink(missing_ok=True)
             raise
         # SUMO repeats the same settings whether a run was searched now or read from its journal.
-        return [run.finish(random_generator_of(task.study, run.key)) for run in runs]
+        return [run.finish(random_generator_of(study, run.key)) for run in runs]
 
 
 def _refuse_failures(study: Study, runs: Sequence[Run]) -> None:

@@ -99,19 +99,13 @@ class LazyCommands(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Suggest the nearest command if the name is unknown, or what stands in its place."""
-        if args and args[0] in ENDED_COMMANDS:
+        name = args[0] if args else "-"
+        if name in ENDED_COMMANDS:
             raise InputError(
-                args[0], "a command of releases before 0.5", ENDED_COMMANDS[args[0]]
+                name, "a command of releases before 0.5", ENDED_COMMANDS[name]
             )
-        if (
-            args
-            and args[0] not in COMMANDS
-            and not args[0].startswith("-")
-            and ":" not in args[0]
-        ):
-            ctx.fail(
-                f"there is no command {args[0]!r}{did_you_mean(args[0], COMMANDS)}"
-            )
+        if name not in COMMANDS and not name.startswith("-") and ":" not in name:
+            ctx.fail(f"there is no command {name!r}{did_you_mean(name, COMMANDS)}")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:

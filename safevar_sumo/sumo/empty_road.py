@@ -115,26 +115,28 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     if (is_slower & (brake > MIN_PEDAL)).any():
         return EmptyRoadFault(Reason.BRAKES, "brakes without an obstacle")
 
-    approach = speed[-1] - obstacle_speed[-1]
-    is_alone = not np.isfinite(gap[-1]) or approach < SLOW_APPROACH
-    keeps_speed = test_speed is not None and speed[-1] > test_speed - MIN_SLOWDOWN
+    last_gap, last_speed = gap[-1], speed[-1]
+    approach = last_speed - obstacle_speed[-1]
+    is_alone = not np.isfinite(last_gap) or approach < SLOW_APPROACH
+    keeps_speed = test_speed is not None and last_speed > test_speed - MIN_SLOWDOWN
     if runs.outcome[0] == Outcome.COLLISION:
         return None
 
     # Who drives past somebody beside its way has met nobody.
     beside = np.abs(trace.lateral[:end, 0]) - (trace.vehicle_width + obstacle_width) / 2
     stays_beside = (beside > 0).all() and beside[-1] >= beside[-2:][0]
-    if gap[-1] <= 0 and stays_beside:
+    if last_gap <= 0 and stays_beside:
         return EmptyRoadFault(
             Reason.LATE,
             "meets nobody: whoever is there stays beside its way, and comes no nearer to it",
         )
-    if gap[-1] <= 0 or (keeps_speed and is_alone):
+    if last_gap <= 0 or (keeps_speed and is_alone):
         return None
 
-    distance = f"{position[-1] - position[0]:.1f}"
-    if np.isfinite(gap[-1]):
-        distance += f" of {position[-1] - position[0] + gap[-1]:.1f}"
+    driven = position[-1] - position[0]
+    distance = f"{driven:.1f}"
+    if np.isfinite(last_gap):
+        distance += f" of {driven + last_gap:.1f}"
     slow_speed = max(speed[0], MIN_SLOWDOWN) - SLOW_APPROACH
     if runs.outcome[0] == Outcome.PASSED and speed[-1] > slow_speed:
         words = f"is late for the encounter: the others have left after {trace.time[end - 1]:.1f} s"
