@@ -98,9 +98,10 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
     study = task.study
     refuse_changed_inputs(study, system_of(study), share.manifest)
     with about(study.source), ExitStack() as stack:
-        runs = [
-            stack.enter_context(closing(_begin(task, share, key))) for key in share.keys
-        ]
+        runs = list[Run]()
+        for key in share.keys:
+            run = closing(_begin(task, share, key))
+            runs.append(stack.enter_context(run))
         # Each search goes on until it asks for settings that are in no journal; a run's settings
         # are neighbours.
         while requests := [(run, setting) for run in runs for setting in run.look_up()]:

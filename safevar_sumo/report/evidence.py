@@ -258,11 +258,11 @@ def _files_of_user(
     places = study.origin.places
     names = [name for name in named if not is_of_shipped_network(name)]
     # What a study names beside itself is there in a pack, too.
-    beside = (*data_files(study), *dict(fmus_of(study)).values())
-    paths_beside = [os.path.abspath(Path(places[0], name)) for name in beside]
-    outside = [
-        path for path in paths_beside if not Path(path).is_relative_to(places[0])
-    ]
+    outside = list[str]()
+    for name in (*data_files(study), *dict(fmus_of(study)).values()):
+        path_beside = os.path.abspath(Path(places[0], name))
+        if not Path(path_beside).is_relative_to(places[0]):
+            outside.append(path_beside)
     for name in [*outside, *filter(os.path.isabs, names)]:
         raise InputError(
             name,
