@@ -278,20 +278,21 @@ def _verdict(
     the rows of `CHANGES` of a vehicle with these.
     """
     members = case.characteristics
+    unsafe = case.unsafe
     solutions = case.different_solutions
     if solutions.empty:
         return [words.NOTHING_RETURNED.fill(reason=case.why_no_solution)], []
-    number = int(case.unsafe.rows(solutions).sum())
+    number = int(unsafe.rows(solutions).sum())
     total = len(solutions)
     template = words.UNSAFE if number else words.NOTHING_UNSAFE
     sentences = [
         template.fill(
-            unsafe=case.unsafe,
+            unsafe=unsafe,
             total=total,
             count=count_in_words(number, total),
-            collide=case.unsafe.verbs[number > 1],
+            collide=unsafe.verbs[number > 1],
         ),
-        *notes_on(case.unsafe, *demanded_in_words(results.study)),
+        *notes_on(unsafe, *demanded_in_words(results.study)),
     ]
     if failed := len(case.failures):
         vehicles = number_of(failed, "vehicle")
@@ -301,30 +302,30 @@ def _verdict(
         return sentences, []
 
     values = members.named(fewest.settings[0])
-    changed = [item for item in members if values[item.name] != item.original]
     texts = change_texts(members.vehicle, values, are_printed=True)
     count = len(texts)
     template = words.FEW_CHANGES if count <= MAX_LISTED else words.MANY_CHANGES
     if not count:
         template = words.ORIGINAL_UNSAFE
-    options = "".join(
-        f" --set {item.name}={values[item.name]:{EXACT}}" for item in changed
-    )
-    command = f"{replay_command(str(results.directory))}{options}"
+    command = replay_command(str(results.directory))
+    rows = []
+    for item in members:
+        value = values[item.name]
+        if value != item.original:
+            rows.append((item.name, item.unit, item.original, value))
+            command += f" --set {item.name}={value:{EXACT}}"
     sentences += [
         template.fill(
-            unsafe=case.unsafe,
+            unsafe=unsafe,
             count=number_of(count, "change"),
             changes=", ".join(texts),
-            breach=case.unsafe.breach_in_words(fewest),
+            breach=unsafe.breach_in_words(fewest),
             where=encounter_in_words(members, values, are_printed=True),
         ),
         words.NO_PROOF.fill(study=study),
         words.COMMAND.fill(command=command),
     ]
-    return sentences, [
-        (item.name, item.unit, item.original, values[item.name]) for item in changed
-    ]
+    return sentences, rows
 
 
 def summarise(results: Results) -> Answer:

@@ -47,22 +47,17 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
         not later_samples.size and np.isfinite(runs.collision_speed[column])
     ):
         return None
-    sample = (
-        later_samples[0] if later_samples.size else braking_samples[-1]
-    )  # a sample of the manoeuvre that counts
+    # A sample of the manoeuvre that counts.
+    sample = later_samples[0] if later_samples.size else braking_samples[-1]
 
     # Where the pedals no longer regulate the speed, the brake begins to rise.
     regulation = np.flatnonzero(
         ((trace.throttle[:sample, column] > 0) | (brake[:sample] > 0))
         & ~is_braking[:sample]
     )
-    onset = int(
-        braking_samples[braking_samples >= (regulation[-1] if regulation.size else 0)][
-            0
-        ]
-    )
-    while onset > 0 and brake[onset - 1] > (
-        brake[onset - 2] if onset > 1 else 0
-    ):  # the command already rises
+    end = regulation[-1] if regulation.size else 0
+    onset = int(braking_samples[braking_samples >= end][0])
+    # The command already rises.
+    while onset > 0 and brake[onset - 1] > (brake[onset - 2] if onset > 1 else 0):
         onset -= 1
     return onset

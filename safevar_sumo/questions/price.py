@@ -141,18 +141,19 @@ class Account:
         """
         # A number that is stated holds for all: the check, and what is repeated at the end.
         parts = 0
-        if self.asked is not None and seconds is not None:
-            parts = sum(spare(self.asked, self.minimum))
-        self.most = self.asked
-        if self.asked is not None and self.asked >= expected + parts:
+        allowance = self.asked
+        if allowance is not None and seconds is not None:
+            parts = sum(spare(allowance, self.minimum))
+        self.most = allowance
+        if allowance is not None and allowance >= expected + parts:
             self.most = None
             # Half of what is more than usual: some searches take longer than they are expected to.
-            effort = self.asked / (2 * (expected + parts))
+            effort = allowance / (2 * (expected + parts))
             self.effort = min(max(self.effort, effort), MOST_EFFORT)
         if seconds is None:
             return
         longest = LONGEST / self.questions
-        if self.asked is None and expected * seconds > longest:
+        if allowance is None and expected * seconds > longest:
             self.most = round_down(longest / seconds)
             parts = sum(spare(self.most, self.minimum))
         if self.most is not None:
@@ -162,7 +163,7 @@ class Account:
             price = _price(min(expected, self.most), seconds).removeprefix("about ")
             words = f"at most {price}, of about {expected:,.0f} in full"
         words += f" (one takes {seconds:.2g} s"
-        if checked and self.asked is None:
+        if checked and allowance is None:
             words += f", besides {checked:,} for a check of the class"
         elif checked:
             words += f", with {checked:,} for a check of the class, which is shorter than usual"
@@ -207,9 +208,8 @@ def print_price_of_list(
 def _timed(task: Task, settings: FloatArray, pool: Pool) -> tuple[Evaluations, float]:
     """What settings do, and how long a worker takes for them [s]."""
     jobs = [(task, settings)]
-    carry_out(
-        evaluate_settings, jobs, pool
-    )  # a worker starts, and so does its simulator
+    # A worker starts, and so does its simulator.
+    carry_out(evaluate_settings, jobs, pool)
     start = time.perf_counter()
     (evaluations,) = carry_out(evaluate_settings, jobs, pool)
     return evaluations, time.perf_counter() - start

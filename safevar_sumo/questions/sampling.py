@@ -27,12 +27,10 @@ class Stream(IntEnum):
     JOINT_LIMITS = 4  # falsification of joint limits
     LIMITS_ALONE = 6  # falsification of the limits of one characteristic alone
     REPAIRED_BOUND = 7  # vehicles within the required range, for the bound of a repair
-    NEAREST_LIMIT = (
-        8  # falsification of a limit in place of a specified one that does not hold
-    )
-    WIDER_SCOPE = (
-        9  # falsification of limits in the scope of a wider study, and up to a value
-    )
+    # Falsification of a limit in place of a specified one that does not hold.
+    NEAREST_LIMIT = 8
+    # Falsification of limits in the scope of a wider study, and up to a value.
+    WIDER_SCOPE = 9
     EXTENSION = 10  # falsification of joint limits of which one is extended
     SPECIFIED_BETWEEN = 11  # specified limits between the tests of a matrix
     VALIDATION = 15  # further falsifications of joint limits that passed one

@@ -214,9 +214,10 @@ def bound_in_words(at_most: float) -> str:
 
 def two_decimals(value: float | None) -> str:
     """A value with two decimals, never `-0.00`; `-` if undefined."""
-    return (
-        "-" if value is None or math.isnan(value) else f"{round(value, 2) + 0.0:.2f}"
-    )  # -0.0 + 0.0 is 0.0
+    if value is None or math.isnan(value):
+        return "-"
+    # -0.0 + 0.0 is 0.0.
+    return f"{round(value, 2) + 0.0:.2f}"
 
 
 def counted_in_words(study: Study, omissions: int | None = None) -> list[str]:

@@ -63,7 +63,7 @@ SEVERITY = [
 ]
 """Outcomes of the rounds of a setting, the worst first."""
 COLLISION = Unsafe()
-Result = Mapping[str, Any]
+StatedRun = Mapping[str, Any]
 """What a simulator states of a run."""
 _steps = WeakKeyDictionary[type, dict[str, float]]()
 """The time step of each class, as this process has loaded it, at each point [s]."""
@@ -230,7 +230,7 @@ def _check_step(simulator: Simulator, time: FloatArray, point: str) -> None:
         raise code.wrong("simulate", f"{step:g} s", "one time step in all runs")
 
 
-def _check_names(scenario: Simulator, result: Result, system: System) -> None:
+def _check_names(scenario: Simulator, result: StatedRun, system: System) -> None:
     """Refuse metrics that nobody knows, and objectives that are missing, in a result without a
     trace.
     """
@@ -261,11 +261,11 @@ def _check_names(scenario: Simulator, result: Result, system: System) -> None:
 
 
 def _runs_of(
-    results: Sequence[Result], system: System, allowed_impact_speed: float
+    results: Sequence[StatedRun], system: System, allowed_impact_speed: float
 ) -> SimulationRuns:
     """The runs of N results, each with its own number of samples; 0 without a trace."""
     # A result with a trace states no metrics: they follow from the trace.
-    traces, rigs = list[Result](), list[Result]()
+    traces, rigs = list[StatedRun](), list[StatedRun]()
     for result in results:
         has_trace = TIME in result
         traces.append(result if has_trace else {})
@@ -285,7 +285,7 @@ def _runs_of(
                 values[:, row] = trace[name][np.minimum(samples, lengths[row] - 1)]
         return values
 
-    def number(name: str, of: Sequence[Result] = results) -> FloatArray:
+    def number(name: str, of: Sequence[StatedRun] = results) -> FloatArray:
         """What results state, shape (N,), NaN where they do not."""
         return np.array([result.get(name, np.nan) for result in of], dtype=float)
 

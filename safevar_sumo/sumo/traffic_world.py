@@ -151,7 +151,8 @@ class TrafficWorld(SumoWorld):
 
     def _add(self, actor: Placed) -> None:
         """Add an actor to every copy, wherever it may be put."""
-        types = self.api.vehicletype
+        api = self.api
+        types = api.vehicletype
         track = actor.track
         # Who is not there yet has the size that it will have.
         lengths = self._of_copies(track.length.max(axis=0, keepdims=True))
@@ -165,13 +166,13 @@ class TrafficWorld(SumoWorld):
             types.setMinGap(id_, 0)
             types.setShapeClass(id_, SHAPES.get(track.kind, "evehicle"))
             if actor.is_person:
-                self.api.person.add(id_, route[0], 0.0, typeID=id_)
-                self.api.person.appendWaitingStage(id_, WAIT)
+                api.person.add(id_, route[0], 0.0, typeID=id_)
+                api.person.appendWaitingStage(id_, WAIT)
             else:
-                self.api.route.add(id_, route)
-                self.api.vehicle.add(id_, id_, typeID=id_)
-                self.api.vehicle.setSpeedMode(id_, SPEED_MODE)
-                self.api.vehicle.setLaneChangeMode(id_, 0)
+                api.route.add(id_, route)
+                api.vehicle.add(id_, id_, typeID=id_)
+                api.vehicle.setSpeedMode(id_, SPEED_MODE)
+                api.vehicle.setLaneChangeMode(id_, 0)
 
     def _put(self) -> None:
         """Put all actors where they are at the sample that the coming step leads to."""

@@ -296,10 +296,9 @@ def draw_needed(answer: Answer) -> Figure:
         new_figure,
     )
 
-    # Bars over each other, the most necessary characteristic first.
-    frame = answer.tables["characteristics"].iloc[
-        ::-1
-    ]  # bars are drawn from the bottom up
+    # Bars over each other, the most necessary characteristic at the top: bars are drawn from the
+    # bottom up.
+    frame = answer.tables["characteristics"].iloc[::-1]
     size = (6.4, 1.4 + 0.3 * max(len(frame), 4))
     figure, ((axis,),) = new_figure(
         f"{answer.study.name}: which changed characteristics are necessary", 1, 1, size

@@ -208,9 +208,8 @@ def median_interval(values: ArrayLike, alpha: float = ALPHA) -> Interval:
     statistics; NaN if there are too few values.
     """
     ordered = np.sort(np.asarray(values, float))
-    rank = int(
-        scipy.stats.binom.ppf(alpha / 2, ordered.size, 0.5)
-    )  # the first whose probability is not too small
+    # The first rank whose probability is not too small.
+    rank = int(scipy.stats.binom.ppf(alpha / 2, ordered.size, 0.5))
     if rank:
         return (ordered[rank - 1], ordered[-rank])
     return (math.nan, math.nan)

@@ -130,10 +130,8 @@ def rules(
             f"study {study.name!r}: none of {len(evaluations)} vehicles could be simulated"
         )
 
-    # Rules are boxes in which unsafe vehicles are dense.
-    trained = np.tile(
-        training.settings, (len(of_runs), 1)
-    )  # with repeats, each run is one
+    # Rules are boxes in which unsafe vehicles are dense; with repeats, each run is a vehicle.
+    trained = np.tile(training.settings, (len(of_runs), 1))
     boxes = _boxes(trained, of_runs.ravel(), characteristics)
     groups = [is_within(box, vehicles) & ~is_first_half for box in boxes]
     over_sets = SharesOverSets.of(evaluator, criterion, vehicles, groups)
