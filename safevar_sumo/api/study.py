@@ -221,7 +221,7 @@ def _found(
     if system.meets_nobody and not (unsafe or results.study.unsafe.criterion):
         advice = ""
     if breach := _breach_of_original(case):
-        sentences = [words.ALREADY_UNSAFE.fill(breach=breach)]
+        sentences = [words.ALREADY_UNSAFE(breach=breach)]
         advice = ""
     else:
         sentences, changes = _verdict(results, case, jobs, study)
@@ -281,12 +281,12 @@ def _verdict(
     unsafe = case.unsafe
     solutions = case.different_solutions
     if solutions.empty:
-        return [words.NOTHING_RETURNED.fill(reason=case.why_no_solution)], []
+        return [words.NOTHING_RETURNED(reason=case.why_no_solution)], []
     number = int(unsafe.rows(solutions).sum())
     total = len(solutions)
     template = words.UNSAFE if number else words.NOTHING_UNSAFE
     sentences = [
-        template.fill(
+        template(
             unsafe=unsafe,
             total=total,
             count=count_in_words(number, total),
@@ -296,7 +296,7 @@ def _verdict(
     ]
     if failed := len(case.failures):
         vehicles = number_of(failed, "vehicle")
-        sentences.append(words.NOT_SIMULATED.fill(failed=vehicles))
+        sentences.append(words.NOT_SIMULATED(failed=vehicles))
     fewest = fewest_changes(case, jobs)
     if fewest is None:
         return sentences, []
@@ -315,15 +315,15 @@ def _verdict(
             rows.append((item.name, item.unit, item.original, value))
             command += f" --set {item.name}={value:{EXACT}}"
     sentences += [
-        template.fill(
+        template(
             unsafe=unsafe,
             count=number_of(count, "change"),
             changes=", ".join(texts),
             breach=unsafe.breach_in_words(fewest),
             where=encounter_in_words(members, values, are_printed=True),
         ),
-        words.NO_PROOF.fill(study=study),
-        words.COMMAND.fill(command=command),
+        words.NO_PROOF(study=study),
+        words.COMMAND(command=command),
     ]
     return sentences, rows
 
@@ -387,7 +387,7 @@ def summarise(results: Results) -> Answer:
         study=study,
         verdict=Verdict(
             [
-                words.PROGRESS.fill(
+                words.PROGRESS(
                     finished=len(results.finished),
                     runs=number_of(runs, "run"),
                     directory=results.directory,

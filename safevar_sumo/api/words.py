@@ -2,48 +2,40 @@
 
 from __future__ import annotations
 
-from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.sentence import answer, condition, evidence, note
 
-ALREADY_UNSAFE = Sentence(
-    "answer",
+ALREADY_UNSAFE = answer(
     "The original vehicle is already unsafe: it {breach}. A failure needs no change of the"
-    " vehicle.",
+    " vehicle."
 )
-NOTHING_RETURNED = Sentence("answer", "The search returned no vehicle: {reason}.")
-NOTHING_UNSAFE = Sentence(
-    "answer",
+NOTHING_RETURNED = answer("The search returned no vehicle: {reason}.")
+NOTHING_UNSAFE = answer(
     "The search did not find {unsafe.event}: none of the {total:,} different vehicles that the"
-    " search returned (its solutions) {unsafe.verbs[0]}.",
+    " search returned (its solutions) {unsafe.verbs[0]}."
 )
-ORIGINAL_UNSAFE = Sentence(
-    "answer",
-    "The search found {unsafe.event} of the original vehicle, which {breach}{where}.",
+ORIGINAL_UNSAFE = answer(
+    "The search found {unsafe.event} of the original vehicle, which {breach}{where}."
 )
-FEW_CHANGES = Sentence(
-    "answer",
+FEW_CHANGES = answer(
     "The search found {unsafe.event} with only {count}: {changes}. The changed vehicle"
-    " {breach}{where}.",
+    " {breach}{where}."
 )
-MANY_CHANGES = Sentence(
-    "answer",
-    'The search found {unsafe.event} with only {count}, which the table "fewest" lists (--details).'
-    " The changed vehicle {breach}{where}.",
+MANY_CHANGES = answer(
+    'The search found {unsafe.event} with only {count}, which the table "fewest" lists'
+    " (--details). The changed vehicle {breach}{where}."
 )
-UNSAFE = Sentence(
-    "evidence",
-    "{count} different vehicles that the search returned (its solutions) {collide}.",
+UNSAFE = evidence(
+    "{count} different vehicles that the search returned (its solutions) {collide}."
 )
-NOT_SIMULATED = Sentence(
-    "condition", "The search could not simulate {failed}, and no result has them."
+NOT_SIMULATED = condition(
+    "The search could not simulate {failed}, and no result has them."
 )
-NO_PROOF = Sentence(
-    "note",
+NO_PROOF = note(
     'The search does not prove that fewer changes are safe. The command "explain {study}" tries'
     " single changes and combinations of changes, each at an end of its domain (its range of"
-    " values).",
+    " values)."
 )
-COMMAND = Sentence("note", "This command simulates the vehicle: {command}")
-PROGRESS = Sentence(
-    "answer",
-    "{finished} of the {runs} of the search are finished. The results are in {directory}.",
+COMMAND = note("This command simulates the vehicle: {command}")
+PROGRESS = answer(
+    "{finished} of the {runs} of the search are finished. The results are in {directory}."
 )

@@ -132,8 +132,8 @@ class Answer:
     study
         The study that was examined; `list` is about none.
     verdict
-        Conclusion, evidence and next step in a few sentences, of which one screen has the first
-        three, and each that begins with `Scope:` or `Remark:`.
+        Conclusion and evidence in a few sentences; of a `Verdict`, which knows what each sentence
+        is, one screen has the first five and the notes.
     tested
         How the conclusion was tested, in sentences that readers see below the tables.
     numbers

@@ -36,6 +36,7 @@ from safevar_sumo.questions.options import (
     flag_of,
     options_of,
 )
+from safevar_sumo.questions.sentence import Sentence, Verdict, answer, note
 from safevar_sumo.questions.subject import (
     Results,
     part_of,
@@ -74,11 +75,17 @@ safety degree below half of the original's.
 """
 QUICK = "quick"
 """The option of questions that have a rough answer, too."""
-ROUGH = (
-    "Rough answer (--quick: at most an eighth of the search, with one parameter set; it proves"
-    " nothing):"
+ROUGH = answer(
+    "Rough answer (--quick): at most an eighth of the search was simulated, with one parameter set,"
+    " and proves nothing."
 )
-"""The beginning of such an answer."""
+ROUGH_OF_FEW = answer(
+    "Rough answer (--simulations {most}): fewer simulations than usual were allowed."
+)
+"""The beginning of such answers."""
+CRITERION_OF_STUDY = note("Criterion: {criterion} ({source}).")
+NOT_SIMULATED = note("Not simulated: {parts}.")
+"""Where a study's own criterion comes from, and what it leaves out."""
 
 
 class Question:
@@ -279,61 +286,67 @@ class Question:
 
             # The question's own function.
             with user_errors(self.name):
-                answer = self.compute(subjects[0], evaluator, *subjects[1:], **values)
-            if not isinstance(answer, Answer):
+                result = self.compute(subjects[0], evaluator, *subjects[1:], **values)
+            if not isinstance(result, Answer):
                 raise InputError(
-                    self.name, f"returns {type(answer).__name__}", "an Answer"
+                    self.name, f"returns {type(result).__name__}", "an Answer"
                 )
 
             # An answer about a driving system that fails by itself begins with that.
-            if answer.study is not study:
-                reason = evaluator.for_study(answer.study).no_verdict
+            if result.study is not study:
+                reason = evaluator.for_study(result.study).no_verdict
             else:
                 reason = evaluator.no_verdict
             evaluator.end()
-        numbers = {"driven": not reason, **answer.numbers}
-        rough = ""
+        numbers = {"driven": not reason, **result.numbers}
+        beginning = [answer(reason)]
         if values.get(QUICK):
-            rough = ROUGH
+            beginning.append(ROUGH)
         if account.most is not None:
             numbers |= {"rough": True, "simulations": account.spent}
-            rough = f"Rough answer (--simulations {account.most}):"
+            beginning[1:] = [ROUGH_OF_FEW(most=account.most)]
         if self.has_rough_answer:
-            numbers["rough"] = bool(rough or numbers.get("rough"))
-        sentences = reason, rough, answer.verdict, cites, account.undefined_in_words
-        verdict = " ".join(filter(None, sentences))
+            numbers["rough"] = bool(beginning[1:] or numbers.get("rough"))
+        sentences = [*beginning, *Verdict.of(result.verdict).sentences, *cites]
+        undefined = note(account.undefined_in_words)
         limit = account.asked if account.most is None else account.most
         return replace(
-            answer,
-            verdict=verdict,
+            result,
+            verdict=Verdict([*sentences, undefined]),
             numbers=numbers,
-            next=self._next(subjects[0], evaluator, called, values) or answer.next,
+            next=self._next(subjects[0], evaluator, called, values) or result.next,
             command="" if limit is None else f" --simulations {limit}",
         )
 
     def _criterion(
         self, values: JsonObject, study: Study
-    ) -> tuple[Unsafe | None, JsonObject, str]:
+    ) -> tuple[Unsafe | None, JsonObject, Sequence[Sentence]]:
         """What is unsafe, the values of options with it, and where it comes from: a study's own
         criterion stands where neither a criterion nor a margin is asked for.
         """
         names = [option.name for option in self.options if option.metavar == CRITERION]
         if not names:
-            return None, values, ""
+            return None, values, ()
         (name,) = names
         # Who states a distance to keep means a collision, whatever the study calls unsafe.
         if values.get(name) is not None or values.get("margin") is not None:
-            return values.get(name), values, ""
+            return values.get(name), values, ()
         stated = study.unsafe
         cites = []
         if stated.source:
-            cites.append(f"Criterion: {stated.criterion or None} ({stated.source}).")
+            rule = stated.criterion or None
+            cites.append(
+                CRITERION_OF_STUDY(
+                    criterion=rule,
+                    source=stated.source,
+                )
+            )
         if stated.not_simulated:
-            cites.append(f"Not simulated: {stated.not_simulated}.")
+            cites.append(NOT_SIMULATED(parts=stated.not_simulated))
         criterion = None
         if stated.criterion:
             criterion = Unsafe.parse(stated.criterion)
-        return criterion, {**values, name: criterion}, " ".join(cites)
+        return criterion, {**values, name: criterion}, cites
 
     def _next(
         self, subject: Subject, evaluator: Evaluator, called: str, values: JsonObject

@@ -135,7 +135,12 @@ class SharesOverSets(NamedTuple):
         )
         template = SAME_SHARE if smallest == greatest else SHARES
         sets = len(shares)
-        yield template.fill(least=smallest, greatest=greatest, sets=sets, most=VEHICLES)
+        yield template(
+            least=smallest,
+            greatest=greatest,
+            sets=sets,
+            most=VEHICLES,
+        )
 
     def _in_words(self, number: np.intp) -> str:
         """The share of all vehicles with a set, and its number if no other interval overlaps."""

@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.answer import Answer, Column, Columns
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.records import Evaluations
 
 if TYPE_CHECKING:
@@ -27,25 +28,7 @@ UNSAFE_IN = {
 """In which systems a setting is unsafe, as the table says it, and the number that counts such
 settings.
 """
-SETTING_COLUMNS: Columns = {
-    "solution": "handle of the solution",
-    "unsafe_in": f"systems in which the setting is unsafe: {', '.join(UNSAFE_IN)}",
-    **{
-        f"{side}_{name}": column
-        for side in SIDES
-        for name, column in (
-            ("outcome", Column("", f"how the simulation ends in {side.upper()}")),
-            (
-                "degree",
-                Column(
-                    "m",
-                    f"safety degree in {side.upper()}; in -m/s on a collision",
-                    ".2f",
-                ),
-            ),
-        )
-    },
-}
+SETTING_COLUMNS = shipped_columns("compare")["settings"]
 ENDS = [name for name in SETTING_COLUMNS if name.startswith(("a_", "b_"))]
 
 

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.part import at_point
 from safevar_sumo.questions.sampling import clopper_pearson
-from safevar_sumo.questions.tables import Column, Columns, with_interval
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import drive_worst
@@ -36,37 +36,7 @@ OF_LANES = ("rss", "fuzzy_safety", "r157")
 """Further drivers where somebody drives ahead in the lane, or comes into it."""
 NOBODY, NO_VERDICT = "nobody", "no verdict"
 """In the place of a driver who avoids a collision."""
-COLUMNS: Columns = {
-    "driver": (
-        "reference driver in the same vehicle: a competent driver; full braking at the first"
-        " possible moment; where a car ahead brakes, or takes or leaves the lane, rss"
-        " (responsibility-sensitive safety), fuzzy_safety and r157 (UN R157, 5.2.5)"
-    ),
-    "avoided": Column(
-        "", "collisions that this driver avoids", head="collisions avoided"
-    ),
-    "no_longer": Column(
-        "",
-        "collisions that this driver avoids in the original vehicle, but not in the changed one",
-        head="avoided only in the original vehicle",
-    ),
-    "no_verdict": Column(
-        "",
-        "collisions in test cases where this driver collides even in the original vehicle; these"
-        " collisions do not count in the share",
-        head="not decided",
-    ),
-    **with_interval(
-        "share",
-        Column(
-            "-",
-            "share of the decided collisions that this driver avoids",
-            ".2f",
-            head="share avoided",
-        ),
-    ),
-    "no_verdict_points": Column("", "points without a verdict", is_shown=False),
-}
+COLUMNS = shipped_columns("drivers")["drivers"]
 """The interval is Clopper and Pearson's for a sample (slightly too wide, without a correction for
 the finite population), the share itself if all collisions were simulated.
 """

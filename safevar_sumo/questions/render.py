@@ -16,7 +16,7 @@ import pandas as pd
 from rich.console import Console
 
 from safevar_sumo.errors import printable
-from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.questions.tables import (
     LATEX_PREAMBLE,
     MAX_LEAD_ROWS,
@@ -36,18 +36,10 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.answer import Answer
 
 Form = Literal["text", "json", "csv", "latex", "html"]
-SENTENCE_END = re.compile(r"(?<=[^.]{2}\.) (?=[A-Z0-9])")
-"""Between two sentences."""
-MAX_SENTENCES = 3
+MAX_SENTENCES = 5
 """Number of sentences of the verdict that one screen has."""
 CODE = re.compile("`([^`<>]+)`")
 """What a text quotes as code."""
-SCOPE = "Scope: "
-NOTE = re.compile(
-    "(Valid for|Remark|Changed|Criterion|Not simulated|Counted as unsafe|Unsafe means|Safe means):"
-    " |An encounter counts|A vehicle counts|Left out|If all changes go"
-)
-"""Beginnings of sentences of a verdict that one screen has below the table."""
 MAX_ROWS = 200
 """Number of rows up to which readers see a table; JSON and CSV have them all."""
 MAX_LINES = 30
@@ -85,13 +77,13 @@ def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
     its attribute `shown_whole` is the number of rows up to which it is.
     """
     # Sentences of the verdict by kind.
-    said = _sentences_of(answer.verdict)
+    said = Verdict.of(answer.verdict).sentences
+    tested = Verdict.of(answer.tested).sentences
     sentences = [text for kind, text in said if kind != "note"]
     notes = [text for kind, text in said if kind == "note"]
-    if answer.tested:
-        first, *further = SENTENCE_END.split(answer.tested)
-        notes.insert(1, f"Tested: {first}")
-        notes += filter(NOTE.match, further)
+    if tested:
+        notes.insert(1, f"Tested: {tested[0].text}")
+        notes += [text for kind, text in tested[1:] if kind == "note"]
 
     # The lead, and what it does not show.
     lead = pd.DataFrame()
@@ -107,15 +99,6 @@ def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
             notes.insert(0, f"{cut} more rows: --details.")
     unsaid = max(len(sentences) - MAX_SENTENCES, 0)
     return Screen(sentences[:MAX_SENTENCES], unsaid, lead, notes, others)
-
-
-def _sentences_of(verdict: str) -> list[Sentence]:
-    if isinstance(verdict, Verdict):
-        return verdict.sentences
-    return [
-        Sentence("note" if NOTE.match(text) else "answer", text)
-        for text in SENTENCE_END.split(verdict.replace(SCOPE, "Valid for: "))
-    ]
 
 
 def _more(answer: Answer, screen: Screen) -> str:
@@ -156,7 +139,7 @@ def print_answer(answer: Answer, console: Console, *, details: bool) -> None:
 
 
 def _print_whole(answer: Answer, max_rows: int, console: Console) -> None:
-    print_text(console, answer.verdict.replace(f" {SCOPE}", f"\n{SCOPE}"))
+    print_text(console, answer.verdict)
     for frame in _short_tables(answer).values():
         cut = len(frame) - max_rows
         part = frame[:max_rows]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from typing import NamedTuple
 
 KINDS = "answer", "evidence", "condition", "note"
@@ -18,10 +19,14 @@ class Sentence(NamedTuple):
     kind: str
     text: str
 
-    def fill(self, **values: object) -> Sentence:
+    def __call__(self, **values: object) -> Sentence:
         """The sentence with values in its slots."""
         text = self.text.format(**values)
         return self._replace(text=text[:1].upper() + text[1:])
+
+
+answer, evidence, condition, note = (partial(Sentence, kind) for kind in KINDS)
+"""A sentence of this kind."""
 
 
 class Verdict(str):
@@ -36,3 +41,8 @@ class Verdict(str):
         verdict = super().__new__(cls, " ".join(text for _, text in kept_sentences))
         verdict.sentences = kept_sentences
         return verdict
+
+    @classmethod
+    def of(cls, text: str) -> Verdict:
+        """A text as a verdict; one without kinds is a single sentence."""
+        return text if isinstance(text, Verdict) else cls([answer(text)])

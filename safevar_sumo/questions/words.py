@@ -8,7 +8,7 @@ from shlex import quote
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.sampling import CONFIDENCE
-from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.sentence import Sentence, note
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -27,7 +27,8 @@ OUTCOME_VERBS = {
 """How a run ended, as the verb of a sentence; a collision is described with its speed instead."""
 
 
-UNSAFE_MEANS = Sentence("note", "Unsafe means: {description}.")
+VALID_FOR = note("Valid for: {scope}.")
+UNSAFE_MEANS = note("Unsafe means: {description}.")
 EXACT = ".15g"
 """How values are printed with which a vehicle was simulated: all their digits."""
 LOST_SHARE = 0.05
@@ -239,7 +240,7 @@ def counted_in_words(study: Study, omissions: int | None = None) -> list[str]:
 def notes_on(unsafe: Unsafe, *texts: str) -> list[Sentence]:
     """Notes, among them what is unsafe where that is not a collision alone."""
     means = "" if unsafe.is_collision else f"Unsafe means: {unsafe.description}."
-    return [Sentence("note", text) for text in (*texts, unsafe.remark, means)]
+    return [note(text) for text in (*texts, unsafe.remark, means)]
 
 
 def demanded_in_words(study: Study) -> list[str]:

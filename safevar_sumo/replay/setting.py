@@ -111,11 +111,11 @@ def answer_of_setting(
         if item.name != PHASE and named[item.name] != item.original
     ]
     if texts := change_texts(system.characteristics.vehicle, named):
-        sentences.append(words.CHANGES.fill(changes=", ".join(texts)))
+        sentences.append(words.CHANGES(changes=", ".join(texts)))
     if places:
-        sentences.append(words.ENCOUNTER.fill(values=join_phrases(places)))
+        sentences.append(words.ENCOUNTER(values=join_phrases(places)))
     if phase := named.get(PHASE):
-        sentences.append(words.LATER.fill(phase=phase))
+        sentences.append(words.LATER(phase=phase))
     numbers = simulation.numbers
     if handle is not None:
         numbers = {"solution": str(handle), **numbers}
@@ -177,7 +177,7 @@ def _verdict(simulation: Simulation, point_count: int) -> list[Sentence]:
         templates = words.ORIGINAL_IN_TEST, words.CHANGED_IN_TEST
     sentences = [
         Sentence("answer", simulation.no_verdict),
-        templates[is_changed].fill(
+        templates[is_changed](
             original=simulation.original.verdict,
             changed=simulation.verdict,
             number=point_count,
@@ -190,7 +190,7 @@ def _verdict(simulation: Simulation, point_count: int) -> list[Sentence]:
     # NaN is no safety degree that suffices.
     demand = simulation.scoring.safe_original
     if demand is not None and not simulation.original.metrics[SAFETY_DEGREE] >= demand:
-        sentences.append(words.LEFT_OUT.fill(demand=demand))
+        sentences.append(words.LEFT_OUT(demand=demand))
     return sentences
 
 
@@ -200,7 +200,7 @@ def _safety_comparison(simulation: Simulation) -> Sentence:
         metrics.get(STOPPING_DISTANCE.name, np.nan) for metrics in (changed, original)
     )
     if np.isfinite(stop / original_stop):
-        return words.STOPPING_DISTANCE.fill(factor=stop / original_stop)
+        return words.STOPPING_DISTANCE(factor=stop / original_stop)
     gain = changed[SAFETY_DEGREE] - original[SAFETY_DEGREE]
     if np.isnan(gain):
         return words.UNDECIDED

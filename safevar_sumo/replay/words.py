@@ -2,52 +2,38 @@
 
 from __future__ import annotations
 
-from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.sentence import answer, condition, note
 
-ORIGINAL = Sentence("answer", "The original vehicle {original}.")
-CHANGED = Sentence(
-    "answer", "The changed vehicle {changed}. The original vehicle {original}."
+ORIGINAL = answer("The original vehicle {original}.")
+CHANGED = answer("The changed vehicle {changed}. The original vehicle {original}.")
+ORIGINAL_IN_TEST = answer("In the test case {test}, the original vehicle {original}.")
+CHANGED_IN_TEST = answer(
+    "In the test case {test}, the changed vehicle {changed}. The original vehicle {original} in"
+    " the same test case."
 )
-ORIGINAL_IN_TEST = Sentence(
-    "answer", "In the test case {test}, the original vehicle {original}."
+ORIGINAL_IN_WORST = answer(
+    "The original vehicle {original} in the worst of {number} test cases ({test})."
 )
-CHANGED_IN_TEST = Sentence(
-    "answer",
-    "In the test case {test}, the changed vehicle {changed}. The original vehicle {original} in the"
-    " same test case.",
-)
-ORIGINAL_IN_WORST = Sentence(
-    "answer",
-    "The original vehicle {original} in the worst of {number} test cases ({test}).",
-)
-CHANGED_IN_WORST = Sentence(
-    "answer",
+CHANGED_IN_WORST = answer(
     "The changed vehicle {changed} in the worst of {number} test cases ({test}). The original"
-    " vehicle {original} in the same test case.",
+    " vehicle {original} in the same test case."
 )
-STOPPING_DISTANCE = Sentence(
-    "answer",
-    "The changed vehicle needs {factor:.2f} times the stopping distance of the original vehicle.",
+STOPPING_DISTANCE = answer(
+    "The changed vehicle needs {factor:.2f} times the stopping distance of the original vehicle."
 )
-LESS_SAFE = Sentence(
-    "answer", "The changed vehicle is less safe than the original vehicle."
+LESS_SAFE = answer("The changed vehicle is less safe than the original vehicle.")
+SAFER = answer("The changed vehicle is safer than the original vehicle.")
+EQUALLY_SAFE = answer("Both vehicles are equally safe.")
+UNDECIDED = answer(
+    "This simulation cannot tell which vehicle is safer, because a safety degree is undefined."
 )
-SAFER = Sentence("answer", "The changed vehicle is safer than the original vehicle.")
-EQUALLY_SAFE = Sentence("answer", "Both vehicles are equally safe.")
-UNDECIDED = Sentence(
-    "answer",
-    "This simulation cannot tell which vehicle is safer, because a safety degree is undefined.",
-)
-LEFT_OUT = Sentence(
-    "condition",
+LEFT_OUT = condition(
     "A search would leave this encounter out: the original vehicle keeps less than the required"
-    " {demand:.2f} m in this encounter.",
+    " {demand:.2f} m in this encounter."
 )
-CHANGES = Sentence("note", "Changed: {changes}.")
-ENCOUNTER = Sentence("condition", "The encounter has {values}.")
-LATER = Sentence(
-    "condition", "The encounter begins {phase:g} steps of the driving system later."
-)
+CHANGES = note("Changed: {changes}.")
+ENCOUNTER = condition("The encounter has {values}.")
+LATER = condition("The encounter begins {phase:g} steps of the driving system later.")
 IGNORED = (
     "The largest change (f_diff) and the number of changes (f_num_diff) count {small} as unchanged,"
     " because a search ignores such small changes. All other numbers are those of the vehicle as"

@@ -223,7 +223,7 @@ def test_the_speed_of_a_packed_sheet_is_that_of_its_own_limits() -> None:
     with ZipFile("it.zip") as pack:
         # It is about brakes at the limit, not about those of the car, which fail.
         assert (
-            b"<dt>Greatest speed</dt><dd>Safe from 30 up to 60 km/h, the greatest"
+            b"<dt>Greatest speed</dt><dd>The car is safe from 30 up to 60 km/h, the highest"
             in pack.read("1-july/report.html")
         )
     assert json_of("verify", "it.zip")["numbers"]["passed"]

@@ -330,7 +330,7 @@ def test_a_boundary_is_rounded_to_the_unsafe_side_with_as_many_digits_as_it_need
     rounded = printed_of(
         1, lambda rows: (rows[:, 0] > low) & (rows[:, 0] < high), value
     )
-    number_format = CAUSE_COLUMNS["boundary"].number_format  # type: ignore[union-attr]
+    number_format = CAUSE_COLUMNS["boundary"].number_format
     for values in (rounded["boundary"], rounded["single_boundary"]):
         assert cell_text(values["a"], number_format) == printed
         assert low < values["a"] < high

@@ -14,12 +14,10 @@ from hypothesis import given, strategies as st
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.permit.assumed import (
-    assumed_cells,
-    assumed_in_words,
-    cars_of,
-)
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
+from safevar_sumo.questions.permit.rows import assumed_cells, assumed_sentences
+from safevar_sumo.questions.permit.search import cars_of
+from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
@@ -154,18 +152,16 @@ def test_what_is_assumed_is_named_with_its_value_and_where_that_is_from() -> Non
         f"{own}, sensorLatency 0.1 s",
         f"treadDepth 8 mm, {own}, sensorLatency 0.1 s",
     ]
-    assert assumed_in_words(JOINT, vehicle, fleet) == (
-        "Assumed, because not measured: brakeTorque 1 (relative brake torque, as new),"
-        " brakeResponse 0.2 s (brake actuator delay, by [unmeasured]), payload 75 kg (payload, as"
-        " new), payloadCentre 2.6 m (longitudinal position of the payload, by"
-        " [unmeasured]), sensorLatency 0.1 s (perception latency, by [unmeasured]) and values in 1"
-        " of 2 cars that others state (column assumed, --details)."
+    assert Verdict(assumed_sentences(JOINT, vehicle, fleet)) == (
+        "This answer assumes values that were not measured, as the study states under [unmeasured]:"
+        " brake actuator delay 0.2 s, longitudinal position of the payload 2.6 m and perception"
+        " latency 0.1 s. This answer assumes values that were not measured, as in a new car:"
+        " relative brake torque 1 and payload 75 kg. In 1 of 2 cars, further values are assumed,"
+        ' which the column "assumed" names (--details).'
     )
     whole = read({"a": vehicle.named(vehicle.original)})
-    assert (assumed_cells(vehicle, whole), assumed_in_words(JOINT, vehicle, whole)) == (
-        [None],
-        "",
-    )
+    assert not any(assumed_sentences(JOINT, vehicle, whole))
+    assert assumed_cells(vehicle, whole) == [None]
 
 
 def test_a_written_answer_is_read_as_the_list_that_it_is_about() -> None:

@@ -20,7 +20,6 @@ from safevar_sumo.questions.cases import LEAST_SIMULATIONS
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit import permit
-from safevar_sumo.questions.permit.answer import ROUGH_NEED
 from safevar_sumo.questions.permit.encounters import (
     EncounterRange,
     encounters_of,
@@ -29,6 +28,7 @@ from safevar_sumo.questions.permit.encounters import (
 from safevar_sumo.questions.permit.rows import verdict_of
 from safevar_sumo.questions.permit.search import PermitSearch, Reached
 from safevar_sumo.questions.permit.speeds import Cars
+from safevar_sumo.questions.permit.words import ROUGH_NEED
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -143,7 +143,7 @@ def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(
     assert numbers["drive"] + numbers["limited"] + numbers["stop"] == 3
     by_name = {car["car"]: car for car in cars}
     assert by_name["slow"]["up_to"] is None
-    assert by_name["slow"]["because"].startswith("Not even at 34 km/h: ")
+    assert by_name["slow"]["because"].startswith("Already at 34 km/h, ")
     assert by_name["new"]["verdict"] == "drive", "as fast as the new car"
     assert (
         by_name["new"]["up_to"]
@@ -153,10 +153,7 @@ def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(
     assert by_name["007"]["repair_first"] == "brakeTorque"
     assert by_name["007"]["up_to_after_repair"] == by_name["new"]["up_to"]
     assert {car["assumed"] for car in cars} == {"payloadCentre 1.4 m, sensorRange 80 m"}
-    assert (
-        "Assumed, because not measured: payloadCentre 1.4 m (longitudinal pos"
-        in row["verdict"]
-    )
+    assert "longitudinal position of the payload 1.4 m and " in row["verdict"]
 
     typed = [
         "permit",
@@ -247,7 +244,7 @@ def test_a_speed_that_no_scenario_can_move_is_one_that_was_driven() -> None:
     asked = {"unsafe": "stopping_distance > 50", "quick": True}
     answer = permit("stop", cars={"a": {"brakeTorque": 0.9}}, others="new", **asked)
     assert "5 values (30, 50, 80, 100 and 120 km/h)" in answer.tested
-    assert "a may drive from 30 up to 80 km/h" in answer.verdict
+    assert 'The car "a" may drive from 30 up to 80 km/h' in answer.verdict
     assert "(test stop, driven at 100 km/h)" in answer.verdict
     assert "at 30, 50, 80, 100 and 120 km/h" in answer.numbers["scope"]
 
@@ -258,8 +255,8 @@ def test_a_car_passes_a_test_of_a_regulation() -> None:
     told = permit(
         "r152", cars={"a": {"brakeTorque": 0.9}}, others="new", quick=True
     ).verdict
-    assert "a passes the test up to 40 km/h" in told
-    assert "the new car passes the test up to 40 km/h" in told
+    assert '"a" can pass the test up to 40 km/h' in told
+    assert "A new car can pass the test up to 40 km/h" in told
     assert "may drive" not in told
 
 
@@ -294,11 +291,11 @@ def test_one_car_is_told_which_assumed_value_lowers_its_speed_most(
     stated = {"brakeTorque": 0.7, "brakeResponse": 0.1, "sensorLatency": 0.05}
     options: dict[str, Any] = {"others": "new", "fits": 0, "quick": True}
     told = permit(short, cars={"a": stated}, **options).verdict
-    words = r"the car, (.*) [a-z]+ lowers the speed most: the car is unsafe already at (\d+) km/h"
+    words = r"matters most is (.*) [a-z]+ \(.*?\): the car would be unsafe already at (\d+) km/h"
     ((worst, failing),) = re.findall(words, told)
     two = permit(short, cars={"a": stated, "b": stated}, **options).table()
     assert {*two["assumed_matters_most"]} == {worst.partition(" ")[0]}
-    assert " a may drive from" in told, "as given"
+    assert 'The car "a" may drive from' in told
 
     # Each of the ends as a car of a list, which has no such sentence.
     cars = {

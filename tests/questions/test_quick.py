@@ -36,7 +36,7 @@ def test_a_rough_tolerance_calls_no_limit_kept() -> None:
         1,
     ]
     assert {row["kept"] for row in answer["tables"]["limits"]["rows"]} == {None}
-    assert "calls no limit kept" in done.stderr
+    assert "confirms no limit" in done.stderr
 
 
 WORN = {"one": {"brakeTorque": 0.7}, "two": {"brakeTorque": 0.9}}

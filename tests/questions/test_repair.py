@@ -25,7 +25,6 @@ from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.repair import (
     smallest,
     survivors,
-    validation,
     write_repair,
 )
 from safevar_sumo.questions.repair.price import benign_scenes
@@ -153,7 +152,7 @@ grip = { at_least = 5 }
 def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for module, name, number in (
         (cases, "USUAL_BUDGET", 300),
-        (validation, "MAX_UNSAFE_SHARE", 0.01),
+        (survivors, "MAX_UNSAFE_SHARE", 0.01),
         (question, "SOBOL_VEHICLES", 32),
     ):
         monkeypatch.setattr(module, name, number)
@@ -279,7 +278,10 @@ def test_an_impossible_promise_has_no_repair(planted: Path) -> None:
     planted.write_text(STUDY.replace("upper = 64.0", "upper = 26.0"))
     found = sv.repair(planted, change=["gap"], pool=InlinePool())
     assert found.numbers["repairs"] == len(found.table("repairs")) == 0
-    assert "No change of one or two of gap was found" in found.verdict
+    assert (
+        "No repair was found among the changes of one or two parameters."
+        in found.verdict
+    )
     assert not found.numbers["not_repairable"]  # full braking sees far enough
 
 
@@ -348,7 +350,7 @@ def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(
     monkeypatch.setattr(question, "SOBOL_VEHICLES", 3)
     monkeypatch.setattr(survivors, "find_failures", lambda *_: [])
     monkeypatch.setattr(
-        survivors, "prove_change", lambda *_: (validation.Proof(5, 0, 0.45, 0), [])
+        survivors, "prove_change", lambda *_: (survivors.Proof(5, 0, 0.45, 0), [])
     )
     kept = sv.repair("native", promise=["decel>=7"], pool=InlinePool())
     worst = kept.numbers["worst_today"]
@@ -356,7 +358,7 @@ def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(
     words = f"{worst:.2f} m from centre to centre (gap {worst - 4.7:.2f} m)"
     assert f"The worst vehicle has a safety degree of {words}." in kept.verdict
     assert (
-        "Of 5 worn vehicles that were sampled afterwards none is unsafe" in kept.tested
+        "None of 5 worn vehicles that were sampled afterwards is unsafe" in kept.tested
     )
     table = pd.DataFrame({"parameters": [{"standing_gap": 3.25}]})
     # A study that results alone hold has no file to extend.

@@ -521,7 +521,7 @@ def test_equal_solutions_of_a_run_are_counted_and_said_in_pooled_tables() -> Non
         assert twice in " ".join(answer.only(name).tables["remarks"]["remark"])
     assert twice not in " ".join(answer.only("rq1-runs").tables["remarks"]["remark"])
     assert answer.numbers["solutions"] == 5
-    assert "0 of 1 different solution collide" in answer.verdict, (
+    assert "0 of the 1 different solutions of " in answer.verdict, (
         "as the verdict of study counts"
     )
     different = answer_questions(

@@ -17,7 +17,7 @@ import pandas as pd
 
 from safevar_sumo.errors import about
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.answer import Answer, Column, Columns, contents, tabulate
+from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.compare import words
@@ -67,6 +67,7 @@ from safevar_sumo.questions.research_questions.statistics import (
 )
 from safevar_sumo.questions.sentence import Sentence, Verdict
 from safevar_sumo.questions.subject import study_in
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.tolerance.asked import usual_alone
 from safevar_sumo.questions.tolerance.oracle import STAGE
 from safevar_sumo.questions.words import UNSAFE_MEANS, counted_in_words, join_phrases
@@ -76,11 +77,7 @@ from safevar_sumo.study import limits_of
 RELEASE, DO_NOT_RELEASE, DECIDE = "RELEASE", "DO NOT RELEASE", "DECIDE"
 MAX_REASONS = 3
 """Largest number of differences that the verdict names."""
-PAIR_COLUMNS: Columns = {
-    "pair": "run, with its solutions in both systems, or line of sampled settings",
-    "a": Column("", "mean in A", ".2f"),
-    "b": Column("", "mean in B", ".2f"),
-}
+PAIR_COLUMNS = shipped_columns("compare")["pairs"]
 
 
 @question
@@ -384,15 +381,15 @@ def _decide(
         template = words.BETTER if better else words.ALIKE
     safe = "safer than" if better else "as safe as"
     leading = [*worse[: MAX_REASONS - bool(better)], *better][:MAX_REASONS]
-    reasons = [reason.template.fill(**reason.values, **titles) for reason in leading]
-    sentences = [template.fill(safe=safe, **titles), *lacks]
+    reasons = [reason.template(**reason.values, **titles) for reason in leading]
+    sentences = [template(safe=safe, **titles), *lacks]
     return decision, [*sentences, *dict.fromkeys(reasons)]
 
 
 def _test_in_words(tested: _PairedTest, titles: Mapping[str, str]) -> str:
     if np.isnan(tested.p):
         return words.NO_TEST.text
-    return words.TEST.fill(
+    return words.TEST(
         number=len(tested.pairs),
         pairs=tested.unit,
         p=tested.p,
@@ -409,9 +406,9 @@ def _basis(
 ) -> Iterator[Sentence]:
     """What counts as unsafe, within which limits, and around which originals."""
     if not unsafe.is_collision or unsafe.keep:
-        yield UNSAFE_MEANS.fill(description=unsafe.description)
+        yield UNSAFE_MEANS(description=unsafe.description)
     if limits:
-        yield words.WITHIN.fill(limits=join_phrases(limits))
+        yield words.WITHIN(limits=join_phrases(limits))
 
     # Original values that differ.
     a, b = (side.characteristics.members for side in common.evaluators)
@@ -421,4 +418,7 @@ def _basis(
         for column in np.flatnonzero(common.shift)
     ]
     if values:
-        yield words.ORIGINALS_DIFFER.fill(values=join_phrases(values), **titles)
+        yield words.ORIGINALS_DIFFER(
+            values=join_phrases(values),
+            **titles,
+        )

@@ -73,8 +73,10 @@ def missing_in_words(
             parts[MAX_PARTS_NAMED:] = [f"{len(parts) - MAX_PARTS_NAMED} more"]
         if parts:
             version, reference_title = map(titles.__getitem__, names)
-            yield LACKS.fill(
-                version=version, parts=join_phrases(parts), other=reference_title
+            yield LACKS(
+                version=version,
+                parts=join_phrases(parts),
+                other=reference_title,
             )
 
 

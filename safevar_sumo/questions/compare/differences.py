@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.answer import Column, Columns, tabulate, with_interval
+from safevar_sumo.questions.answer import tabulate
 from safevar_sumo.questions.compare import words
 from safevar_sumo.questions.compare.coverage import TestCase, cases_of
 from safevar_sumo.questions.compare.settings import within
@@ -28,6 +28,7 @@ from safevar_sumo.questions.repair.price import (
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.tolerance.alone import Alone
 from safevar_sumo.questions.tolerance.asked import Asked, asked_of
 from safevar_sumo.questions.tolerance.search import alone_with_own_set
@@ -38,24 +39,7 @@ from safevar_sumo.study import Limit
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.vehicles import CharacteristicSet
 
-LIMIT_COLUMNS: Columns = {
-    "characteristic": "characteristic of the vehicle",
-    "unit": "its unit",
-    **with_interval(
-        "a",
-        Column("", "value of A's original vehicle (interval: safe alone in A)", ".10g"),
-    ),
-    **with_interval(
-        "b",
-        Column("", "value of B's original vehicle (interval: safe alone in B)", ".10g"),
-    ),
-    "change": "how the interval changes from A to B: grown, shrunk, both, or the same",
-}
-SUMMARY_COLUMNS = {
-    "what": Column("", "what is compared"),
-    "a": Column("", "in A", ".3g"),
-    "b": Column("", "in B", ".3g"),
-}
+LIMIT_COLUMNS, SUMMARY_COLUMNS, *_ = shipped_columns("compare").values()
 GROWN = "grown"
 SHRUNK = "shrunk"
 BOTH = "both"

@@ -29,9 +29,7 @@ from safevar_sumo.questions.explain.failures import (
 )
 from safevar_sumo.questions.explain.smallest import (
     MAX_SETTINGS,
-    SMALLEST_COLUMNS,
     SMALLEST_NUMBERS,
-    STAIRCASE_COLUMNS,
     Smallest,
     draw_staircase,
     smallest_tables,
@@ -40,7 +38,9 @@ from safevar_sumo.questions.explain.tables import (
     CAUSE_COLUMNS,
     CHARACTERISTIC_COLUMNS,
     DISTINCT_COLUMNS,
+    SMALLEST_COLUMNS,
     SOLUTION_COLUMNS,
+    STAIRCASE_COLUMNS,
     causes_table,
     failures_frame,
     statistics_tables,

@@ -283,7 +283,7 @@ def compare_at_points(
         pair = result.evaluations.take([original, vehicle])
         runs = zip(pair.outcome.tolist(), pair.f_safe.tolist(), strict=True)
         endings = [ending_in_words(*run, system.contact) for run in runs]
-        sentence = words.AT_POINT.fill(
+        sentence = words.AT_POINT(
             point=result.point.name or "of the study",
             original=endings[0],
             changed=endings[1],

@@ -19,9 +19,12 @@ from safevar_sumo.questions.explain.combinations import (
     enumerate_causes,
     staircase,
 )
-from safevar_sumo.questions.explain.tables import RUNS, sureness
-from safevar_sumo.questions.tables import Column, Columns, Frames, tabulate
-from safevar_sumo.questions.words import EXACT
+from safevar_sumo.questions.explain.tables import (
+    SMALLEST_COLUMNS,
+    STAIRCASE_COLUMNS,
+    sureness,
+)
+from safevar_sumo.questions.tables import Frames, tabulate
 from safevar_sumo.records import JsonObject
 
 if TYPE_CHECKING:
@@ -31,71 +34,6 @@ MAX_SETTINGS = 12_000
 """Largest number of settings for the combinations at the ends, and again for the staircase."""
 CURES = 4
 """Combinations that contain a cause are as many of these settings, divided by this number."""
-SMALLEST_COLUMNS: Columns = {
-    "causes": Column(
-        "",
-        "smallest set of changes that is unsafe, at the ends of the domain (or where the set begins"
-        " to be unsafe)",
-        EXACT,
-        head="changes, with their values",
-    ),
-    "size": Column("", "number of changes", is_shown=False),
-    "begins_at": Column(
-        "-",
-        "share of the way from the original values to these values at which the vehicle becomes"
-        " unsafe (all changes at the same share, in steps of 1 %)",
-        EXACT,
-        head="becomes unsafe at this share of the way",
-    ),
-    "boundary": Column(
-        "",
-        "values at which the vehicle becomes unsafe, simulated as printed",
-        EXACT,
-        is_shown=False,
-    ),
-    "safe_again": Column(
-        "-",
-        "smallest larger share of the way at which these changes are safe again; - without any",
-        ".2f",
-    ),
-    "holds": Column(
-        "",
-        "number of parameter sets of the vehicle model in which these changes are a cause",
-        head="parameter sets in which these changes are a cause",
-    ),
-    "fits": Column(
-        "", "number of parameter sets that were tried", head="parameter sets tried"
-    ),
-    "robust_share": Column(
-        "-",
-        "share of the vehicles with slightly different values that are unsafe",
-        ".2f",
-        head="unsafe share of similar vehicles",
-    ),
-    "unsafe_runs": RUNS,
-    "outcome": Column("", "outcome with these changes only", is_shown=False),
-}
-STAIRCASE_COLUMNS: Columns = {
-    "share": Column(
-        "-",
-        "share of the way to its end at which each changed part is",
-        ".1f",
-        head="share of the way to the end",
-    ),
-    "fewest": Column(
-        "",
-        "fewest changes at this share of the way that are unsafe; - if none was found",
-        head="fewest unsafe changes",
-    ),
-    "tried": Column(
-        "",
-        "combinations of changes that were simulated",
-        head="combinations simulated",
-    ),
-    "causes": Column(
-        "", "the parts that are changed", head="characteristics that are changed"
-    ),
-}
 TITLE = "The smallest unsafe changes, each at an end of its domain"
 
 SMALLEST_NUMBERS = (

@@ -35,159 +35,28 @@ from safevar_sumo.questions.preventability import (
     has_reference_drivers,
 )
 from safevar_sumo.questions.tables import (
-    Column,
-    Columns,
     Frames,
+    shipped_columns,
     tabulate,
-    with_interval,
 )
-from safevar_sumo.questions.words import EXACT, number_of
+from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import FloatArray, NamedValues
 
 MAX_DISTINCT = 10
 """Maximum number of distinct causes in their table."""
-RUNS = Column(
-    "-",
-    "share of the runs with these changes only that are unsafe, where runs repeat",
-    ".2f",
-    False,
-)
-CAUSE_COLUMNS: Columns = {
-    "solution": Column("", "handle of the failure", is_detail=True),
-    "changes": Column(
-        "",
-        "smallest set of changes of this failure that is unsafe without the other changes",
-        ".5g",
-        is_shown=False,
-    ),
-    "encounter": Column(
-        "", "the encounter, in which the original vehicle is safe", EXACT
-    ),
-    "boundary": Column(
-        "",
-        "smallest values of these changes that are still unsafe; rounded to the unsafe side and"
-        " simulated as printed",
-        EXACT,
-        head="changes, with the values at which the failure begins",
-    ),
-    "single_boundary": Column(
-        "",
-        "smallest unsafe value of each change while the other changes stay; rounded and simulated"
-        " as printed",
-        EXACT,
-        is_shown=False,
-    ),
-    "fraction": Column(
-        "-",
-        "factor by which all changes of the cause are multiplied at their smallest unsafe values",
-        ".3f",
-        is_shown=False,
-    ),
-    "end": Column("", "what happens with slightly smaller changes", is_shown=False),
-    "size": Column("", "number of changes", is_shown=False),
-    "elsewhere": Column(
-        "",
-        "whether these changes are unsafe in the original encounter, too",
-        head="unsafe in the original encounter, too",
-    ),
-    "outcome": Column("", "outcome with these changes only", is_shown=False),
-    "safety_degree": Column(
-        "m",
-        "safety degree with these changes only; -m/s on a collision",
-        is_shown=False,
-    ),
-    "share": Column(
-        "-",
-        "share of the failures that have such a cause",
-        ".2f",
-        head="share of failures with this cause",
-    ),
-    "robust_share": Column(
-        "-",
-        "share of the vehicles with slightly different values of the cause that are unsafe",
-        ".2f",
-        head="unsafe share of similar vehicles",
-    ),
-    "unsafe_runs": RUNS,
-    "holds": Column(
-        "",
-        "number of parameter sets of the vehicle model with which these changes are a cause",
-        head="parameter sets in which these changes are a cause",
-    ),
-    "fits": Column(
-        "", "number of parameter sets that were tried", head="parameter sets tried"
-    ),
-    "avoided_by": Column(
-        "",
-        "weakest of the other drivers who avoids the failure in the same vehicle; nobody: no driver"
-        " avoids it",
-        is_shown=False,
-    ),
-}
+(
+    CAUSE_COLUMNS,
+    SOLUTION_COLUMNS,
+    CHARACTERISTIC_COLUMNS,
+    DISTINCT_COLUMNS,
+    SMALLEST_COLUMNS,
+    STAIRCASE_COLUMNS,
+) = shipped_columns("explain").values()
+"""The interval of a characteristic is Clopper and Pearson's, 95 %, if only a sample of the failures
+was analysed, else the share itself.
+"""
 OF_ENCOUNTER = ("encounter", "elsewhere")
 """Columns of a study whose encounters are ranges."""
-SOLUTION_COLUMNS: Columns = {
-    "solution": "handle of the failure",
-    "reason": Column(
-        "", "why this failure was chosen", head="why this failure was examined"
-    ),
-    "outcome": Column("", "outcome", is_shown=False),
-    "safety_degree": Column("m", "safety degree; in -m/s on a collision", ".2f"),
-    "changed": Column("", "number of changes", head="characteristics changed"),
-    "largest_change": Column(
-        "-",
-        "largest change of a characteristic (share of the original value)",
-        is_shown=False,
-    ),
-    "unsafe_neighbours": Column(
-        "-",
-        "share of the vehicles with slightly different values of the whole failure that are unsafe",
-        ".2f",
-        head="unsafe share of similar vehicles",
-    ),
-    "ends": Column(
-        "",
-        "how the original vehicle and this one end, where this one is worst",
-        is_shown=False,
-    ),
-    "points": Column("", "points at which it is unsafe", is_shown=False),
-    "avoided_by": (
-        "weakest of the other drivers who avoids the failure in the same vehicle; nobody: no driver"
-        " avoids it"
-    ),
-}
-CHARACTERISTIC_COLUMNS: Columns = {
-    "characteristic": "characteristic of the vehicle",
-    "changed": Column(
-        "-",
-        "share of the failures that change it",
-        ".2f",
-        head="changed in (share of failures)",
-    ),
-    **with_interval(
-        "needed",
-        Column(
-            "-",
-            "share of the failures for which it is in every minimal cause",
-            ".2f",
-            head="necessary in (share of failures)",
-        ),
-    ),
-    "in_some": Column(
-        "-",
-        "share of the failures for which it is in some minimal cause",
-        ".2f",
-        head="part of some cause in (share of failures)",
-    ),
-}
-"""The interval is Clopper and Pearson's, 95 %, if only a sample of the failures was analysed, else
-the share itself.
-"""
-DISTINCT_COLUMNS: Columns = {
-    "cause": "a minimal cause, without the sizes of its changes",
-    "failures": "failures with this cause",
-    "share": Column("-", "their share", ".2f"),
-}
 
 
 def failures_frame(

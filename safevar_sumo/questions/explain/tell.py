@@ -67,7 +67,7 @@ def smallest_sentences(
     yield from _containing(smallest)
     yield from _in_none(smallest.at_ends, members)
     if encounters := len(evaluator.critical_encounters):
-        yield words.SCOPE.fill(number=encounters)
+        yield words.SCOPE(number=encounters)
 
 
 def _leading_of_study(
@@ -80,7 +80,10 @@ def _leading_of_study(
         return
     if table.empty:
         largest = max(smallest.at_ends.simulated)
-        yield words.NOTHING_FOUND.fill(unsafe=unsafe.event, up_to=_up_to(largest))
+        yield words.NOTHING_FOUND(
+            unsafe=unsafe.event,
+            up_to=_up_to(largest),
+        )
         return
     fewest = table[table["size"] == table["size"].min()]
     in_order = fewest.sort_values("begins_at", kind="stable")
@@ -92,17 +95,17 @@ def _leading_of_study(
     templates = words.ON_THE_WAY if share < 1 else words.AT_ENDS
     yield _enough(templates, members, unsafe, leading["boundary"], share)
     if number_of_others := len(fewest) - 1:
-        yield words.OTHERS.fill(causes=number_of(number_of_others, "further cause"))
+        yield words.OTHERS(causes=number_of(number_of_others, "further cause"))
 
     # How sure they are.
     if pd.notna(leading["safe_again"]):
-        yield words.GAP.fill(share=percentage(leading["safe_again"]))
+        yield words.GAP(share=percentage(leading["safe_again"]))
     is_checked = pd.notna(leading["robust_share"])
     if is_checked and leading["causes"] != leading["boundary"]:
         changes = values_in_words(members, leading["causes"])
-        yield words.CHECKED_WITH.fill(changes=changes)
+        yield words.CHECKED_WITH(changes=changes)
     if leading["unsafe_runs"] < 1:
-        yield words.RUNS.fill(share=percentage(leading["unsafe_runs"]))
+        yield words.RUNS(share=percentage(leading["unsafe_runs"]))
     yield from _sureness(leading)
 
 
@@ -114,7 +117,7 @@ def _enough(
     share: float = 1.0,
 ) -> Sentence:
     """That changes are enough, by the template of one or of several."""
-    return templates[len(changes) > 1].fill(
+    return templates[len(changes) > 1](
         unsafe=unsafe.event,
         number=_count(len(changes)),
         changes=values_in_words(members, changes),
@@ -127,11 +130,17 @@ def _of_size(at_ends: Enumeration, unsafe: Unsafe, size: int) -> Sentence:
     number = sum(len(cause.changes) == size for cause in at_ends.causes)
     existing = at_ends.existing[size]
     simulated = at_ends.simulated[size]
+    if simulated == 1:
+        is_safe = "is unsafe" if number else "is safe"
+        return words.ONLY(
+            changes=number_of(size, "change"),
+            is_safe=is_safe,
+        )
     template = words.OF_SIZE if simulated == existing else words.OF_PART
     combinations = f"combinations of {_count(size)} changes"
     if size == 1:
         combinations = "changes of a single characteristic to an end of its domain"
-    return template.fill(
+    return template(
         count=count_in_words(number, simulated),
         combinations=combinations,
         causes=unsafe.effects[number > 1],
@@ -148,12 +157,16 @@ def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Iterator[Sentence]:
         shares = " to ".join(ends)
         if size:
             changes = "1 change is" if size == 1 else f"{_count(size)} changes are"
-            yield words.STEP.fill(shares=shares, changes=changes, unsafe=unsafe.event)
+            yield words.STEP(
+                shares=shares,
+                changes=changes,
+                unsafe=unsafe.event,
+            )
             continue
         up_to = _up_to(largest)
         if alike[0].is_cut:
             up_to += ", as there are too many larger ones"
-        yield words.STEP_WITHOUT.fill(
+        yield words.STEP_WITHOUT(
             shares=shares,
             tried=sum(step.tried for step in alike),
             up_to=up_to,
@@ -165,9 +178,9 @@ def _containing(smallest: Smallest) -> Iterator[Sentence]:
     """How many combinations contain a smaller cause, and how many of these are safe."""
     total, simulated, cures = smallest.containing
     if total:
-        yield words.CONTAINING.fill(combinations=number_of(total, "combination"))
+        yield words.CONTAINING(combinations=number_of(total, "combination"))
     if simulated:
-        yield words.CURES.fill(count=count_in_words(cures, simulated))
+        yield words.CURES(count=count_in_words(cures, simulated))
 
 
 def _in_none(at_ends: Enumeration, members: CharacteristicSet) -> Iterator[Sentence]:
@@ -176,7 +189,10 @@ def _in_none(at_ends: Enumeration, members: CharacteristicSet) -> Iterator[Sente
     changed = {name for cause in at_ends.causes for name in cause.changes}
     names = [item.short_name for item in members.vehicle if item.name not in changed]
     if names and changed and size:
-        yield words.IN_NONE.fill(up_to=_up_to(size), names=join_phrases(names, "or"))
+        yield words.IN_NONE(
+            up_to=_up_to(size),
+            names=join_phrases(names, "or"),
+        )
 
 
 def failure_sentences(
@@ -189,7 +205,7 @@ def failure_sentences(
     original = population.original
     if not evaluator.study.ranges and unsafe.of(original)[0]:
         breach = unsafe.breach_in_words(original)
-        yield words.ALREADY_UNSAFE.fill(breach=breach)
+        yield words.ALREADY_UNSAFE(breach=breach)
         yield Sentence("answer", unsafe.smaller_demand(original))
         return
     if causes.empty and unsafe.number(population.evaluations):
@@ -200,7 +216,7 @@ def failure_sentences(
         contact = evaluator.system.contact
         ending = ending_in_words(str(original.outcome[0]), degree, contact)
         yield words.NONE_UNSAFE
-        yield words.ENDING.fill(ending=ending)
+        yield words.ENDING(ending=ending)
         return
     leading = causes.to_dict("records")[0]
     if not leading["changes"]:
@@ -213,11 +229,14 @@ def failure_sentences(
     yield _enough(words.CHANGES, members, unsafe, boundary)
     place = leading.get("encounter", {})
     if values := place_in_words(members, place, are_printed=True):
-        yield words.ENCOUNTER.fill(values=values)
+        yield words.ENCOUNTER(values=values)
     if analysed > 1 and pd.notna(leading["share"]):
         number = round(leading["share"] * analysed)
         count = count_in_words(number, analysed)
-        yield words.SHARE.fill(count=count, have="has" if number <= 1 else "have")
+        yield words.SHARE(
+            count=count,
+            have="has" if number <= 1 else "have",
+        )
     yield from _beyond(evaluator, unsafe, boundary, place)
     yield from _sureness(leading)
 
@@ -242,7 +261,7 @@ def _beyond(
     larger = "larger changes of the same characteristics"
     if len(cause) == 1:
         larger = "a larger change of the same characteristic"
-    yield words.BEYOND.fill(
+    yield words.BEYOND(
         count=count_in_words(failures, number),
         larger=larger,
         collide=unsafe.verbs[failures > 1],
@@ -254,9 +273,12 @@ def _sureness(row: Mapping[Any, Any]) -> Iterator[Sentence]:
     share = row["robust_share"]
     if not np.isnan(share):
         template = words.ROBUST if share >= MIN_ROBUST_SHARE else words.BORDERLINE
-        yield template.fill(share="all" if share == 1 else f"{100 * share:.0f} % of")
+        yield template(share="all" if share == 1 else f"{100 * share:.0f} % of")
     if pd.notna(row["holds"]):
-        yield words.SETS.fill(holds=row["holds"], fits=row["fits"])
+        yield words.SETS(
+            holds=row["holds"],
+            fits=row["fits"],
+        )
 
 
 def other_sentences(
@@ -265,18 +287,18 @@ def other_sentences(
     """Up to which size causes are complete, who avoids the failures, and what counts."""
     unsafe = population.unsafe
     if complete:
-        yield words.COMPLETE.fill(changes=number_of(complete, "change"))
+        yield words.COMPLETE(changes=number_of(complete, "change"))
     yield from avoidance(verdicts)
     number = unsafe.number(population.evaluations)
     over_sets = population.over_sets
     template = words.NUMBER_OF_SAMPLE if over_sets else words.NUMBER_OF_SOLUTIONS
-    yield template.fill(
+    yield template(
         count=count_in_words(number, len(population.evaluations)),
         sampled=sampled_in_words(study),
         collide=unsafe.verbs[number > 1],
     )
     if not unsafe.is_collision:
-        yield UNSAFE_MEANS.fill(description=unsafe.description)
+        yield UNSAFE_MEANS(description=unsafe.description)
     notes = [unsafe.remark, *constraints_in_words(study)]
     if over_sets:
         yield from over_sets.sentences()
@@ -295,7 +317,10 @@ def avoidance(verdicts: pd.DataFrame) -> Iterator[Sentence]:
             collisions = f"{number:,} collisions with a verdict ({len(verdicts):,} were examined)"
         if number:
             avoided = int(verdicts[name].sum())
-            yield template.fill(avoided=avoided, collisions=collisions)
+            yield template(
+                avoided=avoided,
+                collisions=collisions,
+            )
 
 
 def _count(number: int) -> str:

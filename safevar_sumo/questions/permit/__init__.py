@@ -29,11 +29,16 @@ from safevar_sumo.questions.options import (
     ValueTexts,
 )
 from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
-from safevar_sumo.questions.permit.assumed import assumed_in_words, cars_of, worst_end
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
 from safevar_sumo.questions.permit.rows import CARS, SETS, failure_columns
-from safevar_sumo.questions.permit.search import Permit, PermitSearch, Repaired
+from safevar_sumo.questions.permit.search import (
+    Permit,
+    PermitSearch,
+    Repaired,
+    cars_of,
+    worst_end,
+)
 from safevar_sumo.questions.permit.speeds import Cars
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
@@ -133,21 +138,49 @@ def permit(
     needed = _needed(need, span)
     values = _grid(span, step)
     members = evaluator.characteristics.vehicle
-    _check_forms(cars, set, limits, out, is_quick=quick)
-    fleet = read_cars(study, cars, set, limits, others, ignore)
+    _check_forms(
+        cars,
+        set,
+        limits,
+        out,
+        is_quick=quick,
+    )
+    fleet = read_cars(
+        study,
+        cars,
+        set,
+        limits,
+        others,
+        ignore,
+    )
     criterion = keeping_distance(
         evaluator,
         evaluator.checked(unsafe or Unsafe()),
         margin,
         is_stated=unsafe is not None,
     )
-    models = models_of(evaluator, criterion, fits, with_unsafe_originals=True)
+    models = models_of(
+        evaluator,
+        criterion,
+        fits,
+        with_unsafe_originals=True,
+    )
     # A claim about all cars within limits gets the search of one about joint limits.
     budget = cases.USUAL_BUDGET if limits else SEARCHES * cases.LEAST_SIMULATIONS
     budget = 0 if quick else evaluator.scaled(budget)
-    search = PermitSearch(models, span, values, budget)
+    search = PermitSearch(
+        models,
+        span,
+        values,
+        budget,
+    )
     _check_driven(needed, search)
-    within = _within(members, limits, study, fleet.settings[0])
+    within = _within(
+        members,
+        limits,
+        study,
+        fleet.settings[0],
+    )
     asked = [within] if limits else cars_of(members, fleet)
     has_repairs = not (quick or limits)
     new_car, permits, repaired = _drive(
@@ -170,7 +203,6 @@ def permit(
         is_quick=quick,
         is_rough=quick or evaluator.account.most is not None,
         is_box=bool(limits),
-        assumed=assumed_in_words(study, members, fleet),
         ends=ends,
     )
     answer = result.of(fleet, permits, repaired)
@@ -215,7 +247,16 @@ def _drive(
     if not with_repairs or evaluator.left is not None:
         return new_car, permits, [None] * len(permits)
     worn = fleet.measured & (fleet.settings != members.original)
-    return new_car, permits, search.repair_first(asked, worn, members.original, permits)
+    return (
+        new_car,
+        permits,
+        search.repair_first(
+            asked,
+            worn,
+            members.original,
+            permits,
+        ),
+    )
 
 
 def read_cars(

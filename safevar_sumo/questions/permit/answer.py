@@ -4,10 +4,10 @@ list that fleet software reads.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,29 +16,38 @@ from safevar_sumo.campaign.inputs import manifest_now
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.part import study_up_to
-from safevar_sumo.questions.permit.assumed import (
-    WorstEnd,
-    assumed_cells,
-    worst_end_in_words,
-)
+from safevar_sumo.questions.permit import words
 from safevar_sumo.questions.permit.encounters import Span
-from safevar_sumo.questions.permit.fleet import ROUGH, YES, Fleet
+from safevar_sumo.questions.permit.fleet import ROUGH, THIS_CAR, YES, Fleet
 from safevar_sumo.questions.permit.rows import (
     CARS,
     DRIVE,
     LIMITED,
     SETS,
     STOP,
+    assumed_cells,
+    assumed_sentences,
     because,
     failure_columns,
     set_rows,
     verdict_of,
 )
-from safevar_sumo.questions.permit.search import Permit, PermitSearch, Repaired
+from safevar_sumo.questions.permit.search import (
+    Permit,
+    PermitSearch,
+    Repaired,
+    WorstEnd,
+)
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.tables import Column, Columns, tabulate
-from safevar_sumo.questions.words import join_phrases, number_of, precise_in_words
+from safevar_sumo.questions.sentence import Sentence, Verdict, answer, condition
+from safevar_sumo.questions.tables import Column, tabulate
+from safevar_sumo.questions.words import (
+    VALID_FOR,
+    join_phrases,
+    number_of,
+    precise_in_words,
+)
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, unit_text
@@ -46,14 +55,6 @@ from safevar_sumo.sumo.system import assemble
 
 DIGEST = "study_digest"
 """The column of the list that holds the digest of the study, its models and versions."""
-ROUGH_LIST = (
-    "Remark: the list is a rough answer (rough = yes), whose speeds prove nothing."
-)
-"""What to know of a list that `--quick` wrote."""
-ROUGH_NEED = (
-    "a rough answer lets no car drive: ask without --quick, or for more simulations"
-)
-"""Why no gate passes on a rough answer."""
 SHOWN_WHOLE = 50
 """Number of cars up to which one screen shows all: there the list is the answer."""
 
@@ -66,8 +67,6 @@ class PermitAnswer:
     ----------
     is_quick, is_rough
         Whether cars drive the grid alone, and whether the answer is rough for any reason.
-    assumed
-        What was not measured, in a sentence that follows the one about the cars.
     ends
         The worst end of each car; None where none was sought.
     """
@@ -82,7 +81,6 @@ class PermitAnswer:
     is_quick: bool
     is_rough: bool
     is_box: bool
-    assumed: str
     ends: Sequence[WorstEnd | None] | None
 
     def of(
@@ -95,10 +93,7 @@ class PermitAnswer:
         if self._is_test:
             columns["up_to"] = columns["up_to"]._replace(head="passes the test up to")
         cars = tabulate("The cars, first those that may not drive", columns, rows)
-        counts = {
-            verdict: int((cars["verdict"] == verdict).sum())
-            for verdict in NUMBERS.values()
-        }
+        counts = Counter(cars["verdict"])
         too_slow = 0
         if self.need is not None:
             too_slow = int((~(cars["up_to"].astype(float) >= self.need)).sum())
@@ -106,26 +101,36 @@ class PermitAnswer:
             "up_to", kind="stable", na_position="first", ignore_index=True
         )
         ordered.attrs = {**cars.attrs, "shown_whole": SHOWN_WHOLE}
-        unit = unit_text(span.unit)
-        end = f"{span.name}={span.high!r}"
-        scope = scope_of(study_up_to(self.study, end) if span.ending else self.study)
-        own = self.models.own.unsafe
-        cannot = f"{number_of(too_slow, 'car')} {self._no_verb(too_slow)}"
-        slower = f"{cannot} at {self.need or 0:g}{unit}"
-        failures: tuple[str, ...] = (slower,) if too_slow else ()
-        if self.is_rough and self.need is not None:
-            failures += (ROUGH_NEED,)
+        claim = self.study
+        if span.ending:
+            claim = study_up_to(claim, f"{span.name}={span.high!r}")
+        scope = scope_of(claim)
+        unsafe = self.models.own.unsafe
+        failures = list[str]()
+        sentences = [*self._sentences(fleet, cars, counts)]
+        if self.need is not None:
+            slow = words.TOO_SLOW(
+                count=number_of(too_slow, "car"),
+                need=span.text(self.need),
+                **self._verbs,
+            )
+            sentences.append(slow)
+            failures += [slow.text] * (too_slow > 0)
+            failures += [words.ROUGH_NEED] * self.is_rough
+        sentences += [*self._notes(fleet), VALID_FOR(scope=scope), self._safe]
         return Answer(
             question="permit",
             study=self.study,
-            verdict=" ".join(self._sentences(fleet, cars, counts, slower, scope)),
-            tested=self._tested(),
+            verdict=Verdict(sentences),
+            tested=Verdict([self._tested()]),
             numbers={
-                "unsafe": str(own),
-                "margin": own.keep,
+                "unsafe": str(unsafe),
+                "margin": unsafe.keep,
                 "scope": scope,
                 "cars": len(rows),
-                **{name: counts[verdict] for name, verdict in NUMBERS.items()},
+                "drive": counts[DRIVE],
+                "limited": counts[LIMITED],
+                "stop": counts[STOP],
                 "fits": len(self.models.members),
                 "attacked": self.search.attacked,
                 "step": self.step,
@@ -142,7 +147,7 @@ class PermitAnswer:
                 ),
             },
             folded=("sets",),
-            failures=failures,
+            failures=tuple(failures),
             listing=self._listing(cars, fleet),
         )
 
@@ -176,7 +181,7 @@ class PermitAnswer:
                 self.need,
                 is_proven=not self.is_quick,
             )
-            words = found["because"]
+            event = found["because"]
             row = {
                 "car": name,
                 "up_to": permit.up_to,
@@ -184,9 +189,9 @@ class PermitAnswer:
                 "unit": self.span.unit,
                 "verdict": verdict,
                 "because": because(
-                    permit, words, verdict, self.span, new_car, self.need
-                ),
-                "parameter_set": permit.least.fit if words else None,
+                    permit, event, verdict, self.span, new_car, self.need
+                ).text,
+                "parameter_set": permit.least.fit if event else None,
                 "repair_first": None if best is None else vehicle.names[best[0]],
                 "up_to_after_repair": None if best is None else best[1].up_to,
                 "assumed": assumed,
@@ -196,79 +201,96 @@ class PermitAnswer:
         return rows
 
     def _sentences(
-        self,
-        fleet: Fleet,
-        cars: pd.DataFrame,
-        counts: Mapping[str, int],
-        slower: str,
-        scope: str,
-    ) -> list[str]:
-        """The verdict: how many cars may drive, what is safe, and what was not driven."""
+        self, fleet: Fleet, cars: pd.DataFrame, counts: Mapping[str, int]
+    ) -> Iterator[Sentence]:
+        """How far cars are safe, why no farther, and what is assumed."""
         span = self.span
-        unit = unit_text(span.unit)
-        top = f"{span.high:g}{unit}"
-        number = len(cars)
-        new_car = f"the new car {self._verb()} {self._reach(self.new_car.order)}"
-        goal = (
-            f"{top} or as fast as the new car"
-            if self.need is None
-            else f"{self.need:g}{unit}"
+        if len(cars) == 1:
+            yield self._car(cars["car"][0], cars["up_to"][0])
+        else:
+            yield from self._groups(counts)
+        reach = self._reach(self.new_car.order)
+        yield words.NEW_CAR(
+            reach=reach,
+            **self._verbs,
         )
-        phrases = {
-            DRIVE: f"up to {goal}",
-            LIMITED: f"up to a lower {span.name.replace('_', ' ')}",
-            STOP: f"not even at {span.low:g}{unit}",
+        vehicle = self.models.own.characteristics.vehicle
+        if len(cars) == 1:
+            yield answer(cars["because"][0])
+        yield from assumed_sentences(self.study, vehicle, fleet)
+        is_checked = len(cars) == 1 and not pd.isna(cars["up_to"][0])
+        if is_checked and self.ends and not fleet.measured.all():
+            end = self.ends[0]
+            yield (
+                words.NO_WORST_END(name=span.title)
+                if end is None
+                else end.sentence(span)
+            )
+
+    def _car(self, name: str, up_to: float) -> Sentence:
+        """How far a single car is safe."""
+        car = name
+        if not (self.is_box or name == THIS_CAR):
+            car = words.NAMED_CAR.format(name=name)
+        if pd.isna(up_to):
+            return words.CAR_STOPS(
+                car=car,
+                **self._verbs,
+            )
+        return words.CAR(
+            car=car,
+            reach=self._reach(up_to),
+            **self._verbs,
+        )
+
+    def _groups(self, counts: Mapping[str, int]) -> Iterator[Sentence]:
+        """How many cars are safe how far."""
+        span = self.span
+        slots = {
+            **self._verbs,
+            "top": span.text(span.high),
+            "low": span.text(span.low),
+            "name": span.title,
         }
-        of_all = f" of {number_of(number, 'car')}"
-        parts = list[str]()
-        for verdict, phrase in phrases.items():
-            if count := counts[verdict]:
-                verb = (
-                    f"{self._no_verb(count)}," if verdict == STOP else self._verb(count)
-                )
-                parts.append(f"{count}{'' if parts else of_all} {verb} {phrase}")
-        told = join_phrases(parts)
-        name, up_to = cars.iloc[0][["car", "up_to"]]
-        is_safe = not pd.isna(up_to)
-        if number == 1:
-            may = f"{self._verb()} {self._reach(up_to)}" if is_safe else self._no_verb()
-            told = f"{name} {may}"
-        sentences = [
-            f"{told}{self._measured_in_words(fleet)}; {new_car}.",
-            self.assumed,
-        ]
-        if number == 1:
-            if is_safe and self.ends and not fleet.measured.all():
-                sentences.append(worst_end_in_words(self.ends[0], span))
-            sentences.append(cars["because"][0])
+        templates = {DRIVE: words.FAST, LIMITED: words.SLOWER, STOP: words.STOPPING}
         if self.need is not None:
-            sentences.append(f"{slower}.")
+            templates[DRIVE] = words.FAST_ENOUGH
+            slots["need"] = span.text(self.need)
+        cars = number_of(sum(counts.values()), "car")
+        for verdict, template in templates.items():
+            if counts[verdict]:
+                count = f"{counts[verdict]} of {cars}"
+                yield template(
+                    count=count,
+                    **slots,
+                )
+
+    def _notes(self, fleet: Fleet) -> Iterator[Sentence]:
+        """What counts of measured values, and what was not driven."""
+        vehicle = self.models.own.characteristics.vehicle
+        # Limits are no measurements.
+        is_measured = np.any(fleet.measured, axis=0) & (not self.is_box)
+        if names := precise_in_words(compress(vehicle, is_measured)):
+            yield words.MEASURED(names=names)
         if fleet.is_rough:
-            sentences.append(ROUGH_LIST)
-        sentences.append(remark_on_phases(self.models.own.in_phases))
-        if span.ending:
-            tests = join_phrases(span.ending)
-            sentences.append(
-                f"Above {top} nothing was driven, where the tests {tests} end."
+            yield words.ROUGH_LIST
+        yield condition(remark_on_phases(self.models.own.in_phases))
+        top = self.span.text(self.span.high)
+        if self.span.ending:
+            yield words.ENDING(
+                top=top,
+                tests=join_phrases(self.span.ending),
             )
-        if span.left_out:
-            sentences.append(
-                f"Not driven, because they begin above {top}: {join_phrases(span.left_out)}."
+        if self.span.left_out:
+            yield words.LEFT_OUT(
+                top=top,
+                tests=join_phrases(self.span.left_out),
             )
-        sentences += [f"Scope: {scope}.", f"Safe means: {self._safe_in_words()}."]
-        return [*filter(None, sentences)]
 
-    def _verb(self, count: int = 1) -> str:
-        """What safe cars do."""
-        if not self._is_test:
-            return "may drive"
-        return "passes the test" if count == 1 else "pass the test"
-
-    def _no_verb(self, count: int = 1) -> str:
-        """What unsafe cars do."""
-        if not self._is_test:
-            return "may not drive"
-        return f"{'does' if count == 1 else 'do'} not pass the test"
+    @property
+    def _verbs(self) -> dict[str, str]:
+        """What safe cars do, and unsafe ones."""
+        return words.PASSING if self._is_test else words.DRIVING
 
     def _reach(self, value: float) -> str:
         """Up to which value cars are safe, behind the verb."""
@@ -280,42 +302,37 @@ class PermitAnswer:
         allows_impacts = any(test.allowed_impact_speed for test in self.study.tests)
         return allows_impacts or bool(self.study.unsafe.source)
 
-    def _measured_in_words(self, fleet: Fleet) -> str:
-        """That measured values count as they are least safe, behind how far cars are safe."""
-        vehicle = self.models.own.characteristics.vehicle
-        # Limits are no measurements.
-        is_measured = np.any(fleet.measured, axis=0, keepdims=True)[0] & (
-            not self.is_box
-        )
-        precise = precise_in_words(compress(vehicle, is_measured))
-        return f" with the least safe value of {precise}" if precise else ""
-
-    def _safe_in_words(self) -> str:
+    @property
+    def _safe(self) -> Sentence:
         """What a safe car does, with the study's own parameter set and with the others."""
-        own = self.models.own.unsafe
-        others = len(self.models.members) - 1
-        if own.below is None and not own.is_collision:
-            return f"not {own.description}, in {number_of(others + 1, 'parameter set')}"
-        if not own.keep:
-            clearance = f" and {own.below:g} m of clearance" if own.below else ""
-            return f"no contact{clearance}, in {number_of(others + 1, 'parameter set')}"
-        rest = f", and no contact with {number_of(others, 'other')}" if others else ""
-        return (
-            f"no contact and {own.keep:g} m of clearance with the study's own"
-            f" parameter set{rest}"
+        unsafe = self.models.own.unsafe
+        sets = len(self.models.members)
+        template = words.SAFE_WITHOUT_CONTACT
+        if unsafe.keep:
+            template = words.SAFE_WITH_CLEARANCE[sets > 1]
+        elif unsafe.below:
+            template = words.SAFE_WITH_DISTANCE
+        elif unsafe.below is None and not unsafe.is_collision:
+            template = words.SAFE_BY_CRITERION
+        return template(
+            unsafe=unsafe.description,
+            keep=unsafe.keep,
+            below=unsafe.below,
+            sets=number_of(sets, "parameter set"),
+            others=number_of(sets - 1, "other parameter set"),
         )
 
-    def _tested(self) -> str:
+    def _tested(self) -> Sentence:
+        """How cars were tested."""
         values = self.search.values
-        unit = unit_text(self.span.unit)
-        driven = f"from {values[0]:g} to {values[-1]:g}{unit}"
+        driven = f"from {values[0]:g} to {self.span.text(values[-1])}"
         if len(values) == len(self.search.listed):
-            driven = f"({join_phrases(f'{value:g}' for value in values)}{unit})"
-        grid = f"{len(values)} values {driven} in each test"
-        attacked = (
-            f"{self.search.attacked:,} simulations that search for an unsafe encounter"
+            listed = join_phrases(f"{value:g}" for value in values)
+            driven = f"({listed}{unit_text(self.span.unit)})"
+        template = words.TESTED_QUICK if self.is_quick else words.TESTED
+        return template(
+            number=len(values), values=driven, attacked=self.search.attacked
         )
-        return f"{grid}; {'no search for an unsafe encounter' if self.is_quick else attacked}."
 
     def _listing(self, cars: pd.DataFrame, fleet: Fleet) -> pd.DataFrame:
         """The list: the columns of the input, then those of the answer, in the input's order."""
@@ -329,15 +346,9 @@ class PermitAnswer:
         return listing
 
 
-NUMBERS = {"drive": DRIVE, "limited": LIMITED, "stop": STOP}
-"""The numbers that count cars, by what they may do."""
-
-
-def _in_unit(columns: Columns, span: Span) -> dict[str, Any]:
+def _in_unit(columns: Mapping[str, Column], span: Span) -> dict[str, Column]:
     """Columns with the unit of the parameter."""
-    named = dict[str, Any](columns)
-    for name in ("up_to", "new_car_up_to", "up_to_after_repair"):
-        column = columns.get(name)
-        if isinstance(column, Column):
-            named[name] = column._replace(unit=span.unit)
+    named = dict(columns)
+    for name in {"up_to", "new_car_up_to", "up_to_after_repair"} & named.keys():
+        named[name] = named[name]._replace(unit=span.unit)
     return named

@@ -55,9 +55,18 @@ class Span(NamedTuple):
     ending: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
 
+    @property
+    def title(self) -> str:
+        """The parameter in a sentence."""
+        return self.name.replace("_", " ")
+
+    def text(self, value: float) -> str:
+        """A value of the parameter, such as `35 km/h`."""
+        return f"{value:g}{unit_text(self.unit)}"
+
     def up_to(self, value: float, *, with_low: bool = True) -> str:
         """What is driven up to a value: `from 10 up to 35 km/h`, or `up to 35 km/h`."""
-        reached = f"{value:g}{unit_text(self.unit)}"
+        reached = self.text(value)
         if not with_low:
             return f"up to {reached}"
         return (

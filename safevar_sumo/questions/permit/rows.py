@@ -2,75 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import compress
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from safevar_sumo.questions.counterexamples import OF_ENCOUNTER, failures_at, texts_of
+from safevar_sumo.questions.permit import words
 from safevar_sumo.questions.permit.encounters import Span
+from safevar_sumo.questions.permit.fleet import Fleet
 from safevar_sumo.questions.permit.search import Permit
 from safevar_sumo.questions.permit.speeds import LimitingFailure
-from safevar_sumo.questions.tables import Column, Columns
-from safevar_sumo.questions.words import change_texts, join_phrases
-from safevar_sumo.records import JsonObject
-from safevar_sumo.study import PHASE, unit_text
+from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.tables import shipped_columns
+from safevar_sumo.questions.words import EXACT, change_texts, join_phrases
+from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.study import PHASE, Study
+from safevar_sumo.vehicles import CharacteristicSet
 
-PHASE_COLUMN = Column("-", "steps by which that encounter begins later", ".4f")
 DRIVE, LIMITED, STOP = "drive", "up to", "stop"
 """Verdicts: as fast as is needed, else as was driven or as the new car; up to a speed; not at all.
 """
-CARS: Columns = {
-    "car": "name of the car",
-    "up_to": Column(
-        "", "greatest value up to which it is safe", ".10g", head="may drive up to"
-    ),
-    "new_car_up_to": Column("", "that of the new car", ".10g", is_shown=False),
-    "unit": Column("", "unit of these values", is_shown=False),
-    "verdict": "drive, up to, or stop",
-    "because": "why no faster",
-    "test": Column("", "the test that limits it", is_shown=False),
-    "encounter": Column("", "the encounter in which it is unsafe", is_shown=False),
-    "outcome": Column("", "what happens there", is_shown=False),
-    "phase": PHASE_COLUMN._replace(is_shown=False),
-    "parameter_set": Column(
-        "-", "number of the set of [spread] in which it does", "d", False
-    ),
-    "repair_first": "the measured characteristic that, as new again, raises the value most",
-    "up_to_after_repair": Column(
-        "", "the greatest value then", ".10g", head="then up to"
-    ),
-    "simulate": Column("", "the command that simulates its failure", is_detail=True),
-    "assumed": Column(
-        "", "what was not measured, with its assumed value", is_detail=True
-    ),
-    "assumed_matters_most": Column(
-        "",
-        "the assumed value that, at an end of its domain, lowers the value most",
-        is_detail=True,
-    ),
-    "rough": Column(
-        "", "whether the answer is rough and proves nothing", is_detail=True
-    ),
-    "parameter_sets": Column(
-        "-", "number of parameter sets that were driven", "d", is_detail=True
-    ),
-    "margin": Column("m", "clearance to keep with the study's own set", is_detail=True),
-    "unsafe": Column("", "what is unsafe", is_detail=True),
-}
-SETS: Columns = {
-    "car": "name of the car",
-    "fit": Column(
-        "-", "number of the parameter set in [spread] (0: that of the study)", "d"
-    ),
-    "up_to": Column("", "greatest value up to which it is safe with this set", ".10g"),
-    "test": "the test that limits it",
-    "encounter": "the encounter in which it is unsafe",
-    "phase": PHASE_COLUMN,
-    "outcome": "what happens there",
-    "simulate": "the command that simulates it",
-}
-
-
+CARS, SETS = shipped_columns("permit").values()
 NO_FAILURE: JsonObject = dict.fromkeys(
     ("test", "encounter", "phase", "outcome", "simulate")
 )
@@ -80,8 +35,8 @@ NO_FAILURE: JsonObject = dict.fromkeys(
 def failure_columns(
     failures: Sequence[LimitingFailure | None], *, with_car: bool = False
 ) -> list[JsonObject]:
-    """The columns of failures, simulated once more as they are printed, and each in a sentence
-    without its end, `because`; `with_car` names the car's values in it, too.
+    """The columns of failures, simulated once more as they are printed, and each in words,
+    `because`; `with_car` names the car's values in it, too.
     """
     found = [{**NO_FAILURE, "because": ""}] * len(failures)
     of_range = dict[int, dict[int, LimitingFailure]]()
@@ -96,13 +51,14 @@ def failure_columns(
         described = failures_at(model, settings)
         for row, number in enumerate(known):
             failed = described[row]
-            words = failed.words.partition(" (parameter set")[0]
+            event = failed.words.partition(" (parameter set")[0]
             if with_car:
                 values = dict(
                     zip(members.vehicle.names, settings[row].tolist(), strict=False)
                 )
                 changes = change_texts(members.vehicle, values, are_printed=True)
-                words = f"with {join_phrases(changes or ['no change'])}, {words}"
+                phrases = join_phrases(changes or ["no change"])
+                event = words.WITH_CHANGES.format(changes=phrases, event=event)
             left_out = {*OF_ENCOUNTER, *members.names}
             met = {
                 name: value
@@ -119,7 +75,7 @@ def failure_columns(
                 "phase": phase,
                 "outcome": failed.breach,
                 "simulate": failed.command,
-                "because": words,
+                "because": event,
             }
     return found
 
@@ -141,25 +97,34 @@ def verdict_of(
 
 def because(
     permit: Permit,
-    words: str,
+    event: str,
     verdict: str,
     span: Span,
     new_car: float,
     need: float | None,
-) -> str:
-    """Why a car may drive no faster, in one sentence for a foreman."""
-    unit = unit_text(span.unit)
-    up_to = permit.up_to
-    if up_to is None:
-        return f"Not even at {span.low:g}{unit}: {words}."
-    if not words:
-        name = span.name.replace("_", " ")
-        return f"Safe {span.up_to(up_to)}, the greatest {name} that was driven."
-    if verdict != DRIVE:
-        return f"{words[:1].upper()}{words[1:]}."
-    if need is not None and up_to >= need:
-        return f"Safe {span.up_to(up_to)}, and {need:g}{unit} is needed."
-    return f"As fast as the new car, which is safe {span.up_to(new_car)}: {words}."
+) -> Sentence:
+    """Why a car may drive no faster, for a foreman."""
+    slots = {
+        "low": span.text(span.low),
+        "name": span.title,
+        "event": event,
+        "new_car": span.up_to(new_car),
+        "need": "",
+        "reach": "",
+    }
+    if need is not None:
+        slots["need"] = span.text(need)
+    if permit.up_to is None:
+        return words.NOT_AT_ALL(**slots)
+    slots["reach"] = span.up_to(permit.up_to)
+    template = words.AS_NEW
+    if not event:
+        template = words.SAFE_TO_TOP
+    elif verdict != DRIVE:
+        template = words.UNSAFE_BEYOND
+    elif need is not None and permit.up_to >= need:
+        template = words.NEED_REACHED
+    return template(**slots)
 
 
 def set_rows(
@@ -176,3 +141,44 @@ def set_rows(
         {"car": name, **each._asdict(), **columns}
         for (name, each), columns in zip(reached, found, strict=True)
     ]
+
+
+def assumed_cells(vehicle: CharacteristicSet, fleet: Fleet) -> list[str | None]:
+    """For each car what was not measured with the value that is assumed, such as `brakeResponse
+    0.2 s, sensorLatency 0.1 s`; None if all was measured.
+    """
+    return [
+        ", ".join(_texts(vehicle, setting)[~measured]) or None
+        for setting, measured in zip(fleet.settings, fleet.measured, strict=True)
+    ]
+
+
+def _texts(vehicle: CharacteristicSet, setting: FloatArray) -> NDArray[Any]:
+    """The values of a car, such as `brakeResponse 0.2 s`, shape (n,)."""
+    pairs = zip(vehicle, setting, strict=True)
+    return np.array(
+        [f"{item.name} {value:{EXACT}}{item.suffix}" for item, value in pairs]
+    )
+
+
+def assumed_sentences(
+    study: Study, vehicle: CharacteristicSet, fleet: Fleet
+) -> Iterator[Sentence]:
+    """What is assumed of all cars, with its value and where that comes from, and in how many cars
+    more than that is.
+    """
+    is_measured = fleet.measured.any(axis=0)
+    values: dict[Sentence, list[str]] = {words.ASSUMED: [], words.ASSUMED_NEW: []}
+    for item, value in compress(
+        zip(vehicle, fleet.settings[0], strict=True), np.logical_not(is_measured)
+    ):
+        template = words.ASSUMED_NEW
+        if item.name in study.unmeasured:
+            template = words.ASSUMED
+        values[template].append(f"{item.short_name} {value:{EXACT}}{item.suffix}")
+    for template, texts in values.items():
+        if texts:
+            yield template(values=join_phrases(texts))
+    if further := np.sum((fleet.measured < is_measured).any(axis=1)):
+        count = f"{further} of {len(fleet.names)} cars"
+        yield words.FURTHER_ASSUMED(count=count)

@@ -9,9 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.questions.models import Models
+from safevar_sumo.questions.permit import words
 from safevar_sumo.questions.permit.encounters import Span, encounters_of
+from safevar_sumo.questions.permit.fleet import Fleet
 from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSearch
+from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.words import EXACT
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues
+from safevar_sumo.vehicles import CharacteristicSet
 
 REPAIR_STAGE = "cars with one part as new"
 ENDS_STAGE = "cars with assumed values at ends of their domains"
@@ -181,7 +186,13 @@ class PermitSearch:
         up_to = permit.order
         driven = [each for each in self._ranges[permit.least.fit] if each.low <= up_to]
         values = self.values[self.values <= up_to]
-        search = SpeedSearch(driven, [cars], values, [up_to], ENDS_STAGE)
+        search = SpeedSearch(
+            driven,
+            [cars],
+            values,
+            [up_to],
+            ENDS_STAGE,
+        )
         search.drive_grid()
         return search.failures[0]
 
@@ -214,7 +225,12 @@ class PermitSearch:
         with self._models.own.evaluator.phases.stage(REPAIR_STAGE) as expect:
             while any(bounds):
                 expect(self._usual * sum(map(len, bounds)))
-                self._lower(bounds, failures, cars, original)
+                self._lower(
+                    bounds,
+                    failures,
+                    cars,
+                    original,
+                )
                 # The most promising repair of each car, unless a better one is known.
                 chosen = dict[int, int]()
                 for row, of_car in enumerate(bounds):
@@ -256,7 +272,12 @@ class PermitSearch:
                     repaired = cars[row].with_value_of(column, original)
                     setting = failure.setting.copy()
                     vehicle = setting[: len(original)]
-                    np.clip(vehicle, repaired.lower, repaired.upper, out=vehicle)
+                    np.clip(
+                        vehicle,
+                        repaired.lower,
+                        repaired.upper,
+                        out=vehicle,
+                    )
                     rows.setdefault(id(failure.encounters), []).append(
                         (row, column, failure.value, setting)
                     )
@@ -273,3 +294,63 @@ class PermitSearch:
                         default=-np.inf,
                     )
                     bounds[row][column] = min(bounds[row][column], most)
+
+
+def cars_of(vehicle: CharacteristicSet, fleet: Fleet) -> list[Cars]:
+    """The cars of a list, with all values that their measured ones may really have."""
+    ends = np.array(
+        [
+            [item.measured(value) for item, value in zip(vehicle, setting, strict=True)]
+            for setting in fleet.settings
+        ]
+    )
+    ends = np.where(
+        fleet.measured[..., np.newaxis], ends, fleet.settings[..., np.newaxis]
+    )
+    return [Cars.measured(*car.T) for car in ends]
+
+
+class WorstEnd(NamedTuple):
+    """The assumed value of a car that lowers its speed most at an end of its domain: the name of
+    the characteristic, the end as text, and the value at which the car is unsafe then.
+    """
+
+    name: str
+    text: str
+    value: float
+
+    def sentence(self, span: Span) -> Sentence:
+        """That this value matters most."""
+        value = span.text(max(self.value, span.low))
+        return words.WORST_END(
+            end=f"{self.name} {self.text}",
+            value=value,
+        )
+
+
+def worst_end(
+    search: PermitSearch,
+    vehicle: CharacteristicSet,
+    car: Cars,
+    is_measured: BoolArray,
+    permit: Permit,
+) -> WorstEnd | None:
+    """The worst end of a car; None where nothing is assumed, the car may not drive as it is, or no
+    end lowers its speed on the grid.
+    """
+    if permit.up_to is None or is_measured.all():
+        return None
+
+    # Each assumed value at either end, all others as they are worst. Any failure shows that the car
+    # may drive no faster, so the grid up to its own speed is enough, with the set that limits it.
+    limiting = permit.least.failure
+    own = car.lower if limiting is None else limiting.setting[: len(vehicle)]
+    is_one = np.eye(len(vehicle), dtype=bool)[~is_measured]
+    sides = [np.where(is_one, end, own) for end in (vehicle.lower, vehicle.upper)]
+    failure = search.worst_end(Cars(own, own, np.vstack(sides)), permit)
+    worst = own if failure is None else failure.setting[: len(vehicle)]
+    if failure is None or (worst == own).all():
+        return None
+    column = np.argmax(worst != own)
+    item = vehicle.members[column]
+    return WorstEnd(item.name, f"{worst[column]:{EXACT}}{item.suffix}", failure.value)

@@ -34,8 +34,11 @@ from safevar_sumo.questions.options import Fits, LimitTexts, Margin
 from safevar_sumo.questions.repair.answer import REPAIRS, answer_of
 from safevar_sumo.questions.repair.problem import Promise, RepairProblem, parameters_of
 from safevar_sumo.questions.repair.smallest import MOST_CHANGED
-from safevar_sumo.questions.repair.survivors import Survivors, find_survivors
-from safevar_sumo.questions.repair.validation import usual_test
+from safevar_sumo.questions.repair.survivors import (
+    Survivors,
+    find_survivors,
+    usual_test,
+)
 from safevar_sumo.questions.sampling import sobol_points
 from safevar_sumo.questions.tolerance.oracle import Oracle, product_of
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues

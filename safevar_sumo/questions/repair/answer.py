@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.metrics import F_SAFE
-from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
+from safevar_sumo.metrics import F_SAFE, Unsafe
+from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.models import Models, fit_names
 from safevar_sumo.questions.phases import remark_on_phases
+from safevar_sumo.questions.repair import words
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.repair.survivors import Survivors
-from safevar_sumo.questions.sampling import CONFIDENCE
+from safevar_sumo.questions.sentence import Sentence, Verdict, condition
+from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import (
+    UNSAFE_MEANS,
     bound_in_words,
     encounter_in_words,
     join_phrases,
+    number_of,
 )
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, NamedValues
 from safevar_sumo.scenarios import distance_in_words
@@ -27,63 +31,7 @@ from safevar_sumo.study import unit_text
 
 SHOWN_LIMITS = 3
 """Number of limits of full braking that the verdict names."""
-REPAIRS: Columns = {
-    "parameters": Column(
-        "", "the parameters that change, with their new values", ".10g", is_shown=False
-    ),
-    "change": "what changes, in words",
-    "changed": Column("-", "number of parameters that change", is_shown=False),
-    "fits": Column(
-        "-",
-        "number of parameter sets of the vehicle model in which it holds",
-        is_shown=False,
-    ),
-    "largest_change": Column(
-        "-", "largest change of a parameter (share of its range)", is_detail=True
-    ),
-    "metres_earlier": Column(
-        "m",
-        "how much earlier a new vehicle brakes, at most over all test cases",
-        ".2f",
-        head="brakes earlier",
-    ),
-    "metres_earlier_mean": Column(
-        "m",
-        "how much earlier it brakes on average over all test cases",
-        ".2f",
-        is_shown=False,
-    ),
-    "seconds_earlier": Column(
-        "s",
-        "how much earlier it brakes in the test case with the most metres",
-        ".2f",
-        is_shown=False,
-    ),
-    "most_at": Column("", "the test case with the most metres", is_shown=False),
-    "largest_deceleration": Column(
-        "m/s^2", "largest deceleration of a new vehicle", ".1f", is_detail=True
-    ),
-    "needless_braking": Column(
-        "-", "number of benign scenes in which the changed driving system brakes"
-    ),
-    "needless_braking_today": Column(
-        "-", "number of benign scenes in which the driving system of today brakes"
-    ),
-    "benign_scenes": Column("-", "number of scenes in which nobody needs to brake"),
-    "proof_samples": Column(
-        "-",
-        "number of worn vehicles sampled after the parameters were chosen",
-        head="proof: vehicles sampled",
-    ),
-    "proof_failures": Column(
-        "-", "number of these vehicles that are unsafe", head="of them unsafe"
-    ),
-    "at_most": Column(
-        "-",
-        f"upper bound of the share of unsafe vehicles, with {100 * CONFIDENCE:g} % confidence",
-        ".2g",
-    ),
-}
+(REPAIRS,) = shipped_columns("repair").values()
 
 
 def answer_of(
@@ -106,13 +54,18 @@ def answer_of(
     kept_today = any(
         not problem.changed_values(change) for change, _ in survivors.changes
     )
-    repairs = []
+    repairs = list[JsonObject]()
     if not kept_today:
-        repairs = [
-            _row(problem, change, proof, survivors.fits)
+        rows = [
+            _row(
+                problem,
+                change,
+                proof,
+                survivors.fits,
+            )
             for change, proof in survivors.changes
         ]
-        repairs.sort(key=_cost_of)
+        repairs = sorted(rows, key=_cost_of)
     tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
     numbers = {
         "unsafe": str(unsafe),
@@ -128,94 +81,98 @@ def answer_of(
         "fits": survivors.fits if survivors.changes else 0,
         "fits_tried": len(models.members),
     }
-    verdict = _verdict(
-        problem, survivors, worst=worst, repairs=repairs, not_repairable=not_repairable
-    )
-    tested = ""
+    ending = f"has a safety degree of {distance_in_words(worst, unsafe.contact)}"
+    if unsafe.bound:
+        ending = unsafe.value_in_words(worst)
+    if kept_today:
+        template = words.NOT_NECESSARY[bool(not_repairable)]
+        necessary = template(safe=_safe_in_words(unsafe))
+        sentences = [necessary, words.WORST(ending=ending)]
+    else:
+        sentences = [*_repair(problem, repairs)]
+    tested = list[Sentence]()
     if survivors.changes:
         proof = repairs[0] if repairs else _columns_of(survivors.changes[0][1])
-        tested = (
-            f"{_proof_in_words(**proof)}{_fits_in_words(models, survivors)}."
-            f" {remark_on_phases(models.own.in_phases)}".strip()
-        )
+        tested = [*_tested(models, survivors, proof)]
     return Answer(
         question="repair",
         study=problem.study,
-        verdict=verdict,
+        verdict=Verdict([*sentences, *_notes(problem, not_repairable)]),
         numbers=numbers,
         tables=tables,
-        tested=tested,
+        tested=Verdict(tested),
     )
 
 
-def _verdict(
-    problem: RepairProblem,
-    survivors: Survivors,
-    *,
-    worst: float,
-    repairs: list[JsonObject],
-    not_repairable: list[NamedValues],
-) -> str:
-    """Whether a repair is necessary, the smallest that was found and its price, and what no driving
-    system survives.
-    """
-    unsafe = problem.unsafe
-    wear = problem.promise.in_words
-    safe = f"keep {unsafe.keep:g} m of clearance" if unsafe.keep else "stay safe"
-    demand = "" if unsafe.keep else f" Counted as unsafe: {unsafe.description}."
-    if survivors.changes and not repairs:  # the driving system of today survives
-        where = " that any driving system can keep safe" if not_repairable else ""
-        degree = f"has a safety degree of {distance_in_words(worst, unsafe.contact)}"
-        ending = unsafe.value_in_words(worst) if unsafe.bound else degree
-        verdict = (
-            "No repair is necessary: with the driving system of today all tested vehicles"
-            f"{where} {safe} within the required range ({wear}). The worst vehicle {ending}."
-        )
-    elif repairs:
-        verdict = _repair_in_words(repairs, wear, safe)
-    else:
+def _safe_in_words(unsafe: Unsafe) -> str:
+    """What all vehicles do."""
+    return f"keep {unsafe.keep:g} m of clearance" if unsafe.keep else "stay safe"
+
+
+def _repair(
+    problem: RepairProblem, repairs: Sequence[JsonObject]
+) -> Iterator[Sentence]:
+    """The first repair, which is the cheapest one, and its price on a new vehicle."""
+    if not repairs:
         names = join_phrases(parameter.name for parameter in problem.parameters)
-        verdict = (
-            f"No change of one or two of {names} was found with which all vehicles within the"
-            f" required range ({wear}) {safe}."
-        )
-    verdict += demand
-    if not_repairable:
-        fewest = sorted(not_repairable, key=len)
-        parts = "; or ".join(
-            _limits_in_words(problem, part) for part in fewest[:SHOWN_LIMITS]
-        )
-        more = len(fewest) - SHOWN_LIMITS
-        others = (
-            f" ({more} more are in the numbers, not_repairable)" if more > 0 else ""
-        )
-        verdict += (
-            f" Remark: Even full braking at the first possible moment fails with {parts}{others}:"
-            " that needs another part, not another parameter."
-        )
-    return verdict
+        yield words.NOTHING_FOUND(names=names)
+        return
+    repair = repairs[0]
+    smallest = min(row["largest_change"] for row in repairs)
+    kind = "smallest" if repair["largest_change"] == smallest else "cheapest"
+    number = number_of(repair["changed"], "parameter")
+    yield words.REPAIR(
+        kind=kind,
+        number=number,
+        change=repair["change"],
+    )
+    yield words.REPAIRED(safe=_safe_in_words(problem.unsafe))
+    price = words.EARLIER
+    if repair["metres_earlier"] is None:
+        price = words.NO_BRAKING
+    needless = words.NO_SCENES
+    if repair["benign_scenes"]:
+        needless = words.NEEDLESS_BRAKING
+    yield from (price(**repair), needless(**repair))
 
 
-def _fits_in_words(models: Models, survivors: Survivors) -> str:
-    """In how many parameter sets the answer holds; empty with one model."""
-    count = len(models.members)
-    if count == 1:
-        return ""
-    broken = (
-        f", not in {fit_names(survivors.broken)}, where it collides"
-        if survivors.broken
-        else ""
+def _notes(
+    problem: RepairProblem, not_repairable: Sequence[NamedValues]
+) -> Iterator[Sentence]:
+    """The wear, what is unsafe, and what no driving system survives."""
+    yield words.WEAR(wear=problem.promise.in_words)
+    if not problem.unsafe.keep:
+        yield UNSAFE_MEANS(description=problem.unsafe.description)
+    fewest = sorted(not_repairable, key=len)
+    parts = [_limits_in_words(problem, part) for part in fewest[:SHOWN_LIMITS]]
+    if parts:
+        yield words.NOT_REPAIRABLE(parts=join_phrases(parts, "or"))
+    if len(fewest) > SHOWN_LIMITS:
+        number = len(fewest) - SHOWN_LIMITS
+        yield words.MORE_NOT_REPAIRABLE(number=number)
+
+
+def _tested(
+    models: Models, survivors: Survivors, proof: JsonObject
+) -> Iterator[Sentence]:
+    """How a change was tested, and in how many parameter sets it holds."""
+    bound = bound_in_words(proof["at_most"])
+    yield words.PROOF(
+        samples=proof["proof_samples"],
+        bound=bound,
     )
-    left_out = (
-        f"; left out: {fit_names([model.fit for model in models.left_out])}, where the original is"
-        " unsafe"
-        if models.left_out
-        else ""
-    )
-    return (
-        f"; it holds in {survivors.fits} of {count} parameter sets of the vehicle model, each with"
-        f" a search for counterexamples{broken}{left_out}"
-    )
+    number = len(models.members)
+    if number > 1:
+        yield words.SETS(
+            fits=survivors.fits,
+            number=number,
+        )
+    if survivors.broken:
+        yield words.BROKEN(sets=fit_names(survivors.broken))
+    if models.left_out and number > 1:
+        sets = fit_names([model.fit for model in models.left_out])
+        yield words.LEFT_OUT(sets=sets)
+    yield condition(remark_on_phases(models.own.in_phases))
 
 
 def _row(
@@ -224,13 +181,18 @@ def _row(
     """A repair, its price and its proof, by the names of columns."""
     values = problem.changed_values(change)
     texts = [
-        f"{name} {today:.6g} -> {values[name]:.10g}{unit_text(row.unit)} ({row.meaning})"
+        words.CHANGE.format(
+            meaning=row.meaning,
+            name=name,
+            old=f"{today:.6g}",
+            new=f"{values[name]:.10g}{unit_text(row.unit)}",
+        )
         for name, row, today in problem.parameters
         if name in values
     ]
     return {
         "parameters": values,
-        "change": ", ".join(texts),
+        "change": join_phrases(texts) if texts else "",
         "changed": len(values),
         "largest_change": float(np.max(np.abs(change - problem.today))),
         "fits": fits,
@@ -252,42 +214,6 @@ def _columns_of(proof: Proof) -> JsonObject:
         "proof_failures": proof.failures,
         "at_most": proof.at_most,
     }
-
-
-def _repair_in_words(repairs: Sequence[JsonObject], wear: str, safe: str) -> str:
-    """The first repair, which is the cheapest one, and its price on a new vehicle."""
-    repair = repairs[0]
-    smallest = min(one["largest_change"] for one in repairs)
-    kind = "smallest" if repair["largest_change"] == smallest else "cheapest"
-    found = f"{kind} change of the driving system that was"
-    if repair["changed"] > 1:
-        found = f"{kind} changes of the driving system that were"
-    metres = repair["metres_earlier"]
-    earlier = (
-        "brakes nowhere" if metres is None else f"brakes up to {metres:.2f} m earlier"
-    )
-    needless = "; needless braking was not measured: the study has no benign scenes"
-    if repair["benign_scenes"]:
-        needless = (
-            f", and needlessly in {repair['needless_braking']} of {repair['benign_scenes']} benign"
-            f" scenes ({repair['needless_braking_today']} today)"
-        )
-    return (
-        f"The {found} found: {repair['change']}. Then all tested vehicles within the"
-        f" required range ({wear}) {safe}. The price: a new vehicle"
-        f" {earlier}{needless}."
-    )
-
-
-def _proof_in_words(
-    *, proof_samples: int, proof_failures: int, at_most: float, **_: object
-) -> str:
-    """The validation of a change, without a full stop."""
-    return (
-        f"Of {proof_samples:,} worn vehicles that were sampled afterwards"
-        f" {proof_failures or 'none'} {'is' if proof_failures < 2 else 'are'} unsafe:"
-        f" {bound_in_words(at_most)} are"
-    )
 
 
 def _limits_in_words(problem: RepairProblem, part: NamedValues) -> str:

@@ -1,27 +1,122 @@
-"""Search, attack and prove in turns: the smallest changes that survive everything, and in which
-parameter sets of the vehicle model.
+"""Search, attack and prove in turns: the smallest changes that survive the search for
+counterexamples in all parameter sets of the vehicle model, and a bound on new wear.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from safevar_sumo.questions.box import Proof
+import numpy as np
+
+from safevar_sumo.questions.box import Judgement, Proof, proof_size, prove
+from safevar_sumo.questions.cases import SearchPlan, search_cases
+from safevar_sumo.questions.evaluator import ENCOUNTERS
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.repair.smallest import Search
-from safevar_sumo.questions.repair.validation import (
-    ATTACK_STAGE,
-    KNOWN,
-    find_failures,
-    prove_change,
-    usual_test,
-)
-from safevar_sumo.records import FloatArray
+from safevar_sumo.questions.sampling import Stream
+from safevar_sumo.questions.tolerance.oracle import product_of
+from safevar_sumo.records import FloatArray, IntArray
 
+KNOWN = 256
+"""Number of known cases with which a search begins, and of unsafe ones that it hands over; with
+each other parameter set an eighth."""
+OWN_SEARCHES = 4
+"""Number of searches with the study's own parameter set; each other one has one of half the
+size."""
+MAX_UNSAFE_SHARE = 0.001
+"""Upper bound of the share of unsafe vehicles that fresh wear has to prove."""
 FIRST = 1024
 """Number of the worst cases that are the first counterexamples."""
 MAX_ROUNDS = 30
 """Largest number of rounds of attacks."""
+ATTACK_STAGE, PROOF_STAGE = "attack on the change", "proof on fresh wear"
+
+
+def usual_test(problem: RepairProblem, sets: int) -> float:
+    """How many settings test a change that holds in so many parameter sets."""
+    points = len(problem.evaluator.system.points)
+    encounters = 1 + ENCOUNTERS if problem.study.ranges else points
+    searched = problem.budget * (OWN_SEARCHES + (sets - 1) / 2)
+    proved = proof_size(1, unsafe_share(problem)) * encounters * min(sets, 2)
+    return (searched + proved) / points
+
+
+def unsafe_share(problem: RepairProblem) -> float:
+    """The upper bound to prove, by how much is searched."""
+    return MAX_UNSAFE_SHARE / problem.evaluator.account.effort
+
+
+def find_failures(
+    problem: RepairProblem,
+    fits: tuple[int, ...],
+    change: FloatArray,
+    known: FloatArray,
+    number: int,
+) -> FloatArray:
+    """Search some parameter sets for cases that a change does not keep safe, from `known` ones on,
+    the worst first; none if it keeps all safe. `number` counts the attacks, for their random
+    numbers.
+    """
+    # These numbers are of no `Stream`: repairs depend on them.
+    rng = np.random.default_rng((problem.study.search.seed, number))
+
+    def judge(cases: FloatArray) -> FloatArray:
+        return problem.robustness(change, cases, ATTACK_STAGE)
+
+    # Few large generations of the other sets cost less than many small ones.
+    own = SearchPlan(problem.budget)
+    other = SearchPlan(problem.budget // 2, generation=2 * own.generation)
+    for fit in [*fits, *fits[:1] * (OWN_SEARCHES - 1)]:
+        first = known[: KNOWN // 8 if fit else KNOWN]
+        cases = problem.with_sets(first, fit)
+        plan = other if fit else own
+        met = search_cases(judge, problem.space(fit), cases, plan, rng)
+        if len(met.unsafe):
+            return met.unsafe[:KNOWN]
+    return known[:0]
+
+
+def prove_change(
+    problem: RepairProblem,
+    fits: tuple[int, ...],
+    change: FloatArray,
+    number: int,
+    attempt: int,
+) -> tuple[Proof, FloatArray]:
+    """Draw fresh wear for a change: its proof with the study's own set in the listed encounters,
+    and the unsafe cases; only without them the change is proved.
+
+    As many vehicles again each drive with one of the other sets, at random. `number` counts the
+    searches, for the random numbers, and `attempt` the proofs, from 1 on.
+    """
+    rng = Stream.REPAIRED_BOUND.generator(problem.study.search.seed, number)
+    unsafe = list[FloatArray]()
+
+    def drive(vehicles: FloatArray, sets: IntArray) -> FloatArray:
+        """What vehicles, each with a parameter set, leave in the listed encounters."""
+        cases = product_of(vehicles, problem.encounters)
+        cases = problem.with_sets(cases, np.repeat(sets, len(problem.encounters)))
+        robustness = problem.robustness(change, cases, PROOF_STAGE)
+        unsafe.append(cases[robustness < 0][:KNOWN])
+        return robustness.reshape(len(vehicles), -1)
+
+    def judge(vehicles: FloatArray) -> Judgement:
+        """The judgement of vehicles with the study's own parameter set."""
+        robustness = drive(vehicles, np.zeros(len(vehicles), dtype=np.intp))
+        least = np.min(robustness, axis=1)
+        return Judgement(
+            least < 0, np.zeros(len(least), dtype=bool), np.isfinite(least)
+        )
+
+    def draw(count: int) -> FloatArray:
+        """Promised vehicles."""
+        return problem.promise.draw(count, rng)[:, : problem.size]
+
+    proof, _ = prove(draw, judge, unsafe_share(problem), attempt)
+    if len(fits) > 1 and not len(unsafe[0]):
+        vehicles = draw(proof.samples)
+        drive(vehicles, rng.integers(1, len(fits), size=len(vehicles)))
+    return proof, unsafe[-1]
 
 
 class Survivors(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
@@ -48,6 +48,7 @@ from safevar_sumo.questions.research_questions.tables import (
     POOLED,
     TABLES,
 )
+from safevar_sumo.questions.sentence import Sentence, Verdict, answer, note
 from safevar_sumo.questions.words import demanded_in_words, join_phrases, number_of
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import SAFETY_DEGREE, label_of
@@ -62,6 +63,20 @@ REMARKS: Columns = {
     "table": "table",
     "remark": "what is missing or left out there, and why",
 }
+
+NO_SOLUTION = answer("The results of {name} contain no solution: {reason}.")
+COLLISIONS = answer("{count} of the {total} different solutions of {name} collide.")
+LESS_SAFE = (
+    answer(
+        "{count} of the {total} solutions of {algorithm} are less safe than the original vehicle."
+    ),
+    answer(
+        "{count} of the {total} solutions of {algorithm} are less safe than the original vehicle"
+        " in the same encounter."
+    ),
+)
+"""Of listed encounters, and of encounters that are ranges."""
+REMARK = note("Remark: {remark}")
 
 
 @contents(
@@ -230,11 +245,11 @@ def answer_questions(
     # Nothing at all is an error; remarks stand once.
     if errors and all(frame.empty for frame in frames.values()):
         raise errors[0]
-    verdict = [*map(_verdict, cases)]
+    sentences = [*chain.from_iterable(map(_verdict, cases))]
     of_all = []
     for case in cases:
         # Which runs and settings are in no table.
-        verdict += [f"Remark: {remark}" for remark in case.remarks]
+        sentences += [REMARK(remark=remark) for remark in case.remarks]
         of_all += [
             *case.remarks,
             why_few_evaluations(case),
@@ -246,7 +261,7 @@ def answer_questions(
     return Answer(
         question="tables",
         study=cases[0].study,
-        verdict=" ".join(verdict),
+        verdict=Verdict(sentences),
         numbers={
             "cases": len(cases),
             "solutions": sum(len(case.solutions) for case in cases),
@@ -257,26 +272,32 @@ def answer_questions(
     )
 
 
-def _verdict(case: Case) -> str:
+def _verdict(case: Case) -> Iterator[Sentence]:
     """How many of a case's solutions collide, and how many of NSGA-II's are critical."""
     if case.why_no_solution:
-        return f"{case.name} has no solution: {case.why_no_solution}."
+        yield NO_SOLUTION(
+            name=case.name,
+            reason=case.why_no_solution,
+        )
+        return
 
     # Collisions, and solutions that are less safe than the original.
     solutions = case.different_solutions
-    collisions = are_collisions(solutions).sum()
-    text = f"{case.name}: {collisions} of {number_of(len(solutions), 'different solution')} collide"
+    yield COLLISIONS(
+        count=are_collisions(solutions).sum(), total=len(solutions), name=case.name
+    )
     try:
         critical = len(changes.critical_solutions(case))
     except UnanswerableError:
-        return f"{text}."
-    of_all = len(case.solutions_of(NSGA2))
-    where = " in the same encounter" if case.study.ranges else ""
-    less_safe = (
-        f"{critical} of {case.title_of(NSGA2)}'s {of_all} are less safe than the original"
-        f" vehicle{where}."
+        return
+    less_safe = LESS_SAFE[bool(case.study.ranges)]
+    total = len(case.solutions_of(NSGA2))
+    yield less_safe(
+        count=critical,
+        total=total,
+        algorithm=case.title_of(NSGA2),
     )
-    return " ".join([f"{text}; {less_safe}", *demanded_in_words(case.study)])
+    yield from map(note, demanded_in_words(case.study))
 
 
 def _equal_solutions(case: Case) -> str:

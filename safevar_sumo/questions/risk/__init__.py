@@ -160,7 +160,7 @@ def risk(
     omissions = int(evaluations.infeasible.sum())
     sentences = _share_in_words(study, criterion, numbers, samples - total - omissions)
     if not has_design and total < LEAST_VEHICLES:
-        sentences.append(words.UNKNOWN_INFLUENCE.fill(least=LEAST_VEHICLES))
+        sentences.append(words.UNKNOWN_INFLUENCE(least=LEAST_VEHICLES))
     else:
         names = {item.name: item.short_name for item in evaluator.characteristics}
         sentences += influence_in_words(table, failures, confidence, names)
@@ -209,7 +209,7 @@ def _share_in_words(
         "needed": needed_samples,
         "failed": number_of(failed, "vehicle"),
     }
-    return [template.fill(**slots) for template in templates]
+    return [template(**slots) for template in templates]
 
 
 def influence_in_words(
@@ -229,7 +229,7 @@ def influence_in_words(
     template = words.UNCERTAIN_INFLUENCE if rivals else words.LARGEST_INFLUENCE
     if np.isnan(share[0]):
         template = words.NO_INFLUENCE
-    yield template.fill(
+    yield template(
         name=name,
         measure=table.attrs[OF_WHAT]["degree"],
         share=share[0],
@@ -241,4 +241,4 @@ def influence_in_words(
 
     # Without the outcome's own shares, what decides it is unknown.
     if failures and table[f"unsafe_{index}"].isna().all():
-        yield words.FEW_OUTCOMES.fill(least=MIN_OUTCOMES)
+        yield words.FEW_OUTCOMES(least=MIN_OUTCOMES)

@@ -163,7 +163,7 @@ def rules(
     }
     counted = counted_in_words(study, int(evaluations.infeasible.sum()))
     sentences = [
-        words.SHARE.fill(
+        words.SHARE(
             count=count_in_words(failures, total),
             sampled=sampled_in_words(study),
             collide=criterion.verbs[failures > 1],
@@ -176,7 +176,7 @@ def rules(
     denser = frame[frame["density_low"] > failures / total]
     if not boxes:
         sentences.append(
-            words.TOO_FEW.fill(
+            words.TOO_FEW(
                 unsafe=int(of_runs.sum()),
                 safe=int((~of_runs).sum()),
                 least=MIN_SETTINGS,
@@ -201,10 +201,10 @@ def _region_in_words(rule: pd.Series[Any], region: str) -> Iterator[Sentence]:
     """The region of a row of the table."""
     shares = 100 * rule[1:]
     is_wider = rule["density_least"] < rule["density_greatest"]
-    yield words.REGION.fill(region=region)
+    yield words.REGION(region=region)
     density = words.DENSITY_OVER_SETS if is_wider else words.DENSITY
-    yield density.fill(**shares)
-    yield words.COVERAGE.fill(**shares)
+    yield density(**shares)
+    yield words.COVERAGE(**shares)
 
 
 def conditions(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import chain
+
 import numpy as np
 import pandas as pd
 
@@ -10,22 +13,26 @@ from safevar_sumo.questions.bars import bars_of, draw_bars
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import Failure, describe, limit_text
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
+from safevar_sumo.questions.sentence import Sentence, Verdict, condition
 from safevar_sumo.questions.tables import Rows, shipped_columns, tabulate
+from safevar_sumo.questions.tolerance import words
 from safevar_sumo.questions.tolerance.oracle import Oracle
 from safevar_sumo.questions.tolerance.told import (
     InRanges,
     Told,
-    broken_in_words,
+    limit_in_words,
     refusal_in_words,
-    tested_sentences,
     verdict_sentences,
     worst_of,
 )
 from safevar_sumo.questions.words import (
+    bound_in_words,
     constraints_in_words,
     counted_in_words,
     join_phrases,
+    percentage,
 )
 from safevar_sumo.records import FloatArray, JsonObject, finite_or_none
 from safevar_sumo.scenarios import SPEED_DIMENSION
@@ -37,9 +44,6 @@ NUMBERS = (
 )
 LIMITS_TITLE = "Limits, rounded to the safe side"
 LIMITS, FITS, NEAREST, IN_RANGES = shipped_columns("tolerance").values()
-ROUGH = (
-    "a rough answer calls no limit kept: ask without --quick, or for more simulations"
-)
 
 
 def answer_limits(
@@ -54,22 +58,60 @@ def answer_limits(
     near = _nearest_rows(facts, nearest)
     if near:
         tables["nearest"] = tabulate("Limits that would do", NEAREST, near)
-    in_ranges = [] if ranges is None else [_row_in_ranges(facts, ranges)]
-    if in_ranges:
+    in_ranges = list[Sentence]()
+    if ranges is not None:
+        sentence, failure = _verdict_in_ranges(facts, ranges)
+        in_ranges = [sentence]
         title = "The same limits in the ranges of the study"
-        tables["ranges"] = tabulate(title, IN_RANGES, in_ranges)
-    sentences = verdict_sentences(facts, near, in_ranges)
+        rows = [_row_in_ranges(ranges, sentence.text, failure)]
+        tables["ranges"] = tabulate(title, IN_RANGES, rows)
     counted = counted_in_words(facts.study), constraints_in_words(facts.study)
+    conditions = map(condition, chain(*counted))
     return Answer(
         question="tolerance",
         study=facts.study,
-        verdict=" ".join(sentences),
-        tested=" ".join([*tested_sentences(facts), *counted[0], *counted[1]]),
+        verdict=Verdict(verdict_sentences(facts, near, in_ranges)),
+        tested=Verdict([*_tested(facts), *conditions]),
         numbers=_numbers(facts),
         tables=tables,
         failures=_failures(facts),
         draw=draw_bars,
     )
+
+
+def _tested(facts: Told) -> Iterator[Sentence]:
+    """How joint limits were tested; nothing without such limits."""
+    if facts.study.ranges and facts.is_safe:
+        share = percentage(facts.own.evaluator.share_left_out)
+        margin = facts.study.scenario.margin or 0
+        yield words.NOT_COUNTED(
+            share=share,
+            margin=margin,
+        )
+    if facts.box is None:
+        return
+    least = facts.least
+    search = words.EMPTY_SEARCH
+    keeps = ""
+    if least is not None:
+        search = words.SEARCH
+        keeps = facts.unsafe.value_in_words(least)
+    yield search(
+        number=facts.attacked,
+        keeps=keeps,
+    )
+    if facts.task.effort.corners:
+        yield words.CORNERS
+    proof = facts.limits.proof
+    if proof is not None:
+        bound = bound_in_words(proof.at_most)
+        yield words.PROOF(
+            samples=proof.samples,
+            bound=bound,
+        )
+        if proof.not_simulated:
+            yield words.NOT_SIMULATED(not_simulated=proof.not_simulated)
+    yield condition(remark_on_phases(facts.own.in_phases))
 
 
 def _numbers(facts: Told) -> JsonObject:
@@ -104,8 +146,11 @@ def _failures(facts: Told) -> tuple[str, ...]:
     if not facts.is_safe:
         return (refusal_in_words(facts),)
     if facts.broken:
-        return tuple(f"limit of {text}" for text in broken_in_words(facts))
-    return (ROUGH,) if facts.is_rough and facts.stated else ()
+        return tuple(
+            words.BROKEN.format(name=facts.members[column].short_name)
+            for column in facts.broken
+        )
+    return (words.ROUGH,) if facts.is_rough and facts.stated else ()
 
 
 def _limits_table(facts: Told) -> pd.DataFrame:
@@ -115,9 +160,13 @@ def _limits_table(facts: Told) -> pd.DataFrame:
     end = LIMITS["alone_low"]._replace(is_detail=facts.box is not None)
     shown = {**LIMITS, "alone_low": end}
     texts = [text for row in rows if (text := row["fails_first"])]
-    words = {text: text.removeprefix("the vehicle ") for text in texts}
+    events = {text: text.removeprefix("the vehicle ") for text in texts}
+    cells = [[*row.values()] for row in rows]
     table = tabulate(
-        LIMITS_TITLE, shown, [[*row.values()] for row in rows], words=words
+        LIMITS_TITLE,
+        shown,
+        cells,
+        words=events,
     )
     members = [facts.members[column] for column in facts.columns]
     domains = [(item.lower, item.upper) for item in members]
@@ -167,48 +216,55 @@ def _sentence(facts: Told, column: int) -> str:
     item = facts.members[column]
     box = facts.box
     name = item.short_name[:1].upper() + item.short_name[1:]
-    scope = f"Scope: {facts.scope}."
     if box is None:
-        return f"{name}: no joint limits were found."
-    ends = float(box.lower[column]), float(box.upper[column])
-    if ends[0] == ends[1]:
-        value = limit_text(item, ends[0])
-        state = "as in the original vehicle; no room was found for it"
-        return f"{name}: {value}, {state}. {scope}"
-    demands = list[str]()
-    if ends[0] != item.lower:
-        demands.append(f"at least {limit_text(item, ends[0])}")
-    if ends[1] != item.upper:
-        demands.append(f"at most {limit_text(item, ends[1])}")
-    if not demands:
-        span = f"from {item.lower:.10g} to {limit_text(item, item.upper)}"
-        return f"{name}: any value {span}. {scope}"
-    sentence = f"{name}: {' and '.join(demands)}."
+        return words.MANUAL_NONE.format(name=name)
+    original = limit_text(item, item.original)
+    limit = limit_in_words(facts, box, column)
     failure = facts.failures.get(column)
-    if failure is None:
-        return f"{sentence} {scope}"
-    vehicle = _vehicle_in_words(facts, box, column, failure)
-    return f"{sentence} {vehicle}, {failure.words}. {scope}"
+    template = words.MANUAL
+    values = event = ""
+    if box.lower[column] == box.upper[column]:
+        template = words.MANUAL_ORIGINAL
+    elif not limit:
+        template = words.MANUAL_ANY
+    elif failure is not None:
+        template = words.MANUAL_FAILURE
+        values = _values_in_words(
+            facts,
+            box,
+            column,
+            failure,
+        )
+        event = failure.words
+    return template.format(
+        name=name,
+        original=original,
+        lower=f"{item.lower:.10g}",
+        upper=limit_text(item, item.upper),
+        limit=limit,
+        values=values,
+        event=event,
+        scope=facts.scope,
+    )
 
 
-def _vehicle_in_words(facts: Told, box: Box, column: int, failure: Failure) -> str:
-    """The vehicle that fails just beyond a limit: `At 0.81, with all others at their limits`, and
-    which of the others are elsewhere.
+def _values_in_words(facts: Told, box: Box, column: int, failure: Failure) -> str:
+    """What is not at its limit in the vehicle that fails just beyond a limit: `tread depth at 1.5
+    mm and payload at 300 kg`, with the value beyond the limit at first.
     """
-    others = list[str]()
+    texts = list[str]()
     for number, item in enumerate(facts.members):
         value = float(failure.setting[number])
+        text = f"{item.short_name} at {limit_text(item, value)}"
         # Others are at their limit, if they have one, and as in the original, if they have none.
         ends = {float(box.lower[number]), float(box.upper[number])}
         limits = ends - {item.lower, item.upper} or {item.original}
         is_said = len(limits) == 1 and np.isclose(value, [*limits])[0]
-        if number != column and not is_said:
-            others.append(f"{item.name} {limit_text(item, value)}")
-    places = "all others at their limits"
-    if others:
-        places = f"{join_phrases(others)} and {places}"
-    value = float(failure.setting[column])
-    return f"At {limit_text(facts.members[column], value)}, with {places}"
+        if number == column:
+            texts.insert(0, text)
+        elif not is_said:
+            texts.append(text)
+    return join_phrases(texts)
 
 
 def _fit_rows(facts: Told) -> Rows:
@@ -236,27 +292,37 @@ def _nearest_rows(facts: Told, nearest: FloatArray | None) -> Rows:
     return rows
 
 
-def _row_in_ranges(facts: Told, ranges: InRanges) -> tuple[object, ...]:
-    """The row of `IN_RANGES`; of several failures that at the lowest speed."""
-    own = ranges.task.oracle.own
+def _verdict_in_ranges(
+    facts: Told, ranges: InRanges
+) -> tuple[Sentence, Failure | None]:
+    """Whether the limits hold in the ranges; of several failures that at the lowest speed."""
     attacks = ranges.attacks.values()
-    simulations = f"{sum(attack.simulated for attack in attacks):,} simulations"
+    number = sum(attack.simulated for attack in attacks)
     unsafe = np.concatenate([attack.unsafe for attack in attacks])
     least = worst_of(ranges.unsafe, ranges.attacks)
-    vehicle: tuple[object, ...] = (None, None)
     if len(unsafe):
-        verdict = "they do not hold: a vehicle within them is unsafe."
         failure = _slowest_failure(facts, ranges.task.oracle, unsafe)
-        if failure is not None:
-            verdict = f"they do not hold: {failure.words}."
-            vehicle = _values_of(own, failure), failure.command
-    elif least is None:
-        verdict = f"none of {simulations} met an encounter that counts."
-    else:
-        keeps = ranges.unsafe.value_in_words(least)
-        search = f"{simulations} that search for a counterexample"
-        verdict = f"the limits hold: the worst of {search} {keeps}."
-    return (scope_of(own.evaluator.study), not len(unsafe), verdict, *vehicle)
+        event = words.SOME_UNSAFE if failure is None else failure.words
+        return words.RANGES_FAIL(event=event), failure
+    if least is None:
+        return words.RANGES_UNKNOWN(number=number), None
+    keeps = ranges.unsafe.value_in_words(least)
+    return words.RANGES_HOLD(
+        number=number,
+        keeps=keeps,
+    ), None
+
+
+def _row_in_ranges(
+    ranges: InRanges, verdict: str, failure: Failure | None
+) -> tuple[object, ...]:
+    """The row of `IN_RANGES`."""
+    own = ranges.task.oracle.own
+    holds = not any(len(attack.unsafe) for attack in ranges.attacks.values())
+    vehicle: tuple[object, ...] = (None, None)
+    if failure is not None:
+        vehicle = _values_of(own, failure), failure.command
+    return (scope_of(own.evaluator.study), holds, verdict, *vehicle)
 
 
 def _slowest_failure(facts: Told, oracle: Oracle, unsafe: FloatArray) -> Failure | None:

@@ -1,6 +1,4 @@
-"""What was found about limits, as it is told; and the verdict in words: the decision, what would do
-instead, and the scope.
-"""
+"""What was found about limits, and what is told about it: which templates, and what fills them."""
 
 from __future__ import annotations
 
@@ -22,24 +20,26 @@ from safevar_sumo.questions.counterexamples import (
     limit_text,
 )
 from safevar_sumo.questions.models import Model, fit_names
-from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
+from safevar_sumo.questions.sentence import Sentence, answer, evidence, note
 from safevar_sumo.questions.tables import Rows
+from safevar_sumo.questions.tolerance import words
 from safevar_sumo.questions.tolerance.alone import Side
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.boxes import Attack
 from safevar_sumo.questions.tolerance.search import FoundLimits
 from safevar_sumo.questions.words import (
-    bound_in_words,
+    VALID_FOR,
     join_phrases,
     number_of,
-    percentage,
     undecidable_in_words,
 )
 from safevar_sumo.records import Evaluations, FloatArray, finite_or_none
 from safevar_sumo.study import Study, unit_text
 from safevar_sumo.vehicles import Characteristic
 
+MOST_LIMITS = 3
+"""Number of joint limits up to which a sentence names all."""
 DECIMALS = 3
 """Decimals of limits beyond those that are printed: further ones are rounding errors."""
 
@@ -120,7 +120,7 @@ class Told:
             return []
         is_free = self.limits.boxes.is_free.any(axis=0)
         closed = np.flatnonzero(is_free & (sides.sum(axis=0) == 0))
-        return [self.members[column].name for column in closed.tolist()]
+        return [self.members[column].short_name for column in closed.tolist()]
 
     def box_of(self, sides: FloatArray) -> Box:
         """A box of vehicles as it is printed."""
@@ -266,229 +266,235 @@ def worst_of(
 def refusal_in_words(facts: Told) -> str:
     """Why no limit can be kept."""
     breach = facts.unsafe.breach_in_words(facts.original)
-    return f"the original vehicle itself {breach}: no limit can be kept"
+    return words.ORIGINAL_UNSAFE.format(breach=breach)
 
 
-def verdict_sentences(facts: Told, nearest: Rows, in_ranges: Rows) -> Iterator[str]:
+def verdict_sentences(
+    facts: Told, nearest: Rows, in_ranges: Sequence[Sentence]
+) -> Iterator[Sentence]:
     """The sentences of the verdict: the decision, what decides it, what would do instead, and the
     scope.
     """
     if not facts.is_safe:
-        refusal = refusal_in_words(facts)
-        yield f"{refusal[:1].upper()}{refusal[1:]}."
-        demand = facts.unsafe.smaller_demand(facts.original)
-        if demand:
-            yield demand
+        yield words.REFUSAL(reason=refusal_in_words(facts))
+        yield answer(facts.unsafe.smaller_demand(facts.original))
         return
     if facts.broken:
-        yield f"Do not release: {'; '.join(broken_in_words(facts))}."
-    yield from _sets_in_words(facts)
-    yield from _nearest_in_words(nearest)
-    yield from _box_in_words(facts)
-    yield from _vague_in_words(facts)
-    for row in in_ranges:
-        yield f"In the ranges of the study {row[2]}"
-    yield from _alone_in_words(facts)
-    if facts.unsafe.remark:
-        yield facts.unsafe.remark
+        yield from _broken(facts)
+    yield from _sets(facts)
+    yield from _nearest(facts, nearest)
+    if facts.box is not None:
+        yield from _joint(facts, facts.box)
+    elif 0 not in facts.limits.broken:
+        yield from _no_box(facts)
+    yield from in_ranges
+    yield from _alone(facts)
+    yield note(facts.unsafe.remark)
     if facts.tests_left_out:
         tests = join_phrases(facts.tests_left_out)
-        yield f"Left out, because all their values are above {facts.up_to}: {tests}."
+        yield words.TESTS_LEFT_OUT(
+            tests=tests,
+            up_to=facts.up_to,
+        )
     if facts.at_tests:
-        yield "Nothing was simulated between the values of the tests (--at-tests)."
-    yield f"Scope: {facts.scope}."
+        yield words.AT_TESTS
+    yield VALID_FOR(scope=facts.scope)
 
 
-def broken_in_words(facts: Told) -> list[str]:
-    """What is wrong with the specified limits: of each that is not safe alone, else of all
-    together.
-    """
+def _broken(facts: Told) -> Iterator[Sentence]:
+    """That specified limits do not hold: each that is not safe alone, else all together."""
+    yield words.DO_NOT_RELEASE
     outside = [column for column in facts.broken if facts.outside(column) > 0]
+    for column in outside:
+        yield _outside(facts, column)
     if outside:
-        return [_outside_in_words(facts, column) for column in outside]
-    texts = list[str]()
+        return
+    values = list[str]()
     for column in facts.broken:
         item = facts.members[column]
         for end in facts.given(column):
             if end is not None:
-                texts.append(f"{item.name} {limit_text(item, end)}")
+                values.append(f"{item.short_name} {limit_text(item, end)}")
     case = next(iter(facts.limits.broken.values()))
     failure = facts.failure(case, facts.box_of(facts.limits.specified))
-    words = "the vehicle is unsafe" if failure is None else failure.words
-    return [f"{join_phrases(texts)}: with all specified limits, {words}"]
+    event = words.SOME_UNSAFE if failure is None else failure.words
+    yield words.TOGETHER(
+        limits=join_phrases(values),
+        event=event,
+    )
 
 
-def _outside_in_words(facts: Told, column: int) -> str:
-    """What is wrong with a limit: `payload 500: the vehicle hits a pedestrian (outside by 8)`.
-
-    At the specified value itself the vehicle may be safe; then what fails beyond the limit is said.
+def _outside(facts: Told, column: int) -> Sentence:
+    """That a specified limit is not safe alone. At the specified value itself the vehicle may be
+    safe; then what fails beyond the limit is said.
     """
     item = facts.members[column]
-    low, high = facts.given(column)
+    value, event = _failure_outside(facts, column)
     outside = limit_text(item, round(facts.outside(column), 9))
+    return words.OUTSIDE(
+        name=item.short_name,
+        value=limit_text(item, value),
+        event=event,
+        outside=outside,
+    )
+
+
+def _failure_outside(facts: Told, column: int) -> tuple[float, str]:
+    """The value with which the vehicle fails at or beyond a specified limit, and how it does."""
+    low, high = facts.given(column)
     for side, end in enumerate((low, high)):
-        beyond = facts.limits.alone.beyond.get((side, column))
-        if end is None or beyond is None:
+        unsafe = facts.limits.alone.beyond.get((side, column))
+        if end is None or unsafe is None:
             continue
-        case = beyond.copy()
+        case = unsafe.copy()
         case[column] = end
         vehicle = case[: len(facts.members)]
         point = Box(facts.own.evaluator.region, vehicle, vehicle)
-        for failure in (facts.failure(case, point), facts.failure(beyond)):
+        for failure in (facts.failure(case, point), facts.failure(unsafe)):
             if failure is not None:
-                value = limit_text(item, float(failure.setting[column]))
-                return f"{item.name} {value}: {failure.words} (outside by {outside})"
+                return float(failure.setting[column]), failure.words
     end = low if high is None else high
     assert end is not None
-    return f"{item.name} {limit_text(item, end)}: the vehicle is unsafe (outside by {outside})"
+    return end, words.SOME_UNSAFE
 
 
-def _sets_in_words(facts: Told) -> Iterator[str]:
+def _sets(facts: Told) -> Iterator[Sentence]:
     """In which parameter sets the specified limits do not hold."""
     broken = sorted(facts.limits.broken)
-    number = len(facts.task.fits)
-    if broken and number > 1:
-        holding = f"{number - len(broken)} of {number}"
-        yield (
-            f"The specified limits hold in {holding} parameter sets of the vehicle, not in"
-            f" {fit_names(broken)}."
+    fits = len(facts.task.fits)
+    if broken and fits > 1:
+        holding = fits - len(broken)
+        sets = fit_names(broken)
+        yield words.SPECIFIED_SETS(
+            holding=holding,
+            fits=fits,
+            broken=sets,
         )
 
 
-def _nearest_in_words(nearest: Rows) -> Iterator[str]:
+def _nearest(facts: Told, nearest: Rows) -> Iterator[Sentence]:
     """Which values would hold in place of the specified limits."""
-    values = [
-        f"{name} {value:.10g}{unit_text(unit)}"
+    names = {item.name: item.short_name for item in facts.members}
+    limits = [
+        f"{names[str(name)]} {value:.10g}{unit_text(unit)}"
         for name, unit, _, value in nearest
         if value is not None
     ]
-    if values:
-        others = ", if the other specified limits stay" if len(nearest) > 1 else ""
-        yield f"A limit that would hold instead: {' or '.join(values)}{others}."
+    if limits:
+        yield words.NEAREST(limits=join_phrases(limits, "or"))
     elif nearest:
-        yield "No other value of a single specified limit would hold."
+        yield words.NONE_NEAREST
 
 
-def _box_in_words(facts: Told) -> Iterator[str]:
+def _joint(facts: Told, box: Box) -> Iterator[Sentence]:
     """The joint limits, and what was found within them."""
-    broken = facts.limits.broken
-    if facts.box is None:
-        if 0 not in broken:
-            yield from _no_box_in_words(facts)
-        return
-    where = ""
-    number = len(facts.task.fits)
-    holding = number - len(broken)
-    if number > 1:
-        where = f" in {holding} of {number} parameter sets of the vehicle model"
-    decision = "All joint limits hold at the same time"
-    if facts.stated:
-        decision = "The joint limits below hold" if broken else "All limits hold"
-    yield f"{decision}{where}: {tested_in_words(facts.unsafe, holding)}."
+    if not facts.stated:
+        yield from _limits(facts, box)
+    elif facts.limits.broken:
+        yield words.NOT_SPECIFIED
+    else:
+        yield words.SPECIFIED
+    if facts.without_room:
+        yield words.WITHOUT_ROOM(names=join_phrases(facts.without_room))
+    fits = len(facts.task.fits)
+    holding = fits - len(facts.limits.broken)
+    if fits > 1:
+        yield words.SETS(
+            holding=holding,
+            fits=fits,
+        )
+    yield _tested(facts.unsafe, holding)
+    yield from _undecidable(facts, box)
     for model in facts.task.left_out:
         # Its words name the test and the parameter set.
         described = describe(model, {"": model.characteristics.original})
-        words = f"parameter set {model.fit} is unsafe"
+        event = words.SOME_UNSAFE
         if described:
-            words = described[""].words
-        yield f"No limit holds in an encounter in which the original vehicle fails: {words}."
-    is_single = number == 1 and not facts.task.left_out
-    if is_single and facts.study.spread:
-        yield (
-            "The limits were computed with one parameter set of the vehicle model, not with the"
-            " study's other sets."
+            event = described[""].words
+        yield words.LEFT_OUT(
+            fit=model.fit,
+            event=event,
         )
-    if facts.without_room:
-        names = join_phrases(facts.without_room)
-        yield f"No room was found for {names}: they stay as in the original."
+    if fits == 1 and not facts.task.left_out and facts.study.spread:
+        yield words.ONE_SET
 
 
-def _no_box_in_words(facts: Told) -> Iterator[str]:
+def _limits(facts: Told, box: Box) -> Iterator[Sentence]:
+    """The joint limits of the characteristics that have some room; in the table if many have."""
+    texts = [
+        limit_in_words(facts, box, column)
+        for column in facts.columns
+        if box.lower[column] < box.upper[column]
+    ]
+    limits = [*filter(None, texts)]
+    if len(limits) > MOST_LIMITS:
+        yield words.JOINT(number=len(limits))
+    elif limits:
+        yield words.KEEP(limits=join_phrases(limits))
+    elif len(texts) == len(facts.columns):
+        yield words.UNLIMITED
+
+
+def limit_in_words(facts: Told, box: Box, column: int) -> str:
+    """A joint limit, such as `payload at 500 kg or less`; empty if all the domain is safe."""
+    item = facts.members[column]
+    low = float(box.lower[column])
+    high = float(box.upper[column])
+    return words.LIMITS[low != item.lower, high != item.upper].format(
+        name=item.short_name, low=limit_text(item, low), high=limit_text(item, high)
+    )
+
+
+def _no_box(facts: Told) -> Iterator[Sentence]:
     """That no joint limits were found."""
     if facts.stated and not facts.is_rough:
-        yield "The specified limits hold with all other characteristics as in the original."
+        yield words.SPECIFIED_ALONE
+    boxes = facts.limits.failures.boxes
     if facts.without_room:
-        yield (
-            "The simulations found no joint limits of use, because no safe change of"
-            f" {join_phrases(facts.without_room)} was found beside the others."
-        )
-        return
-    boxes = number_of(facts.limits.failures.boxes, "operating range")
-    if facts.limits.failures.boxes:
-        yield (
-            f"No joint limits were found ({facts.unsafe.description}): the search tested {boxes},"
-            " and found an unsafe vehicle in each. That is no proof that there are none."
+        yield words.NO_ROOM(names=join_phrases(facts.without_room))
+    elif boxes:
+        ranges = number_of(boxes, "set") + " of limits"
+        yield words.NO_BOX(
+            unsafe=facts.unsafe.description,
+            boxes=ranges,
         )
     else:
-        yield "The simulations did not suffice to search joint limits."
+        yield words.TOO_FEW
 
 
-def tested_in_words(unsafe: Unsafe, fits: int) -> str:
+def _tested(unsafe: Unsafe, fits: int) -> Sentence:
     """What every vehicle within limits did that hold in some parameter sets: with others than the
     study's own, no distance is demanded.
     """
     if not unsafe.keep:
-        sets = f" in any of {fits} parameter sets" if fits > 1 else ""
-        return f"no vehicle that was tested within them is unsafe ({unsafe.description}){sets}"
-    sets = ""
-    if fits > 1:
-        others = number_of(fits - 1, "other")
-        sets = f" with the study's own parameter set, and none collides with {others}"
-    clearance = f"at least {unsafe.keep:.3g} m of clearance"
-    return f"every vehicle that was tested within them keeps {clearance}{sets}"
+        return words.SAFE(unsafe=unsafe.description)
+    template = words.CLEARANCE[fits > 1]
+    others = number_of(fits - 1, "other parameter set")
+    return template(
+        keep=unsafe.keep,
+        others=others,
+    )
 
 
-def _vague_in_words(facts: Told) -> Iterator[str]:
+def _undecidable(facts: Told, box: Box) -> Iterator[Sentence]:
     """Which limits a workshop cannot decide."""
-    box = facts.box
-    if box is None:
-        return
     ends = zip(facts.members, box.lower.tolist(), box.upper.tolist(), strict=True)
     vague = [item for item, low, high in ends if not item.is_decidable(low, high)]
     if vague:
-        yield undecidable_in_words(vague)
+        yield evidence(undecidable_in_words(vague))
 
 
-def _alone_in_words(facts: Told) -> Iterator[str]:
+def _alone(facts: Told) -> Iterator[Sentence]:
     """Which characteristics can make the vehicle unsafe on their own, of those that were asked
     about.
     """
-    columns = {column for _, column in facts.limits.alone.beyond}
+    limited = {column for _, column in facts.limits.alone.beyond}
     names = [
-        facts.members[column].name for column in facts.columns if column in columns
+        facts.members[column].short_name
+        for column in facts.columns
+        if column in limited
     ]
-    if len(names) > 1:
-        yield f"{join_phrases(names)} can each make the vehicle unsafe on their own."
-    elif names:
-        yield f"{names[0]} can make the vehicle unsafe on its own."
+    if names:
+        yield words.ALONE(names=join_phrases(names, "or"))
     elif facts.has_scan:
-        yield "No single characteristic makes the vehicle unsafe on its own."
-
-
-def tested_sentences(facts: Told) -> Iterator[str]:
-    """How joint limits were tested; nothing without such limits."""
-    if facts.study.ranges and facts.is_safe:
-        share = percentage(facts.own.evaluator.share_left_out)
-        yield (
-            f"{share} % of the encounters do not count, because the original vehicle keeps less"
-            f" than {facts.study.scenario.margin or 0:g} m of clearance in them."
-        )
-    if facts.box is None:
-        return
-    search = f"{facts.attacked:,} simulations that search for a counterexample"
-    least = facts.least
-    worst = "of which none met an encounter that counts"
-    if least is not None:
-        worst = f"the worst {facts.unsafe.value_in_words(least)}"
-    corners = "All corner cases; " if facts.task.effort.corners else ""
-    yield f"{corners}{search} ({worst})."
-    proof = facts.limits.proof
-    if proof is not None:
-        failed = ""
-        if proof.not_simulated:
-            failed = f" ({proof.not_simulated} could not be simulated)"
-        bound = bound_in_words(proof.at_most).capitalize()
-        yield f"None of {proof.samples:,} sampled vehicles is unsafe{failed}."
-        yield f"{bound} of uniformly sampled vehicles within the limits are unsafe."
-    if remark := remark_on_phases(facts.own.in_phases):
-        yield remark
+        yield words.NONE_ALONE

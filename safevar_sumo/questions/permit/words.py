@@ -1,0 +1,92 @@
+"""What `permit` can say.
+
+`{may}` is what safe cars do and `{may_not}` what unsafe ones do, `{reach}` is how far, `{name}` the
+parameter over which cars are driven, and `{event}` how a car fails.
+"""
+
+from __future__ import annotations
+
+from safevar_sumo.questions.sentence import answer, condition, evidence, note
+
+# What cars may do.
+DRIVING = {"may": "may drive", "may_not": "may not drive"}
+PASSING = {"may": "can pass the test", "may_not": "cannot pass the test"}
+"""Verbs of cars, on roads and in a test of a regulation."""
+NAMED_CAR = 'The car "{name}"'
+CAR = answer("{car} {may} {reach}.")
+CAR_STOPS = answer("{car} {may_not}.")
+FAST = answer("{count} {may} up to {top}, or as fast as a new car.")
+FAST_ENOUGH = answer("{count} {may} up to {need}.")
+SLOWER = answer("{count} {may} only up to a lower {name}, which the table states.")
+STOPPING = answer("{count} {may_not}, not even at {low}.")
+NEW_CAR = answer("A new car {may} {reach}.")
+TOO_SLOW = answer("{count} {may_not} at {need}.")
+ROUGH_NEED = (
+    "a rough answer lets no car drive: ask without --quick, or for more simulations"
+)
+"""Why no gate passes on a rough answer."""
+
+# Why a car may drive no faster.
+NOT_AT_ALL = answer("Already at {low}, {event}.")
+SAFE_TO_TOP = answer("The car is safe {reach}, the highest {name} that was simulated.")
+UNSAFE_BEYOND = answer("At a higher {name}, {event}.")
+NEED_REACHED = answer("The car is safe {reach}, and {need} is needed.")
+AS_NEW = answer(
+    "The car may drive as fast as a new car, {new_car}. At a higher {name}, {event}."
+)
+WITH_CHANGES = "with {changes}, {event}"
+
+# What nobody knows of a car.
+MEASURED = condition(
+    "Within its measuring error, the least safe value counts of {names}."
+)
+ASSUMED = evidence(
+    "This answer assumes values that were not measured, as the study states under [unmeasured]:"
+    " {values}."
+)
+ASSUMED_NEW = evidence(
+    "This answer assumes values that were not measured, as in a new car: {values}."
+)
+FURTHER_ASSUMED = condition(
+    'In {count}, further values are assumed, which the column "assumed" names (--details).'
+)
+WORST_END = evidence(
+    "The assumed value that matters most is {end} (checked at the ends of all domains, with the"
+    " parameter set that limits the car): the car would be unsafe already at {value}."
+)
+NO_WORST_END = evidence(
+    "No assumed value lowers the {name}, not even at an end of its domain (checked at the tested"
+    " values, with the parameter set that limits the car)."
+)
+
+# What was simulated, and what a safe car does.
+ROUGH_LIST = note(
+    "Remark: the list is a rough answer (rough = yes), whose speeds prove nothing."
+)
+ENDING = note("Nothing was simulated above {top}, where these tests end: {tests}.")
+LEFT_OUT = note("Some tests were not driven, because they begin above {top}: {tests}.")
+SAFE_BY_CRITERION = note(
+    "Safe means: the car is not unsafe ({unsafe}) in {sets} of the vehicle model."
+)
+SAFE_WITHOUT_CONTACT = note(
+    "Safe means: the car touches nobody in {sets} of the vehicle model."
+)
+SAFE_WITH_DISTANCE = note(
+    "Safe means: the car keeps at least {below:g} m of clearance in {sets} of the vehicle model."
+)
+SAFE_WITH_CLEARANCE = (
+    note("Safe means: the car keeps at least {keep:g} m of clearance."),
+    note(
+        "Safe means: the car keeps at least {keep:g} m of clearance with parameter set 0 of the"
+        " vehicle model (that of the study). With the {others}, the car touches nobody."
+    ),
+)
+"""With one parameter set, and with several."""
+TESTED = evidence(
+    "In each test, {number} values {values} were simulated. {attacked:,} simulations searched for"
+    " an unsafe encounter."
+)
+TESTED_QUICK = evidence(
+    "In each test, {number} values {values} were simulated. No simulation searched for an unsafe"
+    " encounter."
+)
