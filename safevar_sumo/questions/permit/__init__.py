@@ -368,8 +368,8 @@ def _grid(span: Span, step: float) -> FloatArray:
             f"{step:g}",
             f"at most {MOST_VALUES:,} steps from {span.low:g} to {span.high:g}",
         )
-    first, last = np.floor(span.low / step), np.ceil(span.high / step)
-    multiples = np.round(step * np.arange(first, last + 1), 9)
+    numbers = np.arange(span.low // step, span.high / step)
+    multiples = np.round(step * numbers, 9)
     values = [span.low, *multiples, span.high]
     return np.unique(np.clip(values, span.low, span.high))
 

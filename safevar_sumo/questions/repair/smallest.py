@@ -109,9 +109,10 @@ class Search:
         )
         ring = ring[np.max(np.abs(ring), axis=1) == 1]
         subsets = list(combinations(range(len(today)), number))
-        moves = np.zeros((len(subsets) * len(ring), len(today)))
+        moves: FloatArray = np.zeros((len(subsets), len(ring), len(today)))
         for row, subset in enumerate(subsets):
-            moves[row * len(ring) : (row + 1) * len(ring), subset] = ring
+            moves[row][:, subset] = ring
+        moves = moves.reshape(-1, len(today))
         moves = moves[np.argsort(np.sum(np.abs(moves), axis=1), kind="stable")]
         changes = (today + sizes[:, np.newaxis, np.newaxis] * moves).reshape(
             -1, len(today)
@@ -154,7 +155,7 @@ class Search:
     def _survivors(self, changes: FloatArray, cases: FloatArray) -> IntArray:
         """The rows of the changes that survive cases; few at a time."""
         alive = np.arange(len(changes))
-        while len(cases) and len(alive):
+        while cases.size and alive.size:
             count = max(1, BATCH // len(alive))
             robustness = self.problem.robustness_of_each(
                 changes[alive], cases[:count], "changes with one case"

@@ -129,7 +129,10 @@ class Oracle:
     @property
     def available(self) -> float:
         """The number of cases that may follow; infinite without a limit."""
-        return self.own.evaluator.account.left // self._simulations
+        evaluator = self.own.evaluator
+        # The remark on phases, at last, drives the original vehicle twice.
+        remark = 2 * len(evaluator.system.points)
+        return (evaluator.account.left - remark) // self._simulations
 
     def __call__(self, cases: FloatArray) -> FloatArray:
         """What each of M cases leaves, shape (M,): below 0 it is unsafe, infinite where it does not
