@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from difflib import get_close_matches
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+import pandas as pd
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, check_name, check_text
@@ -27,6 +27,31 @@ PARTS, DECIMALS = 5, 9
 """Number of parts of a searched range, and decimals of their ends, within the limits up to which
 those up to larger values lie.
 """
+
+
+class UpperEnd(NamedTuple):
+    """The largest value of an axis that encounters have; `--up-to` states it."""
+
+    axis: str
+    value: float
+
+    @classmethod
+    def of(cls, text: str) -> Self:
+        """The end that an option states, such as `speed=40`.
+
+        Raises
+        ------
+        InputError
+            If the text is no name with a finite number.
+        """
+        name, _, number = map(str.strip, text.partition("="))
+        value = pd.to_numeric(number, errors="coerce")
+        if not (name and np.isfinite(value)):
+            raise InputError(OPTION, repr(text), FORM)
+        return cls(name, float(value))
+
+    def __str__(self) -> str:
+        return f"{self.axis}={self.value:g}"
 
 
 def part_of_study(
@@ -52,7 +77,7 @@ def part_of_study(
         study = at_point(study, point)
     if up_to is None:
         return study
-    cut = study_up_to(study, up_to)
+    cut = study_up_to(study, UpperEnd.of(up_to))
     return replace(cut, origin=replace(cut.origin, up_to=up_to))
 
 
@@ -90,8 +115,8 @@ def at_point(study: Study, name: str) -> Study:
     raise InputError("point", repr(name), legal if points else "a study with a matrix")
 
 
-def study_up_to(study: Study, text: str) -> Study:
-    """The study with an axis that is cut at the value that an option states, such as `speed=40`.
+def study_up_to(study: Study, end: UpperEnd) -> Study:
+    """The study whose axis ends at a value.
 
     An original value above it becomes the value. A test whose axis begins above it is left out; one
     whose list reaches beyond it is driven at the value itself, too, if its scenario can move this
@@ -100,25 +125,18 @@ def study_up_to(study: Study, text: str) -> Study:
     Raises
     ------
     InputError
-        If the study does not vary the parameter, or the value is no number or beyond the values
-        that are driven.
+        If the study does not vary the parameter, or the value is beyond the values that are driven.
     """
-    name, value = _name_and_value(text)
+    name, high = end
     axes = dict.fromkeys(study.ranges)
     for test in study.tests:
         for axis in study.axes_of(test):
             if _values(study, test, axis):
                 axes[axis] = None
     problem = f"study {study.name!r} does not vary {name!r}"
-    if name and not axes:
+    if not axes:
         in_ranges = ", with --ranges" if name in study.axes else ""
         raise InputError(OPTION, problem, f"an axis whose values are listed{in_ranges}")
-    try:
-        high = float(value)
-    except ValueError:
-        high = math.nan
-    if not (name and math.isfinite(high)):
-        raise InputError(OPTION, repr(text), FORM)
     check_name(OPTION, problem, name, axes)
     if name not in study.ranges:
         return _ranges_up_to(_lists_up_to(study, name, high), name, high)
@@ -126,26 +144,20 @@ def study_up_to(study: Study, text: str) -> Study:
     if not domain.lower < high <= domain.upper:
         raise InputError(
             OPTION,
-            f"{name}={high:g} is outside the domain of study {study.name!r}",
+            f"{end} is outside the domain of study {study.name!r}",
             f"a value above {domain.lower:g} and up to {domain.upper:g}"
             f"{unit_text(domain.unit)}",
         )
     return _ranges_up_to(study, name, high)
 
 
-def _name_and_value(text: str) -> tuple[str, str]:
-    """The axis and the value that an option states."""
-    name, _, value = text.partition("=")
-    return name.strip(), value.strip()
-
-
-def smaller_cuts(study: Study, text: str | None) -> list[Study]:
-    """The study cut at smaller values than the one that an option states, in ascending order: those
-    of the matrix, or ends of equal parts of the searched range. None without the option.
+def smaller_cuts(study: Study, end: UpperEnd | None) -> list[Study]:
+    """The study whose axis ends at smaller values, in ascending order: those of the matrix, or ends
+    of equal parts of the searched range. None without an end.
     """
-    if text is None:
+    if end is None:
         return []
-    name, highest = _name_and_value(text)
+    name, highest = end
     values = set[float]()
     for test in study.tests:
         values |= {*_values(study, test, name)}
@@ -153,8 +165,8 @@ def smaller_cuts(study: Study, text: str | None) -> list[Study]:
         domain = study.ranges[name]
         ends = np.linspace(domain.lower, domain.upper, PARTS + 1)[1:]
         values = {*ends.round(DECIMALS).tolist()}
-    smaller_values = sorted(value for value in values if value < float(highest))
-    return [study_up_to(study, f"{name}={value}") for value in smaller_values]
+    smaller_values = sorted(value for value in values if value < highest)
+    return [study_up_to(study, UpperEnd(name, value)) for value in smaller_values]
 
 
 def names_left_out(study: Study, cut: Study) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from safevar_sumo import tolerance
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.part import names_left_out, study_up_to
+from safevar_sumo.questions.part import UpperEnd, names_left_out, study_up_to
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
@@ -35,6 +35,10 @@ over = { speed = [50, 60] }
 ROUGH: dict[str, Any] = {"quick": True, "jobs": 1}
 
 
+def up_to(study: Study, speed: float) -> Study:
+    return study_up_to(study, UpperEnd("speed", speed))
+
+
 def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(
     ahead: Study,
 ) -> None:
@@ -42,28 +46,22 @@ def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(
         return [study.lists_of(test)["speed"] for test in study.matrix.tests]
 
     wear, stop = load_study("wear"), load_study("stop")
-    assert over(study_up_to(wear, "speed=45")) == [[10, 20, 30, 40]] * 3 + [
-        [10, 20, 30, 40, 45]
-    ]
-    assert over(study_up_to(stop, "speed=75")) == [[30, 50]], (
-        "a fixed way to stop has its own speeds"
-    )
-    assert study_up_to(wear, "speed=60") == wear
-    assert over(study_up_to(ahead, "speed=40")) == [[30, 40]]
-    assert names_left_out(ahead, study_up_to(ahead, "speed=40")) == ["fast"]
-    assert names_left_out(ahead, study_up_to(ahead, "speed=50")) == []
-    placed = study_up_to(wear, "impact_location=30")
+    assert over(up_to(wear, 45)) == [[10, 20, 30, 40]] * 3 + [[10, 20, 30, 40, 45]]
+    assert over(up_to(stop, 75)) == [[30, 50]], "a fixed way to stop has its own speeds"
+    assert up_to(wear, 60) == wear
+    assert over(up_to(ahead, 40)) == [[30, 40]]
+    left_out = [names_left_out(ahead, up_to(ahead, speed)) for speed in (40, 50)]
+    assert left_out == [["fast"], []]
+    placed = study_up_to(wear, UpperEnd("impact_location", 30))
     assert over(placed) == over(wear), "tests without such an axis count unchanged"
 
 
 def test_a_searched_original_above_the_value_becomes_it() -> None:
     joint = load_study("wear", encounters="ranges")
-    low, high = (
-        study_up_to(joint, text).ranges["speed"] for text in ("speed=25", "speed=50")
-    )
+    low, high = (up_to(joint, value).ranges["speed"] for value in (25, 50))
     assert (low.original, low.upper) == (25, 25)
     assert (high.original, high.upper) == (40, 50)
-    assert study_up_to(joint, "speed=60") == joint
+    assert up_to(joint, 60) == joint
 
 
 def limits_up_to(study: Study, value: float, **options: Any) -> Answer:
@@ -84,7 +82,7 @@ def test_limits_up_to_a_value_between_two_tests_hold_there_and_lie_between_their
     assert "speed=45: fast" in between.verdict
     assert "test slow (scenario along) at 30 to 45 km/h" in between.numbers["scope"]
     assert between.numbers["up_to"] == 45
-    cut = assemble(study_up_to(ahead, "speed=45"))
+    cut = assemble(up_to(ahead, 45))
     settings = np.tile(cut.characteristics.original, (2, 1))
     settings[:, cut.characteristics.names.index("brakeTorque")] = least[1], least[0]
     is_kept = drive_and_score(cut, settings).f_safe >= between.numbers["margin"]

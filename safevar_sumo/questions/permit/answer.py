@@ -15,7 +15,7 @@ import pandas as pd
 from safevar_sumo.campaign.inputs import manifest_now
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.models import Models
-from safevar_sumo.questions.part import study_up_to
+from safevar_sumo.questions.part import UpperEnd, study_up_to
 from safevar_sumo.questions.permit import words
 from safevar_sumo.questions.permit.encounters import Span
 from safevar_sumo.questions.permit.fleet import ROUGH, THIS_CAR, YES, Fleet
@@ -103,7 +103,7 @@ class PermitAnswer:
         ordered.attrs = {**cars.attrs, "shown_whole": SHOWN_WHOLE}
         claim = self.study
         if span.ending:
-            claim = study_up_to(claim, f"{span.name}={span.high!r}")
+            claim = study_up_to(claim, UpperEnd(span.name, span.high))
         scope = scope_of(claim)
         unsafe = self.models.own.unsafe
         failures = list[str]()

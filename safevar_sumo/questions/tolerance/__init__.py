@@ -20,7 +20,12 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import limit_criterion, models_of
 from safevar_sumo.questions.options import Fits, LimitTexts, Margin
-from safevar_sumo.questions.part import names_left_out, smaller_cuts, study_up_to
+from safevar_sumo.questions.part import (
+    UpperEnd,
+    names_left_out,
+    smaller_cuts,
+    study_up_to,
+)
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.asked import (
     CASES,
@@ -148,11 +153,13 @@ def tolerance(
         confirms no limit that you state, so the exit code is then 3.
     """
     whole = evaluator
+    end = None
     if up_to is not None:
-        evaluator = whole.for_study(study_up_to(whole.study, up_to))
+        end = UpperEnd.of(up_to)
+        evaluator = whole.for_study(study_up_to(whole.study, end))
     study = evaluator.study
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
-    smaller = smaller_cuts(whole.study, up_to)
+    smaller = smaller_cuts(whole.study, end)
     usual = _usual_settings(evaluator, len(columns), fits)
     planned = {name: (1 + len(smaller)) * number for name, number in usual.items()}
     evaluator.begin(planned, least=1 + 2 * len(columns) * LEAST_VALUES)
@@ -165,7 +172,7 @@ def tolerance(
 
     # The criterion is that of the whole study: up to a smaller value nothing stricter counts.
     original = evaluator.evaluate_original()
-    of_whole = original if up_to is None else _original_of(whole)
+    of_whole = original if end is None else _original_of(whole)
     reference = of_whole if of_whole.valid[0] else original
     criterion = limit_criterion(whole, subject, unsafe, margin, reference)
     request = LimitsQuestion(
@@ -189,7 +196,7 @@ def tolerance(
         is_rough=quick or is_few,
         has_scan=not is_few,
         at_tests=at_tests,
-        up_to=up_to,
+        up_to=end,
         tests_left_out=names_left_out(whole.study, study),
     )
     ranges = (

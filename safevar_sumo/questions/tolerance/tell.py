@@ -126,7 +126,7 @@ def _numbers(facts: Told) -> JsonObject:
         "boxes": int(facts.box is not None),
     }
     if facts.up_to is not None:
-        numbers["up_to"] = float(facts.up_to.partition("=")[2])
+        numbers["up_to"] = facts.up_to.value
     if not facts.is_safe:
         return numbers
     fits = len(facts.task.fits)

@@ -20,6 +20,7 @@ from safevar_sumo.questions.counterexamples import (
     limit_text,
 )
 from safevar_sumo.questions.models import Model, fit_names
+from safevar_sumo.questions.part import UpperEnd
 from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.sentence import Sentence, answer, evidence, note
 from safevar_sumo.questions.tables import Rows
@@ -76,7 +77,7 @@ class Told:
     is_rough: bool
     has_scan: bool
     at_tests: bool
-    up_to: str | None
+    up_to: UpperEnd | None
     tests_left_out: Sequence[str]
 
     @property
