@@ -10,7 +10,6 @@ import numpy as np
 
 from safevar_sumo import tolerance
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.part import UpperEnd, names_left_out, study_up_to
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -32,7 +31,6 @@ model = "along"
 parameters = { vut_length = 4.7, vut_width = 1.85 }
 over = { speed = [50, 60] }
 """
-ROUGH: dict[str, Any] = {"quick": True, "jobs": 1}
 
 
 def up_to(study: Study, speed: float) -> Study:
@@ -64,18 +62,21 @@ def test_a_searched_original_above_the_value_becomes_it() -> None:
     assert up_to(joint, 60) == joint
 
 
-def limits_up_to(study: Study, value: float, **options: Any) -> Answer:
-    return tolerance(
-        study, up_to=f"speed={value:g}", characteristics=("brakeTorque",), **options
-    )
-
-
 @SLOW
 def test_limits_up_to_a_value_between_two_tests_hold_there_and_lie_between_theirs(
     ahead: Study,
 ) -> None:
     """At a brake torque that is safe at 40 km/h and not at 50, the cut at 45 decides."""
-    answers = [limits_up_to(ahead, value, **ROUGH) for value in (40, 45, 50)]
+    answers = [
+        tolerance(
+            ahead,
+            up_to=f"speed={value}",
+            characteristics=("brakeTorque",),
+            quick=True,
+            jobs=1,
+        )
+        for value in (40, 45, 50)
+    ]
     least = [answer.values("limits.alone_low")[0] for answer in answers]
     assert least[0] < least[1] < least[2]
     between = answers[1]

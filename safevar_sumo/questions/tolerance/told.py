@@ -46,8 +46,8 @@ DECIMALS = 3
 
 
 class InRanges(NamedTuple):
-    """The searches for counterexamples to limits in the ranges of a study, by the number of the
-    parameter set.
+    """The searches for counterexamples in the ranges of a study, by the number of the parameter
+    set.
     """
 
     task: Asked
@@ -273,9 +273,7 @@ def refusal_in_words(facts: Told) -> str:
 def verdict_sentences(
     facts: Told, nearest: Rows, in_ranges: Sequence[Sentence]
 ) -> Iterator[Sentence]:
-    """The sentences of the verdict: the decision, what decides it, what would do instead, and the
-    scope.
-    """
+    """The sentences of the verdict: the decision, its reason, other limits, and the scope."""
     if not facts.is_safe:
         yield words.REFUSAL(reason=refusal_in_words(facts))
         yield answer(facts.unsafe.smaller_demand(facts.original))
