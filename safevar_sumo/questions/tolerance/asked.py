@@ -63,9 +63,10 @@ class Effort(NamedTuple):
     encounters, values
         Listed encounters in which limits alone are sought, and values between the original and each
         end.
-    alone, own, other
+    alone, own, other, in_ranges
         Cases that search for a counterexample to limits alone, and to a box with the study's own
-        parameter set, and with another one.
+        parameter set, with another one, and with another one if encounters are ranges: these have
+        axes of their own to search.
     generation, more
         Cases of a generation of such a search, and generations that follow the first with an unsafe
         case.
@@ -84,6 +85,7 @@ class Effort(NamedTuple):
     alone: int = 2000
     own: int = 5000
     other: int = 1000
+    in_ranges: int = 3000
     generation: int = 512
     more: int = 2
     box: BoxEffort = BoxEffort()
@@ -247,7 +249,7 @@ def effort_of(evaluator: Evaluator, cases: float, varied: int) -> Effort:
     usual = USUAL
     if math.isfinite(cases):
         return _effort_of_few(int(cases), varied)
-    names = ("values", "alone", "own", "other", "corners", "confirmations")
+    names = ("values", "alone", "own", "other", "in_ranges", "corners", "confirmations")
     scaled = {name: evaluator.scaled(getattr(usual, name)) for name in names}
     scaled["values"] = max(scaled["values"], LEAST_VALUES)
     growths = evaluator.scaled(usual.box.growths)
