@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from numbers import Integral
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from safevar_sumo.campaign import cluster as dask, local
 from safevar_sumo.errors import MAX_JOBS, InputError, SafevarError
@@ -23,7 +23,6 @@ from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins.process import MAX_DEATHS
 from safevar_sumo.records import Evaluations, JsonObject
 
-Result = TypeVar("Result")
 SECONDS_BETWEEN_LOOKS = 0.5
 """Longest time between two looks at the jobs under way [s]."""
 

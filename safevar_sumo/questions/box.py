@@ -34,12 +34,6 @@ class Box:
         """An end of a column: 0, the lower one, or 1, the upper one."""
         return float((self.lower, self.upper)[side][column])
 
-    def with_end(self, side: int, column: int, value: float) -> Box:
-        """The box with another value of an end."""
-        ends = [self.lower.copy(), self.upper.copy()]
-        ends[side][column] = value
-        return Box(self.region, *ends)
-
     def in_encounters_of(self, region: FeasibleRegion) -> Box:
         """The box of its vehicles, in all encounters of another region of the same vehicle."""
         members = region.characteristics

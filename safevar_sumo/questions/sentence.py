@@ -35,8 +35,8 @@ class Verdict(str):
     sentences: list[Sentence]
 
     def __new__(cls, sentences: Iterable[Sentence]) -> Verdict:
-        """The text of sentences, sorted by kind; one without text is left out."""
-        kept_sentences = [sentence for sentence in sentences if sentence.text]
+        """The text of sentences, sorted by kind; each once, and none without text."""
+        kept_sentences = [item for item in dict.fromkeys(sentences) if item.text]
         kept_sentences.sort(key=lambda sentence: KINDS.index(sentence.kind))
         verdict = super().__new__(cls, " ".join(text for _, text in kept_sentences))
         verdict.sentences = kept_sentences

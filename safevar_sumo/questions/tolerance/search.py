@@ -246,25 +246,25 @@ def _with_set(
         effort.alone,
         phases=False,
     )
+    parts = effort.box.parts
     alone = search_alone(
         task.oracle,
         task.star,
         limits.alone,
         search,
-        effort.box.parts,
+        parts,
     )
     limits = _with_broken(task, limits._replace(alone=alone), fit)
     if limits.sides is None or fit in limits.broken:
         return limits
     sides = _within_alone(task, limits, limits.sides)
-    is_searched = task.oracle.own.evaluator.study.ranges
-    budget = effort.in_ranges if is_searched else effort.other
-    search = task.search(Stream.VALIDATION, fit, budget)
+    settled = Settled(sides, limits.failures)
+    searches = [task.search(Stream.VALIDATION, fit)]
     return _with_settled(
         task,
         limits,
-        Settled(sides, limits.failures),
-        [search],
+        settled,
+        searches,
         fit,
     )
 
