@@ -151,10 +151,10 @@ def test_one_screen_says_how_many_sentences_it_leaves_out_and_none_of_what_is_va
         "A vehicle counts only if it satisfies the constraints of the study: a below b."
     )
     tested = Verdict([said("All corners."), said("How it was."), note(valid)])
-    verdict = Verdict([said("A sentence is here.")] * 7)
+    verdict = Verdict(map(said, "abcdefg"))
     text = replace(ANSWER, verdict=verdict, tested=tested).render("text")
     assert "More: --details (2 more sentences" in text
-    assert text.count(" is here.") == 5
+    assert "a b c d e\n" in text
     assert valid in text
     assert "How it was" not in text
 
