@@ -123,8 +123,8 @@ def report(
     fresh
         Simulate everything again. Default: use simulations of earlier commands again.
     quick
-        Give rough answers that prove nothing, with at most an eighth of the usual simulations. The
-        workshop sheet of a rough page has no line to sign.
+        Give rough answers that prove nothing, with at most an eighth of the usual simulations.
+        Nobody can sign the workshop sheet of such a page.
     simulations
         Largest number of simulations of all questions and replays of the page together.
 

@@ -137,8 +137,8 @@ class Weather(Table, frozen=True, kw_only=True):
     - `recognition_delay` [s] is the additional time that the sensors need to recognise a road user.
       The delay is the same for every driving system. The reaction time is a parameter of the
       driving system.
-    - `light` says whether it is day or night. Answers state the light, and no simulation depends on
-      it.
+    - `light` says whether it is day or night. An answer states it, and no simulation depends on
+      day or night.
     """
 
     name: str
@@ -227,9 +227,9 @@ class MatrixTable(Table, frozen=True, kw_only=True):
     """The table [matrix] has the `tests` in which every vehicle is simulated.
 
     `aggregate` says which test case gives the result of a vehicle. With `worst`, this test case is
-    the one with the lowest safety degree. With `drac >`, the result comes from the test case with
-    the largest value of the metric `drac`. With `ttc_min <`, the result comes from the test case
-    with the smallest value of the metric `ttc_min`.
+    the one with the lowest safety degree. With `"drac >"`, the result comes from the test case
+    with the largest value of the metric `drac`. With `"ttc_min <"`, the result comes from the test
+    case with the smallest value of the metric `ttc_min`.
     """
 
     tests: Annotated[list[MatrixTest], Meta(min_length=1)]
