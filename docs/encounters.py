@@ -15,7 +15,7 @@ import sys
 import numpy as np
 
 from safevar_sumo.questions.figures import BLUE, VERMILION, new_figure
-from safevar_sumo.questions.part import study_up_to
+from safevar_sumo.questions.part import UpperEnd, study_up_to
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.scenarios.declared import read_study, with_ranges
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -40,7 +40,8 @@ LINES, PARTS, ENCOUNTERS_ON_LINES = 30, 25, 16
 
 def _up_to(fastest: float) -> System:
     """The study wear in its ranges, up to a speed [km/h]."""
-    return assemble(study_up_to(with_ranges(read_study("wear")), f"speed={fastest:g}"))
+    end = UpperEnd("speed", fastest)
+    return assemble(study_up_to(with_ranges(read_study("wear")), end))
 
 
 def main(path: str) -> None:

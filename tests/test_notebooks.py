@@ -165,7 +165,7 @@ def test_every_question_has_its_table_picture_or_sentence(tmp_path: Path) -> Non
     ) == (5, 3)
     printed = "".join(_texts(notebook))
     for result in (
-        "joint limits hold at the same time",
+        "vehicle that was tested within these limits",
         "The probability that a vehicle",
         "of all unsafe vehicles lie in this region",
     ):

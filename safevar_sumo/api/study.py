@@ -104,8 +104,8 @@ def study(
     status: bool = False,
 ) -> Answer:
     """Search for unsafe vehicles with few and small changes. You get a directory with every vehicle
-    that the search algorithms return, and the fewest changes that they found. The same command
-    continues a search that was interrupted.
+    that the search algorithms return, and the fewest changes that make the vehicle unsafe. The same
+    command continues a search that was interrupted.
 
     Example: python -m safevar_sumo study rain
 

@@ -111,8 +111,8 @@ def evidence(
         Ask this question in place of the usual ones, such as "risk --samples 4000"; may be
         repeated.
     unsafe
-        What makes a vehicle unsafe in every answer of the pack, such as collision or "drac > 6".
-        Default: the criterion of the study, else a collision.
+        Criterion for an unsafe vehicle in every answer of the pack, such as collision or "drac >
+        6". Default: the criterion of the study, else a collision.
     jobs
         Number of worker processes. Default: one for each processor core.
     cluster

@@ -192,6 +192,6 @@ def test_a_set_in_which_the_original_is_unsafe_is_named_with_its_test(
         characteristics=("treadDepth",),
     )
     assert (
-        "in which the original vehicle fails: the vehicle hits a pedestrian ahead"
+        "the original vehicle fails with this set: the vehicle hits a pedestrian ahead"
         in answer.verdict
     )

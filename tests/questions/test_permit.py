@@ -377,7 +377,7 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(
     answer = permit(study, cars={"a": {}}, others="new", fits=0, quick=True)
     assert answer.numbers["margin"] == 0.3, "no axis states a range"
     assert "CPLA" in answer.verdict
-    assert "Above 30 km/h nothing was driven" in answer.verdict
+    assert "Nothing was simulated above 30 km/h" in answer.verdict
     assert span_of(load_study("alks"), "lateral_speed").unit == "m/s"
 
 

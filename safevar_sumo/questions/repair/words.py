@@ -34,7 +34,7 @@ REPAIRED = answer(
 
 # What the repair costs.
 EARLIER = evidence(
-    "The price: the original vehicle brakes up to {metres_earlier:.2f} m earlier."
+    "With the repair, the original vehicle brakes up to {metres_earlier:.2f} m earlier."
 )
 NO_BRAKING = evidence(
     "The original vehicle brakes in none of the test cases, so its braking cannot come earlier."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import chain
 
 import numpy as np
 import pandas as pd
@@ -15,7 +14,7 @@ from safevar_sumo.questions.counterexamples import Failure, describe, limit_text
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.scope import scope_of
-from safevar_sumo.questions.sentence import Sentence, Verdict, condition
+from safevar_sumo.questions.sentence import Sentence, Verdict, condition, note
 from safevar_sumo.questions.tables import Rows, shipped_columns, tabulate
 from safevar_sumo.questions.tolerance import words
 from safevar_sumo.questions.tolerance.oracle import Oracle
@@ -65,13 +64,12 @@ def answer_limits(
         title = "The same limits in the ranges of the study"
         rows = [_row_in_ranges(ranges, sentence.text, failure)]
         tables["ranges"] = tabulate(title, IN_RANGES, rows)
-    counted = counted_in_words(facts.study), constraints_in_words(facts.study)
-    conditions = map(condition, chain(*counted))
+    texts = counted_in_words(facts.study) + constraints_in_words(facts.study)
     return Answer(
         question="tolerance",
         study=facts.study,
         verdict=Verdict(verdict_sentences(facts, near, in_ranges)),
-        tested=Verdict([*_tested(facts), *conditions]),
+        tested=Verdict([*_tested(facts), *map(note, texts)]),
         numbers=_numbers(facts),
         tables=tables,
         failures=_failures(facts),
