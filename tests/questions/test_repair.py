@@ -177,7 +177,7 @@ def test_repair_and_price_of_a_planted_system_equal_the_closed_form(
     )  # another fit than the study's own needs not to collide
     assert repair["parameters"] == {"gap": pytest.approx(needed, rel=0.01)}
     assert repair["fits"] == found.numbers["fits"] == found.numbers["fits_tried"] == 3
-    assert "it holds in 3 of 3 parameter sets of the vehicle model" in found.tested
+    assert "answer holds in 3 of 3 parameter sets of the vehicle model" in found.tested
     assert [repair["metres_earlier"]] == found.values("repairs.metres_earlier_mean")
     assert repair["metres_earlier"] == pytest.approx(needed - GAP_TODAY, rel=0.01)
     assert (

@@ -87,6 +87,5 @@ TESTED = evidence(
     " an unsafe encounter."
 )
 TESTED_QUICK = evidence(
-    "In each test, {number} values {values} were simulated. No simulation searched for an unsafe"
-    " encounter."
+    "In each test, {number} values {values} were simulated. No search for failures followed."
 )
