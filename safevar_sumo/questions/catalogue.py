@@ -19,7 +19,7 @@ from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, UNSAFE_S
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.questions.answer import Answer, contents, tabulate
 from safevar_sumo.questions.options import Range
-from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.sentence import Sentence, Verdict, answer, evidence
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.scenarios import (
@@ -330,10 +330,10 @@ def _sentences(
 ) -> Iterator[Sentence]:
     """What was found, what was simulated, and what was left out."""
     if not findings:
-        yield Sentence("answer", f"{name} passed all checks.")
+        yield answer(f"{name} passed all checks.")
     for finding in findings[:1]:
         number = number_of(len(findings), "finding")
-        yield Sentence("answer", f"{name} failed: {number}. {finding}.")
+        yield answer(f"{name} failed: {number}. {finding}.")
     for extent in extents:
         points = number_of(extent.points, "test case")
         vehicles = number_of(extent.vehicles, "vehicle")
@@ -345,4 +345,4 @@ def _sentences(
             text += (
                 f" The option --vehicles {extent.all_vehicles} checks more vehicles."
             )
-        yield Sentence("evidence", text)
+        yield evidence(text)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+FIRST_WORD = re.compile(r"^[a-z]+\b")
 KINDS = "answer", "evidence", "condition", "note"
 """What a sentence is to its reader, the most important kind first; a note stands below the table.
 """
@@ -22,7 +24,8 @@ class Sentence(NamedTuple):
     def __call__(self, **values: object) -> Sentence:
         """The sentence with values in its slots."""
         text = self.text.format(**values)
-        return self._replace(text=text[:1].upper() + text[1:])
+        # A key, such as `brake_force` or `sensorLatency`, stays as users write it.
+        return self._replace(text=FIRST_WORD.sub(lambda word: word[0].title(), text))
 
 
 answer, evidence, condition, note = (partial(Sentence, kind) for kind in KINDS)
@@ -41,6 +44,10 @@ class Verdict(str):
         verdict = super().__new__(cls, " ".join(text for _, text in kept_sentences))
         verdict.sentences = kept_sentences
         return verdict
+
+    def __getnewargs__(self) -> tuple[Any]:
+        """What makes the same verdict again, in a copy or in another process."""
+        return (self.sentences,)
 
     @classmethod
     def of(cls, text: str) -> Verdict:

@@ -239,8 +239,10 @@ def counted_in_words(study: Study, omissions: int | None = None) -> list[str]:
 
 def notes_on(unsafe: Unsafe, *texts: str) -> list[Sentence]:
     """Notes, among them what is unsafe where that is not a collision alone."""
-    means = "" if unsafe.is_collision else f"Unsafe means: {unsafe.description}."
-    return [note(text) for text in (*texts, unsafe.remark, means)]
+    notes = [note(text) for text in (*texts, unsafe.remark)]
+    if not unsafe.is_collision:
+        notes.append(UNSAFE_MEANS(description=unsafe.description))
+    return notes
 
 
 def demanded_in_words(study: Study) -> list[str]:

@@ -8,7 +8,7 @@ import pandas as pd
 from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.questions.answer import Answer, Columns, tabulate
-from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.sentence import Sentence, Verdict, answer, evidence
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import (
     EXACT,
@@ -100,7 +100,7 @@ def answer_of_setting(
         is_changed = simulation.setting != simulation.original.setting
         vehicle = f"The {'changed' if is_changed else 'original'} vehicle"
         points = points_in_words(vehicle, failing, len(system.matrix))
-        sentences.append(Sentence("evidence", points))
+        sentences.append(evidence(points))
 
     rows = [(remark,) for remark in dict.fromkeys(remarks)]
     tables["remarks"] = tabulate("Remarks", REMARKS, rows)
@@ -176,7 +176,7 @@ def _verdict(simulation: Simulation, point_count: int) -> list[Sentence]:
     elif test:
         templates = words.ORIGINAL_IN_TEST, words.CHANGED_IN_TEST
     sentences = [
-        Sentence("answer", simulation.no_verdict),
+        answer(simulation.no_verdict),
         templates[is_changed](
             original=simulation.original.verdict,
             changed=simulation.verdict,

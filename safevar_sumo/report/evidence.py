@@ -30,7 +30,7 @@ from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.options import Cluster, Jobs, Simulations
 from safevar_sumo.questions.permit.fleet import list_without_names
-from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.sentence import Verdict, answer
 from safevar_sumo.questions.subject import study_or_case
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.questions.words import count_in_words
@@ -390,7 +390,7 @@ def verify(
     return Answer(
         question="verify",
         study=next(iter(studies.values())).case.study,
-        verdict=Verdict(Sentence("answer", text) for text in sentences),
+        verdict=Verdict(map(answer, sentences)),
         numbers={
             "passed": counts[SAME] + counts[UNCHECKED] == number,
             "sha256": digest_of(path),

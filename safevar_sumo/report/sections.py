@@ -24,7 +24,7 @@ from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.catalogue import description_of
 from safevar_sumo.questions.explain.failures import REASONS
 from safevar_sumo.questions.model_spread import compute_model_spreads
-from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.sentence import Verdict, answer
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import counted_in_words, number_of
 from safevar_sumo.records import FloatArray, Outcome
@@ -157,7 +157,7 @@ def tested(study: ReportedStudy) -> Answer:
     return Answer(
         question="what was tested",
         study=case.study,
-        verdict=Verdict(Sentence("answer", text) for text in sentences),
+        verdict=Verdict(map(answer, sentences)),
         numbers={},
         tables={
             "characteristics": tabulate(
@@ -293,7 +293,7 @@ def trust(study: ReportedStudy) -> Answer:
     return Answer(
         question="limits and trust",
         study=case.study,
-        verdict=Verdict(Sentence("answer", text) for text in sentences),
+        verdict=Verdict(map(answer, sentences)),
         numbers={},
         tables=tables,
     )

@@ -8,6 +8,7 @@ import io
 import json
 import re
 import shlex
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -147,12 +148,13 @@ def test_a_list_of_up_to_50_cars_is_whole(number: int, shown: int) -> None:
 def test_one_screen_says_how_many_sentences_it_leaves_out_and_none_of_what_is_valid() -> (
     None
 ):
+    """Also of a copy, as answers of other processes are."""
     valid = (
         "A vehicle counts only if it satisfies the constraints of the study: a below b."
     )
     tested = Verdict([said("All corners."), said("How it was."), note(valid)])
     verdict = Verdict(map(said, "abcdefg"))
-    text = replace(ANSWER, verdict=verdict, tested=tested).render("text")
+    text = deepcopy(replace(ANSWER, verdict=verdict, tested=tested)).render("text")
     assert "More: --details (2 more sentences" in text
     assert "a b c d e\n" in text
     assert valid in text

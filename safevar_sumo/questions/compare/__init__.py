@@ -65,7 +65,7 @@ from safevar_sumo.questions.research_questions.statistics import (
     fewest_runs,
     signed_rank_test,
 )
-from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.sentence import Sentence, Verdict, answer, note
 from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.tolerance.asked import usual_alone
@@ -196,10 +196,10 @@ def compare(
     notes = [criteria[0].remark, *counted_in_words(study, pairs.number_infeasible)]
     verdict = Verdict(
         [
-            Sentence("answer", reason),
+            answer(reason),
             *why,
             *_basis(criteria[0], common, limits, titles),
-            *(Sentence("note", note) for note in notes),
+            *map(note, notes),
         ]
     )
     return Answer(

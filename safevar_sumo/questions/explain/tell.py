@@ -18,15 +18,15 @@ from safevar_sumo.questions.explain.failures import Population
 from safevar_sumo.questions.explain.robustness import LEAST_NEIGHBOURS, MIN_ROBUST_SHARE
 from safevar_sumo.questions.explain.smallest import Smallest
 from safevar_sumo.questions.preventability import FULL, LETTER
-from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.sentence import Sentence, answer
 from safevar_sumo.questions.variation import sampled_in_words
 from safevar_sumo.questions.words import (
-    UNSAFE_MEANS,
     constraints_in_words,
     count_in_words,
     counted_in_words,
     ending_in_words,
     join_phrases,
+    notes_on,
     number_of,
     percentage,
     place_in_words,
@@ -206,7 +206,7 @@ def failure_sentences(
     if not evaluator.study.ranges and unsafe.of(original)[0]:
         breach = unsafe.breach_in_words(original)
         yield words.ALREADY_UNSAFE(breach=breach)
-        yield Sentence("answer", unsafe.smaller_demand(original))
+        yield answer(unsafe.smaller_demand(original))
         return
     if causes.empty and unsafe.number(population.evaluations):
         yield words.TOO_FEW
@@ -297,13 +297,11 @@ def other_sentences(
         sampled=sampled_in_words(study),
         collide=unsafe.verbs[number > 1],
     )
-    if not unsafe.is_collision:
-        yield UNSAFE_MEANS(description=unsafe.description)
-    notes = [unsafe.remark, *constraints_in_words(study)]
+    texts = constraints_in_words(study)
     if over_sets:
         yield from over_sets.sentences()
-        notes += counted_in_words(study, population.omissions)
-    yield from (Sentence("note", note) for note in notes)
+        texts += counted_in_words(study, population.omissions)
+    yield from notes_on(unsafe, *texts)
 
 
 def avoidance(verdicts: pd.DataFrame) -> Iterator[Sentence]:

@@ -109,12 +109,12 @@ def because(
         "name": span.title,
         "event": event,
         "new_car": span.up_to(new_car),
-        "need": "",
-        "reach": "",
+        "need": span.text(need or 0.0),
     }
-    if need is not None:
-        slots["need"] = span.text(need)
     if permit.up_to is None:
+        failure = permit.least.failure
+        if failure is not None and np.isneginf(failure.encounters.low):
+            return words.IN_FIXED_TEST(**slots)
         return words.NOT_AT_ALL(**slots)
     slots["reach"] = span.up_to(permit.up_to)
     template = words.AS_NEW

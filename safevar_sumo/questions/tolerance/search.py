@@ -246,13 +246,12 @@ def _with_set(
         effort.alone,
         phases=False,
     )
-    parts = effort.box.parts
     alone = search_alone(
         task.oracle,
         task.star,
         limits.alone,
         search,
-        parts,
+        effort.box.parts,
     )
     limits = _with_broken(task, limits._replace(alone=alone), fit)
     if limits.sides is None or fit in limits.broken:

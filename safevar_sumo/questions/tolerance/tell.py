@@ -80,11 +80,9 @@ def answer_limits(
 def _tested(facts: Told) -> Iterator[Sentence]:
     """How joint limits were tested; nothing without such limits."""
     if facts.study.ranges and facts.is_safe:
-        share = percentage(facts.own.evaluator.share_left_out)
-        margin = facts.study.scenario.margin or 0
         yield words.NOT_COUNTED(
-            share=share,
-            margin=margin,
+            share=percentage(facts.own.evaluator.share_left_out),
+            margin=facts.study.scenario.margin or 0,
         )
     if facts.box is None:
         return
@@ -102,10 +100,9 @@ def _tested(facts: Told) -> Iterator[Sentence]:
         yield words.CORNERS
     proof = facts.limits.proof
     if proof is not None:
-        bound = bound_in_words(proof.at_most)
         yield words.PROOF(
             samples=proof.samples,
-            bound=bound,
+            bound=bound_in_words(proof.at_most),
         )
         if proof.not_simulated:
             yield words.NOT_SIMULATED(not_simulated=proof.not_simulated)
