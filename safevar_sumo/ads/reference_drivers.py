@@ -66,9 +66,9 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
     vehicle and the obstacle). The system then brakes with 6 m/s^2 at once. UN R157 states this time
     to collision for cars that cut in (5.2.5.2). If a leader brakes, the system must avoid a
     collision only if the time gap to the leader before the braking was at least 1 s + v / (100
-    km/h) s (5.2.5.1). Behind a leader at this time gap, a system that brakes as hard as the leader
-    avoids a collision. If the time gap to a braking leader was smaller, UN R157 demands nothing,
-    and the system does not react to the leader's braking.
+    km/h) s (5.2.5.1). If the time gap is at least that long, a system that brakes as hard as the
+    leader avoids a collision. With a smaller time gap, UN R157 demands nothing, and the system does
+    not react to the leader's braking.
 
     Parameters
     ----------

@@ -130,7 +130,7 @@ def study(
         of the study.
     unsafe
         Criterion for an unsafe vehicle in the answer, such as collision or "drac > 6". The search
-        itself stays the same.
+        does not depend on this criterion.
     engine
         What moves the vehicles: recorded (fast, in a scene that SUMO played once) or sumo (SUMO in
         every simulation).
@@ -142,8 +142,8 @@ def study(
         Simulate on the workers of this Dask scheduler, such as tcp://host:8786. Default: on this
         machine.
     retry_failed
-        Simulate vehicles again that could not be simulated before. Default: the results leave
-        these vehicles out.
+        Simulate vehicles again that could not be simulated before. Default: the results do not
+        contain vehicles that could not be simulated.
     quiet
         Print only errors, warnings, and an output that you ask for, such as JSON. Default: print
         the answer and the progress as well.

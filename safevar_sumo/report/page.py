@@ -124,7 +124,7 @@ def report(
         Simulate everything again. Default: use simulations of earlier commands again.
     quick
         Give rough answers that prove nothing, with at most an eighth of the usual simulations.
-        Nobody can sign the workshop sheet of such a page.
+        Nobody can sign the workshop sheet of a rough page.
     simulations
         Largest number of simulations of all questions and replays of the page together.
 

@@ -206,8 +206,8 @@ class Constraint(Table, frozen=True, kw_only=True):
     """A constraint bounds a weighted sum of characteristics, from `at_least` to `at_most`.
 
     - `sum` has a weight for each characteristic of the sum.
-    - `unit` is the unit of the sum and of its bounds: the unit of a characteristic, or "-". The
-      unit may be omitted if all characteristics of the sum have the same unit.
+    - `unit` is the unit of the sum and of its bounds: the unit of a characteristic, or "-". The key
+      `unit` may be omitted if all characteristics in `sum` have the same unit.
     - `meaning` explains the constraint and names its source.
     - `tests` names the tests in which the constraint applies. By default a constraint applies in
       all tests.

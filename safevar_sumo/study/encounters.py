@@ -112,15 +112,15 @@ class ScenarioTable(ModelTable, frozen=True, kw_only=True):
     """The table [scenario] describes the encounter: its `model` (name of the scenario) and the
     scenario's `parameters`.
 
-    - `over` has axes (parameters of the scenario or of the weather). A matrix uses these axes for
-      each test that does not state the axis itself.
+    - `over` has axes (parameters of the scenario or of the weather). These axes vary in each test
+      that does not state them itself.
     - `margin` [m] is for studies with ranges of encounters. The original vehicle drives in the
       encounter of each changed vehicle, too. An encounter counts only if the original vehicle keeps
       at least `margin` between bodies. Where the original vehicle fails, a failure of the changed
       vehicle says nothing about the change.
     - `repeats` is for simulators of your own whose runs differ: each vehicle is simulated this
-      number of times. The answers use the share of unsafe runs, the worst run, and the means of
-      metrics.
+      number of times. Answers combine the runs of a vehicle: the share of unsafe runs, the worst
+      run, and the means of metrics.
     """
 
     over: Annotated[Axes, ORDERED] = {}
@@ -135,10 +135,10 @@ class Weather(Table, frozen=True, kw_only=True):
     - `water` [mm] is the depth of the water on the road. Only the vehicle `worn` computes the
       effect of water, and takes `road_friction` for the grip of the same road when dry.
     - `recognition_delay` [s] is the additional time that the sensors need to recognise a road user.
-      The delay is the same for every driving system. The reaction time is a parameter of the
-      driving system.
-    - `light` says whether it is day or night. An answer states it, and no simulation depends on
-      day or night.
+      `recognition_delay` is the same for every driving system, but the reaction time is a parameter
+      of the driving system.
+    - `light` says whether it is day or night. An answer states day or night, but no simulation
+      depends on the light.
     """
 
     name: str
@@ -198,11 +198,12 @@ class MatrixTest(Table, frozen=True, kw_only=True):
     """A test of the matrix has a `name`, and one or more test cases. The test has a test case for
     every combination of the values of its axes in `over`, in each of its `weathers`.
 
-    - `model` is the name of another scenario. A test with a `model` has only its own `parameters`.
+    - `model` is the name of another scenario. A test that names a `model` takes no `parameters`
+      from the study's scenario.
     - `parameters` are added to those of the study's scenario, if the test has no `model`.
     - `weathers` are names of shipped weathers, or tables with weathers of your own.
     - `allowed_impact_speed` [km/h] is the relative speed up to which an impact is allowed. The
-      metric `impact_excess` is the impact speed minus this allowed speed.
+      metric `impact_excess` is the impact speed minus `allowed_impact_speed`.
     """
 
     name: Annotated[str, Meta(min_length=1)]

@@ -27,9 +27,8 @@ class FreeParameter(Table, frozen=True, kw_only=True):
     """A parameter that a repair or a search may change: its bounds `lower` and `upper` in `unit`,
     and its `meaning`.
 
-    The search measures how far two values are apart by their difference. With `log = true`, the
-    search measures the ratio of the two values, which suits positive quantities of unknown
-    magnitude.
+    With `log = true`, the search compares two values of the parameter by their ratio, else by their
+    difference. Ratios suit positive quantities of unknown magnitude.
     """
 
     lower: float

@@ -221,8 +221,8 @@ class Study(Encounters, frozen=True, kw_only=True):
     - `constraints` are conditions that the characteristics of one vehicle satisfy together.
     - `limits` are the values, by name, up to which characteristics may wear in service.
     - `unmeasured` has the values, by name, that `permit` assumes of characteristics that nobody
-      measured in a car. Each assumed value is a number or a table. A study that extends this study
-      does not inherit the table [unmeasured].
+      measured in a car. The value of an unmeasured characteristic is a number or a table. A study
+      that extends this study does not inherit the table [unmeasured].
     - `repair` states what a repair of the driving system may change.
     - `unsafe` states which vehicles the study calls unsafe.
     """

@@ -294,7 +294,7 @@ def test_solutions_of_both_run_by_run(weathers: list[Path]) -> None:
     a, b = means.to_numpy().T
     assert answer.numbers["p"] == pytest.approx(scipy.stats.wilcoxon(a, b).pvalue)
     assert answer.numbers["a12"] == compare_samples(a, b).effect_size
-    assert "over 10 pairs (each pair has the solutions of a run)" in answer.tested
+    assert "over 10 groups of vehicles (the solutions of one run)" in answer.tested
     pairs = answer.tables["pairs"]
     assert pairs["pair"].tolist() == [
         f"nsga2-{run:02d} of {side}" for side in "AB" for run in range(5)

@@ -313,7 +313,7 @@ class _PairedTest(NamedTuple):
     p: float
     a12: float
     pairs: pd.DataFrame
-    unit: str
+    groups: str
 
 
 def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
@@ -326,7 +326,7 @@ def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
     pairs = frame[frame["source"] == SAMPLE].groupby(LINE)[[*SIDES]].mean()
     names = [f"line {int(line)}" for line in pairs.index]
-    unit = "each pair has the same vehicles on a straight line through the domain"
+    groups = "sampled on one line through the domain"
     if "run" in frame:
         means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
         if len(means) >= fewest_runs("RQ1"):
@@ -335,7 +335,7 @@ def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
                 f"{name}-{int(run):02d} of {side.upper()}"
                 for side, name, run in pairs.index
             ]
-            unit = "each pair has the solutions of a run"
+            groups = "the solutions of one run"
     # The p-value of pairs, and the probability that A's value is greater: above 0.5 A is better.
     sides = pairs.to_numpy(dtype=float).T
     p = signed_rank_test(*sides).p_value
@@ -344,7 +344,7 @@ def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
     table = tabulate(
         "Pairs of the statistical test: mean safety degree", PAIR_COLUMNS, rows
     )
-    return _PairedTest(p, a12, table, unit)
+    return _PairedTest(p, a12, table, groups)
 
 
 def _decide(
@@ -391,7 +391,7 @@ def _test_in_words(tested: _PairedTest, titles: Mapping[str, str]) -> str:
         return words.NO_TEST.text
     return words.TEST(
         number=len(tested.pairs),
-        pairs=tested.unit,
+        groups=tested.groups,
         p=tested.p,
         a12=tested.a12,
         **titles,

@@ -62,7 +62,7 @@ ORIGINALS_DIFFER = condition(
 # How it was tested.
 NO_TEST = note("No statistical test is possible, because there is no pair of results.")
 TEST = note(
-    "A signed-rank test compares the mean safety degree in both versions over {number} pairs"
-    " ({pairs}): p = {p:.2g}. A value of {a} is larger than one of {b} with a probability of"
-    " {a12:.2f} (effect size A12)."
+    "A signed-rank test compares the mean safety degree of the same vehicles in both versions,"
+    " over {number} groups of vehicles ({groups}): p = {p:.2g}. A mean safety degree of {a} is"
+    " larger than one of {b} with a probability of {a12:.2f} (effect size A12)."
 )

@@ -129,8 +129,8 @@ def explain(
     Parameters
     ----------
     solution
-        Explain this solution of the results, such as nsga2:3:0; may be repeated. Default: some
-        failures with different causes.
+        Explain this solution of the results, such as nsga2:3:0; may be repeated. Default: explain
+        some failures that have different causes.
     unsafe
         What counts as unsafe: a collision, less than X m of clearance, or a metric beyond a limit.
         Default: the criterion of the study, else a collision (if nothing collides: half of the

@@ -111,10 +111,10 @@ def permit(
     ignore
         Ignore this column of the list; may be repeated.
     need
-        Speed that every car needs, else the exit code is 3.
+        Speed at which every car must be safe, else the exit code is 3.
     by
         Find the highest safe value of this speed, such as target_speed. Default: the speed of the
-        vehicle.
+        car.
     step
         Step between two tested speeds. The answer is a multiple of this step.
     margin

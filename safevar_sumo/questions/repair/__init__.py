@@ -98,7 +98,7 @@ def repair(
     ----------
     promise
         Limit of wear within which every vehicle must be safe, such as "treadDepth >= 3"; may be
-        repeated. For every wear in the domains, write all. Default: the limits under
+        repeated. The value all stands for all values of the domains. Default: the limits under
         [repair.promise] of the study, else under [limits].
     margin
         Clearance that every vehicle must keep between bumpers, in metres. Default: the value of the

@@ -29,7 +29,7 @@ REPAIR = answer(
 )
 CHANGE = "{meaning} ({name}) from {old} to {new}"
 REPAIRED = answer(
-    "With this repair, all tested vehicles within the required wear {safe}."
+    "With this repair, all tested vehicles that wear no further than promised {safe}."
 )
 
 # What the repair costs.
