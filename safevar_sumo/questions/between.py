@@ -1,61 +1,74 @@
-"""Encounters between the tests of a matrix: the axes that a test's scenario can move, as ranges.
+"""Encounters between those that a matrix lists: the axes that a scenario can move, as ranges, and
+the phase.
 
-Each such test alone, with its axes as searched parameters, is a study of its own; a setting there
-has the vehicle's characteristics, then a place on each axis.
+A driving system decides once in a step, so what a vehicle leaves to the limit depends on when
+between two decisions the encounter begins. Claims meet the worst phase.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
+import numpy as np
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.phases import in_phases
-from safevar_sumo.questions.scope import moving_axes, points_of_tests
+from safevar_sumo.questions.part import moving_axes, points_of_tests
 from safevar_sumo.questions.words import join_phrases
+from safevar_sumo.scenarios import PHASES
 from safevar_sumo.study import PHASE, RANGES, Domain, MatrixTest, Study, axis_of
+from safevar_sumo.study.encounters import Axes
+from safevar_sumo.sumo.batch import reason_against_scenes
 from safevar_sumo.sumo.system import System, assemble
 
+if TYPE_CHECKING:
+    from safevar_sumo.questions.models import Model
 
-class MovingTest(NamedTuple):
-    """A test of a model's matrix, whose axes are ranges.
+AT_ONE_PHASE = (
+    "Every encounter began at the same moment of a step (the time between two decisions of the"
+    " driving system)."
+)
+"""What to know of encounters without phases."""
+COUNTS_STEPS = (
+    "In this study, an encounter that begins one step later ends differently, because the driving"
+    " system or a sensor counts steps. Only encounters that begin within one step were simulated."
+)
+"""What to know of a driving system whose cycle is longer than a step."""
+SAME = 1e-6
+"""Difference up to which what is left at two phases is the same."""
+DOMAIN = Domain(unit=PHASES[PHASE].unit, original=0.0, lower=0.0, upper=1.0)
+"""All phases: an encounter that begins a whole step later is the same one."""
 
-    Attributes
-    ----------
-    test
-        The test of the matrix, with the values of its axes.
-    model
-        The model in this test alone. An encounter counts only where the original is safe, too.
+
+def in_phases(study: Study, system: System) -> Study:
+    """A study that searches the phase, too, as its last parameter; itself where the encounters of
+    some point have none, as bodies do not move on tracks.
     """
+    has_phases = all(point.scenario.has_phase for point in system.points)
+    if (
+        not has_phases
+        or reason_against_scenes(system)
+        or PHASE in system.characteristics.names
+    ):
+        return study
+    base = study if study.ranges else study.listed().all_count
+    over: Axes = {**base.scenario.over, PHASE: axis_of(DOMAIN)}
+    return replace_in(
+        base, encounters=RANGES, scenario=replace_in(base.scenario, over=over)
+    )
 
-    test: MatrixTest
-    model: Model
 
-
-def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
-    """The tests of a model's matrix with axes that move; an encounter counts unless the original is
-    unsafe by `new_car` in it.
+def remark_on_phases(claim: Model | None) -> str:
+    """What to know of claims without phases, or in whose model the original vehicle ends otherwise
+    in its own encounter, if that begins a whole step later; else "".
     """
-    study = model.evaluator.study
-    tests = []
-    for test, points in points_of_tests(study, assemble(study).points):
-        axes = moving_axes(study, test, points)
-        lists = study.lists_of(test)
-        # An axis with one value does not move.
-        domains = {name: axes[name] for name in axes if len(lists[name]) > 1}
-        if test and domains:
-            listed = replace_in(test, over={**lists})
-            evaluator = model.evaluator.for_study(
-                in_ranges(study, [(listed, domains)]), verified=0
-            )
-            # The original is simulated only where a vehicle fails.
-            moving = Model(model.fit, evaluator, model.unsafe, new_car=new_car)
-            tests.append(MovingTest(listed, moving))
-    return tests
+    if claim is None:
+        return AT_ONE_PHASE
+    rows = np.repeat(claim.characteristics.original_settings, 2, axis=0)
+    rows[1, -1] = 1.0
+    at_begin, at_end = claim.robustness(rows, "phases of the original")
+    return "" if np.isclose(at_begin, at_end, atol=SAME) else COUNTS_STEPS
 
 
 def in_ranges(

@@ -1,16 +1,28 @@
-"""The boundary between what is safe and what is unsafe on straight lines of settings."""
+"""The boundary between what is safe and what is unsafe on straight lines of settings, and how far
+each value of a vehicle may go alone, all others as in the original.
+
+Nothing here knows of studies: a star is a space of vehicles that differ from its center in one
+value.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from safevar_sumo.questions.cases import CaseJudge, CaseSearch, Space
 from safevar_sumo.records import BoolArray, FloatArray
 
 PARTS = (8, 8, 8, 8)
 """Number of equal parts into which each round divides what is left of a line."""
+MOST_SEARCHES = 20
+"""Largest number of searches that move limits alone; values that the last one moves stay as in the
+original.
+"""
+Side = tuple[int, int]
+"""0, below the original, or 1, above it; and the column of a value."""
 
 
 class Boundaries(NamedTuple):
@@ -70,3 +82,132 @@ def on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) -> FloatA
     start = starts[:, np.newaxis]
     end = ends[:, np.newaxis]
     return np.where(factors >= 1, end, start + factors * (end - start))
+
+
+class Alone(NamedTuple):
+    """The last safe values below and above the original, each of shape (n,); and by side a case
+    just beyond.
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    beyond: Mapping[Side, FloatArray] = {}
+
+    def without(
+        self,
+        cases: FloatArray,
+        center: FloatArray,
+    ) -> Alone:
+        """Limits that leave no room on the sides where some cases are."""
+        vehicles = cases[:, : len(center)]
+        is_below = (vehicles < center).any(axis=0)
+        is_above = (vehicles > center).any(axis=0)
+        return self._replace(
+            lower=np.where(is_below, center, self.lower),
+            upper=np.where(is_above, center, self.upper),
+        )
+
+
+def scan_alone(
+    judge: CaseJudge,
+    star: Space,
+    limits: Alone,
+    encounters: FloatArray,
+    values: int,
+    parts: Sequence[int],
+) -> Alone:
+    """Limits of a star within known ones, by some values between its center and each of these, in
+    some encounters; `parts` as of `find_boundaries`.
+    """
+    center = _center_of(star)
+
+    # Each line leads from the original to an end, in one encounter.
+    ends = np.stack([limits.lower, limits.upper], axis=1)
+    columns, sides = np.nonzero(ends != center[:, np.newaxis])
+    number = len(encounters)
+    originals = np.hstack([np.tile(center, (number, 1)), encounters])
+    starts = np.tile(originals, (len(columns), 1))
+    lasts = starts.copy()
+    rows = np.arange(len(lasts))
+    lasts[rows, columns.repeat(number)] = ends[columns, sides].repeat(number)
+
+    # The first unsafe value of each line; the value before it is safe.
+    lines = find_boundaries(
+        starts,
+        lasts,
+        lambda cases: judge(cases) < 0,
+        [values],
+    )
+    fails = np.flatnonzero((judge(lasts) < 0) | (lines.unsafe_shares < 1))
+    passed = np.rint(lines.safe_shares[fails] * values)
+    lowest = passed / (passed + 1)
+    return limits_before(
+        judge,
+        star,
+        limits,
+        lines.unsafe[fails],
+        parts,
+        lowest,
+    )
+
+
+def limits_before(
+    judge: CaseJudge,
+    star: Space,
+    limits: Alone,
+    unsafe: FloatArray,
+    parts: Sequence[int],
+    lowest: FloatArray | float = 0.0,
+) -> Alone:
+    """Limits before K unsafe cases of a star, each safe up to the share `lowest` of its change."""
+    center = _center_of(star)
+    starts = unsafe.copy()
+    starts[:, : star.size] = center
+    lines = find_boundaries(
+        starts,
+        unsafe,
+        lambda cases: judge(cases) < 0,
+        parts,
+        lowest,
+    )
+    ends = np.stack([limits.lower, limits.upper])
+    beyond = {**limits.beyond}
+    for safe, failure in zip(lines.safe, lines.unsafe, strict=True):
+        (column,) = np.flatnonzero(failure[: star.size] != center).tolist()
+        side = int(failure[column] > center[column])
+        sign = 2 * side - 1
+        if sign * safe[column] < sign * ends[side, column]:
+            ends[side, column] = safe[column]
+            beyond[side, column] = failure
+    lower, upper = ends
+    return Alone(lower, upper, beyond)
+
+
+def search_alone(
+    judge: CaseJudge,
+    star: Space,
+    limits: Alone,
+    search: CaseSearch,
+    parts: Sequence[int],
+) -> Alone:
+    """Limits of a star in which a search finds nothing, within known ones."""
+    start = star.lower[np.newaxis][:0]
+    unsafe = start
+    for _ in range(MOST_SEARCHES):
+        space = star.of_vehicles(limits.lower, limits.upper)
+        unsafe = search(space, start).unsafe
+        if not len(unsafe):
+            return limits
+        limits = limits_before(
+            judge,
+            star,
+            limits,
+            unsafe,
+            parts,
+        )
+    return limits.without(unsafe, _center_of(star))
+
+
+def _center_of(star: Space) -> FloatArray:
+    assert star.center is not None
+    return star.center

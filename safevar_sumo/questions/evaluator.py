@@ -33,8 +33,8 @@ from safevar_sumo.campaign.evaluation import (
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, Unsafe
+from safevar_sumo.questions.between import in_phases
 from safevar_sumo.questions.case import Case, Subject
-from safevar_sumo.questions.phases import in_phases
 from safevar_sumo.questions.price import (
     MEASURED,
     QUICK,

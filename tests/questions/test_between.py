@@ -16,7 +16,7 @@ from safevar_sumo.questions.cases import SearchPlan, search_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.scope import scope_of
+from safevar_sumo.questions.part import scope_of
 from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.questions.tolerance.oracle import Exhausted, Oracle, product_of
 from safevar_sumo.study import Constraint, Study

@@ -8,6 +8,12 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
+from safevar_sumo.questions.boundary import (
+    MOST_SEARCHES,
+    Alone,
+    scan_alone,
+    search_alone,
+)
 from safevar_sumo.questions.cases import (
     PARENTS,
     CaseJudge,
@@ -16,12 +22,6 @@ from safevar_sumo.questions.cases import (
     SearchPlan,
     Space,
     search_cases,
-)
-from safevar_sumo.questions.tolerance.alone import (
-    MOST_SEARCHES,
-    Alone,
-    scan_alone,
-    search_alone,
 )
 from safevar_sumo.questions.tolerance.boxes import (
     Boxes,

@@ -17,6 +17,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.between import COUNTS_STEPS, in_phases
 from safevar_sumo.questions.cases import (
     SearchPlan,
     Space,
@@ -25,7 +26,6 @@ from safevar_sumo.questions.cases import (
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.part import at_point
-from safevar_sumo.questions.phases import COUNTS_STEPS, in_phases
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import Track, TrackScenario
 from safevar_sumo.scenarios.declared import with_ranges

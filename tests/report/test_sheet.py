@@ -16,8 +16,8 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, tabulate
+from safevar_sumo.questions.part import scope_of
 from safevar_sumo.questions.permit.rows import CARS
-from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.tolerance import study_in_ranges
 from safevar_sumo.questions.tolerance.tell import IN_RANGES
 from safevar_sumo.replay.animation import template_environment

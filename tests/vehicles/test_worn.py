@@ -22,9 +22,9 @@ from calibration import wet_friction as fit
 from safevar_sumo.ads.base import is_in_the_way
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.boundary import Alone
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.tolerance.alone import Alone
 from safevar_sumo.questions.tolerance.asked import asked_of
 from safevar_sumo.questions.tolerance.search import alone_with_own_set
 from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray, Observation

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from safevar_sumo.questions.compare.words import LACKS
 from safevar_sumo.questions.counterexamples import OF_ENCOUNTER
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.scope import points_of_tests
+from safevar_sumo.questions.part import points_of_tests
 from safevar_sumo.questions.sentence import Sentence
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.scenarios import Point

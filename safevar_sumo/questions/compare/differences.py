@@ -13,6 +13,7 @@ import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import tabulate
+from safevar_sumo.questions.boundary import Alone
 from safevar_sumo.questions.compare import words
 from safevar_sumo.questions.compare.coverage import TestCase, cases_of
 from safevar_sumo.questions.compare.settings import within
@@ -29,7 +30,6 @@ from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.sentence import Sentence
 from safevar_sumo.questions.tables import shipped_columns
-from safevar_sumo.questions.tolerance.alone import Alone
 from safevar_sumo.questions.tolerance.asked import Asked, asked_of
 from safevar_sumo.questions.tolerance.search import alone_with_own_set
 from safevar_sumo.questions.words import count_in_words, join_phrases

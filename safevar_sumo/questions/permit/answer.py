@@ -14,8 +14,9 @@ import pandas as pd
 
 from safevar_sumo.campaign.inputs import manifest_now
 from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.between import remark_on_phases
 from safevar_sumo.questions.models import Models
-from safevar_sumo.questions.part import UpperEnd, study_up_to
+from safevar_sumo.questions.part import UpperEnd, scope_of, study_up_to
 from safevar_sumo.questions.permit import words
 from safevar_sumo.questions.permit.encounters import Span
 from safevar_sumo.questions.permit.fleet import ROUGH, THIS_CAR, YES, Fleet
@@ -38,8 +39,6 @@ from safevar_sumo.questions.permit.search import (
     Repaired,
     WorstEnd,
 )
-from safevar_sumo.questions.phases import remark_on_phases
-from safevar_sumo.questions.scope import scope_of
 from safevar_sumo.questions.sentence import Sentence, Verdict, answer, condition
 from safevar_sumo.questions.tables import Column, tabulate
 from safevar_sumo.questions.words import (

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError, check_name
+from safevar_sumo.questions.between import in_phases
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.phases import in_phases
+from safevar_sumo.questions.part import points_of_tests
 from safevar_sumo.questions.sampling import sobol_points
-from safevar_sumo.questions.scope import points_of_tests
 from safevar_sumo.records import FloatArray, IntArray
 from safevar_sumo.scenarios import SPEED_DIMENSION, searchable_in, unit_of
 from safevar_sumo.scenarios.declared import with_ranges

@@ -9,9 +9,9 @@ import pandas as pd
 
 from safevar_sumo.metrics import F_SAFE, Unsafe
 from safevar_sumo.questions.answer import Answer, tabulate
+from safevar_sumo.questions.between import remark_on_phases
 from safevar_sumo.questions.box import Proof
 from safevar_sumo.questions.models import Models, fit_names
-from safevar_sumo.questions.phases import remark_on_phases
 from safevar_sumo.questions.repair import words
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import RepairProblem

@@ -9,21 +9,39 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.between import MovingTest, moving_tests
+from safevar_sumo.questions.between import in_ranges
 from safevar_sumo.questions.cases import Space
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.part import moving_axes, points_of_tests
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
-from safevar_sumo.study import PHASE
+from safevar_sumo.study import PHASE, MatrixTest
 from safevar_sumo.sumo.simulators import simulations_of_setting
+from safevar_sumo.sumo.system import assemble
 
 STAGE = "limits"
 
 
 class Exhausted(InputError):
     """Fewer simulations may follow than are asked for."""
+
+
+class MovingTest(NamedTuple):
+    """A test of a model's matrix, whose axes are ranges.
+
+    Attributes
+    ----------
+    test
+        The test of the matrix, with the values of its axes.
+    model
+        The model in this test alone. An encounter counts only where the original is safe, too.
+    """
+
+    test: MatrixTest
+    model: Model
 
 
 class CaseWorld(NamedTuple):
@@ -324,3 +342,25 @@ def worlds_of(
     if standing or not moving:
         worlds.append(CaseWorld(model.in_phases or model))
     return worlds
+
+
+def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
+    """The tests of a model's matrix with axes that move; an encounter counts unless the original is
+    unsafe by `new_car` in it.
+    """
+    study = model.evaluator.study
+    tests = []
+    for test, points in points_of_tests(study, assemble(study).points):
+        axes = moving_axes(study, test, points)
+        lists = study.lists_of(test)
+        # An axis with one value does not move.
+        domains = {name: axes[name] for name in axes if len(lists[name]) > 1}
+        if test and domains:
+            listed = replace_in(test, over={**lists})
+            evaluator = model.evaluator.for_study(
+                in_ranges(study, [(listed, domains)]), verified=0
+            )
+            # The original is simulated only where a vehicle fails.
+            moving = Model(model.fit, evaluator, model.unsafe, new_car=new_car)
+            tests.append(MovingTest(listed, moving))
+    return tests

@@ -10,16 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.box import Judgement, Proof, prove
-from safevar_sumo.questions.cases import CaseSearch, Counterexamples, Space
-from safevar_sumo.questions.sampling import Stream
-from safevar_sumo.questions.tolerance.alone import (
+from safevar_sumo.questions.boundary import (
     Alone,
     Side,
     limits_before,
     scan_alone,
     search_alone,
 )
+from safevar_sumo.questions.box import Judgement, Proof, prove
+from safevar_sumo.questions.cases import CaseSearch, Counterexamples, Space
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.asked import LEAST_CASES, Asked
 from safevar_sumo.questions.tolerance.boxes import (
     LEAST_MOVE,

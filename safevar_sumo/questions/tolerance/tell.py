@@ -9,11 +9,11 @@ import pandas as pd
 
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.bars import bars_of, draw_bars
+from safevar_sumo.questions.between import remark_on_phases
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.counterexamples import Failure, describe, limit_text
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.phases import remark_on_phases
-from safevar_sumo.questions.scope import scope_of
+from safevar_sumo.questions.part import scope_of
 from safevar_sumo.questions.sentence import Sentence, Verdict, condition, note
 from safevar_sumo.questions.tables import Rows, shipped_columns, tabulate
 from safevar_sumo.questions.tolerance import words

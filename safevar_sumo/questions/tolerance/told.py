@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.boundary import find_boundaries
+from safevar_sumo.questions.boundary import Side, find_boundaries
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.cases import Counterexamples
 from safevar_sumo.questions.counterexamples import (
@@ -20,12 +20,10 @@ from safevar_sumo.questions.counterexamples import (
     limit_text,
 )
 from safevar_sumo.questions.models import Model, fit_names
-from safevar_sumo.questions.part import UpperEnd
-from safevar_sumo.questions.scope import scope_of
+from safevar_sumo.questions.part import UpperEnd, scope_of
 from safevar_sumo.questions.sentence import Sentence, answer, evidence, note
 from safevar_sumo.questions.tables import Rows
 from safevar_sumo.questions.tolerance import words
-from safevar_sumo.questions.tolerance.alone import Side
 from safevar_sumo.questions.tolerance.asked import Asked
 from safevar_sumo.questions.tolerance.boxes import Attack
 from safevar_sumo.questions.tolerance.search import FoundLimits
