@@ -370,7 +370,7 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(
     study = load_study("three.toml")
     span = span_of(study, None)
     assert (span.low, span.high, span.unit) == (10, 30, "km/h")
-    assert (span.ending, span.left_out) == (("CPFA",), ("CPLA",))
+    assert (span.ending, span.tests_above) == (("CPFA",), ("CPLA",))
     model = model_of(study)
     ends = [(each.test, each.low, each.high) for each in encounters_of(model, span)]
     assert ends == [("CPFA", 20, 30), ("CPNA", 10, 30), ("CPNCO", -np.inf, -np.inf)]

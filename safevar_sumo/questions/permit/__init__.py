@@ -37,7 +37,6 @@ from safevar_sumo.questions.permit.search import (
     PermitSearch,
     Repaired,
     cars_of,
-    worst_end,
 )
 from safevar_sumo.questions.permit.speeds import Cars
 from safevar_sumo.questions.words import join_phrases
@@ -55,18 +54,19 @@ NEED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(\S.*?)?\s*")
 
 @question
 @contents(
-    *(
-        "unsafe",
-        "margin",
-        "scope",
-        "cars",
-        "drive",
-        "limited",
-        "stop",
-        "fits",
-        "attacked",
-    ),
-    *("step", "need", "not_driven_above", "rough"),
+    "unsafe",
+    "margin",
+    "scope",
+    "cars",
+    "drive",
+    "limited",
+    "stop",
+    "fits",
+    "attacked",
+    "step",
+    "need",
+    "not_driven_above",
+    "rough",
     lead="cars",
     cars=CARS,
     sets=SETS,
@@ -135,7 +135,7 @@ def permit(
         evaluator = evaluator.for_study(with_ranges(evaluator.study))
     study = evaluator.study
     span = span_of(study, by)
-    needed = _needed(need, span)
+    demand = _demand_of(need, span)
     values = _grid(span, step)
     members = evaluator.characteristics.vehicle
     _check_forms(
@@ -174,38 +174,37 @@ def permit(
         values,
         budget,
     )
-    _check_driven(needed, search)
-    within = _within(
-        members,
-        limits,
-        study,
-        fleet.settings[0],
-    )
-    asked = [within] if limits else cars_of(members, fleet)
+    _check_driven(demand, search)
+    if limits:
+        candidates = [_cars_within(members, limits, study, fleet.settings[0])]
+    else:
+        candidates = cars_of(members, fleet)
     has_repairs = not (quick or limits)
     new_car, permits, repaired = _drive(
-        evaluator, search, fleet, asked, with_repairs=has_repairs
+        evaluator, search, fleet, candidates, with_repairs=has_repairs
     )
     # Further simulations, where their number has no limit.
     is_free = not limits and evaluator.account.asked is evaluator.left is None
-    found = zip(asked, fleet.measured, permits, strict=True)
-    ends = (
-        [worst_end(search, members, *of_car) for of_car in found] if is_free else None
-    )
-    result = PermitAnswer(
+    ends = None
+    if is_free:
+        of_cars = zip(candidates, fleet.measured, permits, strict=True)
+        ends = [search.worst_end(members, *of_car) for of_car in of_cars]
+    answer = PermitAnswer(
         study=study,
         span=span,
-        need=needed,
+        need=demand,
         step=step,
         models=models,
         search=search,
+        fleet=fleet,
         new_car=new_car,
+        permits=permits,
+        repaired=repaired,
         is_quick=quick,
         is_rough=quick or evaluator.account.most is not None,
         is_box=bool(limits),
         ends=ends,
-    )
-    answer = result.of(fleet, permits, repaired)
+    ).answer()
     if out is not None:
         with whole_file(Path(out), "out") as file:
             file.write_text(answer.render("csv"), encoding="utf-8")
@@ -216,7 +215,7 @@ def _drive(
     evaluator: Evaluator,
     search: PermitSearch,
     fleet: Fleet,
-    asked: Sequence[Cars],
+    candidates: Sequence[Cars],
     *,
     with_repairs: bool,
 ) -> tuple[Permit, list[Permit], list[Repaired]]:
@@ -228,12 +227,12 @@ def _drive(
         If the new car is not safe at the least value.
     """
     members = evaluator.characteristics.vehicle
-    cars = [Cars.one(members.original), *asked]
+    cars = [Cars.one(members.original), *candidates]
     phases = search.phases(cars, with_repairs=with_repairs)
     # Every encounter counts, so that the original vehicle drives in none beside a car.
     alone = evaluator.for_study(evaluator.study.all_count)
-    alone.begin(phases, search.least, of_list=len(asked) > 1)
-    new_car, *permits = search.reach(cars, [-np.inf, *[None] * len(asked)])
+    alone.begin(phases, search.least, of_list=len(candidates) > 1)
+    new_car, *permits = search.reach(cars, [-np.inf, *[None] * len(candidates)])
     if new_car.up_to is None:
         study = evaluator.study
         words = failure_columns([new_car.least.failure])[0]["because"]
@@ -251,7 +250,7 @@ def _drive(
         new_car,
         permits,
         search.repair_first(
-            asked,
+            candidates,
             worn,
             members.original,
             permits,
@@ -302,7 +301,7 @@ def _check_forms(
     """Refuse several forms of cars, and none; and a file that is to be written in place of the
     list, or with a rough answer.
     """
-    given = [
+    forms = [
         flag
         for flag, value in (
             ("--cars", cars is not None),
@@ -311,10 +310,10 @@ def _check_forms(
         )
         if value
     ]
-    if len(given) != 1:
+    if len(forms) != 1:
         raise InputError(
             "permit",
-            f"{join_phrases(given or ['no car'])} given",
+            f"{join_phrases(forms or ['no car'])} given",
             "--cars, --set or --limits",
         )
     if out is None:
@@ -331,8 +330,8 @@ def _check_forms(
     check_writable(path, "out", (".csv",))
 
 
-def _needed(text: str | None, span: Span) -> float | None:
-    """The value that an option needs, in the study's unit."""
+def _demand_of(text: str | None, span: Span) -> float | None:
+    """The value that an option demands, in the study's unit."""
     if text is None:
         return None
     match = NEED.fullmatch(text)
@@ -350,12 +349,12 @@ def _needed(text: str | None, span: Span) -> float | None:
     return float(match[1])
 
 
-def _check_driven(needed: float | None, search: PermitSearch) -> None:
-    """Refuse a value that is needed between those of a test that lists them."""
-    if needed is not None and len(search.listed) and needed not in search.listed:
+def _check_driven(demand: float | None, search: PermitSearch) -> None:
+    """Refuse a demand between the values of a test that lists them."""
+    if demand is not None and len(search.listed) and demand not in search.listed:
         raise InputError(
             "need",
-            f"{needed:g}",
+            f"{demand:g}",
             f"a value that is driven: {join_phrases(f'{value:g}' for value in search.listed)}",
         )
 
@@ -374,11 +373,12 @@ def _grid(span: Span, step: float) -> FloatArray:
     return np.unique(np.clip(values, span.low, span.high))
 
 
-def _within(
-    members: CharacteristicSet, limits: Sequence[str], study: Study, others: FloatArray
+def _cars_within(
+    members: CharacteristicSet, limits: Sequence[str], study: Study, setting: FloatArray
 ) -> Cars:
-    """All cars within limits, with stated values of all other characteristics."""
-    lower, upper = others.copy(), others.copy()
+    """All cars within limits, with a setting's values of all other characteristics."""
+    lower = setting.copy()
+    upper = setting.copy()
     for name, limit in limits_of(limits, study.vehicle.characteristics).items():
         column = members.names.index(name)
         item = members.members[column]

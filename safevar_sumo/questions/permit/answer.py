@@ -28,7 +28,6 @@ from safevar_sumo.questions.permit.rows import (
     STOP,
     assumed_cells,
     assumed_sentences,
-    because,
     failure_columns,
     set_rows,
     verdict_of,
@@ -60,10 +59,12 @@ SHOWN_WHOLE = 50
 
 @dataclass(frozen=True, kw_only=True)
 class PermitAnswer:
-    """What an answer is made of, beside its rows.
+    """What the answer about the cars of a list is made of, in its order.
 
     Attributes
     ----------
+    repaired
+        The best repair of each car.
     is_quick, is_rough
         Whether cars drive the grid alone, and whether the answer is rough for any reason.
     ends
@@ -76,26 +77,24 @@ class PermitAnswer:
     step: float
     models: Models
     search: PermitSearch
+    fleet: Fleet
     new_car: Permit
+    permits: Sequence[Permit]
+    repaired: Sequence[Repaired]
     is_quick: bool
     is_rough: bool
     is_box: bool
     ends: Sequence[WorstEnd | None] | None
 
-    def of(
-        self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[Repaired]
-    ) -> Answer:
-        """The answer about the cars of a list, in its order, each with its best repair."""
+    def answer(self) -> Answer:
+        """The answer."""
         span = self.span
-        rows = self._rows(fleet, permits, repaired)
+        rows = self._rows()
         columns = _in_unit(CARS, span)
         if self._is_test:
             columns["up_to"] = columns["up_to"]._replace(head="passes the test up to")
         cars = tabulate("The cars, first those that may not drive", columns, rows)
         counts = Counter(cars["verdict"])
-        too_slow = 0
-        if self.need is not None:
-            too_slow = int((~(cars["up_to"].astype(float) >= self.need)).sum())
         ordered = cars.sort_values(
             "up_to", kind="stable", na_position="first", ignore_index=True
         )
@@ -106,8 +105,10 @@ class PermitAnswer:
         scope = scope_of(claim)
         unsafe = self.models.own.unsafe
         failures = list[str]()
-        sentences = [*self._sentences(fleet, cars, counts)]
+        sentences = [*self._sentences(cars, counts)]
         if self.need is not None:
+            is_slow = ~(cars["up_to"].astype(float) >= self.need)
+            too_slow = int(is_slow.sum())
             slow = words.TOO_SLOW(
                 count=number_of(too_slow, "car"),
                 need=span.text(self.need),
@@ -116,7 +117,7 @@ class PermitAnswer:
             sentences.append(slow)
             failures += [slow.text] * (too_slow > 0)
             failures += [words.ROUGH_NEED] * self.is_rough
-        sentences += [*self._notes(fleet), VALID_FOR(scope=scope), self._safe]
+        sentences += [*self._notes(), VALID_FOR(scope=scope), self._safe]
         return Answer(
             question="permit",
             study=self.study,
@@ -142,36 +143,39 @@ class PermitAnswer:
                 "sets": tabulate(
                     "By parameter set",
                     _in_unit(SETS, span),
-                    set_rows(fleet.names, permits, with_car=self.is_box),
+                    set_rows(self.fleet.names, self.permits, with_car=self.is_box),
                 ),
             },
             folded=("sets",),
             failures=tuple(failures),
-            listing=self._listing(cars, fleet),
+            listing=self._listing(cars),
         )
 
-    def _rows(
-        self, fleet: Fleet, permits: Sequence[Permit], repaired: Sequence[Repaired]
-    ) -> list[JsonObject]:
+    def _rows(self) -> list[JsonObject]:
         """A row of `CARS` for each car, in the order of the list."""
         vehicle = self.models.own.characteristics.vehicle
-        new_car = self.new_car.up_to
-        assert new_car is not None
-        columns = failure_columns(
-            [each.least.failure for each in permits], with_car=self.is_box
+        new_car = self.new_car.order
+        failures = failure_columns(
+            [permit.least.failure for permit in self.permits], with_car=self.is_box
         )
-        own = self.models.own.unsafe
+        criterion = self.models.own.unsafe
         of_all = {
             "rough": self.is_rough,
             "parameter_sets": len(self.models.members),
-            "margin": own.keep,
-            "unsafe": str(own),
+            "margin": criterion.keep,
+            "unsafe": str(criterion),
         }
-        ends = self.ends or [None] * len(permits)
-        cells = assumed_cells(vehicle, fleet)
+        ends = self.ends or [None] * len(failures)
+        cells = assumed_cells(vehicle, self.fleet)
         rows = []
-        for name, permit, found, best, assumed, end in zip(
-            fleet.names, permits, columns, repaired, cells, ends, strict=True
+        for name, permit, failure, best, assumed, end in zip(
+            self.fleet.names,
+            self.permits,
+            failures,
+            self.repaired,
+            cells,
+            ends,
+            strict=True,
         ):
             verdict = verdict_of(
                 permit.up_to,
@@ -180,27 +184,50 @@ class PermitAnswer:
                 self.need,
                 is_proven=not self.is_quick,
             )
-            event = found["because"]
+            event = failure["because"]
             row = {
                 "car": name,
                 "up_to": permit.up_to,
                 "new_car_up_to": new_car,
                 "unit": self.span.unit,
                 "verdict": verdict,
-                "because": because(
-                    permit, event, verdict, self.span, new_car, self.need
-                ).text,
+                "because": self._reason(permit, event, verdict).text,
                 "parameter_set": permit.least.fit if event else None,
                 "repair_first": None if best is None else vehicle.names[best[0]],
                 "up_to_after_repair": None if best is None else best[1].up_to,
                 "assumed": assumed,
                 "assumed_matters_most": None if end is None else end.name,
             }
-            rows.append(found | row | of_all)
+            rows.append(failure | row | of_all)
         return rows
 
+    def _reason(self, permit: Permit, event: str, verdict: str) -> Sentence:
+        """Why a car may drive no faster, for a foreman."""
+        span = self.span
+        slots = {
+            "low": span.text(span.low),
+            "name": span.title,
+            "event": event,
+            "new_car": span.up_to(self.new_car.order),
+            "need": span.text(self.need or 0.0),
+        }
+        if permit.up_to is None:
+            failure = permit.least.failure
+            if failure is not None and np.isneginf(failure.encounters.low):
+                return words.IN_FIXED_TEST(**slots)
+            return words.NOT_AT_ALL(**slots)
+        slots["reach"] = span.up_to(permit.up_to)
+        template = words.AS_NEW
+        if not event:
+            template = words.SAFE_TO_TOP
+        elif verdict != DRIVE:
+            template = words.UNSAFE_BEYOND
+        elif self.need is not None and permit.up_to >= self.need:
+            template = words.NEED_REACHED
+        return template(**slots)
+
     def _sentences(
-        self, fleet: Fleet, cars: pd.DataFrame, counts: Mapping[str, int]
+        self, cars: pd.DataFrame, counts: Mapping[str, int]
     ) -> Iterator[Sentence]:
         """How far cars are safe, why no farther, and what is assumed."""
         span = self.span
@@ -216,15 +243,17 @@ class PermitAnswer:
         vehicle = self.models.own.characteristics.vehicle
         if len(cars) == 1:
             yield answer(cars["because"][0])
-        yield from assumed_sentences(self.study, vehicle, fleet)
+        yield from assumed_sentences(self.study, vehicle, self.fleet)
         is_checked = len(cars) == 1 and not pd.isna(cars["up_to"][0])
-        if is_checked and self.ends and not fleet.measured.all():
+        if is_checked and self.ends and not self.fleet.measured.all():
             end = self.ends[0]
-            yield (
-                words.NO_WORST_END(name=span.title)
-                if end is None
-                else end.sentence(span)
-            )
+            if end is None:
+                yield words.NO_WORST_END(name=span.title)
+            else:
+                yield words.WORST_END(
+                    end=f"{end.name} {end.text}",
+                    value=span.text(max(end.value, span.low)),
+                )
 
     def _car(self, name: str, up_to: float) -> Sentence:
         """How far a single car is safe."""
@@ -264,14 +293,14 @@ class PermitAnswer:
                     **slots,
                 )
 
-    def _notes(self, fleet: Fleet) -> Iterator[Sentence]:
+    def _notes(self) -> Iterator[Sentence]:
         """What counts of measured values, and what was not driven."""
         vehicle = self.models.own.characteristics.vehicle
         # Limits are no measurements.
-        is_measured = np.any(fleet.measured, axis=0) & (not self.is_box)
+        is_measured = np.any(self.fleet.measured, axis=0) & (not self.is_box)
         if names := precise_in_words(compress(vehicle, is_measured)):
             yield words.MEASURED(names=names)
-        if fleet.is_rough:
+        if self.fleet.is_rough:
             yield words.ROUGH_LIST
         yield condition(remark_on_phases(self.models.own.in_phases))
         top = self.span.text(self.span.high)
@@ -280,10 +309,10 @@ class PermitAnswer:
                 top=top,
                 tests=join_phrases(self.span.ending),
             )
-        if self.span.left_out:
+        if self.span.tests_above:
             yield words.LEFT_OUT(
                 top=top,
-                tests=join_phrases(self.span.left_out),
+                tests=join_phrases(self.span.tests_above),
             )
 
     @property
@@ -333,13 +362,14 @@ class PermitAnswer:
             number=len(values), values=driven, attacked=self.search.attacked
         )
 
-    def _listing(self, cars: pd.DataFrame, fleet: Fleet) -> pd.DataFrame:
+    def _listing(self, cars: pd.DataFrame) -> pd.DataFrame:
         """The list: the columns of the input, then those of the answer, in the input's order."""
         manifest = manifest_now(self.study, assemble(self.study))
-        given = fleet.table.reset_index(drop=True)
-        # Limits are no measured values of a car.
-        given = given[given.columns[:1]] if self.is_box else given
-        listing = pd.concat([given, cars.drop(columns="car")], axis=1)
+        table = self.fleet.table.reset_index(drop=True)
+        if self.is_box:
+            # Limits are no measured values of a car.
+            table = table[table.columns[:1]]
+        listing = pd.concat([table, cars.drop(columns="car")], axis=1)
         listing[ROUGH] = YES if self.is_rough else "no"
         listing[DIGEST] = identity_digest(manifest)[:12]
         return listing

@@ -44,7 +44,7 @@ class Span(NamedTuple):
     ----------
     ending
         The names of the tests that end at `high`, where others go on.
-    left_out
+    tests_above
         The names of the tests that begin above `high`, and are not driven.
     """
 
@@ -53,7 +53,7 @@ class Span(NamedTuple):
     low: float
     high: float
     ending: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
+    tests_above: tuple[str, ...] = ()
 
     @property
     def title(self) -> str:
@@ -99,7 +99,7 @@ class EncounterRange(NamedTuple):
     high: float
 
     @property
-    def others(self) -> IntArray:
+    def axes(self) -> IntArray:
         """The columns of the axes beside the parameter; the phase is the last."""
         is_other = ~self.model.characteristics.of_vehicle
         if self.column is not None:
@@ -111,11 +111,11 @@ class EncounterRange(NamedTuple):
         least the least of the test, and the share of the range of each other axis.
         """
         members = self.model.characteristics
-        others = self.others
+        axes = self.axes
         width = members.upper - members.lower
         settings = members.lower + np.zeros((len(places), 1))
         settings[:, : vehicles.shape[1]] = vehicles
-        settings[:, others] += places[:, 1 : 1 + len(others)] * width[others]
+        settings[:, axes] += places[:, 1 : 1 + len(axes)] * width[axes]
         if self.column is not None:
             settings[:, self.column] = places[:, 0]
         return members.with_printed_encounters(settings)
@@ -131,9 +131,13 @@ class EncounterRange(NamedTuple):
         all others, each at several phases.
         """
         has_phase = self.model.characteristics.names[-1] == PHASE
-        shares = unit_places(len(self.others) - has_phase, value)
+        shares = unit_places(len(self.axes) - has_phase, value)
         if has_phase:
-            phases = phases_at(value, len(shares))
+            # One phase in each part of a step.
+            parts = np.tile(np.arange(GRID_PHASES), len(shares))
+            seed = zlib.crc32(np.array([value, len(shares)]).tobytes())
+            rng = np.random.default_rng(seed)
+            phases = (parts + rng.random(len(parts))) / GRID_PHASES
             shares = np.column_stack([np.repeat(shares, GRID_PHASES, axis=0), phases])
         return np.column_stack([np.full(len(shares), value), shares])
 
@@ -165,19 +169,10 @@ def unit_places(dimensions: int, value: float) -> FloatArray:
         return np.zeros((1, 0))
     seed = zlib.crc32(np.array([value]).tobytes())
     corners = np.array([*product((0.0, 1.0), repeat=min(dimensions, MOST_ENDS))])
-    others = dimensions - corners.shape[1]
-    further = np.random.default_rng(seed).integers(0, 2, size=(len(corners), others))
+    shape = len(corners), dimensions - corners.shape[1]
+    further = np.random.default_rng(seed).integers(0, 2, size=shape)
     spread = sobol_points(SPREAD_PLACES, dimensions, seed)
     return np.concatenate([spread, np.hstack([corners, further])])
-
-
-def phases_at(value: float, number: int) -> FloatArray:
-    """Phases of so many places at a value of a parameter, shape (number x `GRID_PHASES`,): one in
-    each part of a step.
-    """
-    rng = np.random.default_rng(zlib.crc32(np.array([value, number]).tobytes()))
-    parts = np.tile(np.arange(GRID_PHASES), number)
-    return np.asarray((parts + rng.random(len(parts))) / GRID_PHASES)
 
 
 def span_of(study: Study, by: str | None) -> Span:
@@ -194,23 +189,19 @@ def span_of(study: Study, by: str | None) -> Span:
     # Speeds alone are offered, also those of a simulator or a scenario's file, without a unit.
     units = {name: domain.unit for name, domain in study.ranges.items()}
     ends: dict[str, dict[str, tuple[float, float]]] = {}
-    for test, own in tests:
-        searchable = searchable_in(own[0].scenario)
-        lists = {
-            name: each
-            for name, each in study.lists_of(test).items()
-            if are_numbers(each)
-        }
-        for axis in lists:
-            if axis in searchable or SPEED_DIMENSION in axis:
-                units[axis] = unit_of(own[0].scenario, axis)
-        of_test = {
-            axis: (float(min(each)), float(max(each))) for axis, each in lists.items()
-        }
+    for test, (point, *_) in tests:
+        searchable = searchable_in(point.scenario)
         domains = study.ranges_of(test)
-        of_test |= {axis: (each.lower, each.upper) for axis, each in domains.items()}
-        for axis, both in of_test.items():
-            ends.setdefault(axis, {})["" if test is None else test.name] = both
+        of_test = {
+            axis: (domain.lower, domain.upper) for axis, domain in domains.items()
+        }
+        for axis, values in study.lists_of(test).items():
+            if are_numbers(values):
+                of_test[axis] = (float(min(values)), float(max(values)))
+                if axis in searchable or SPEED_DIMENSION in axis:
+                    units[axis] = unit_of(point.scenario, axis)
+        for axis, limits in of_test.items():
+            ends.setdefault(axis, {})["" if test is None else test.name] = limits
     speeds = [name for name, unit in units.items() if unit in SPEED_UNITS]
     name = by or SPEED_DIMENSION
     problem = (
@@ -222,17 +213,17 @@ def span_of(study: Study, by: str | None) -> Span:
     check_name("by", problem, name, speeds)
 
     # It ends at the least of the tests' greatest values.
-    high = min(last for _, last in ends[name].values())
-    goes_on = any(last > high for _, last in ends[name].values())
+    high = min(top for _, top in ends[name].values())
+    goes_on = any(top > high for _, top in ends[name].values())
     return Span(
         name=name,
         unit=units[name],
         low=min(low for low, _ in ends[name].values()),
         high=high,
         ending=tuple(
-            test for test, (_, last) in ends[name].items() if goes_on and last == high
+            test for test, (_, top) in ends[name].items() if goes_on and top == high
         ),
-        left_out=tuple(test for test, (low, _) in ends[name].items() if low > high),
+        tests_above=tuple(test for test, (low, _) in ends[name].items() if low > high),
     )
 
 
@@ -250,10 +241,12 @@ def encounters_of(model: Model, span: Span) -> list[EncounterRange]:
         column = None
         if span.name in alone.ranges:
             column = members.names.index(span.name)
-            low, high = float(members.lower[column]), float(members.upper[column])
+            low = float(members.lower[column])
+            high = float(members.upper[column])
         if low <= span.high:
-            own = Model(model.fit, evaluator, model.unsafe)
-            ranges.append(EncounterRange(test, own, column, low, min(high, span.high)))
+            of_test = model._replace(evaluator=evaluator)
+            top = min(high, span.high)
+            ranges.append(EncounterRange(test, of_test, column, low, top))
     return ranges
 
 

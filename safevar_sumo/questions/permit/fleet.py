@@ -28,11 +28,13 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet, region_of
 
 CAR = "car"
 """Natural header of the column that names the cars, which the answer has, too."""
-ROUGH, YES = "rough", "yes"
+ROUGH = "rough"
+YES = "yes"
 """The column of an answer that says whether it is rough, and its text then."""
 NEW = "new"
 """Value of `--others`: a characteristic without a value is as in the original vehicle."""
-TYPED, THIS_CAR = "--set", "This car"
+TYPED = "--set"
+THIS_CAR = "This car"
 """The option of typed values, and the name of the car that has them."""
 SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma"}
 """Separators of columns: the first one that the header has outside of quotation marks is meant."""
@@ -144,7 +146,8 @@ def read_fleet(
     is_answer = bool(written) and written <= {text.strip() for text in cells.header}
     if is_answer:
         cells = cells._replace(separator=",;")
-        ignore, answer_columns = [*ignore, *written], ()
+        ignore = [*ignore, *written]
+        answer_columns = ()
 
     # The columns, the names in the first one, and the values.
     naming, columns = _columns(cells, study, vehicle, ignore, answer_columns)
@@ -170,10 +173,10 @@ def list_without_names(path: Path, ignore: Collection[str]) -> bytes:
     writer = csv.writer(text, "unix", delimiter=cells.separator)
     writer.writerow(cells.header)
     for number, row in enumerate(cells.rows, 1):
-        kept = [cell if read else "" for cell, read in zip(row, is_read, strict=True)]
+        texts = [text if read else "" for text, read in zip(row, is_read, strict=True)]
         if any(is_read):
-            kept[is_read.index(True)] = f"{CAR} {number}"
-        writer.writerow(kept)
+            texts[is_read.index(True)] = f"{CAR} {number}"
+        writer.writerow(texts)
     return text.getvalue().encode()
 
 
@@ -198,13 +201,12 @@ def _cells_of_file(path: Path) -> _Cells:
     # The separator, by Excel's first line or by the header.
     stated = SEPARATOR_LINE.match(text)
     lines = io.StringIO(text[stated.end() :] if stated else text, newline="")
-    first = 1 if stated else 0
+    skipped = 1 if stated else 0
     head = re.sub('"[^"]*"', "", lines.readline())
     lines.seek(0)
-    separator = (
-        stated[1] if stated else next((one for one in SEPARATORS if one in head), "")
-    )
-    place = f"{path}, line {first + 1}"
+    separator = next((mark for mark in SEPARATORS if mark in head), "")
+    separator = stated[1] if stated else separator
+    place = f"{path}, line {skipped + 1}"
     if separator not in SEPARATORS or separator not in head:
         raise InputError(
             place,
@@ -218,11 +220,11 @@ def _cells_of_file(path: Path) -> _Cells:
     start = 0
     try:
         for record in reader:
-            records.append((first + start + 1, record))
+            records.append((skipped + start + 1, record))
             start = reader.line_num
     except csv.Error as error:
         raise InputError(
-            f"{path}, line {first + start + 1}", str(error), "CSV"
+            f"{path}, line {skipped + start + 1}", str(error), "CSV"
         ) from None
     while len(records) > 1 and not any(cell.strip() for cell in records[-1][1]):
         records.pop()
@@ -355,8 +357,8 @@ def _names(cells: _Cells, naming: int) -> list[str]:
             # Names that differ in case, blanks or the form of their characters are one.
             key = " ".join(unicodedata.normalize("NFKC", name).casefold().split())
             if key in places:
-                first = f"a name that no other car has ({places[key]})"
-                raise InputError("", f"the car {name!r} is there twice", first)
+                legal = f"a name that no other car has ({places[key]})"
+                raise InputError("", f"the car {name!r} is there twice", legal)
         places[key] = place
     return names
 
@@ -382,13 +384,10 @@ def _values(
                     except InputError as fault:
                         faults.append(fault)
     if faults:
-        first, *later = faults
-        problems = [
-            first.problem,
-            *(f"{fault.source}: {fault.problem}" for fault in later),
-        ]
+        problems = [f"{fault.source}: {fault.problem}" for fault in faults]
+        problems[0] = faults[0].problem
         legal = dict.fromkeys(fault.legal for fault in faults)
-        raise InputError(first.source, "\n".join(problems), "; ".join(legal))
+        raise InputError(faults[0].source, "\n".join(problems), "; ".join(legal))
     return settings, ~np.isnan(settings)
 
 
@@ -442,14 +441,9 @@ def _completed(
     if others == NEW:
         stated = np.where(np.isnan(stated), vehicle.original, stated)
     settings = np.where(np.isnan(settings), stated, settings)
-    missing = np.isnan(settings)
-    if lacking := np.flatnonzero(missing.any(axis=1)).tolist():
-        names = ", ".join(
-            compress(
-                vehicle.names,
-                map(any, missing.T),
-            )
-        )
+    gaps = np.isnan(settings)
+    if lacking := np.flatnonzero(gaps.any(axis=1)).tolist():
+        names = ", ".join(compress(vehicle.names, map(any, gaps.T)))
         problem = (
             f"no value of {names}, neither measured nor under [unmeasured] of the study"
         )
@@ -469,8 +463,9 @@ def _check_constraints(
     """Refuse a car that violates a constraint among the vehicle's characteristics."""
     with about(study.source):
         region = region_of(study)
-    within = [one for one in region.bounds if {*one.constraint.sum} <= {*vehicle.names}]
-    region = replace(region, bounds=tuple(within))
+    names = {*vehicle.names}
+    bounds = [bound for bound in region.bounds if names >= {*bound.constraint.sum}]
+    region = replace(region, bounds=tuple(bounds))
     cars = np.repeat(region.characteristics.original_settings, len(settings), axis=0)
     cars[:, region.characteristics.of_vehicle] = settings
     for car, place in zip(cars, cells.places, strict=True):

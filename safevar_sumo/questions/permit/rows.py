@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from safevar_sumo.questions.counterexamples import OF_ENCOUNTER, failures_at, texts_of
 from safevar_sumo.questions.permit import words
-from safevar_sumo.questions.permit.encounters import Span
 from safevar_sumo.questions.permit.fleet import Fleet
 from safevar_sumo.questions.permit.search import Permit
 from safevar_sumo.questions.permit.speeds import LimitingFailure
@@ -22,7 +21,9 @@ from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.study import PHASE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
-DRIVE, LIMITED, STOP = "drive", "up to", "stop"
+DRIVE = "drive"
+LIMITED = "up to"
+STOP = "stop"
 """Verdicts: as fast as is needed, else as was driven or as the new car; up to a speed; not at all.
 """
 CARS, SETS = shipped_columns("permit").values()
@@ -38,18 +39,18 @@ def failure_columns(
     """The columns of failures, simulated once more as they are printed, and each in words,
     `because`; `with_car` names the car's values in it, too.
     """
-    found = [{**NO_FAILURE, "because": ""}] * len(failures)
+    columns = [{**NO_FAILURE, "because": ""}] * len(failures)
     of_range = dict[int, dict[int, LimitingFailure]]()
     for number, failure in enumerate(failures):
         if failure is not None:
             of_range.setdefault(id(failure.encounters), {})[number] = failure
-    for known in of_range.values():
-        settings = np.array([failure.setting for failure in known.values()])
-        encounters = next(iter(known.values())).encounters
+    for numbered in of_range.values():
+        settings = np.array([failure.setting for failure in numbered.values()])
+        encounters = next(iter(numbered.values())).encounters
         model = encounters.model
         members = model.characteristics
         described = failures_at(model, settings)
-        for row, number in enumerate(known):
+        for row, number in enumerate(numbered):
             failed = described[row]
             event = failed.words.partition(" (parameter set")[0]
             if with_car:
@@ -59,16 +60,14 @@ def failure_columns(
                 changes = change_texts(members.vehicle, values, are_printed=True)
                 phrases = join_phrases(changes or ["no change"])
                 event = words.WITH_CHANGES.format(changes=phrases, event=event)
-            left_out = {*OF_ENCOUNTER, *members.names}
-            met = {
-                name: value
-                for name, value in failed.point.items()
-                if name not in left_out
+            named = {*OF_ENCOUNTER, *members.names}
+            encounter = {
+                name: value for name, value in failed.point.items() if name not in named
             }
-            met |= members.scenario.named(settings[row, ~members.of_vehicle])
-            phase = met.pop(PHASE, None)
-            texts = texts_of(model.evaluator.system.points[0], met)
-            found[number] = {
+            encounter |= members.scenario.named(settings[row, ~members.of_vehicle])
+            phase = encounter.pop(PHASE, None)
+            texts = texts_of(model.evaluator.system.points[0], encounter)
+            columns[number] = {
                 "test": encounters.test or None,
                 "encounter": ", ".join(f"{name} {text}" for name, text in texts.items())
                 or None,
@@ -77,7 +76,7 @@ def failure_columns(
                 "simulate": failed.command,
                 "because": event,
             }
-    return found
+    return columns
 
 
 def verdict_of(
@@ -95,52 +94,17 @@ def verdict_of(
     return DRIVE if is_enough and is_proven else LIMITED
 
 
-def because(
-    permit: Permit,
-    event: str,
-    verdict: str,
-    span: Span,
-    new_car: float,
-    need: float | None,
-) -> Sentence:
-    """Why a car may drive no faster, for a foreman."""
-    slots = {
-        "low": span.text(span.low),
-        "name": span.title,
-        "event": event,
-        "new_car": span.up_to(new_car),
-        "need": span.text(need or 0.0),
-    }
-    if permit.up_to is None:
-        failure = permit.least.failure
-        if failure is not None and np.isneginf(failure.encounters.low):
-            return words.IN_FIXED_TEST(**slots)
-        return words.NOT_AT_ALL(**slots)
-    slots["reach"] = span.up_to(permit.up_to)
-    template = words.AS_NEW
-    if not event:
-        template = words.SAFE_TO_TOP
-    elif verdict != DRIVE:
-        template = words.UNSAFE_BEYOND
-    elif need is not None and permit.up_to >= need:
-        template = words.NEED_REACHED
-    return template(**slots)
-
-
 def set_rows(
     names: Sequence[str], permits: Sequence[Permit], *, with_car: bool
 ) -> list[JsonObject]:
     """The rows of `SETS`."""
-    reached = [
-        (name, each)
+    cells = [
+        {"car": name, **reached._asdict()}
         for name, permit in zip(names, permits, strict=True)
-        for each in permit.reached
+        for reached in permit.reached
     ]
-    found = failure_columns([each.failure for _, each in reached], with_car=with_car)
-    return [
-        {"car": name, **each._asdict(), **columns}
-        for (name, each), columns in zip(reached, found, strict=True)
-    ]
+    failures = failure_columns([row["failure"] for row in cells], with_car=with_car)
+    return [row | columns for row, columns in zip(cells, failures, strict=True)]
 
 
 def assumed_cells(vehicle: CharacteristicSet, fleet: Fleet) -> list[str | None]:

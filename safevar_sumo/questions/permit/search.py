@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import compress, product
 from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.questions.models import Models
-from safevar_sumo.questions.permit import words
 from safevar_sumo.questions.permit.encounters import Span, encounters_of
 from safevar_sumo.questions.permit.fleet import Fleet
 from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSearch
-from safevar_sumo.questions.sentence import Sentence
 from safevar_sumo.questions.words import EXACT
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 from safevar_sumo.vehicles import CharacteristicSet
@@ -46,12 +45,12 @@ class Reached(NamedTuple):
 class Permit(NamedTuple):
     """What is known of a car: how far it is safe in each parameter set."""
 
-    reached: Sequence[Reached]
+    reached: list[Reached]
 
     @property
     def least(self) -> Reached:
         """The parameter set that limits it most."""
-        return min(self.reached, key=lambda each: each.order)
+        return min(self.reached, key=lambda reached: reached.order)
 
     @property
     def up_to(self) -> float | None:
@@ -60,7 +59,9 @@ class Permit(NamedTuple):
     @property
     def failures(self) -> list[LimitingFailure]:
         """The failure that limits it in each parameter set in which one was found."""
-        return [each.failure for each in self.reached if each.failure is not None]
+        return [
+            reached.failure for reached in self.reached if reached.failure is not None
+        ]
 
     @property
     def limiting(self) -> list[LimitingFailure]:
@@ -75,6 +76,16 @@ class Permit(NamedTuple):
 
 Repaired = tuple[int, Permit] | None
 """The column of the characteristic that raises a car's value most, and the car as it is then."""
+
+
+class WorstEnd(NamedTuple):
+    """The assumed value of a car that lowers its speed most at an end of its domain: the name of
+    the characteristic, the end as text, and the value at which the car is unsafe then.
+    """
+
+    name: str
+    text: str
+    value: float
 
 
 class PermitSearch:
@@ -101,7 +112,7 @@ class PermitSearch:
         self._budget = budget
         ranges = encounters_of(models.own, span)
         self._ranges = {models.own.fit: ranges}
-        fixed = [each.low for each in ranges if each.column is None]
+        fixed = [encounters.low for encounters in ranges if encounters.column is None]
         self.listed = np.unique([value for value in fixed if np.isfinite(value)])
         is_moved = len(fixed) < len(ranges)
         self.values = np.union1d(values, self.listed) if is_moved else self.listed
@@ -118,10 +129,11 @@ class PermitSearch:
         places = len(self.values) * USUAL_PLACES
         searched = len(cars) * self._budget
         self.least = len(members) * searched // points
-        each = (vehicles * places + searched) / points
-        self._usual = len(members) * each / len(cars)
-        phases = {self._stage(model.fit): each for model in members}
-        return phases | ({REPAIR_STAGE: len(members) * each} if with_repairs else {})
+        of_set = (vehicles * places + searched) / points
+        of_sets = len(members) * of_set
+        self._usual = of_sets / len(cars)
+        phases = {self._stage(model.fit): of_set for model in members}
+        return phases | ({REPAIR_STAGE: of_sets} if with_repairs else {})
 
     def _stage(self, fit: int) -> str:
         return (
@@ -129,29 +141,24 @@ class PermitSearch:
         )
 
     def reach(
-        self, cars: Sequence[Cars], above: Sequence[float | None], stage: str = ""
+        self, cars: Sequence[Cars], floors: Sequence[float | None], stage: str = ""
     ) -> list[Permit]:
         """How far each of the cars is safe, whichever others are asked for with it.
 
-        A car of which only the least value counts, where it is `above` one, is driven no further
+        A car of which only the least value counts, where it is above a floor, is driven no further
         in a parameter set than in those before, and in no further set once it is not.
         """
-        found = list[list[Reached]]([] for _ in cars)
+        permits = [Permit([]) for _ in cars]
         top = float(self.values[-1])
         for model in self._models_in_order:
             # The cars that are still of interest, and how far.
-            permits = [Permit(reached) for reached in found]
-            waiting = [
-                car
-                for car, permit in enumerate(permits)
-                if not permit.reached
-                or (least := above[car]) is None
-                or permit.order > least
-            ]
-            caps = [
-                permits[car].order if found[car] and above[car] is not None else top
-                for car in waiting
-            ]
+            waiting = list[int]()
+            caps = list[float]()
+            for car, (permit, floor) in enumerate(zip(permits, floors, strict=True)):
+                cap = permit.order if permit.reached and floor is not None else top
+                if floor is None or not permit.reached or cap > floor:
+                    waiting.append(car)
+                    caps.append(cap)
             if not waiting:
                 break
             if model.fit not in self._ranges:
@@ -170,31 +177,54 @@ class PermitSearch:
                     search.attack(self._budget)
             self.attacked += search.attacked
             for number, car in enumerate(waiting):
-                up_to = self._driven(search.up_to(number))
-                found[car].append(Reached(model.fit, up_to, search.failures[number]))
-        return [Permit(reached) for reached in found]
+                up_to = search.up_to(number)
+                # The last listed value, if any.
+                values = self.listed[self.listed <= (up_to or -np.inf)]
+                up_to = max(values.tolist(), default=up_to)
+                reached = Reached(model.fit, up_to, search.failures[number])
+                permits[car].reached.append(reached)
+        return permits
 
-    def _driven(self, up_to: float | None) -> float | None:
-        """The last listed value up to one, if any."""
-        below = self.listed[self.listed <= (up_to or -np.inf)]
-        return max(below.tolist(), default=up_to)
-
-    def worst_end(self, cars: Cars, permit: Permit) -> LimitingFailure | None:
-        """The failure at the least value, up to that of a permit, of cars that drive the grid with
-        the parameter set that limits the permit; None where none fails.
+    def worst_end(
+        self,
+        vehicle: CharacteristicSet,
+        car: Cars,
+        is_measured: BoolArray,
+        permit: Permit,
+    ) -> WorstEnd | None:
+        """The worst end of a car; None where nothing is assumed, the car may not drive as it is, or
+        no end lowers its speed on the grid.
         """
-        up_to = permit.order
-        driven = [each for each in self._ranges[permit.least.fit] if each.low <= up_to]
-        values = self.values[self.values <= up_to]
+        if permit.up_to is None or is_measured.all():
+            return None
+
+        # Each assumed value at either end, all others as they are worst. Any failure shows that
+        # the car may drive no faster, so the grid up to its own speed is enough, with the set that
+        # limits it.
+        limiting = permit.least.failure
+        worst = car.lower if limiting is None else limiting.setting[: len(vehicle)]
+        is_assumed = np.eye(len(vehicle), dtype=bool)[~is_measured]
+        sides = [
+            np.where(is_assumed, end, worst) for end in (vehicle.lower, vehicle.upper)
+        ]
+        ranges = self._ranges[permit.least.fit]
         search = SpeedSearch(
-            driven,
-            [cars],
-            values,
-            [up_to],
+            [encounters for encounters in ranges if encounters.low <= permit.up_to],
+            [Cars(worst, worst, np.vstack(sides))],
+            self.values[self.values <= permit.up_to],
+            [permit.up_to],
             ENDS_STAGE,
         )
         search.drive_grid()
-        return search.failures[0]
+        (failure,) = search.failures
+        if failure is None:
+            return None
+        changed = np.flatnonzero(failure.setting[: len(vehicle)] != worst)
+        if not len(changed):
+            return None
+        item = vehicle.members[changed[0]]
+        value = failure.setting[changed[0]]
+        return WorstEnd(item.name, f"{value:{EXACT}}{item.suffix}", failure.value)
 
     def repair_first(
         self,
@@ -217,7 +247,8 @@ class PermitSearch:
         bounds = list[dict[int, float]]()
         failures = list[list[LimitingFailure]]()
         best = list[Repaired]([None] * len(cars))
-        known = [permit.order for permit in permits]  # with the best repair so far
+        # With the best repair so far.
+        orders = [permit.order for permit in permits]
         for row, permit in enumerate(permits):
             columns = np.flatnonzero(worn[row] & (permit.order < top)).tolist()
             bounds.append(dict.fromkeys(columns, np.inf))
@@ -234,23 +265,25 @@ class PermitSearch:
                 # The most promising repair of each car, unless a better one is known.
                 chosen = dict[int, int]()
                 for row, of_car in enumerate(bounds):
-                    for column in [
-                        column for column, most in of_car.items() if most <= known[row]
-                    ]:
-                        del of_car[column]
-                    if of_car:
-                        chosen[row] = max(of_car, key=of_car.__getitem__)
-                        del of_car[chosen[row]]
+                    promising = {
+                        column: bound
+                        for column, bound in of_car.items()
+                        if bound > orders[row]
+                    }
+                    if promising:
+                        chosen[row] = max(promising, key=promising.__getitem__)
+                        del promising[chosen[row]]
+                    bounds[row] = promising
                 repaired = [
                     cars[row].with_value_of(column, original)
                     for row, column in chosen.items()
                 ]
-                above = [known[row] for row in chosen]
-                driven = self.reach(repaired, above, REPAIR_STAGE) if repaired else []
+                floors = [orders[row] for row in chosen]
+                driven = self.reach(repaired, floors, REPAIR_STAGE) if repaired else []
                 for (row, column), permit in zip(chosen.items(), driven, strict=True):
-                    if permit.order > known[row]:
+                    if permit.order > orders[row]:
                         best[row] = column, permit
-                        known[row] = permit.order
+                        orders[row] = permit.order
                     failures[row] = permit.failures
         return best
 
@@ -264,36 +297,23 @@ class PermitSearch:
         """Lower what each repair could reach at most, by the failures of other cars that it does
         not avoid.
         """
-        rows = dict[int, list[tuple[int, int, float, FloatArray]]]()
-        ranges = {id(each): each for of_fit in self._ranges.values() for each in of_fit}
+        repairs = dict[int, list[tuple[int, int, LimitingFailure, FloatArray]]]()
         for row, of_car in enumerate(bounds):
-            for failure in failures[row]:
-                for column in of_car:
-                    repaired = cars[row].with_value_of(column, original)
-                    setting = failure.setting.copy()
-                    vehicle = setting[: len(original)]
-                    np.clip(
-                        vehicle,
-                        repaired.lower,
-                        repaired.upper,
-                        out=vehicle,
-                    )
-                    rows.setdefault(id(failure.encounters), []).append(
-                        (row, column, failure.value, setting)
-                    )
-        for number, of_range in rows.items():
-            driven = np.array([setting for _, _, _, setting in of_range])
-            robustness = ranges[number].robustness(driven, REPAIR_STAGE)
-            for (row, column, value, _), left in zip(
-                of_range, robustness.tolist(), strict=True
-            ):
-                if left < 0:
-                    below = self.values[self.values < value].tolist()
-                    most = max(
-                        below,
-                        default=-np.inf,
-                    )
-                    bounds[row][column] = min(bounds[row][column], most)
+            for failure, column in product(failures[row], of_car):
+                repaired = cars[row].with_value_of(column, original)
+                setting = failure.setting.copy()
+                vehicle = setting[: len(original)]
+                np.clip(vehicle, repaired.lower, repaired.upper, out=vehicle)
+                of_range = repairs.setdefault(id(failure.encounters), [])
+                of_range.append((row, column, failure, setting))
+        for of_range in repairs.values():
+            encounters = of_range[0][2].encounters
+            settings = np.array([setting for *_, setting in of_range])
+            is_unsafe = encounters.robustness(settings, REPAIR_STAGE) < 0
+            for row, column, failure, _ in compress(of_range, is_unsafe):
+                values = self.values[self.values < failure.value].tolist()
+                bound = max(values, default=-np.inf)
+                bounds[row][column] = min(bounds[row][column], bound)
 
 
 def cars_of(vehicle: CharacteristicSet, fleet: Fleet) -> list[Cars]:
@@ -308,49 +328,3 @@ def cars_of(vehicle: CharacteristicSet, fleet: Fleet) -> list[Cars]:
         fleet.measured[..., np.newaxis], ends, fleet.settings[..., np.newaxis]
     )
     return [Cars.measured(*car.T) for car in ends]
-
-
-class WorstEnd(NamedTuple):
-    """The assumed value of a car that lowers its speed most at an end of its domain: the name of
-    the characteristic, the end as text, and the value at which the car is unsafe then.
-    """
-
-    name: str
-    text: str
-    value: float
-
-    def sentence(self, span: Span) -> Sentence:
-        """That this value matters most."""
-        value = span.text(max(self.value, span.low))
-        return words.WORST_END(
-            end=f"{self.name} {self.text}",
-            value=value,
-        )
-
-
-def worst_end(
-    search: PermitSearch,
-    vehicle: CharacteristicSet,
-    car: Cars,
-    is_measured: BoolArray,
-    permit: Permit,
-) -> WorstEnd | None:
-    """The worst end of a car; None where nothing is assumed, the car may not drive as it is, or no
-    end lowers its speed on the grid.
-    """
-    if permit.up_to is None or is_measured.all():
-        return None
-
-    # Each assumed value at either end, all others as they are worst. Any failure shows that the car
-    # may drive no faster, so the grid up to its own speed is enough, with the set that limits it.
-    limiting = permit.least.failure
-    own = car.lower if limiting is None else limiting.setting[: len(vehicle)]
-    is_one = np.eye(len(vehicle), dtype=bool)[~is_measured]
-    sides = [np.where(is_one, end, own) for end in (vehicle.lower, vehicle.upper)]
-    failure = search.worst_end(Cars(own, own, np.vstack(sides)), permit)
-    worst = own if failure is None else failure.setting[: len(vehicle)]
-    if failure is None or (worst == own).all():
-        return None
-    column = np.argmax(worst != own)
-    item = vehicle.members[column]
-    return WorstEnd(item.name, f"{worst[column]:{EXACT}}{item.suffix}", failure.value)

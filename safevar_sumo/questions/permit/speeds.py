@@ -32,7 +32,8 @@ cars.
 """
 EFFICIENT = 512
 """Number of cars times values that fill a batch: a smaller one costs hardly less."""
-GENERATION, MORE = 512, 1
+GENERATION = 512
+MORE = 1
 """Number of cases of a generation of the search for counterexamples, and the generations that
 follow the first with an unsafe case.
 """
@@ -77,11 +78,12 @@ class Cars(NamedTuple):
         points = np.concatenate([np.round(points), points])
         return cls(lower, upper, np.unique(lower + points * (upper - lower), axis=0))
 
-    def with_value_of(self, column: int, other: FloatArray) -> Cars:
-        """A car with one of its values as in another car, such as the original."""
-        lower, upper, vehicles = (values.copy() for values in self)
-        for values in (lower, upper, vehicles):
-            values[..., column] = other[column]
+    def with_value_of(self, column: int, model: FloatArray) -> Cars:
+        """A car with one of its values as in a model, such as the original."""
+        fields = [values.copy() for values in self]
+        for values in fields:
+            values[..., column] = model[column]
+        lower, upper, vehicles = fields
         return Cars(lower, upper, np.unique(vehicles, axis=0))
 
     @property
@@ -156,7 +158,7 @@ class SpeedSearch:
         self._size = len(cars[0].lower)
         members = [encounters.model.characteristics for encounters in ranges]
         self._axes = max(map(len, members)) - self._size
-        self._met: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in cars]
+        self._judged: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in cars]
 
     def up_to(self, car: int) -> float | None:
         """The greatest value of the grid below the limiting failure of a car, at most its cap; None
@@ -175,24 +177,23 @@ class SpeedSearch:
         """Have all cars meet the encounters of the grid, from low values to high ones, each up to
         the first block in which it fails.
         """
-        rest = self._values
-        while len(rest):
+        values = self._values
+        while len(values):
             alive = [
                 car
                 for car, failure in enumerate(self.failures)
-                if failure is None and rest[0] <= self._caps[car]
+                if failure is None and values[0] <= self._caps[car]
             ]
             vehicles = sum(self._cars[car].together for car in alive)
             size = max(BLOCK, EFFICIENT // max(vehicles, 1))
-            block, rest = rest[:size], rest[size:]
-            places = self._places(block)
+            places = self._places(values[:size])
+            values = values[size:]
             if alive and len(places):
                 cases = [self._cases(car, places) for car in alive]
-                sizes = [len(of_car) for of_car in cases]
-                robustness = self._judge(np.concatenate(cases))
-                parts = np.split(robustness, np.cumsum(sizes)[:-1])
-                for met in zip(alive, cases, parts, strict=True):
-                    self._note(*met)
+                ends = np.cumsum([*map(len, cases)])[:-1]
+                parts = np.split(self._judge(np.concatenate(cases)), ends)
+                for car, of_car, robustness in zip(alive, cases, parts, strict=True):
+                    self._note(car, of_car, robustness)
 
     def _places(self, block: FloatArray) -> FloatArray:
         """The numbers of tests, and their places at the values of a block, shape (P, 2 + k). The
@@ -223,39 +224,37 @@ class SpeedSearch:
     def _judge(self, cases: FloatArray) -> FloatArray:
         """What each of M cases leaves to the limit, shape (M,)."""
         robustness = np.zeros(len(cases))
-        for number, rows in self._by_test(cases):
-            encounters = self._ranges[number]
-            settings = self._settings(number, cases[rows])
+        for encounters, rows, settings in self._in_tests(cases):
             robustness[rows] = encounters.robustness(settings, self._stage)
         return robustness
 
-    def _by_test(self, cases: FloatArray) -> Iterator[tuple[int, IntArray]]:
-        """The number of each test that cases meet, and their rows."""
+    def _in_tests(
+        self, cases: FloatArray
+    ) -> Iterator[tuple[EncounterRange, IntArray, FloatArray]]:
+        """The tests that cases meet, each with their rows and their settings there."""
         numbers = np.floor(cases[:, self._size]).astype(int)
         for number in np.unique(numbers).tolist():
-            yield number, np.flatnonzero(numbers == number)
-
-    def _settings(self, number: int, cases: FloatArray) -> FloatArray:
-        """The settings of cases of a test."""
-        vehicles, places = cases[:, : self._size], cases[:, self._size + 1 :]
-        return self._ranges[number].settings(vehicles, places)
+            rows = np.flatnonzero(numbers == number)
+            vehicles, places = np.split(cases[rows], [self._size], axis=1)
+            encounters = self._ranges[number]
+            yield encounters, rows, encounters.settings(vehicles, places[:, 1:])
 
     def _note(self, car: int, cases: FloatArray, robustness: FloatArray) -> bool:
         """Keep what a car met, and its failure at the least value, of several the worst; whether it
         fails.
         """
-        self._met[car].append((cases, robustness))
-        unsafe, left = cases[robustness < 0], robustness[robustness < 0]
-        for number, rows in self._by_test(unsafe):
-            encounters = self._ranges[number]
-            settings = self._settings(number, unsafe[rows])
+        self._judged[car].append((cases, robustness))
+        unsafe = np.flatnonzero(robustness < 0)
+        for encounters, rows, settings in self._in_tests(cases[unsafe]):
             values = encounters.values_in(settings)
-            first = np.lexsort((left[rows], values))[0]
-            least = float(values[first]), float(left[rows][first])
-            known = self.failures[car]
-            if known is None or least < (known.value, known.robustness):
+            degrees = robustness[unsafe[rows]]
+            row = np.lexsort((degrees, values))[0]
+            value = float(values[row])
+            degree = float(degrees[row])
+            former = self.failures[car]
+            if former is None or (value, degree) < (former.value, former.robustness):
                 self.failures[car] = LimitingFailure(
-                    least[0], encounters, settings[first], least[1]
+                    value, encounters, settings[row], degree
                 )
         return len(unsafe) > 0
 
@@ -288,7 +287,8 @@ class SpeedSearch:
 
     def _search(self, car: int, budget: int, attempt: int) -> Generations:
         """The search for counterexamples to the value of a car."""
-        up_to, cars = self.up_to(car), self._cars[car]
+        up_to = self.up_to(car)
+        cars = self._cars[car]
         assert up_to is not None
         number = sum(encounters.low <= up_to for encounters in self._ranges)
         ends = np.array([np.zeros(2 + self._axes), np.ones(2 + self._axes)])
@@ -299,12 +299,11 @@ class SpeedSearch:
         )
 
         # The worst cases so far, up to this value.
-        cases = np.concatenate([cases for cases, _ in self._met[car]])
-        robustness = np.concatenate([left for _, left in self._met[car]])
+        cases, robustness = map(np.concatenate, zip(*self._judged[car], strict=True))
         is_inside = (cases >= space.lower) & (cases <= space.upper)
         robustness = np.where(is_inside.all(axis=1), robustness, np.inf)
         worst = np.argsort(robustness, kind="stable")[:PARENTS]
-        known = cases[worst[np.isfinite(robustness[worst])]]
+        starts = cases[worst[np.isfinite(robustness[worst])]]
         fit = self._ranges[0].model.fit
         rng = Stream.PERMIT.generator(cars.number, fit, attempt)
-        return generations_of(space, known, SearchPlan(budget, GENERATION, MORE), rng)
+        return generations_of(space, starts, SearchPlan(budget, GENERATION, MORE), rng)
