@@ -55,17 +55,15 @@ def find_boundaries(
     high = np.ones(len(lines))
     for number in parts:
         # The bounds between equal parts of what is left of each line.
-        shares = (
-            low[:, np.newaxis]
-            + (high - low)[:, np.newaxis] * np.arange(number + 1) / number
-        )
-        shares[:, -1] = high  # without a rounding error
+        width = (high - low)[:, np.newaxis]
+        shares = low[:, np.newaxis] + width * np.arange(number + 1) / number
+        # Without a rounding error.
+        shares[:, -1] = high
         bounds = on_lines(starts, ends, shares[:, 1:-1])
-        tested = are_unsafe(bounds.reshape(-1, starts.shape[1])).reshape(
-            len(lines), number - 1
-        )
+        is_unsafe = np.ones((len(lines), number), dtype=bool)
+        tested = are_unsafe(bounds.reshape(-1, starts.shape[1]))
+        is_unsafe[:, :-1] = tested.reshape(len(lines), number - 1)
         # Of these parts the one below the first unsafe bound is left.
-        is_unsafe = np.column_stack([tested, np.ones(len(lines), dtype=bool)])
         first_unsafe = np.argmax(is_unsafe, axis=1)
         low = shares[lines, first_unsafe]
         high = shares[lines, first_unsafe + 1]
@@ -91,21 +89,7 @@ class Alone(NamedTuple):
 
     lower: FloatArray
     upper: FloatArray
-    beyond: Mapping[Side, FloatArray] = {}
-
-    def without(
-        self,
-        cases: FloatArray,
-        center: FloatArray,
-    ) -> Alone:
-        """Limits that leave no room on the sides where some cases are."""
-        vehicles = cases[:, : len(center)]
-        is_below = (vehicles < center).any(axis=0)
-        is_above = (vehicles > center).any(axis=0)
-        return self._replace(
-            lower=np.where(is_below, center, self.lower),
-            upper=np.where(is_above, center, self.upper),
-        )
+    breaches: Mapping[Side, FloatArray] = {}
 
 
 def scan_alone(
@@ -127,18 +111,18 @@ def scan_alone(
     number = len(encounters)
     originals = np.hstack([np.tile(center, (number, 1)), encounters])
     starts = np.tile(originals, (len(columns), 1))
-    lasts = starts.copy()
-    rows = np.arange(len(lasts))
-    lasts[rows, columns.repeat(number)] = ends[columns, sides].repeat(number)
+    stops = starts.copy()
+    rows = np.arange(len(stops))
+    stops[rows, columns.repeat(number)] = ends[columns, sides].repeat(number)
 
     # The first unsafe value of each line; the value before it is safe.
     lines = find_boundaries(
         starts,
-        lasts,
+        stops,
         lambda cases: judge(cases) < 0,
         [values],
     )
-    fails = np.flatnonzero((judge(lasts) < 0) | (lines.unsafe_shares < 1))
+    fails = np.flatnonzero((judge(stops) < 0) | (lines.unsafe_shares < 1))
     passed = np.rint(lines.safe_shares[fails] * values)
     lowest = passed / (passed + 1)
     return limits_before(
@@ -171,16 +155,16 @@ def limits_before(
         lowest,
     )
     ends = np.stack([limits.lower, limits.upper])
-    beyond = {**limits.beyond}
+    breaches = {**limits.breaches}
     for safe, failure in zip(lines.safe, lines.unsafe, strict=True):
         (column,) = np.flatnonzero(failure[: star.size] != center).tolist()
         side = int(failure[column] > center[column])
         sign = 2 * side - 1
         if sign * safe[column] < sign * ends[side, column]:
             ends[side, column] = safe[column]
-            beyond[side, column] = failure
+            breaches[side, column] = failure
     lower, upper = ends
-    return Alone(lower, upper, beyond)
+    return Alone(lower, upper, breaches)
 
 
 def search_alone(
@@ -205,7 +189,14 @@ def search_alone(
             unsafe,
             parts,
         )
-    return limits.without(unsafe, _center_of(star))
+
+    # No room is left on the sides where unsafe cases are.
+    center = _center_of(star)
+    vehicles = unsafe[:, : star.size]
+    return limits._replace(
+        lower=np.where((vehicles < center).any(axis=0), center, limits.lower),
+        upper=np.where((vehicles > center).any(axis=0), center, limits.upper),
+    )
 
 
 def _center_of(star: Space) -> FloatArray:

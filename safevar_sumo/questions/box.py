@@ -60,14 +60,6 @@ class Box:
         )
 
 
-class Judgement(NamedTuple):
-    """Which of M settings are unsafe, which could not be simulated, and which count, shape (M,)."""
-
-    unsafe: BoolArray
-    failed: BoolArray
-    counted: BoolArray
-
-
 class Proof(NamedTuple):
     """`failures` of `samples` settings drawn after the box was chosen, and those that could not be
     simulated; at most the share `at_most` of all is unsafe or cannot be simulated, with
@@ -94,12 +86,13 @@ def _error_of(attempt: int) -> float:
 
 def prove(
     draw: Callable[[int], FloatArray],
-    judge: Callable[[FloatArray], Judgement],
+    judge: Callable[[FloatArray], FloatArray],
     share: float,
     attempt: int,
-) -> tuple[Proof, FloatArray]:
-    """Test with settings drawn anew that at most `share` of all are unsafe: the proof, and the
-    unsafe settings.
+) -> Proof:
+    """Test with settings drawn anew that at most `share` of all are unsafe. The judge says what
+    each of M settings leaves to the limit in E encounters, shape (M, E): NaN where it could not be
+    simulated, infinite where it does not count.
 
     Notes
     -----
@@ -113,18 +106,20 @@ def prove(
     `CONFIDENCE`: it is smaller than `share`, and a box between both passes as safe by no later
     test, whose bound is `share`.
     """
-    import scipy  # takes longer to load than a simulation
+    # It takes longer to load than a simulation.
+    import scipy
 
     # Samples enough for the bound, if all are safe.
     error = _error_of(attempt)
     settings = draw(proof_size(attempt, share))
-    judgement = judge(settings)
-    is_unsafe = judgement.unsafe & judgement.counted
+    robustness = judge(settings)
+    is_unsafe = (robustness < 0).any(axis=1)
+    has_failed = np.isnan(robustness).any(axis=1)
 
     # An upper bound on the share, where a failed simulation counts as unsafe.
-    samples = int(np.count_nonzero(judgement.counted))
+    samples = int(np.count_nonzero((robustness < np.inf).any(axis=1) | has_failed))
     failures = int(np.count_nonzero(is_unsafe))
-    not_simulated = int(np.count_nonzero(judgement.failed & judgement.counted))
+    not_simulated = int(np.count_nonzero(has_failed & ~is_unsafe))
     safe = samples - failures - not_simulated
     if attempt == 1 and safe == len(settings):
         error = 1 - CONFIDENCE
@@ -133,4 +128,4 @@ def prove(
         if safe
         else 1.0
     )
-    return Proof(samples, failures, at_most, not_simulated), settings[is_unsafe]
+    return Proof(samples, failures, at_most, not_simulated)

@@ -26,7 +26,8 @@ N_SIMILAR_POINTS = 4
 """Number of similar points that the error about an unknown point lists."""
 OPTION = "up_to"
 FORM = "NAME=V: an axis of the study's encounters, and a number"
-PARTS, DECIMALS = 5, 9
+PARTS = 5
+DECIMALS = 9
 """Number of parts of a searched range, and decimals of their ends, within the limits up to which
 those up to larger values lie.
 """
@@ -185,7 +186,8 @@ def _ranges_up_to(study: Study, name: str, high: float) -> Study:
         axis = axes.get(name)
         if axis is None or axis.range is None or axis.range.upper <= high:
             return {**axes}
-        if axis.range.lower >= high:  # a list may end where the range begins
+        # A list may end where the range begins.
+        if axis.range.lower >= high:
             return {**axes, name: axis.at}
         original = min(axis.range.original, high)
         return {**axes, name: replace(axis, upper=high, original=original)}
@@ -219,8 +221,12 @@ def _lists_up_to(study: Study, name: str, high: float) -> Study:
             if values_up_to and max(values) > high:
                 values_up_to = sorted({*values_up_to, high})
         if values_up_to:
-            tests.append(_with_list(study, test, name, values_up_to))
-    low, highest = min(all_values), max(all_values)
+            axis = study.axes_of(test)[name]
+            is_plain = axis.range is None
+            listed = values_up_to if is_plain else replace(axis, at=values_up_to)
+            tests.append(replace(test, over={**test.over, name: listed}))
+    low = min(all_values)
+    highest = max(all_values)
     if not low <= high <= highest:
         raise InputError(
             OPTION,
@@ -228,15 +234,6 @@ def _lists_up_to(study: Study, name: str, high: float) -> Study:
             f"a value from {low:g} to {highest:g}{unit}",
         )
     return study.with_tests(tests)
-
-
-def _with_list(
-    study: Study, test: MatrixTest, name: str, values: list[float]
-) -> MatrixTest:
-    """A test with other values of an axis."""
-    axis = replace(study.axes_of(test)[name], at=values)
-    is_plain = axis.range is None
-    return replace(test, over={**test.over, name: values if is_plain else axis})
 
 
 def _values(study: Study, test: MatrixTest, name: str) -> Sequence[float]:

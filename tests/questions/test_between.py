@@ -102,8 +102,8 @@ def test_what_cannot_be_simulated_or_is_infeasible_leaves_everything() -> None:
     cases = product_of(vehicles, encounter[np.newaxis])
     assert oracle(cases).tolist() == [np.inf, np.inf, -1.5, -0.25, 2.5]
     assert oracle.available == 10 - 4, "those that satisfy the constraint"
-    assert oracle.with_failed(cases[:3]).tolist() == [-np.inf, np.inf, -1.5]
-    assert np.isnan(oracle.measure(cases[:1])).all()
+    assert oracle(cases[:3], 7).tolist() == [7, np.inf, -1.5]
+    assert np.isnan(oracle(cases[:1], np.nan)).all()
     assert oracle.available == 3
     with pytest.raises(Exhausted):
         oracle(cases[:4])

@@ -355,9 +355,9 @@ def test_a_scan_meets_each_value_in_each_encounter_and_a_limit_ends_in_the_worst
     assert len(scanned) == 3 * 2 * 10, "three sides may move"
     assert {*np.diff(np.unique(scanned[:, 0]))} == {0.5}
     assert [len(rows) for rows in cases[2:]] == [3, 3]
-    failure = limits.beyond[1, 0]
+    failure = limits.breaches[1, 0]
     assert failure.tolist() == [6.125, 5, 0, 0, 0]
-    assert limits.beyond[0, 1].tolist() == [5, 0.875, 0, 0, 1]
+    assert limits.breaches[0, 1].tolist() == [5, 0.875, 0, 0, 1]
 
 
 def test_what_a_search_keeps_is_the_worst_that_counts() -> None:

@@ -13,7 +13,7 @@ from safevar_sumo import tolerance
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.box import Box, Judgement, prove
+from safevar_sumo.questions.box import Box, prove
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.tolerance import boxes
@@ -153,31 +153,29 @@ def test_the_bound_of_the_box_holds_where_every_box_is_as_unsafe() -> None:
     """
     q, wrong, seeds, region = 0.031, 0, 100, region_of(made_up_study(2))
 
-    def judge(settings: FloatArray) -> Judgement:
-        is_unsafe = np.log(np.abs(settings[:, 0] - 5) + 1e-99) * 1e6 % 1 < q
-        return Judgement(is_unsafe, np.zeros_like(is_unsafe), np.ones_like(is_unsafe))
+    def judge(settings: FloatArray) -> FloatArray:
+        return np.log(np.abs(settings[:, :1] - 5) + 1e-99) * 1e6 % 1 - q
 
     for seed in range(seeds):
         for attempt in range(1, 12):
             box = Box(region, np.full(2, attempt / 3), np.full(2, 10 - attempt / 3))
             rng = np.random.default_rng((seed, attempt))
-            proof, found = prove(
+            proof = prove(
                 lambda number, box=box, rng=rng: box.draw(number, rng),
                 judge,
                 0.03,
                 attempt,
             )
-            if not len(found):
+            if not proof.failures:
                 wrong += proof.at_most < q
                 break
     assert 0 < wrong <= 0.05 * seeds
 
 
 def test_the_bound_of_a_first_test_without_failure_is_one_sided() -> None:
-    none = np.zeros(1228, dtype=bool)
-    proof, _ = prove(
+    proof = prove(
         lambda number: np.zeros((number, 2)),
-        lambda _: Judgement(none, none, ~none),
+        lambda _: np.zeros((1228, 1)),
         0.003,
         1,
     )
@@ -229,8 +227,8 @@ def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> N
         [0, pytest.approx(7, abs=0.15)],
         [pytest.approx(-3, abs=0.15), 10],
     )
-    ((side, column),) = limits.beyond
-    case = limits.beyond[side, column]
+    ((side, column),) = limits.breaches
+    case = limits.breaches[side, column]
     assert corner(case[np.newaxis, :3])[0]
     is_within = (case[:3] >= ends[0]) & (case[:3] <= ends[1])
     assert is_within.tolist() == [number != column for number in range(3)]
@@ -258,7 +256,7 @@ def test_few_simulations_claim_nothing_of_a_set_that_they_do_not_reach() -> None
 def test_few_simulations_are_shared_between_limits_alone_and_the_box() -> None:
     evaluator = made_up_evaluator(4, nowhere)
     effort = effort_of(evaluator, 3000, 4)
-    assert (effort.values, effort.alone, effort.own) == (8, 0, 300)
+    assert (effort.values, effort.alone, effort.cases) == (8, 0, 300)
     on_lines = effort.encounters * (effort.values + sum(effort.box.parts))
     assert 300 < 8 * on_lines <= 0.15 * 3000
     assert (effort.corners, effort.confirmations, effort.share) == (0, 2, 1)
@@ -267,7 +265,7 @@ def test_few_simulations_are_shared_between_limits_alone_and_the_box() -> None:
     assert usual_alone(evaluator) == 4 * usual_alone(evaluator, 1) == 4 * 5000
     evaluator.account.effort = 1 / 8
     quick = effort_of(evaluator, np.inf, 4)
-    assert (quick.values, quick.own, quick.other) == (12, 625, 125)
+    assert (quick.values, quick.cases, quick.cases_of_set) == (12, 625, 125)
     evaluator.account.effort = 1 / 64
     assert effort_of(evaluator, np.inf, 4).values == 8, "fewer show no limit"
 

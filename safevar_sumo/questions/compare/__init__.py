@@ -74,7 +74,9 @@ from safevar_sumo.questions.words import UNSAFE_MEANS, counted_in_words, join_ph
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import limits_of
 
-RELEASE, DO_NOT_RELEASE, DECIDE = "RELEASE", "DO NOT RELEASE", "DECIDE"
+RELEASE = "RELEASE"
+DO_NOT_RELEASE = "DO NOT RELEASE"
+DECIDE = "DECIDE"
 MAX_REASONS = 3
 """Largest number of differences that the verdict names."""
 PAIR_COLUMNS = shipped_columns("compare")["pairs"]
@@ -82,16 +84,22 @@ PAIR_COLUMNS = shipped_columns("compare")["pairs"]
 
 @question
 @contents(
-    *("decision", "unsafe", "margin", "settings", *UNSAFE_IN.values(), "p", "a12"),
-    *(
-        "better_in",
-        "worse_in",
-        "limits_grown",
-        "limits_shrunk",
-        "outside",
-        "not_simulated",
-    ),
-    *(*ENDS, "metres_earlier", "metres_later"),
+    "decision",
+    "unsafe",
+    "margin",
+    "settings",
+    *UNSAFE_IN.values(),
+    "p",
+    "a12",
+    "better_in",
+    "worse_in",
+    "limits_grown",
+    "limits_shrunk",
+    "outside",
+    "not_simulated",
+    *ENDS,
+    "metres_earlier",
+    "metres_later",
     *(f"{side}_{name}" for side in SIDES for name in ("gap", "needless_braking")),
     "benign_scenes",
     lead="summary",

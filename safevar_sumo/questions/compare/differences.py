@@ -44,6 +44,8 @@ GROWN = "grown"
 SHRUNK = "shrunk"
 BOTH = "both"
 SAME = "the same"
+CHANGES = (SAME, GROWN, SHRUNK, BOTH)
+"""What becomes of an interval: it grows (1), it shrinks (2), or it does both (3)."""
 UNDEFINED = (np.nan, np.nan)
 """The ends of no interval."""
 MAX_LIMITS_NAMED = 3
@@ -130,15 +132,16 @@ def limits_of_both(
     """The table of limits alone with the study's own set, as in `tolerance`, within the user's
     limits; no interval where the original is unsafe.
     """
-    requests = [
-        _asked_alone(side, unsafe, at_tests=at_tests)
-        for side, unsafe in zip(evaluators, criteria, strict=True)
-    ]
+    vehicles = [side.characteristics.vehicle for side in evaluators]
+    requests = list[Asked]()
+    for side, unsafe, vehicle in zip(evaluators, criteria, vehicles, strict=True):
+        models = Models((Model(0, side, unsafe),), ())
+        columns = range(len(vehicle))
+        requests.append(asked_of(models, unsafe, columns, {}, at_tests=at_tests))
     # Few simulations search both alike: what the first one takes does not shrink the second.
-    effort = min(requests, key=lambda request: request.effort.own).effort
+    effort = min(requests, key=lambda request: request.effort.cases).effort
     alone = [_safe_alone(request._replace(effort=effort)) for request in requests]
     rows = []
-    vehicles = [side.characteristics.vehicle for side in evaluators]
     for a, b, *safe in zip(*vehicles, *alone, strict=True):
         in_a, in_b = (
             _within(interval, within(limits, a.name, side.study.domains[a.name]))
@@ -156,16 +159,10 @@ def limits_of_both(
     )
 
 
-def _asked_alone(evaluator: Evaluator, unsafe: Unsafe, *, at_tests: bool) -> Asked:
-    """The limits alone that are sought in a system."""
-    models = Models((Model(0, evaluator, unsafe),), ())
-    columns = range(len(evaluator.characteristics.vehicle))
-    return asked_of(models, unsafe, columns, {}, at_tests=at_tests)
-
-
 def _safe_alone(request: Asked) -> list[Interval | None]:
     """What is safe of each characteristic alone, rounded inwards; None if the original is not."""
-    model, members = request.oracle.own, request.oracle.vehicle.members
+    model = request.oracle.own
+    members = request.oracle.vehicle.members
     if model.are_unsafe(model.characteristics.original_settings, "original vehicle")[0]:
         return [None] * len(members)
     alone = alone_with_own_set(request, Alone(request.lower, request.upper))
@@ -180,13 +177,12 @@ def _within(safe: Interval | None, ends: Interval) -> Interval | None:
 
 def _change_of(a: Interval | None, b: Interval | None) -> str:
     """What becomes of A's interval in B."""
-    if a is None or b is None:
-        return SAME if a is b else (GROWN if a is None else SHRUNK)
-    grows = b[0] < a[0] or b[1] > a[1]
-    shrinks = b[0] > a[0] or b[1] < a[1]
-    return {(True, True): BOTH, (True, False): GROWN, (False, True): SHRUNK}.get(
-        (grows, shrinks), SAME
-    )
+    grows = b is not None
+    shrinks = a is not None
+    if a and b:
+        grows = b[0] < a[0] or b[1] > a[1]
+        shrinks = b[0] > a[0] or b[1] < a[1]
+    return CHANGES[grows + 2 * shrinks]
 
 
 def compare_limits(

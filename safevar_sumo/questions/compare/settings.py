@@ -149,11 +149,11 @@ class CommonDomain(NamedTuple):
 
     def as_in_b(self, settings: FloatArray) -> FloatArray:
         """A's settings as B's: the same changes of the other original vehicle."""
-        return np.where(self.shift == 0, settings, settings + self.shift)
+        return settings + self.shift
 
     def as_in_a(self, settings: FloatArray) -> FloatArray:
         """B's settings as A's."""
-        return np.where(self.shift == 0, settings, settings - self.shift)
+        return settings - self.shift
 
     def holds(self, settings: FloatArray) -> BoolArray:
         """Which settings, shape (2, M, n), are in both domains, shape (M,)."""

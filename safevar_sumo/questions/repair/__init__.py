@@ -46,7 +46,8 @@ from safevar_sumo.study import SCHEMA_LINE, Study, study_names, write_study
 
 ROUNDS_STAGE = "smallest change that survives"
 """The phase of progress."""
-USUAL_ROUNDS, OF_ROUND = 8, 2
+USUAL_ROUNDS = 8
+OF_ROUND = 2
 """Its usual number of rounds; in a round, changes meet the cases of this number of searches for a
 counterexample, and of another one for each test.
 """
@@ -60,17 +61,17 @@ CAUSES_OF = 4
 
 @question
 @contents(
-    *(
-        "unsafe",
-        "margin",
-        "promise",
-        "worst_today",
-        "kept_today",
-        "repairs",
-        "not_repairable",
-        "simulations",
-    ),
-    *("rough", "fits", "fits_tried"),
+    "unsafe",
+    "margin",
+    "promise",
+    "worst_today",
+    "kept_today",
+    "repairs",
+    "not_repairable",
+    "simulations",
+    "rough",
+    "fits",
+    "fits_tried",
     lead="repairs",
     repairs=REPAIRS,
 )
@@ -123,13 +124,13 @@ def repair(
     """
     study = evaluator.study
     evaluator.system.require("a driving system", "repair")
-    if out is not None and quick:
-        raise InputError(
-            "quick",
-            f"a rough repair is not written to {out}",
-            "--quick without --out, or --out without --quick",
-        )
     if out is not None:
+        if quick:
+            raise InputError(
+                "quick",
+                f"a rough repair is not written to {out}",
+                "--quick without --out, or --out without --quick",
+            )
         _check_file(Path(out), study)
     criterion = evaluator.checked(unsafe or Unsafe())
     check_margin(criterion, margin)
@@ -149,13 +150,13 @@ def repair(
     rounds = searches * problem.budget / len(evaluator.system.points)
     usual = round(rounds + MOST_CHANGED * usual_test(problem, len(models.members)))
     evaluator.begin({ROUNDS_STAGE: usual}, least=usual)
-    first, is_repairable = _worst_first(problem, _first_cases(problem, subject))
+    cases_today, is_repairable = _worst_first(problem, _first_cases(problem, subject))
     survivors = Survivors([], len(models.members), ())
     if is_repairable.any():
         with evaluator.phases.stage(ROUNDS_STAGE):
-            survivors = find_survivors(problem, models.fits, first[is_repairable])
-    worst = problem.outcome_today(first[np.argmax(is_repairable)])
-    not_repairable = _not_repairable(problem, first[~is_repairable])
+            survivors = find_survivors(problem, models.fits, cases_today[is_repairable])
+    worst = problem.outcome_today(cases_today[np.argmax(is_repairable)])
+    not_repairable = _not_repairable(problem, cases_today[~is_repairable])
     answer = answer_of(problem, models, survivors, worst, not_repairable)
     if out is not None and answer.numbers["repairs"]:
         write_repair(Path(out), answer)
@@ -175,20 +176,20 @@ def _first_cases(problem: RepairProblem, subject: Subject) -> FloatArray:
         rows = subject.solutions[problem.unsafe.rows(subject.solutions)]
         failures = rows[list(members.names)].to_numpy(dtype=float)
         failures = failures[promise.holds(failures)]
-    settings = np.vstack(
-        [members.original, promise.at(np.round(points)), promise.at(points)]
-    )
+    points = np.vstack([np.round(points), points])
+    settings = np.vstack([members.original, promise.at(points)])
     settings = np.vstack([settings[promise.holds(settings)], failures])
     vehicles = np.unique(settings[:, : problem.size], axis=0)
     listed = product_of(vehicles, problem.encounters)
-    own = problem.cases_of(failures)
-    cases = np.vstack([listed, own[problem.counts(own)]])
+    cases = problem.cases_of(failures)
+    cases = np.vstack([listed, cases[problem.counts(cases)]])
     if not len(cases):
-        kept = f"keeps {problem.unsafe.keep:g} m" if problem.unsafe.keep else "is safe"
+        keep = problem.unsafe.keep
+        demand = f"keeps {keep:g} m" if keep else "is safe"
         study = problem.study
         raise InputError(
             study.source,
-            f"{study.name!r}: the new vehicle {kept} in none of the tested encounters",
+            f"{study.name!r}: the new vehicle {demand} in none of the tested encounters",
             "a smaller --margin, or narrower ranges of the axes",
         )
     return cases

@@ -26,6 +26,9 @@ NEEDLESS_BRAKE = 0.1
 speed.
 """
 
+OF_BRAKING = ("metres_earlier", "metres_earlier_mean", "seconds_earlier", "most_at")
+"""How much earlier a vehicle brakes, and at which point most."""
+
 
 def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonObject:
     """The price of other values of parameters against today's, by the names of the answer's
@@ -37,22 +40,21 @@ def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonO
     onsets_today, _ = drive_new_cars(today, encounters)
     onsets, deceleration = drive_new_cars(changed, encounters)
     benign = benign_scenes(study, today)
-    before = needless_braking(today, benign)
-    after = needless_braking(changed, benign)
+    needless_today = needless_braking(today, benign)
+    needless = needless_braking(changed, benign)
     metres, seconds = onsets_today - onsets
     braked = np.flatnonzero(np.isfinite(metres))
-    most = int(braked[np.argmax(metres[braked])]) if len(braked) else None
-    return {
-        "metres_earlier": None if most is None else float(metres[most]),
-        "metres_earlier_mean": None if most is None else float(np.mean(metres[braked])),
-        "seconds_earlier": None if most is None else float(seconds[most]),
-        "most_at": None
-        if most is None
-        else today.points[most // len(encounters)].name or None,
+    price: JsonObject = dict.fromkeys(OF_BRAKING)
+    if len(braked):
+        row = braked[np.argmax(metres[braked])]
+        point = today.points[row // len(encounters)].name or None
+        earlier = (metres[row], np.mean(metres[braked]), seconds[row])
+        price = dict(zip(OF_BRAKING, (*map(float, earlier), point), strict=True))
+    return price | {
         "largest_deceleration": deceleration,
-        "needless_braking": sum(after) if after else None,
-        "needless_braking_today": sum(before) if before else None,
-        "benign_scenes": len(after),
+        "needless_braking": sum(needless) if needless else None,
+        "needless_braking_today": sum(needless_today) if needless else None,
+        "benign_scenes": len(needless),
     }
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -70,11 +71,9 @@ class Parameter(NamedTuple):
         digits = DIGITS + max(
             0, int(np.log10(max(abs(lower), abs(upper)) / (upper - lower)))
         )
-        exact = (
-            lower * (upper / lower) ** shares
-            if self.range.log
-            else lower + shares * (upper - lower)
-        )
+        exact = lower + shares * (upper - lower)
+        if self.range.log:
+            exact = lower * (upper / lower) ** shares
         distinct, row_of = np.unique(exact, return_inverse=True)
         return np.clip(
             [float(f"{value:.{digits}g}") for value in distinct.tolist()], lower, upper
@@ -207,8 +206,9 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
             )
     ads = assemble(study).ads
     parameters = []
-    for name in (name for name in table if name in (names or table)):
-        row = table[name]
+    for name, row in table.items():
+        if name not in (names or table):
+            continue
         today = study.ads.parameters.get(name, getattr(ads, name, None))
         number = float(today) if isinstance(today, int | float) else math.nan
         if table is shipped:
@@ -295,11 +295,9 @@ class RepairProblem:
     def changed_values(self, change: FloatArray) -> NamedValues:
         """The values of the parameters that a change, one set of shape (P,), changes, by name."""
         (values,) = self.values(change[np.newaxis]).tolist()
-        names = [parameter.name for parameter in self.parameters]
-        return {
-            names[column]: values[column]
-            for column in np.flatnonzero(change != self.today)
-        }
+        pairs = zip(self.parameters, values, strict=True)
+        changed = compress(pairs, change != self.today)
+        return {parameter.name: value for parameter, value in changed}
 
     @cached_property
     def arrays(self) -> bool:
@@ -371,9 +369,9 @@ class RepairProblem:
         for number, rows, settings in self.oracle.in_worlds(cases):
             model = self.oracle.worlds[number].model
             runs = self.evaluate(model, shares, settings, stage)
-            left = np.where(runs.valid, model.unsafe.robustness(runs), -np.inf)
-            left[runs.infeasible] = np.inf
-            robustness[:, rows] = left.reshape(len(shares), -1)
+            of_world = np.where(runs.valid, model.unsafe.robustness(runs), -np.inf)
+            of_world[runs.infeasible] = np.inf
+            robustness[:, rows] = of_world.reshape(len(shares), -1)
         return robustness
 
     def robustness_with(
@@ -407,11 +405,10 @@ class RepairProblem:
             world = self.oracle.worlds[number]
             if world.test is not None:
                 is_counted[rows] &= self._is_listed(world, settings)
-        others = np.flatnonzero(~is_counted)
-        originals = cases[others]
+        originals = cases[~is_counted]
         originals[:, : self.size] = self.oracle.vehicle.original
         robustness = self.robustness_with(self.today, originals, "new vehicles")
-        is_counted[others] = robustness >= 0
+        is_counted[~is_counted] = robustness >= 0
         return is_counted
 
     def _is_listed(self, world: CaseWorld, settings: FloatArray) -> BoolArray:
@@ -476,7 +473,6 @@ class RepairProblem:
                 is_safe[rows] = runs.valid & (model.unsafe.robustness(runs) >= 0)
 
         # A driver who brakes later may be the better one.
-        others = np.flatnonzero(~is_safe)
-        robustness = self.robustness_with(self.today, cases[others], BRAKING_STAGE)
-        is_safe[others] = robustness >= 0
+        robustness = self.robustness_with(self.today, cases[~is_safe], BRAKING_STAGE)
+        is_safe[~is_safe] = robustness >= 0
         return is_safe

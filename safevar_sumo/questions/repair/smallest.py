@@ -17,7 +17,8 @@ from safevar_sumo.records import FloatArray, IntArray
 
 MOST_CHANGED = 2
 """Largest number of parameters that change together."""
-RINGS, SIDE = 32, 12
+RINGS = 32
+SIDE = 12
 """Number of sizes that are tried, and again between the size that survives and the one below; of
 places on a side of a ring. It is even, so that both parameters change everywhere.
 """
@@ -27,7 +28,8 @@ places on a side.
 """
 LEAST_GAIN = 0.006
 """By how much a change of two parameters has to be smaller than that of one."""
-CHUNK, BATCH = 2048, 2048
+CHUNK = 2048
+BATCH = 2048
 """Number of changes that are tried at a time, the smallest first; of simulations in a batch."""
 FIRST_CASES = 512
 """Number of the first cases with which a change is tried first; then with four times as many, and
@@ -87,11 +89,8 @@ class Search:
                 if row is None:
                     break
                 best = changes[row]
-                ring = int(
-                    np.argmax(
-                        sizes >= np.max(np.abs(best - self.problem.today)) - 1e-12
-                    )
-                )
+                size = np.max(np.abs(best - self.problem.today))
+                ring = int(np.argmax(sizes >= size - 1e-12))
                 low = float(sizes[ring - 1]) if ring else low
                 high = float(sizes[ring])
             self._least[number] = low if best is not None else max(low, high)

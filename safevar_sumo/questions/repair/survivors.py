@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.questions.box import Judgement, Proof, proof_size, prove
+from safevar_sumo.questions.box import Proof, proof_size, prove
 from safevar_sumo.questions.cases import SearchPlan, search_cases
 from safevar_sumo.questions.evaluator import ENCOUNTERS
 from safevar_sumo.questions.repair.problem import RepairProblem
@@ -29,7 +29,8 @@ FIRST = 1024
 """Number of the worst cases that are the first counterexamples."""
 MAX_ROUNDS = 30
 """Largest number of rounds of attacks."""
-ATTACK_STAGE, PROOF_STAGE = "attack on the change", "proof on fresh wear"
+ATTACK_STAGE = "attack on the change"
+PROOF_STAGE = "proof on fresh wear"
 
 
 def usual_test(problem: RepairProblem, sets: int) -> float:
@@ -50,10 +51,10 @@ def find_failures(
     problem: RepairProblem,
     fits: tuple[int, ...],
     change: FloatArray,
-    known: FloatArray,
+    cases: FloatArray,
     number: int,
 ) -> FloatArray:
-    """Search some parameter sets for cases that a change does not keep safe, from `known` ones on,
+    """Search some parameter sets for cases that a change does not keep safe, from known `cases` on,
     the worst first; none if it keeps all safe. `number` counts the attacks, for their random
     numbers.
     """
@@ -64,16 +65,16 @@ def find_failures(
         return problem.robustness(change, cases, ATTACK_STAGE)
 
     # Few large generations of the other sets cost less than many small ones.
-    own = SearchPlan(problem.budget)
-    other = SearchPlan(problem.budget // 2, generation=2 * own.generation)
+    plan_of_study = SearchPlan(problem.budget)
+    generation = 2 * plan_of_study.generation
+    plan_of_set = SearchPlan(problem.budget // 2, generation=generation)
     for fit in [*fits, *fits[:1] * (OWN_SEARCHES - 1)]:
-        first = known[: KNOWN // 8 if fit else KNOWN]
-        cases = problem.with_sets(first, fit)
-        plan = other if fit else own
-        met = search_cases(judge, problem.space(fit), cases, plan, rng)
-        if len(met.unsafe):
-            return met.unsafe[:KNOWN]
-    return known[:0]
+        starts = problem.with_sets(cases[: KNOWN // 8 if fit else KNOWN], fit)
+        plan = plan_of_set if fit else plan_of_study
+        results = search_cases(judge, problem.space(fit), starts, plan, rng)
+        if len(results.unsafe):
+            return results.unsafe[:KNOWN]
+    return cases[:0]
 
 
 def prove_change(
@@ -100,19 +101,15 @@ def prove_change(
         unsafe.append(cases[robustness < 0][:KNOWN])
         return robustness.reshape(len(vehicles), -1)
 
-    def judge(vehicles: FloatArray) -> Judgement:
-        """The judgement of vehicles with the study's own parameter set."""
-        robustness = drive(vehicles, np.zeros(len(vehicles), dtype=np.intp))
-        least = np.min(robustness, axis=1)
-        return Judgement(
-            least < 0, np.zeros(len(least), dtype=bool), np.isfinite(least)
-        )
+    def judge(vehicles: FloatArray) -> FloatArray:
+        """What vehicles leave with the study's own parameter set."""
+        return drive(vehicles, np.zeros(len(vehicles), dtype=np.intp))
 
     def draw(count: int) -> FloatArray:
         """Promised vehicles."""
         return problem.promise.draw(count, rng)[:, : problem.size]
 
-    proof, _ = prove(draw, judge, unsafe_share(problem), attempt)
+    proof = prove(draw, judge, unsafe_share(problem), attempt)
     if len(fits) > 1 and not len(unsafe[0]):
         vehicles = draw(proof.samples)
         drive(vehicles, rng.integers(1, len(fits), size=len(vehicles)))

@@ -14,6 +14,7 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
+from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.cases import Counterexamples
 from safevar_sumo.questions.evaluator import Evaluator
@@ -68,7 +69,7 @@ class LimitsQuestion(NamedTuple):
 
     Attributes
     ----------
-    whole
+    base
         The evaluator of the whole study.
     unsafe
         What is unsafe, with the distance to keep.
@@ -81,7 +82,7 @@ class LimitsQuestion(NamedTuple):
     """
 
     subject: Subject
-    whole: Evaluator
+    base: Evaluator
     unsafe: Unsafe
     stated: Unsafe | None
     margin: float | None
@@ -152,14 +153,14 @@ def tolerance(
         Give a rough answer, with at most an eighth of the usual simulations. A rough answer
         confirms no limit that you state, so the exit code is then 3.
     """
-    whole = evaluator
+    base = evaluator
     end = None
     if up_to is not None:
         end = UpperEnd.of(up_to)
-        evaluator = whole.for_study(study_up_to(whole.study, end))
+        evaluator = base.for_study(study_up_to(base.study, end))
     study = evaluator.study
     columns = columns_of(evaluator.characteristics.vehicle.names, characteristics)
-    smaller = smaller_cuts(whole.study, end)
+    smaller = smaller_cuts(base.study, end)
     usual = _usual_settings(evaluator, len(columns), fits)
     planned = {name: (1 + len(smaller)) * number for name, number in usual.items()}
     evaluator.begin(planned, least=1 + 2 * len(columns) * LEAST_VALUES)
@@ -172,16 +173,16 @@ def tolerance(
 
     # The criterion is that of the whole study: up to a smaller value nothing stricter counts.
     original = evaluator.evaluate_original()
-    of_whole = original if end is None else _original_of(whole)
+    of_whole = original if end is None else _original_of(base)
     reference = of_whole if of_whole.valid[0] else original
-    criterion = limit_criterion(whole, subject, unsafe, margin, reference)
+    criterion = limit_criterion(base, subject, unsafe, margin, reference)
     request = LimitsQuestion(
-        subject, whole, criterion, unsafe, margin, columns, specified, fits, at_tests
+        subject, base, criterion, unsafe, margin, columns, specified, fits, at_tests
     )
 
     # Limits up to a value lie within those up to each smaller one.
     wider = None
-    for cut in map(whole.for_study, smaller):
+    for cut in map(base.for_study, smaller):
         if not request.is_unsafe(_original_of(cut)):
             wider = find_limits(_asked_of(request, cut), wider)
     is_safe = not request.is_unsafe(original)
@@ -197,15 +198,13 @@ def tolerance(
         has_scan=not is_few,
         at_tests=at_tests,
         up_to=end,
-        tests_left_out=names_left_out(whole.study, study),
+        tests_left_out=names_left_out(base.study, study),
     )
-    ranges = (
-        _in_ranges(request, evaluator, results)
-        if is_safe and not facts.is_rough
-        else None
-    )
-    has_nearest = facts.broken and is_safe and not is_few
-    nearest = nearest_limits(task, results) if has_nearest else None
+    ranges = nearest = None
+    if is_safe and not facts.is_rough:
+        ranges = _in_ranges(request, evaluator, results)
+    if is_safe and facts.broken and not is_few:
+        nearest = nearest_limits(task, results)
     return answer_limits(facts, nearest, ranges)
 
 
@@ -229,7 +228,7 @@ def _usual_settings(
         OTHER_SETS_STAGE: scaled(CASES_OF_SET * sets) / points,
     }
     if study.states_ranges and not study.ranges:
-        phases[RANGES_STAGE] = scaled(USUAL.own + USUAL.other * sets) / points
+        phases[RANGES_STAGE] = scaled(USUAL.cases + USUAL.cases_of_set * sets) / points
     return phases
 
 
@@ -251,7 +250,8 @@ def _unsafe_solutions(request: LimitsQuestion, evaluator: Evaluator) -> FloatArr
     n).
     """
     members = evaluator.characteristics
-    subject, vehicle = request.subject, members.vehicle
+    subject = request.subject
+    vehicle = members.vehicle
     if isinstance(subject, Study):
         return np.zeros((0, len(vehicle)))
     frame = subject.solutions[request.unsafe.rows(subject.solutions)]
@@ -259,7 +259,7 @@ def _unsafe_solutions(request: LimitsQuestion, evaluator: Evaluator) -> FloatArr
     is_original = settings[:, : len(vehicle)] == vehicle.original
     varies = np.isin(range(len(vehicle)), request.columns)
     settings = np.unique(settings[is_original[:, ~varies].all(axis=1)], axis=0)
-    if evaluator is not request.whole and len(settings):
+    if evaluator is not request.base and len(settings):
         # They are unsafe in the whole study; those in encounters above the value do not count.
         is_inside = (settings >= members.lower) & (settings <= members.upper)
         settings = settings[is_inside.all(axis=1)]
@@ -272,13 +272,8 @@ def _check_drawable(evaluator: Evaluator) -> None:
     """Refuse a study of which hardly any setting is feasible, before the long scans."""
     region = evaluator.region
     members = region.characteristics
-    rng = np.random.default_rng(evaluator.seed)
-    width = members.upper - members.lower
-
-    def draw(number: int) -> FloatArray:
-        return members.lower + rng.random((number, len(members))) * width
-
-    if not len(region.draw_feasible(draw, 1)):
+    domain = Box(region, members.lower, members.upper)
+    if not len(domain.draw(1, np.random.default_rng(evaluator.seed))):
         raise InputError(
             evaluator.study.source,
             f"fewer than 1 in {REJECTIONS} random settings satisfy the constraints, which leaves no"
@@ -304,7 +299,7 @@ def _in_ranges(
         warn(f"the limits are not tried in the ranges of the study: {error.problem}")
         return None
     unsafe = limit_criterion(wider, study, request.stated, request.margin, original)
-    task = _asked_of(request._replace(unsafe=unsafe, subject=study, whole=wider), wider)
+    task = _asked_of(request._replace(unsafe=unsafe, subject=study, base=wider), wider)
     space = task.boxes(task.domain).cases_in(sides)
     attacks = dict[int, Counterexamples]()
     with evaluator.phases.stage(RANGES_STAGE):

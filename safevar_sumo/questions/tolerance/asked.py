@@ -31,13 +31,16 @@ from safevar_sumo.study import Limit, Study, limits_of
 
 MAX_UNSAFE_SHARE = 0.003
 """Upper bound of a box's unsafe share, with 95 % confidence, if every sampled vehicle is safe."""
-CASES_ALONE, CASES, CASES_OF_SET = 5_000, 80_000, 4_000
+CASES_ALONE = 5_000
+CASES = 80_000
+CASES_OF_SET = 4_000
 """Usual numbers of cases: for each limit alone, for the joint limits with the study's own parameter
 set, and with each other one.
 """
 LEAST_VALUES = 8
 """Least number of values between the original and each end with which a limit alone is stated."""
-FEW_ALONE, FEW_OWN = 0.15, 0.1
+FEW_ALONE = 0.15
+FEW_OWN = 0.1
 """Shares of few simulations that seek limits alone, and that search the box that is printed."""
 FEW_PARTS = 4, 4
 """Into how many parts the way to something unsafe is divided with few simulations."""
@@ -49,7 +52,8 @@ LEAST_CASES = 20
 """Fewest cases of each of three searches of joint limits: if all were drawn at random, at most 5 %
 of such cases are unsafe, with 95 % confidence.
 """
-FEW_RETREAT, FURTHER_RETREAT = 0.5, 200.0
+FEW_RETREAT = 0.5
+FURTHER_RETREAT = 200.0
 """How much farther limits keep off failures after each box that failed, in `LEAST_MOVE`; and what
 is added, times the number of cases: the fewer they are, the fewer boxes can be searched.
 """
@@ -63,10 +67,10 @@ class Effort(NamedTuple):
     encounters, values
         Listed encounters in which limits alone are sought, and values between the original and each
         end.
-    alone, own, other
+    alone, cases, cases_of_set
         Cases that search for a counterexample to limits alone, and to a box with the study's own
         parameter set, and with another one.
-    generation, more
+    generation, followers
         Cases of a generation of such a search, and generations that follow the first with an unsafe
         case.
     box
@@ -82,10 +86,10 @@ class Effort(NamedTuple):
     encounters: float = math.inf
     values: int = 100
     alone: int = 2000
-    own: int = 5000
-    other: int = 1000
+    cases: int = 5000
+    cases_of_set: int = 1000
     generation: int = 512
-    more: int = 2
+    followers: int = 2
     box: BoxEffort = BoxEffort()
     corners: int = MAX_CORNERS
     confirmations: int = 3
@@ -110,11 +114,11 @@ class Asked(NamedTuple):
         The numbers of the parameter sets, the study's own first.
     lower, upper
         The domains of the vehicle's values, shape (n,); the original where a value does not vary.
-    given
+    specification
         The specified limits, shape (2, n); NaN where there are none.
     avoided
         Vehicles that no box may hold, shape (K, n).
-    left_out
+    exclusions
         The models in which the original itself is unsafe.
     """
 
@@ -122,21 +126,25 @@ class Asked(NamedTuple):
     fits: tuple[int, ...]
     lower: FloatArray
     upper: FloatArray
-    given: FloatArray
+    specification: FloatArray
     avoided: FloatArray
     effort: Effort
     seed: int
-    left_out: tuple[Model, ...] = ()
+    exclusions: tuple[Model, ...] = ()
 
     @property
     def original(self) -> FloatArray:
         """The values of the original vehicle."""
         return self.oracle.vehicle.original
 
+    def sides(self, lower: FloatArray, upper: FloatArray) -> FloatArray:
+        """How far values reach below and above the original, shape (2, n)."""
+        return np.stack([self.original - lower, upper - self.original])
+
     @property
     def domain(self) -> FloatArray:
-        """How far the domains reach below and above the original, shape (2, n)."""
-        return np.stack([self.original - self.lower, self.upper - self.original])
+        """The sides of the domains."""
+        return self.sides(self.lower, self.upper)
 
     @property
     def star(self) -> Space:
@@ -161,7 +169,7 @@ class Asked(NamedTuple):
         box.
         """
         if budget is None:
-            budget = self.effort.other if fit else self.effort.own
+            budget = self.effort.cases_of_set if fit else self.effort.cases
         (search,) = self.searches(stream, fit, [budget], phases=phases)
         return search
 
@@ -183,17 +191,17 @@ class Asked(NamedTuple):
             start[:, n] = cases.lower[n] + start[:, n] % oracle.fits.count(fit)
             return search_cases(oracle, cases, start, plan, rng)
 
+        effort = self.effort
         return [
-            partial(
-                search, SearchPlan(budget, self.effort.generation, self.effort.more)
-            )
+            partial(search, SearchPlan(budget, effort.generation, effort.followers))
             for budget in budgets
         ]
 
     def boxes(self, longest: FloatArray) -> Boxes:
         """Boxes with the specified limits, whose other sides are at most so long."""
-        is_given = ~np.isnan(self.given)
-        longest = np.where(is_given, np.abs(self.given - self.original), longest)
+        is_specified = ~np.isnan(self.specification)
+        lengths = np.abs(self.specification - self.original)
+        longest = np.where(is_specified, lengths, longest)
 
         def printed(sides: FloatArray) -> FloatArray:
             """Sides as they are printed; ends of domains and specified limits stay."""
@@ -202,9 +210,9 @@ class Asked(NamedTuple):
                 low = item.rounded(item.original - sides[0, column], upwards=True)
                 high = item.rounded(item.original + sides[1, column], upwards=False)
                 rounded[:, column] = item.original - low, high - item.original
-            return np.where((sides >= self.domain) | is_given, sides, rounded)
+            return np.where((sides >= self.domain) | is_specified, sides, rounded)
 
-        is_free = (self.domain > 0) & ~is_given
+        is_free = (self.domain > 0) & ~is_specified
         space = self.oracle.space(0, self.lower, self.upper)
         effort = self.effort.box
         return Boxes(
@@ -229,19 +237,19 @@ def asked_of(
     varies = np.isin(range(len(vehicle)), columns)
     ends = np.stack([vehicle.lower, vehicle.upper])
     lower, upper = np.where(varies, ends, vehicle.original)
-    given = np.full_like(ends, np.nan)
+    specification = np.full_like(ends, np.nan)
     for name, limit in limits.items():
-        given[:, vehicle.names.index(name)] = limit.at_least, limit.at_most
+        specification[:, vehicle.names.index(name)] = limit.at_least, limit.at_most
     return Asked(
         oracle=oracle,
         fits=models.fits,
         lower=lower,
         upper=upper,
-        given=given,
+        specification=specification,
         avoided=np.zeros((0, len(vehicle))),
         effort=effort_of(evaluator, oracle.available, len(columns)),
         seed=evaluator.seed,
-        left_out=models.left_out,
+        exclusions=models.left_out,
     )
 
 
@@ -255,19 +263,17 @@ def usual_alone(evaluator: Evaluator, columns: int | None = None) -> float:
 
 def effort_of(evaluator: Evaluator, cases: float, varied: int) -> Effort:
     """How much is searched, with at most so many cases."""
-    usual = USUAL
     if math.isfinite(cases):
         return _effort_of_few(int(cases), varied)
-    names = ("values", "alone", "own", "other", "corners", "confirmations")
-    scaled = {name: evaluator.scaled(getattr(usual, name)) for name in names}
+    names = ("values", "alone", "cases", "cases_of_set", "corners", "confirmations")
+    scaled = {name: evaluator.scaled(getattr(USUAL, name)) for name in names}
     scaled["values"] = max(scaled["values"], LEAST_VALUES)
     if evaluator.study.ranges:
-        scaled["other"] *= OF_RANGES
-    growths = evaluator.scaled(usual.box.growths)
-    share = usual.share / evaluator.account.effort
-    return usual._replace(
-        **scaled, share=share, box=usual.box._replace(growths=growths)
-    )
+        scaled["cases_of_set"] *= OF_RANGES
+    growths = evaluator.scaled(USUAL.box.growths)
+    share = USUAL.share / evaluator.account.effort
+    box = USUAL.box._replace(growths=growths)
+    return USUAL._replace(**scaled, share=share, box=box)
 
 
 def _effort_of_few(cases: int, varied: int) -> Effort:
@@ -289,9 +295,9 @@ def _effort_of_few(cases: int, varied: int) -> Effort:
         encounters=max(of_line // (values + sum(FEW_PARTS)), 1),
         values=values,
         alone=0,
-        own=int(FEW_OWN * cases),
+        cases=int(FEW_OWN * cases),
         generation=FEW_GENERATION,
-        more=0,
+        followers=0,
         box=box,
         corners=0,
         confirmations=2,

@@ -102,10 +102,6 @@ class Boxes(NamedTuple):
         space = self.space
         return (space.upper - space.lower)[: space.size]
 
-    def are_unsafe(self, cases: FloatArray) -> BoolArray:
-        """Which cases are unsafe."""
-        return self.judge(cases) < 0
-
     @property
     def fixed(self) -> FloatArray:
         """The sides of the smallest box: without those that are free."""
@@ -345,7 +341,7 @@ def learn(
     starts = causes.copy()
     starts[:, : boxes.space.size] = boxes.original
     parts = boxes.effort.parts
-    lines = find_boundaries(starts, causes, boxes.are_unsafe, parts)
+    lines = find_boundaries(starts, causes, lambda cases: boxes.judge(cases) < 0, parts)
 
     # A place for each combination of changes in each world: that of the worst case.
     n = boxes.space.size
@@ -429,8 +425,8 @@ def _propose(
     candidates = np.clip(sides + steps, 0.0, boxes.longest)
     is_fixed = (rng.random(shape) < WHOLE) | ~boxes.is_free
     candidates = np.where(is_fixed, boxes.longest, candidates)
-    least = boxes.log_volume(sides) + LEAST_GAIN
-    return np.asarray(candidates[boxes.log_volume(candidates) > least])
+    volume = boxes.log_volume(sides) + LEAST_GAIN
+    return np.asarray(candidates[boxes.log_volume(candidates) > volume])
 
 
 def _are_safe(

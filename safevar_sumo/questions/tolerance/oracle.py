@@ -29,28 +29,14 @@ class Exhausted(InputError):
     """Fewer simulations may follow than are asked for."""
 
 
-class MovingTest(NamedTuple):
-    """A test of a model's matrix, whose axes are ranges.
-
-    Attributes
-    ----------
-    test
-        The test of the matrix, with the values of its axes.
-    model
-        The model in this test alone. An encounter counts only where the original is safe, too.
-    """
-
-    test: MatrixTest
-    model: Model
-
-
 class CaseWorld(NamedTuple):
     """Encounters with one parameter set: a model in which the axes of encounters are parameters,
-    the phase last if they have one; and the test of the matrix, if it moves.
+    the phase last if they have one; and the test of the matrix with the values of its axes, if it
+    moves.
     """
 
     model: Model
-    test: MovingTest | None = None
+    test: MatrixTest | None = None
 
     @property
     def has_phase(self) -> bool:
@@ -88,7 +74,7 @@ class CaseWorld(NamedTuple):
             rows = np.vstack([axes.original, hardest])
         else:
             values = [
-                [0.0] if name == PHASE else self.test.test.axes[name].at
+                [0.0] if name == PHASE else self.test.axes[name].at
                 for name in axes.names
             ]
             rows = np.array([*product(*values)]).reshape(-1, len(axes))
@@ -152,28 +138,10 @@ class Oracle:
         remark = 2 * len(evaluator.system.points)
         return (evaluator.account.left - remark) // self._simulations
 
-    def __call__(self, cases: FloatArray) -> FloatArray:
+    def __call__(self, cases: FloatArray, failed: float = np.inf) -> FloatArray:
         """What each of M cases leaves, shape (M,): below 0 it is unsafe, infinite where it does not
-        count, or could not be simulated.
+        count, and `failed` where it could not be simulated.
         """
-        robustness = self.measure(cases)
-        return np.where(
-            np.isnan(robustness),
-            np.inf,
-            robustness,
-        )
-
-    def with_failed(self, cases: FloatArray) -> FloatArray:
-        """What each of M cases leaves; minus infinity where it could not be simulated."""
-        robustness = self.measure(cases)
-        return np.where(
-            np.isnan(robustness),
-            -np.inf,
-            robustness,
-        )
-
-    def measure(self, cases: FloatArray) -> FloatArray:
-        """What each of M cases leaves; NaN where it could not be simulated."""
         # Simulations of the original vehicle may follow.
         if (1 + self._tries_originals) * len(cases) > self.available:
             raise Exhausted(
@@ -184,12 +152,16 @@ class Oracle:
         robustness = np.full(len(cases), np.inf)
         for number, rows, settings in self.in_worlds(cases):
             world = self.worlds[number]
-            robustness[rows] = self._measure_in(
-                world,
-                cases[rows],
-                settings,
-            )
-        return robustness
+            model = world.model
+            runs = model.evaluate(settings, STAGE)
+            of_world = model.robustness_by(runs)
+            of_world[~(runs.valid | runs.infeasible)] = np.nan
+            of_world[~model.evaluator.region.feasible(settings)] = np.inf
+            unsafe = np.flatnonzero(of_world < 0)
+            does_count = self._do_count(world, cases[rows[unsafe]])
+            of_world[unsafe[~does_count]] = np.inf
+            robustness[rows] = of_world
+        return np.where(np.isnan(robustness), failed, robustness)
 
     def in_worlds(
         self,
@@ -205,23 +177,6 @@ class Oracle:
                 cases[rows, n + 1 :],
             )
             yield number, rows, settings
-
-    def _measure_in(
-        self,
-        world: CaseWorld,
-        cases: FloatArray,
-        settings: FloatArray,
-    ) -> FloatArray:
-        """What cases of a world leave, with their settings."""
-        model = world.model
-        runs = model.evaluate(settings, STAGE)
-        robustness = model.robustness_by(runs)
-        robustness[~(runs.valid | runs.infeasible)] = np.nan
-        robustness[~model.evaluator.region.feasible(settings)] = np.inf
-        unsafe = np.flatnonzero(robustness < 0)
-        does_count = self._do_count(world, cases[unsafe])
-        robustness[unsafe[~does_count]] = np.inf
-        return robustness
 
     def _do_count(
         self,
@@ -281,16 +236,12 @@ class Oracle:
     ) -> Space:
         """The cases of vehicles between two ends with a parameter set, at all phases or phase 0."""
         numbers = np.flatnonzero(np.equal(self.fits, fit))
-        first = np.zeros(1 + self.places)
-        first[0] = numbers[0]
-        last = np.ones(1 + self.places)
-        last[0] = np.nextafter(numbers[-1] + 1, 0)
-        last[1] = phases
-        return Space(
-            np.append(lower, first),
-            np.append(upper, last),
-            len(lower),
-        )
+        begin = np.zeros(1 + self.places)
+        begin[0] = numbers[0]
+        end = np.ones(1 + self.places)
+        end[0] = np.nextafter(numbers[-1] + 1, 0)
+        end[1] = phases
+        return Space(np.append(lower, begin), np.append(upper, end), len(lower))
 
     def listed(self) -> FloatArray:
         """The listed encounters with the study's own parameter set: worlds and places, shape (E,
@@ -332,8 +283,8 @@ def worlds_of(
 ) -> list[CaseWorld]:
     """The worlds of a parameter set: each test that moves, and all other points together."""
     moving = moving_tests(model, new_car) if between else []
-    worlds = [CaseWorld(test.model.in_phases or test.model, test) for test in moving]
-    names = {test.test.name for test in moving}
+    worlds = [CaseWorld(alone.in_phases or alone, test) for test, alone in moving]
+    names = {test.name for test, _ in moving}
     evaluator = model.evaluator
     standing = [test for test in evaluator.study.tests if test.name not in names]
     if moving and standing:
@@ -344,9 +295,9 @@ def worlds_of(
     return worlds
 
 
-def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
-    """The tests of a model's matrix with axes that move; an encounter counts unless the original is
-    unsafe by `new_car` in it.
+def moving_tests(model: Model, new_car: Unsafe) -> list[tuple[MatrixTest, Model]]:
+    """The tests of a model's matrix with axes that move, each with the model in this test alone,
+    whose axes are ranges; an encounter counts unless the original is unsafe by `new_car` in it.
     """
     study = model.evaluator.study
     tests = []
@@ -362,5 +313,5 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[MovingTest]:
             )
             # The original is simulated only where a vehicle fails.
             moving = Model(model.fit, evaluator, model.unsafe, new_car=new_car)
-            tests.append(MovingTest(listed, moving))
+            tests.append((listed, moving))
     return tests

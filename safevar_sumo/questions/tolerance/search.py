@@ -5,6 +5,7 @@ in one parameter set of the vehicle model after another.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from itertools import compress
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from safevar_sumo.questions.boundary import (
     scan_alone,
     search_alone,
 )
-from safevar_sumo.questions.box import Judgement, Proof, prove
+from safevar_sumo.questions.box import Proof, prove
 from safevar_sumo.questions.cases import CaseSearch, Counterexamples, Space
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance.asked import LEAST_CASES, Asked
@@ -60,7 +61,7 @@ class FoundLimits(NamedTuple):
         By the number of each parameter set, how the joint limits were searched.
     proof, proofs
         The upper bound of their unsafe share, and how often it was sought.
-    beyond
+    breaches
         By side, an unsafe case just beyond a joint limit.
     """
 
@@ -72,7 +73,7 @@ class FoundLimits(NamedTuple):
     attacks: Mapping[int, Attack] = {}
     proof: Proof | None = None
     proofs: int = 0
-    beyond: Mapping[Side, FloatArray] = {}
+    breaches: Mapping[Side, FloatArray] = {}
 
     @property
     def specified(self) -> FloatArray:
@@ -101,7 +102,7 @@ def find_limits(task: Asked, wider: FoundLimits | None = None) -> FoundLimits:
                 break
     if limits.sides is None or task.effort.share >= 1:
         return limits
-    return limits._replace(beyond=_beyond(task, limits, limits.sides))
+    return limits._replace(breaches=_breaches(task, limits, limits.sides))
 
 
 def no_limits(task: Asked) -> FoundLimits:
@@ -114,18 +115,18 @@ def no_limits(task: Asked) -> FoundLimits:
 def _with_own_set(task: Asked, wider: FoundLimits | None) -> FoundLimits:
     """The limits with the study's own parameter set."""
     alone = Alone(task.lower, task.upper) if wider is None else wider.alone
-    suffices = task.effort.own >= LEAST_CASES
+    suffices = task.effort.cases >= LEAST_CASES
     try:
         alone = alone_with_own_set(task, alone)
     except Exhausted:
         suffices = False
-    longest = _sides_of(task, alone)
+    longest = task.sides(alone.lower, alone.upper)
     if wider is not None:
         sides = wider.specified if wider.sides is None else wider.sides
         longest = np.minimum(longest, sides)
     boxes = task.boxes(longest)
-    encounter = task.star.lower[boxes.space.size :]
-    avoided = np.hstack([task.avoided, np.tile(encounter, (len(task.avoided), 1))])
+    encounter = task.star.lower[np.newaxis, boxes.space.size :]
+    avoided = product_of(task.avoided, encounter)
     limits = FoundLimits(alone, boxes, Failures(avoided, task.nothing))
     if wider is not None:
         limits = limits._replace(broken=wider.broken)
@@ -148,7 +149,7 @@ def alone_with_own_set(task: Asked, limits: Alone) -> Alone:
     parts = effort.box.parts
     hardest = oracle.hardest(effort.encounters)
     limits = scan_alone(
-        oracle.with_failed,
+        partial(oracle, failed=-np.inf),
         star,
         limits,
         hardest,
@@ -171,10 +172,10 @@ def alone_with_own_set(task: Asked, limits: Alone) -> Alone:
         )
 
     # Cases that could not be simulated show nothing.
-    cases = [*limits.beyond.values()]
+    cases = [*limits.breaches.values()]
     rows = np.array(cases).reshape(-1, task.nothing.shape[1])
-    beyond = compress(limits.beyond.items(), oracle(rows) < 0)
-    return limits._replace(beyond=dict(beyond))
+    breaches = compress(limits.breaches.items(), oracle(rows) < 0)
+    return limits._replace(breaches=dict(breaches))
 
 
 def _with_broken(
@@ -205,7 +206,7 @@ def _with_largest_box(task: Asked, limits: FoundLimits) -> FoundLimits:
     boxes = limits.boxes
     settled = Settled(boxes.longest, limits.failures)
     if boxes.effort.explored:
-        budgets = QUICK * effort.generation, effort.own
+        budgets = QUICK * effort.generation, effort.cases
         quick, thorough = task.searches(
             Stream.JOINT_LIMITS,
             0,
@@ -292,45 +293,22 @@ def _with_settled(
         limits = limits._replace(failures=settled.failures)
         limits = limits._replace(alone=_alone_before(task, limits))
         sides = _within_alone(task, limits, settled.sides)
+        unsafe = task.nothing
         is_same = former is not None and np.array_equal(former, sides)
-        if is_same or task.effort.share >= 1:
-            return _passed(
-                limits,
-                sides,
-                settled.attack,
-                fit,
-            )
-        number = limits.proofs + 1
-        proof, unsafe = _prove(task, boxes.cases_in(sides), number)
-        limits = limits._replace(proof=proof, proofs=number)
-        if not len(unsafe):
-            return _passed(
-                limits,
-                sides,
-                settled.attack,
-                fit,
-            )
-        failures = learn(
-            boxes,
-            settled.failures,
-            unsafe,
-            sides,
-        )
-        settled = settled._replace(failures=failures)
+        if not is_same and task.effort.share < 1:
+            number = limits.proofs + 1
+            proof, unsafe = _prove(task, boxes.cases_in(sides), number)
+            limits = limits._replace(proof=proof, proofs=number)
+        if len(unsafe):
+            failures = learn(boxes, settled.failures, unsafe, sides)
+            settled = settled._replace(failures=failures)
+            continue
+        if boxes.is_free.any() and not sides[boxes.is_free].any():
+            # It leaves no characteristic room.
+            break
+        attacks = {**limits.attacks, fit: settled.attack}
+        return limits._replace(sides=sides, attacks=attacks)
     return limits._replace(sides=None, failures=settled.failures, proof=None)
-
-
-def _passed(
-    limits: FoundLimits,
-    sides: FloatArray,
-    attack: Attack,
-    fit: int,
-) -> FoundLimits:
-    """Limits with a box that passed; none if it leaves no characteristic room."""
-    is_free = limits.boxes.is_free
-    if is_free.any() and not sides[is_free].any():
-        return limits._replace(sides=None, proof=None)
-    return limits._replace(sides=sides, attacks={**limits.attacks, fit: attack})
 
 
 def _alone_before(task: Asked, limits: FoundLimits) -> Alone:
@@ -351,11 +329,6 @@ def _alone_before(task: Asked, limits: FoundLimits) -> Alone:
     )
 
 
-def _sides_of(task: Asked, alone: Alone) -> FloatArray:
-    """The sides of limits alone."""
-    return np.stack([task.original - alone.lower, alone.upper - task.original])
-
-
 def _within_alone(
     task: Asked,
     limits: FoundLimits,
@@ -363,30 +336,30 @@ def _within_alone(
 ) -> FloatArray:
     """The sides of joint limits, none longer than what is safe alone."""
     boxes = limits.boxes
-    shorter = np.minimum(sides, _sides_of(task, limits.alone))
+    alone = limits.alone
+    shorter = np.minimum(sides, task.sides(alone.lower, alone.upper))
     return boxes.printed(np.where(boxes.is_free, shorter, sides))
 
 
 def _corner_search(task: Asked) -> CaseSearch:
     """A search of the corners of a box, each in all listed encounters."""
     listed = task.oracle.listed()
-    most = task.effort.corners
+    limit = task.effort.corners
     rng = Stream.FIRST_CORNERS.generator(task.seed)
 
-    def search(space: Space, known: FloatArray) -> Counterexamples:
+    def search(space: Space, start: FloatArray) -> Counterexamples:
         lower = space.lower[: space.size]
         upper = space.upper[: space.size]
         columns = np.flatnonzero(lower < upper)
         number = 2 ** len(columns)
-        corners = np.arange(min(number, most))
-        if number > most:
-            corners = rng.integers(number, size=most)
+        corners = np.arange(min(number, limit))
+        if number > limit:
+            corners = rng.integers(number, size=limit)
         vehicles = np.tile(lower, (len(corners), 1))
-        for digit, column in enumerate(columns.tolist()):
-            is_high = (corners >> digit & 1) > 0
-            vehicles[is_high, column] = upper[column]
+        is_high = corners[:, np.newaxis] >> np.arange(len(columns)) & 1
+        vehicles[:, columns] = np.where(is_high, upper[columns], lower[columns])
         cases = product_of(vehicles, listed)
-        results = Counterexamples(known[:0], np.zeros(0))
+        results = Counterexamples(start[:0], np.zeros(0))
         results = results.after(cases, task.oracle(cases))
         return results._replace(simulated=0)
 
@@ -408,20 +381,16 @@ def _prove(
     rng = Stream.CONFIDENCE_BOUND.generator(task.seed, number)
     unsafe = list[FloatArray]()
 
-    def judge(vehicles: FloatArray) -> Judgement:
+    def judge(vehicles: FloatArray) -> FloatArray:
         cases = product_of(vehicles, listed)
-        robustness = oracle.measure(cases)
+        robustness = oracle(cases, np.nan)
         unsafe.append(cases[robustness < 0])
-        of_vehicle = robustness.reshape(len(vehicles), -1)
-        is_unsafe = np.any(of_vehicle < 0, axis=1)
-        has_failed = np.any(np.isnan(of_vehicle), axis=1)
-        does_count = np.any(~np.isposinf(of_vehicle), axis=1)
-        return Judgement(is_unsafe, has_failed & ~is_unsafe, does_count)
+        return robustness.reshape(len(vehicles), -1)
 
     def draw(count: int) -> FloatArray:
         return lower + rng.random((count, space.size)) * width
 
-    proof, _ = prove(
+    proof = prove(
         lambda count: oracle.feasible(draw, count),
         judge,
         task.effort.share,
@@ -430,7 +399,7 @@ def _prove(
     return proof, unsafe[0]
 
 
-def _beyond(
+def _breaches(
     task: Asked,
     limits: FoundLimits,
     sides: FloatArray,
@@ -439,7 +408,7 @@ def _beyond(
     boxes = limits.boxes
     failures = limits.failures
     search = task.search(Stream.EXTENSION, 0, QUICK * task.effort.generation)
-    beyond = dict[Side, FloatArray]()
+    breaches = dict[Side, FloatArray]()
     for side, column in np.argwhere(sides < task.domain).tolist():
         item = task.oracle.vehicle.members[column]
         move = max(LEAST_MOVE * boxes.width[column], 10.0**-item.digits)
@@ -455,19 +424,19 @@ def _beyond(
             slice_ = space._replace(lower=ends[0], upper=ends[1])
             cases = search(slice_, failures.at_places(boxes, wider)).unsafe
         if len(cases):
-            beyond[side, column] = cases[0]
-    return beyond
+            breaches[side, column] = cases[0]
+    return breaches
 
 
 def nearest_limits(task: Asked, limits: FoundLimits) -> FloatArray:
     """The furthest values of each specified limit with which all hold, the others as specified,
     shape (2, n); NaN where there is none.
     """
-    nearest = np.full_like(task.given, np.nan)
+    nearest = np.full_like(task.specification, np.nan)
     failures = Failures(task.nothing, task.nothing)
-    budget = task.effort.other
+    budget = task.effort.cases_of_set
     searches = [task.search(Stream.NEAREST_LIMIT, fit, budget) for fit in task.fits]
-    for side, column in np.argwhere(~np.isnan(task.given)).tolist():
+    for side, column in np.argwhere(~np.isnan(task.specification)).tolist():
         is_free = np.zeros_like(limits.boxes.is_free)
         is_free[side, column] = True
         effort = limits.boxes.effort._replace(retreat=NEAR)

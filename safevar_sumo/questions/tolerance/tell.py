@@ -23,6 +23,7 @@ from safevar_sumo.questions.tolerance.told import (
     Told,
     limit_in_words,
     refusal_in_words,
+    value_in,
     verdict_sentences,
     worst_of,
 )
@@ -37,9 +38,22 @@ from safevar_sumo.records import FloatArray, JsonObject, finite_or_none
 from safevar_sumo.scenarios import SPEED_DIMENSION
 
 NUMBERS = (
-    *("unsafe", "margin", "kept", "rough", "scope", "up_to", "box", "boxes"),
-    *("samples", "failures", "at_most", "not_simulated", "fits", "fits_tried"),
-    *("attacked", "least_attacked"),
+    "unsafe",
+    "margin",
+    "kept",
+    "rough",
+    "scope",
+    "up_to",
+    "box",
+    "boxes",
+    "samples",
+    "failures",
+    "at_most",
+    "not_simulated",
+    "fits",
+    "fits_tried",
+    "attacked",
+    "least_attacked",
 )
 LIMITS_TITLE = "Limits, rounded to the safe side"
 LIMITS, FITS, NEAREST, IN_RANGES = shipped_columns("tolerance").values()
@@ -50,25 +64,24 @@ def answer_limits(
 ) -> Answer:
     """The answer with limits alone and joint limits."""
     tables = {"limits": _limits_table(facts)}
-    tried = len(facts.task.fits) + len(facts.task.left_out)
-    if facts.is_safe and tried > 1:
+    sets = len(facts.task.fits) + len(facts.task.exclusions)
+    if facts.is_safe and sets > 1:
         title = "The limits in each parameter set of the vehicle model"
         tables["fits"] = tabulate(title, FITS, _fit_rows(facts))
-    near = _nearest_rows(facts, nearest)
-    if near:
-        tables["nearest"] = tabulate("Limits that would do", NEAREST, near)
+    nearest_rows = _nearest_rows(facts, nearest)
+    if nearest_rows:
+        tables["nearest"] = tabulate("Limits that would do", NEAREST, nearest_rows)
     in_ranges = list[Sentence]()
     if ranges is not None:
-        sentence, failure = _verdict_in_ranges(facts, ranges)
+        sentence, row = _told_in_ranges(facts, ranges)
         in_ranges = [sentence]
         title = "The same limits in the ranges of the study"
-        rows = [_row_in_ranges(ranges, sentence.text, failure)]
-        tables["ranges"] = tabulate(title, IN_RANGES, rows)
+        tables["ranges"] = tabulate(title, IN_RANGES, [row])
     texts = counted_in_words(facts.study) + constraints_in_words(facts.study)
     return Answer(
         question="tolerance",
         study=facts.study,
-        verdict=Verdict(verdict_sentences(facts, near, in_ranges)),
+        verdict=Verdict(verdict_sentences(facts, nearest_rows, in_ranges)),
         tested=Verdict([*_tested(facts), *map(note, texts)]),
         numbers=_numbers(facts),
         tables=tables,
@@ -86,12 +99,11 @@ def _tested(facts: Told) -> Iterator[Sentence]:
         )
     if facts.box is None:
         return
-    least = facts.least
     search = words.EMPTY_SEARCH
     keeps = ""
-    if least is not None:
+    if facts.least is not None:
         search = words.SEARCH
-        keeps = facts.unsafe.value_in_words(least)
+        keeps = facts.unsafe.value_in_words(facts.least)
     yield search(
         number=facts.attacked,
         keeps=keeps,
@@ -125,12 +137,13 @@ def _numbers(facts: Told) -> JsonObject:
     if not facts.is_safe:
         return numbers
     fits = len(facts.task.fits)
-    numbers["box"] = facts.box is not None
-    numbers["fits"] = fits - len(facts.limits.broken)
-    numbers["fits_tried"] = fits
+    numbers |= {
+        "box": facts.box is not None,
+        "fits": fits - len(facts.limits.broken),
+        "fits_tried": fits,
+    }
     if facts.box is not None:
-        numbers["attacked"] = facts.attacked
-        numbers["least_attacked"] = facts.least
+        numbers |= {"attacked": facts.attacked, "least_attacked": facts.least}
     if facts.limits.proof is not None:
         numbers |= facts.limits.proof._asdict()
     return numbers
@@ -153,13 +166,13 @@ def _limits_table(facts: Told) -> pd.DataFrame:
     rows = [_limits_row(facts, column) for column in facts.columns]
     # Joint limits lead, without those of each alone.
     end = LIMITS["alone_low"]._replace(is_detail=facts.box is not None)
-    shown = {**LIMITS, "alone_low": end}
+    columns = {**LIMITS, "alone_low": end}
     texts = [text for row in rows if (text := row["fails_first"])]
     events = {text: text.removeprefix("the vehicle ") for text in texts}
     cells = [[*row.values()] for row in rows]
     table = tabulate(
         LIMITS_TITLE,
-        shown,
+        columns,
         cells,
         words=events,
     )
@@ -180,14 +193,14 @@ def _limits_row(facts: Told, column: int) -> JsonObject:
         **dict.fromkeys(LIMITS),
         "characteristic": item.name,
         "unit": item.unit,
+        "original": item.original,
     }
-    row["original"] = item.original
     row["alone_low"], row["alone_high"] = facts.alone(column)
-    row["specified_low"], row["specified_high"] = facts.given(column)
+    row["specified_low"], row["specified_high"] = facts.specified(column)
     if facts.box is not None:
         row["together_low"] = float(facts.box.lower[column])
         row["together_high"] = float(facts.box.upper[column])
-    if facts.given(column) != (None, None):
+    if facts.specified(column) != (None, None):
         is_kept = column not in facts.broken
         row["kept"] = None if is_kept and facts.is_rough else is_kept
     failure = facts.failures.get(column)
@@ -200,9 +213,9 @@ def _limits_row(facts: Told, column: int) -> JsonObject:
     return row
 
 
-def _values_of(own: Model, failure: Failure) -> JsonObject:
+def _values_of(model: Model, failure: Failure) -> JsonObject:
     """The vehicle that fails, with its encounter where encounters are ranges."""
-    names = own.characteristics.names
+    names = model.characteristics.names
     return dict(zip(names, failure.setting.tolist(), strict=False))
 
 
@@ -266,11 +279,12 @@ def _fit_rows(facts: Told) -> Rows:
     """A row of `FITS` for each parameter set."""
     broken = facts.limits.broken
     states = {fit: "not kept" if fit in broken else "kept" for fit in facts.task.fits}
-    states |= {model.fit: "left out" for model in facts.task.left_out}
-    least = dict.fromkeys(states, np.nan)
+    states |= {model.fit: "left out" for model in facts.task.exclusions}
+    values = dict.fromkeys(states, np.nan)
     if facts.box is not None:
-        least |= {fit: facts.value_in(fit) for fit in facts.limits.attacks}
-    return [(fit, states[fit], least[fit]) for fit in sorted(states)]
+        for fit, attack in facts.limits.attacks.items():
+            values[fit] = value_in(facts.unsafe, fit, attack.least)
+    return [(fit, states[fit], values[fit]) for fit in sorted(states)]
 
 
 def _nearest_rows(facts: Told, nearest: FloatArray | None) -> Rows:
@@ -280,44 +294,39 @@ def _nearest_rows(facts: Told, nearest: FloatArray | None) -> Rows:
         return rows
     for column in facts.stated:
         item = facts.members[column]
-        for side, limit in enumerate(facts.given(column)):
+        for side, limit in enumerate(facts.specified(column)):
             value = finite_or_none(nearest[side, column])
             if limit is not None:
                 rows.append((item.name, item.unit, limit, value))
     return rows
 
 
-def _verdict_in_ranges(
+def _told_in_ranges(
     facts: Told, ranges: InRanges
-) -> tuple[Sentence, Failure | None]:
-    """Whether the limits hold in the ranges; of several failures that at the lowest speed."""
+) -> tuple[Sentence, tuple[object, ...]]:
+    """Whether the limits hold in the ranges, and the row of `IN_RANGES`; of several failures that
+    at the lowest speed.
+    """
     attacks = ranges.attacks.values()
     number = sum(attack.simulated for attack in attacks)
     unsafe = np.concatenate([attack.unsafe for attack in attacks])
-    least = worst_of(ranges.unsafe, ranges.attacks)
+    worst = worst_of(ranges.unsafe, ranges.attacks)
+    model = ranges.task.oracle.own
+    vehicle: tuple[object, ...] = (None, None)
     if len(unsafe):
         failure = _slowest_failure(facts, ranges.task.oracle, unsafe)
-        event = words.SOME_UNSAFE if failure is None else failure.words
-        return words.RANGES_FAIL(event=event), failure
-    if least is None:
-        return words.RANGES_UNKNOWN(number=number), None
-    keeps = ranges.unsafe.value_in_words(least)
-    return words.RANGES_HOLD(
-        number=number,
-        keeps=keeps,
-    ), None
-
-
-def _row_in_ranges(
-    ranges: InRanges, verdict: str, failure: Failure | None
-) -> tuple[object, ...]:
-    """The row of `IN_RANGES`."""
-    own = ranges.task.oracle.own
-    holds = not any(len(attack.unsafe) for attack in ranges.attacks.values())
-    vehicle: tuple[object, ...] = (None, None)
-    if failure is not None:
-        vehicle = _values_of(own, failure), failure.command
-    return (scope_of(own.evaluator.study), holds, verdict, *vehicle)
+        event = words.SOME_UNSAFE
+        if failure is not None:
+            event = failure.words
+            vehicle = _values_of(model, failure), failure.command
+        sentence = words.RANGES_FAIL(event=event)
+    elif worst is None:
+        sentence = words.RANGES_UNKNOWN(number=number)
+    else:
+        keeps = ranges.unsafe.value_in_words(worst)
+        sentence = words.RANGES_HOLD(number=number, keeps=keeps)
+    scope = scope_of(model.evaluator.study)
+    return sentence, (scope, not len(unsafe), sentence.text, *vehicle)
 
 
 def _slowest_failure(facts: Told, oracle: Oracle, unsafe: FloatArray) -> Failure | None:
@@ -329,5 +338,5 @@ def _slowest_failure(facts: Told, oracle: Oracle, unsafe: FloatArray) -> Failure
     settings = [oracle.setting(case) for case in unsafe]
     model, setting = min(settings, key=lambda pair: float(pair[1][column]))
     limits = facts.box or facts.box_of(facts.limits.specified)
-    within = limits.in_encounters_of(model.evaluator.region)
-    return describe(model, {"": setting}, within).get("")
+    box = limits.in_encounters_of(model.evaluator.region)
+    return describe(model, {"": setting}, box).get("")

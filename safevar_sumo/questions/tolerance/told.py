@@ -129,8 +129,8 @@ class Told:
         for column, item in enumerate(self.members):
             for end in ends:
                 end[column] = round(float(end[column]), item.digits + DECIMALS)
-        is_specified = ~boxes.is_free & ~np.isnan(self.task.given)
-        ends = np.where(is_specified, self.task.given, ends)
+        is_specified = ~boxes.is_free & ~np.isnan(self.task.specification)
+        ends = np.where(is_specified, self.task.specification, ends)
         lower, upper = np.clip(ends, vehicle.lower, vehicle.upper)
         return Box(self.own.evaluator.region, lower, upper)
 
@@ -139,28 +139,28 @@ class Told:
         if self.task.oracle.available < len(FURTHER_DIGITS):
             return None
         model, setting = self.task.oracle.setting(case)
-        within = None if box is None else box.in_encounters_of(model.evaluator.region)
-        return describe(model, {"": setting}, within).get("")
+        if box is not None:
+            box = box.in_encounters_of(model.evaluator.region)
+        return describe(model, {"": setting}, box).get("")
 
     @cached_property
     def failures(self) -> Mapping[int, Failure]:
         """How the vehicle fails just beyond a limit, by column: beyond the joint one, or alone."""
-        beyond = self.limits.beyond
+        breaches = self.limits.breaches
         if self.box is None:
-            beyond = self.limits.alone.beyond
+            breaches = self.limits.alone.breaches
         failures = dict[int, Failure]()
-        for side in sorted(beyond, key=lambda side: self._change(side, beyond[side])):
-            column = side[1]
+        for (_, column), case in sorted(breaches.items(), key=self._change):
             if column in failures:
                 continue
-            failure = self.failure(beyond[side], self.box)
+            failure = self.failure(case, self.box)
             if failure is not None:
                 failures[column] = failure
         return failures
 
-    def _change(self, side: Side, case: FloatArray) -> float:
+    def _change(self, breach: tuple[Side, FloatArray]) -> float:
         """How far a case beyond a side is from the original."""
-        column = side[1]
+        (_, column), case = breach
         return abs(float(case[column] - self.task.original[column]))
 
     def alone(self, column: int) -> tuple[float, float] | tuple[None, None]:
@@ -182,9 +182,9 @@ class Told:
         line = find_boundaries(start, setting, lambda rows: ~region.feasible(rows))
         return float(line.safe[0, column])
 
-    def given(self, column: int) -> tuple[float | None, float | None]:
+    def specified(self, column: int) -> tuple[float | None, float | None]:
         """The specified limit."""
-        low, high = self.task.given[:, column].tolist()
+        low, high = self.task.specification[:, column].tolist()
         return finite_or_none(low), finite_or_none(high)
 
     def outside(self, column: int) -> float:
@@ -192,13 +192,13 @@ class Told:
         alone = self.limits.alone
         ends = float(alone.lower[column]), float(alone.upper[column])
         low, high = self.members[column].rounded_inwards(ends)
-        given = self.task.given[:, column]
-        return float(np.nanmax([low - given[0], given[1] - high, 0.0]))
+        specified_low, specified_high = self.task.specification[:, column]
+        return float(np.nanmax([low - specified_low, specified_high - high, 0.0]))
 
     @cached_property
     def stated(self) -> list[int]:
         """The columns of the specified limits."""
-        is_stated = ~np.isnan(self.task.given).all(axis=0)
+        is_stated = ~np.isnan(self.task.specification).all(axis=0)
         return list(np.flatnonzero(is_stated).tolist())
 
     @cached_property
@@ -214,17 +214,14 @@ class Told:
         """
         if not self.is_rough:
             return self.outside(column) > 0
-        lengths = np.abs(self.task.given[:, column] - self.task.original[column])
-        beyond = self.limits.alone.beyond
-        return any(
-            self._change(side, case) <= lengths[side[0]]
-            for side, case in beyond.items()
-            if side[1] == column
+        lengths = np.abs(
+            self.task.specification[:, column] - self.task.original[column]
         )
-
-    def value_in(self, fit: int) -> float:
-        """The worst that the search found in a parameter set: a clearance [m], or a metric."""
-        return value_in(self.unsafe, fit, self.limits.attacks[fit].least)
+        return any(
+            self._change(breach) <= lengths[breach[0][0]]
+            for breach in self.limits.alone.breaches.items()
+            if breach[0][1] == column
+        )
 
     @property
     def attacked(self) -> int:
@@ -278,7 +275,6 @@ def verdict_sentences(
         return
     if facts.broken:
         yield from _broken(facts)
-    yield from _sets(facts)
     yield from _nearest(facts, nearest)
     if facts.box is not None:
         yield from _joint(facts, facts.box)
@@ -299,26 +295,35 @@ def verdict_sentences(
 
 
 def _broken(facts: Told) -> Iterator[Sentence]:
-    """That specified limits do not hold: each that is not safe alone, else all together."""
+    """That specified limits do not hold: each that is not safe alone, else all together; and in
+    which parameter sets they fail.
+    """
     yield words.DO_NOT_RELEASE
     outside = [column for column in facts.broken if facts.outside(column) > 0]
     for column in outside:
         yield _outside(facts, column)
-    if outside:
-        return
+    if not outside:
+        yield _together(facts)
+    fits = len(facts.task.fits)
+    if facts.limits.broken and fits > 1:
+        broken = sorted(facts.limits.broken)
+        yield words.SPECIFIED_SETS(
+            holding=fits - len(broken), fits=fits, broken=fit_names(broken)
+        )
+
+
+def _together(facts: Told) -> Sentence:
+    """That all specified limits together do not hold."""
     values = list[str]()
     for column in facts.broken:
         item = facts.members[column]
-        for end in facts.given(column):
+        for end in facts.specified(column):
             if end is not None:
                 values.append(f"{item.short_name} {limit_text(item, end)}")
     case = next(iter(facts.limits.broken.values()))
     failure = facts.failure(case, facts.box_of(facts.limits.specified))
     event = words.SOME_UNSAFE if failure is None else failure.words
-    yield words.TOGETHER(
-        limits=join_phrases(values),
-        event=event,
-    )
+    return words.TOGETHER(limits=join_phrases(values), event=event)
 
 
 def _outside(facts: Told, column: int) -> Sentence:
@@ -338,9 +343,9 @@ def _outside(facts: Told, column: int) -> Sentence:
 
 def _failure_outside(facts: Told, column: int) -> tuple[float, str]:
     """The value with which the vehicle fails at or beyond a specified limit, and how it does."""
-    low, high = facts.given(column)
+    low, high = facts.specified(column)
     for side, end in enumerate((low, high)):
-        unsafe = facts.limits.alone.beyond.get((side, column))
+        unsafe = facts.limits.alone.breaches.get((side, column))
         if end is None or unsafe is None:
             continue
         case = unsafe.copy()
@@ -353,20 +358,6 @@ def _failure_outside(facts: Told, column: int) -> tuple[float, str]:
     end = low if high is None else high
     assert end is not None
     return end, words.SOME_UNSAFE
-
-
-def _sets(facts: Told) -> Iterator[Sentence]:
-    """In which parameter sets the specified limits do not hold."""
-    broken = sorted(facts.limits.broken)
-    fits = len(facts.task.fits)
-    if broken and fits > 1:
-        holding = fits - len(broken)
-        sets = fit_names(broken)
-        yield words.SPECIFIED_SETS(
-            holding=holding,
-            fits=fits,
-            broken=sets,
-        )
 
 
 def _nearest(facts: Told, nearest: Rows) -> Iterator[Sentence]:
@@ -402,7 +393,7 @@ def _joint(facts: Told, box: Box) -> Iterator[Sentence]:
         )
     yield _tested(facts.unsafe, holding)
     yield from _undecidable(facts, box)
-    for model in facts.task.left_out:
+    for model in facts.task.exclusions:
         # Its words name the test and the parameter set.
         described = describe(model, {"": model.characteristics.original})
         event = words.SOME_UNSAFE
@@ -412,7 +403,7 @@ def _joint(facts: Told, box: Box) -> Iterator[Sentence]:
             fit=model.fit,
             event=event,
         )
-    if fits == 1 and not facts.task.left_out and facts.study.spread:
+    if fits == 1 and not facts.task.exclusions and facts.study.spread:
         yield words.ONE_SET
 
 
@@ -465,11 +456,8 @@ def _tested(unsafe: Unsafe, fits: int) -> Sentence:
     """
     if not unsafe.keep:
         return words.SAFE(unsafe=unsafe.description)
-    template = words.CLEARANCE[fits > 1]
-    others = number_of(fits - 1, "other parameter set")
-    return template(
-        keep=unsafe.keep,
-        others=others,
+    return words.CLEARANCE[fits > 1](
+        keep=unsafe.keep, others=number_of(fits - 1, "other parameter set")
     )
 
 
@@ -485,7 +473,7 @@ def _alone(facts: Told) -> Iterator[Sentence]:
     """Which characteristics can make the vehicle unsafe on their own, of those that were asked
     about.
     """
-    limited = {column for _, column in facts.limits.alone.beyond}
+    limited = {column for _, column in facts.limits.alone.breaches}
     names = [
         facts.members[column].short_name
         for column in facts.columns
