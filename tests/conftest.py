@@ -139,7 +139,7 @@ def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     """Claims are falsified with the fewest simulations that are enough to print them."""
     monkeypatch.setattr(cases, "USUAL_BUDGET", cases.LEAST_SIMULATIONS)
     few = asked.USUAL._replace(
-        own=cases.LEAST_SIMULATIONS, alone=cases.LEAST_SIMULATIONS
+        cases=cases.LEAST_SIMULATIONS, alone=cases.LEAST_SIMULATIONS
     )
     monkeypatch.setattr(asked, "USUAL", few)
 

@@ -132,7 +132,7 @@ def run_page(page: str, options_of_tests: bool) -> Iterator[tuple[Block, str]]:
                 if is_shortened and (options_of_tests or not is_shown):
                     least = cases.LEAST_SIMULATIONS
                     patch.setattr(cases, "USUAL_BUDGET", least)
-                    few = asked.USUAL._replace(own=least, alone=least)
+                    few = asked.USUAL._replace(cases=least, alone=least)
                     patch.setattr(asked, "USUAL", few)
                     added = block.comment.removeprefix("in tests").replace(":", "", 1)
                 printed = "".join(
