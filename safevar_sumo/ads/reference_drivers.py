@@ -63,12 +63,11 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
 
     The system reacts to an obstacle that enters its way, or stands or drives steadily in its way,
     if the time to collision is below (v - u) / (2 * 6 m/s^2) + 0.35 s + 0.1 s (v, u: speeds of the
-    vehicle and the obstacle). The system then brakes with 6 m/s^2 at once. UN R157 states this time
-    to collision for cars that cut in (5.2.5.2). If a leader brakes, the system must avoid a
-    collision only if the time gap to the leader before the braking was at least 1 s + v / (100
-    km/h) s (5.2.5.1). If the time gap is at least that long, a system that brakes as hard as the
-    leader avoids a collision. With a smaller time gap, UN R157 demands nothing, and the system does
-    not react to the leader's braking.
+    vehicle and the obstacle). Below this time to collision, the system brakes with 6 m/s^2. UN R157
+    states this time to collision for cars that cut in (5.2.5.2). If a leader brakes, the system
+    must avoid a collision only if the time gap to the leader before the braking was at least 1 s +
+    v / (100 km/h) s (5.2.5.1). With a time gap below 1 s + v / (100 km/h) s, UN R157 demands
+    nothing, and the system does not react to the leader's braking.
 
     Parameters
     ----------
@@ -122,8 +121,9 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
 class Rss(ReferenceDriver, frozen=True, kw_only=True):
     """Responsibility-sensitive safety (Shalev-Shwartz, Shammah, Shashua 2017), longitudinal part.
 
-    The driver reacts to a gap below the safe distance, and brakes. safe distance = v rt + a rt^2 /
-    2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and leader.
+    The driver reacts to a gap below the safe distance, and brakes. The safe distance is v rt + a
+    rt^2 / 2 + (v + rt a)^2 / (2 b) - u^2 / (2 b_u), with the speeds v and u of vehicle and leader,
+    and the parameters rt, a, b and b_u.
 
     Parameters
     ----------

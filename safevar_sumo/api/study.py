@@ -129,8 +129,8 @@ def study(
         Use only encounters in which this value is not exceeded, such as speed=40. The unit is that
         of the study.
     unsafe
-        Criterion for an unsafe vehicle in the answer, such as collision or "drac > 6". The search
-        does not depend on this criterion.
+        Criterion for an unsafe vehicle in the answer, such as collision or "drac > 6". This
+        criterion does not change the search.
     engine
         What moves the vehicles: recorded (fast, in a scene that SUMO played once) or sumo (SUMO in
         every simulation).

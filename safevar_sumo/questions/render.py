@@ -104,12 +104,13 @@ def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
 def _more(answer: Answer, screen: Screen) -> str:
     """The last line: what else there is, and the next question."""
     names = [name for name, frame in screen.others.items() if len(frame)]
+    contents = []
     if screen.unsaid:
-        names.insert(0, number_of(screen.unsaid, "more sentence"))
-    contents = ""
+        contents.append(number_of(screen.unsaid, "more sentence"))
     if names:
-        contents = f" ({', '.join(names)})"
-    line = f"More: --details{contents}, --json."
+        contents.append(f"{number_of(len(names), 'table')}: {', '.join(names)}")
+    in_brackets = f" ({'; '.join(contents)})"
+    line = f"More: --details{in_brackets if contents else ''}, --json."
     if answer.next and answer.numbers.get("driven"):
         line += f" Next: {answer.next}"
     return line

@@ -106,7 +106,7 @@ def evidence(
     results
         Results, or their directories.
     out
-        File to write the pack to. The name ends in .zip.
+        File to write the evidence pack to. The name ends in .zip.
     ask
         Ask this question in place of the usual ones, such as "risk --samples 4000"; may be
         repeated.

@@ -74,12 +74,12 @@ class Individual(list[float]):
 
 
 class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Elitist search by rank and crowding distance, with as many offspring as individuals.
+    """Elitist search by Pareto rank and crowding distance, with as many offspring as individuals.
 
     NSGA-II combines values before the filter, which resets small changes to the original value;
     simulations and results have values after the filter. The default mutation probability is 1/n
     per variable; crossover is simulated binary, mutation polynomial, both bounded by the domains. A
-    tournament has `tournament_size` individuals. The result is the non-dominated part of the last
+    tournament has `tournament_size` individuals. NSGA-II returns the non-dominated part of the last
     population. A vehicle whose simulation failed does not survive. If the search also varies the
     encounter, an encounter in which the original vehicle is safe is better than another encounter.
     If the original vehicle is unsafe in two encounters, the better encounter is the one in which

@@ -33,7 +33,7 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
     from all non-dominated simulated vehicles and 100 sampled vehicles. If earlier rounds of the
     search simulated N vehicles, a round simulates 10 + N / 10 new vehicles that are non-dominated
     in the predictions. Four fifths of the vehicles of a round have the best crowding distance, one
-    fifth has the most uncertain prediction. The result is the non-dominated archive of all
+    fifth has the most uncertain prediction. `surrogate` returns the non-dominated archive of all
     simulations.
     """
 

@@ -227,10 +227,9 @@ class MatrixTest(Table, frozen=True, kw_only=True):
 class MatrixTable(Table, frozen=True, kw_only=True):
     """The table [matrix] has the `tests` in which every vehicle is simulated.
 
-    `aggregate` says which test case gives the result of a vehicle. With `worst`, this test case is
-    the one with the lowest safety degree. With `"drac >"`, the result comes from the test case
-    with the largest value of the metric `drac`. With `"ttc_min <"`, the result comes from the test
-    case with the smallest value of the metric `ttc_min`.
+    `aggregate` says which test case gives the result of a vehicle. The value `worst` takes the test
+    case with the lowest safety degree, `"drac >"` the one with the largest value of the metric
+    `drac`, and `"ttc_min <"` the one with the smallest value of the metric `ttc_min`.
     """
 
     tests: Annotated[list[MatrixTest], Meta(min_length=1)]

@@ -166,8 +166,8 @@ class RepairTable(Table, frozen=True, kw_only=True):
     to keep.
 
     - `parameters` are the parameters that a repair may change, by name. A study's file states the
-      parameters of a repair directly under [repair]. By default a repair may change the parameters
-      that a shipped driving system names.
+      parameters of a repair directly under [repair]. Shipped driving systems name the parameters
+      that a repair may change by default.
     - `promise` has the limits of wear, by characteristic, within which a repaired vehicle must be
       safe. The value "all" means the whole domain (range of values). By default the limits are
       those of the table [limits].

@@ -30,8 +30,8 @@ NEW_COLLISION = answer(
 )
 NEW_COLLISIONS = answer(
     "The original vehicle of {b} collides at {speed:.2f} m/s{place}. The original vehicle of {a}"
-    " does not collide in the same test case. {number} test cases end in a collision with {b} and"
-    " not with {a}, and the stated collision is the fastest."
+    " does not collide in the same test case. {number} test cases end in a collision with {b}"
+    " alone, and this collision speed is the greatest."
 )
 ORIGINAL_UNSAFE = answer(
     "Even the original vehicle is unsafe in {b}, although it is safe in {a}."

@@ -136,8 +136,8 @@ def explain(
         Default: the criterion of the study, else a collision (if nothing collides: half of the
         original vehicle's safety degree).
     of_study
-        Ask which smallest changes make the vehicle unsafe, and ignore the failures in the results.
-        Default: explain these failures.
+        Ask which smallest changes make the vehicle unsafe, and ignore the unsafe vehicles in the
+        results. Default: explain unsafe vehicles in the results.
     top
         Largest number of failures that are examined one by one.
     fits

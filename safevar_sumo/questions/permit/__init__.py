@@ -126,8 +126,8 @@ def permit(
         Number of parameter sets (calibrations) of the vehicle model in which a car must be safe.
         Default: all; 0 uses only the set of the study.
     quick
-        Give a rough answer that proves nothing, from the tested speeds alone. A rough
-        answer never says "drive".
+        Give a rough answer that proves nothing, from the tested speeds alone. In a rough answer, no
+        car gets the verdict "drive".
     out
         Write the list with the highest safe speeds to this file.
     """

@@ -88,6 +88,6 @@ TESTED = evidence(
     " an unsafe encounter."
 )
 TESTED_QUICK = evidence(
-    "In each test, {number} values {values} were simulated. No search for an unsafe"
-    " encounter followed."
+    "In each test, {number} values {values} were simulated. The program did not search for an"
+    " unsafe encounter between them."
 )

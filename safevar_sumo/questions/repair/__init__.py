@@ -90,8 +90,8 @@ def repair(
 ) -> Answer:
     """Find the smallest change of the driving system's parameters that keeps worn vehicles safe.
     You get the new values, the price of the change (the original vehicle brakes earlier, or
-    needlessly), and how the change was tested. If you give results (DIR), the change also makes
-    safe the failures of these results within the limits of wear (--promise).
+    needlessly), and how the change was tested. If you give results (DIR), unsafe vehicles of these
+    results within the limits of wear (--promise) become safe, too.
 
     Example: python -m safevar_sumo repair autoware_july --promise "brakeTorque >= 0.9"
 
@@ -99,7 +99,7 @@ def repair(
     ----------
     promise
         Limit of wear within which every vehicle must be safe, such as "treadDepth >= 3"; may be
-        repeated. The value all stands for all values of the domains. Default: the limits under
+        repeated. Write all for every value in the domains. Default: the limits under
         [repair.promise] of the study, else under [limits].
     margin
         Clearance that every vehicle must keep between bumpers, in metres. Default: the value of the
