@@ -29,9 +29,8 @@ NEW_COLLISION = answer(
     " does not collide in the same test case."
 )
 NEW_COLLISIONS = answer(
-    "The original vehicle of {b} collides at {speed:.2f} m/s{place}. The original vehicle of {a}"
-    " does not collide in the same test case. {number} test cases end in a collision with {b}"
-    " alone, and this collision speed is the greatest."
+    "The original vehicle of {b} collides in {number} test cases in which the original vehicle of"
+    " {a} does not collide. The fastest of these collisions has {speed:.2f} m/s{place}."
 )
 ORIGINAL_UNSAFE = answer(
     "Even the original vehicle is unsafe in {b}, although it is safe in {a}."
@@ -63,6 +62,6 @@ ORIGINALS_DIFFER = condition(
 NO_TEST = note("No statistical test is possible, because there is no pair of results.")
 TEST = note(
     "A signed-rank test compares the mean safety degree of the same vehicles in both versions,"
-    " over {number} groups of vehicles ({groups}): p = {p:.2g}. A mean safety degree of {a} is"
-    " larger than one of {b} with a probability of {a12:.2f} (effect size A12)."
+    " over {number} groups of vehicles ({groups}): p = {p:.2g}. The mean safety degree of a"
+    " group is larger in {a} than in {b} with a probability of {a12:.2f} (effect size A12)."
 )

@@ -77,8 +77,8 @@ GAP = evidence(
     "The unsafe range has a gap: at {share} % of the way to the ends, the vehicle is safe again."
 )
 CHECKED_WITH = evidence(
-    "The program checked this cause with similar vehicles and other parameter sets, at these"
-    " values: {changes}."
+    "In the checks with similar vehicles and with other parameter sets of the vehicle model, the"
+    " cause has these values: {changes}."
 )
 RUNS = evidence("The vehicle is unsafe in {share} % of its repeated runs.")
 SETS = evidence(

@@ -90,8 +90,8 @@ def repair(
 ) -> Answer:
     """Find the smallest change of the driving system's parameters that keeps worn vehicles safe.
     You get the new values, the price of the change (the original vehicle brakes earlier, or
-    needlessly), and how the change was tested. If you give results (DIR), unsafe vehicles of these
-    results within the limits of wear (--promise) become safe, too.
+    needlessly), and how the change was tested. If you give results (DIR), the change also makes
+    unsafe vehicles of these results safe (if they are within the limits of wear, --promise).
 
     Example: python -m safevar_sumo repair autoware_july --promise "brakeTorque >= 0.9"
 
