@@ -121,8 +121,8 @@ def study(
     seed
         Seed of all random numbers of the study. Default: the seed in the study.
     ranges
-        Let the search also choose the encounter, within the ranges that the study states. Default:
-        only the listed test cases.
+        Let the search also choose the encounter, within the ranges of the study. Default: the
+        study's test cases.
     point
         Use only this test or test case of the study, such as CPNA. Default: all tests.
     up_to
@@ -142,8 +142,7 @@ def study(
         Simulate on the workers of this Dask scheduler, such as tcp://host:8786. Default: on this
         machine.
     retry_failed
-        Simulate vehicles again that could not be simulated before. Default: the results do not
-        contain vehicles that could not be simulated.
+        Simulate vehicles again that could not be simulated before. Default: no further attempt.
     quiet
         Print only errors, warnings, and an output that you ask for, such as JSON. Default: print
         the answer and the progress as well.

@@ -111,7 +111,7 @@ def permit(
     ignore
         Ignore this column of the list; may be repeated.
     need
-        Speed at which every car must be safe, else the exit code is 3.
+        Speed at which every car must be safe, else exit code 3.
     by
         Find the highest safe value of this speed, such as target_speed. Default: the speed of the
         car.
@@ -126,8 +126,8 @@ def permit(
         Number of parameter sets (calibrations) of the vehicle model in which a car must be safe.
         Default: all; 0 uses only the set of the study.
     quick
-        Give a rough answer that proves nothing, from the tested speeds alone. In a rough answer, no
-        car gets the verdict "drive".
+        Give a rough answer that proves nothing, from the tested speeds alone. No car gets the
+        verdict "drive".
     out
         Write the list with the highest safe speeds to this file.
     """
