@@ -224,11 +224,11 @@ def _found(
         advice = ""
     else:
         sentences, changes = _verdict(results, case, jobs, study)
-    tables = answer.tables
+    tables = answer.tables.records
     if changes:
         title = "The smallest number of changes that the search found to be unsafe"
-        frame = tabulate(title, CHANGES, changes)
-        tables = {"algorithms": tables["algorithms"], "fewest": frame, **tables}
+        fewest = tabulate(title, CHANGES, changes)
+        tables = {"algorithms": tables["algorithms"], "fewest": fewest, **tables}
     return replace(
         answer,
         verdict=reason or Verdict(sentences),
@@ -372,13 +372,16 @@ def summarise(results: Results) -> Answer:
     # Tests that none of so few runs can pass are folded, with a remark.
     untested = []
     with suppress(UnanswerableError):
-        tables |= answer_questions([case], names=RUN_TESTS).tables
-        untested = [name for name in RUN_TESTS if not tables[name]["enough_runs"].any()]
+        of_runs = answer_questions([case], names=RUN_TESTS).tables
+        tables |= of_runs.records
+        untested = [
+            name for name in RUN_TESTS if not of_runs[name]["enough_runs"].any()
+        ]
         # The first remark on tests of which none can be significant says how many runs are needed.
         if few := " ".join(
-            next(remarks_on_runs(name, tables[name]), "") for name in untested
+            next(remarks_on_runs(name, of_runs[name]), "") for name in untested
         ):
-            remarks = tables["remarks"]
+            remarks = of_runs["remarks"]
             remarks.loc[len(remarks)] = ["all", few]
     runs = study.search.runs * len(rows)
     return Answer(

@@ -16,11 +16,12 @@ from safevar_sumo.questions.render import print_answer, render
 from safevar_sumo.questions.tables import (
     HIGH as HIGH,
     LOW as LOW,
+    AnswerTable as AnswerTable,
     Column as Column,
     Columns as Columns,
+    Frames,
     Wide as Wide,
     cell_text,
-    columns_of,
     plain,
     tabulate as tabulate,
     with_interval as with_interval,
@@ -139,14 +140,12 @@ class Answer:
     numbers
         Values by name; NaN or None where undefined.
     tables
-        Frames by name, made by `tabulate`.
+        Frames by name. A question gives what `tabulate` makes; `tables.records` has it.
     failures
         Sentences that say which of the user's limits are not kept; the command then ends with exit
         code 3.
     lead
-        The table of the one screen, by default the first; None for none. Its attribute `lead_rows`
-        holds the places of the rows that it shows, the most important first; by default all. One
-        with the attribute `shown_whole` is not cut up to this number of rows.
+        The table of the one screen, by default the first; None for none.
     folded
         Names of tables that readers see only by name; JSON and CSV have all.
     is_whole
@@ -174,7 +173,7 @@ class Answer:
     study: Study
     verdict: str
     numbers: JsonObject
-    tables: dict[str, pd.DataFrame]
+    tables: Any
     failures: tuple[str, ...] = ()
     lead: str | None = ""
     folded: tuple[str, ...] = ()
@@ -185,18 +184,22 @@ class Answer:
     listing: pd.DataFrame | None = field(default=None, compare=False)
     draw: Callable[[Answer], Figure] | None = field(default=None, compare=False)
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.tables, Frames):
+            object.__setattr__(self, "tables", Frames(self.tables))
+
     def to_dict(self) -> JsonObject:
         """Plain values: question, study, verdict, numbers, and of each table its columns and rows;
         null where undefined.
         """
         # Each table with units and meanings.
         tables = {}
-        for name, frame in self.tables.items():
+        for name, table in self.tables.records.items():
             columns = {
                 key: {"unit": column.unit, "meaning": column.meaning}
-                for key, column in columns_of(frame).items()
+                for key, column in table.columns.items()
             }
-            rows = list(map(plain, frame.to_dict("records")))
+            rows = list(map(plain, table.frame.to_dict("records")))
             tables[name] = {"columns": columns, "rows": rows}
         answer = {
             "question": self.question,
@@ -215,10 +218,11 @@ class Answer:
         InputError
             If the answer has no such table.
         """
+        frames: dict[str, pd.DataFrame] = self.tables
         if name is None:
-            return next(iter(self.tables.values()), pd.DataFrame())
-        check_name("table", f"there is no table {name!r}", name, self.tables)
-        return self.tables[name]
+            return next(iter(frames.values()), pd.DataFrame())
+        check_name("table", f"there is no table {name!r}", name, frames)
+        return frames[name]
 
     def only(self, name: str) -> Answer:
         """The answer with one of its tables, and the remarks on it.
@@ -228,12 +232,14 @@ class Answer:
         InputError
             If the answer has no such table.
         """
-        tables = {name: self.table(name)}
-        remarks = self.tables.get("remarks")
-        if remarks is not None:
-            if "table" in remarks:
-                remarks = remarks[remarks["table"].isin([name, "all"])]
-            tables["remarks"] = remarks
+        self.table(name)
+        records = self.tables.records
+        tables = {name: records[name]}
+        if remarks := records.get("remarks"):
+            rows = remarks.frame
+            if "table" in rows:
+                rows = rows[rows["table"].isin([name, "all"])]
+            tables["remarks"] = remarks.with_rows(rows)
         return replace(self, tables=tables, folded=(), lead=name, is_whole=True)
 
     def render(
@@ -307,7 +313,8 @@ def _draw_intervals(answer: Answer) -> Figure:
 
     # A panel for each column.
     size = (max(2.6 * len(names), 5.2), 1.1 + 0.35 * len(frame))
-    figure, axes = new_figure(frame.attrs["title"], 1, len(names), size, sharey=True)
+    table, *_ = answer.tables.records.values()
+    figure, axes = new_figure(table.title, 1, len(names), size, sharey=True)
     places = range(len(frame), 0, -1)
     for axis, name in zip(axes[0], names, strict=True):
         columns = [name, f"{name}{LOW}", f"{name}{HIGH}"]

@@ -118,7 +118,8 @@ class Question:
         # Options that all questions have.
         names = [parameter.name for parameter in parameters]
         common_parameters = inspect.signature(Question.__call__).parameters
-        parameters.pop(1)  # the evaluator
+        # The evaluator is no subject.
+        parameters.pop(1)
         texts = [inspect.cleandoc(compute.__doc__ or "")]
         for option in COMMON_OPTIONS:
             if option.name not in names:
@@ -302,14 +303,14 @@ class Question:
         beginning = [answer(reason)]
         if values.get(QUICK):
             beginning.append(ROUGH)
-        if account.most is not None:
+        if account.limit is not None:
             numbers |= {"rough": True, "simulations": account.spent}
-            beginning[1:] = [ROUGH_OF_FEW(most=account.most)]
+            beginning[1:] = [ROUGH_OF_FEW(most=account.limit)]
         if self.has_rough_answer:
             numbers["rough"] = bool(beginning[1:] or numbers.get("rough"))
         sentences = [*beginning, *Verdict.of(result.verdict).sentences, *cites]
         undefined = note(account.undefined_in_words)
-        limit = account.asked if account.most is None else account.most
+        limit = account.allowance if account.limit is None else account.limit
         return replace(
             result,
             verdict=Verdict([*sentences, undefined]),
@@ -335,12 +336,7 @@ class Question:
         cites = []
         if stated.source:
             rule = stated.criterion or None
-            cites.append(
-                CRITERION_OF_STUDY(
-                    criterion=rule,
-                    source=stated.source,
-                )
-            )
+            cites.append(CRITERION_OF_STUDY(criterion=rule, source=stated.source))
         if stated.not_simulated:
             cites.append(NOT_SIMULATED(parts=stated.not_simulated))
         criterion = None
@@ -432,7 +428,8 @@ def find_question(name: str) -> Question:
         add_import_folders(())
     else:
         module, function = QUESTIONS[name], name
-    invalidate_caches()  # the module may have been written a moment ago
+    # The module may have been written a moment ago.
+    invalidate_caches()
 
     # Its module has a function with the decorator.
     try:

@@ -99,9 +99,7 @@ def bars_of(limits: pd.DataFrame, domains: Iterable[tuple[float, float]]) -> lis
 
 
 def draw_bars(answer: Answer) -> Figure:
-    """The bars of a table of limits, a row for each characteristic; `tolerance` keeps them in its
-    attribute `bars`.
-    """
+    """The bars of a table of limits, a row for each characteristic."""
     from safevar_sumo.questions.figures import (
         BLUE,
         SKY_BLUE,
@@ -110,10 +108,11 @@ def draw_bars(answer: Answer) -> Figure:
         new_figure,
     )
 
-    limits = answer.tables["limits"]
+    table = answer.tables.records["limits"]
+    limits = table.frame
     size = (6.4, 1.3 + 0.3 * len(limits))
     figure, ((axis,),) = new_figure(f"{answer.study.name}: limits", 1, 1, size)
-    for place, bar in enumerate(limits.attrs["bars"]):
+    for place, bar in enumerate(table.bars):
         for ends, colour in ((bar.alone, SKY_BLUE), (bar.together, BLUE)):
             if ends:
                 axis.barh(

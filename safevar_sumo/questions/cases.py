@@ -145,7 +145,7 @@ class SearchPlan(NamedTuple):
 
     budget: int
     generation: int = 512
-    more: int = 2
+    sequel: int = 2
 
 
 class Counterexamples(NamedTuple):
@@ -235,7 +235,7 @@ def generations_of(
 ) -> Generations:
     """The generations of a search of a space."""
     size = plan.generation
-    generations = plan.more
+    generations = plan.sequel
     results = Counterexamples(start[:0], np.zeros(0))
     cases = np.concatenate([space.hold(start, rng), space.draw(size, rng)])
     while results.simulated < plan.budget and generations >= 0:

@@ -125,7 +125,7 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
         )
         tables = {kind: tables[kind]}
     counts = ", ".join(
-        f"{frame.iloc[:, 0].nunique()} {name}" for name, frame in tables.items()
+        f"{table.frame.iloc[:, 0].nunique()} {name}" for name, table in tables.items()
     )
     verdict = f"The package has {counts}."
     if scenarios is not SCENARIOS:

@@ -139,7 +139,8 @@ def are_causes(
     groups = []
     for setting in settings_of(characteristics, causes):
         is_changed = (setting != characteristics.original) & characteristics.of_vehicle
-        is_left_out = np.diag(is_changed)[is_changed]  # in a row for each change
+        # A row for each change leaves it out.
+        is_left_out = np.diag(is_changed)[is_changed]
         groups.append(
             np.vstack(
                 [setting, np.where(is_left_out, characteristics.original, setting)]

@@ -132,12 +132,18 @@ class Evaluator:
         """
         if ignore_constraints:
             return self._simulate_shown(settings, stage, self._verified)
-        return self._evaluate_feasible(settings, stage, self._verified, EVERYTHING)
+        return self.evaluate_selection(settings, EVERYTHING, stage, self._verified)
 
-    def _evaluate_feasible(
-        self, rows: FloatArray, stage: str, verified: int, selection: Selection
+    def evaluate_selection(
+        self, rows: FloatArray, selection: Selection, stage: str, verified: int = 0
     ) -> Evaluations:
-        """Evaluate rows, of which those that violate a constraint are not simulated."""
+        """Evaluate M settings as `selection` says: at some points, and with values of P parameters
+        of the ADS.
+
+        The values stand beside the settings, shape (M, n + P). Of a part of the points, encounters
+        in which the original vehicle is not safe count, too. Settings that violate a constraint are
+        not simulated.
+        """
         n = len(self.characteristics)
         is_feasible = self.region.feasible(rows[:, :n])
         if is_feasible.all():
@@ -155,25 +161,25 @@ class Evaluator:
         return evaluations.take(np.argsort(np.argsort(~is_feasible, kind="stable")))
 
     def begin(
-        self, settings: NamedValues, least: int = 1, *, of_list: bool = False
+        self, settings: NamedValues, minimum: int = 1, *, of_list: bool = False
     ) -> None:
         """Begin a question of these phases, each with the number of settings that it is expected to
-        simulate; below the `least` number there is no answer. One about a list of vehicles says how
+        simulate; below the `minimum` there is no answer. One about a list of vehicles says how
         long it takes where a simulation is short, too.
         """
         expected = sum(settings.values())
-        if self.account.is_question:
-            account = self.account
-            number = least + MEASURED * self.system.mover.takes_long
+        account = self.account
+        if account.is_question:
+            number = minimum + MEASURED * self.system.mover.takes_long
             account.require(account.spent + number * self._each)
             if self.system.mover.takes_long:
-                if account.asked is not None:
-                    self._pool.spare = spare(account.asked, account.minimum)
+                if account.allowance is not None:
+                    self._pool.spare = spare(account.allowance, account.minimum)
                 check_simulator(self.study, self._pool)
             seconds = seconds_of_simulation(self.study, self.system, self._pool)
-            self.account.open(expected * self._each, seconds, self._pool.checked)
+            account.open(expected * self._each, seconds, self._pool.checked)
             if seconds is not None:
-                self.account.spend(MEASURED * self._each)
+                account.spend(MEASURED * self._each)
             elif of_list and self.left is None:
                 simulations = expected * len(self.system.points)
                 print_price_of_list(self.study, self.system, self._pool, simulations)
@@ -187,7 +193,7 @@ class Evaluator:
     def left(self) -> int | None:
         """The number of settings that may follow; None without a limit."""
         account = self.account
-        if account.most is None:
+        if account.limit is None:
             return None
         return int(account.left) // self._each
 
@@ -201,7 +207,7 @@ class Evaluator:
         self.account.effort = 1.0
         if quick:
             self.account.effort = float(np.clip(QUICK_SECONDS / seconds, *QUICK))
-        self.account.asked = self.account.most = simulations
+        self.account.allowance = self.account.limit = simulations
         self.account.questions = questions
         self.account.is_question = True
         self._pool.spare = None
@@ -225,17 +231,6 @@ class Evaluator:
     @property
     def _each(self) -> int:
         return simulations_of_setting(self.system)
-
-    def evaluate_selection(
-        self, rows: FloatArray, selection: Selection, stage: str
-    ) -> Evaluations:
-        """Evaluate M settings as `selection` says: at some points, and with values of P parameters
-        of the ADS.
-
-        The values stand beside the settings, shape (M, n + P). Encounters in which the original
-        vehicle is not safe count, too. Settings that violate a constraint are not simulated.
-        """
-        return self._evaluate_feasible(rows, stage, 0, selection)
 
     def _simulate_shown(
         self,
@@ -287,8 +282,11 @@ class Evaluator:
         }
         metrics[ORIGINAL_DEGREE] = evaluations.column(ORIGINAL_DEGREE)
         counts = ~is_left_out | evaluations.failed
-        outcome = np.where(counts, evaluations.outcome, Outcome.INFEASIBLE.value)
-        return replace(evaluations, outcome=outcome, metrics=metrics)
+        return replace(
+            evaluations,
+            outcome=np.where(counts, evaluations.outcome, Outcome.INFEASIBLE.value),
+            metrics=metrics,
+        )
 
     def evaluate_over_encounters(
         self, settings: FloatArray, unsafe: Unsafe, stage: str
@@ -313,29 +311,24 @@ class Evaluator:
         """The original vehicle in those `ENCOUNTERS` of many encounters in which it is least safe,
         shape (k, n); none where encounters are listed.
         """
-        if not len(self.characteristics.scenario):
-            return np.zeros((0, len(self.characteristics)))
-        originals = self._originals
-        valid = originals.take(originals.valid)
-        least_safe_first = np.argsort(valid.f_safe, kind="stable")  # NaN is last
+        valid = self._originals.take(self._originals.valid)
+        # NaN is last.
+        least_safe_first = np.argsort(valid.f_safe, kind="stable")
         return valid.settings[least_safe_first[:ENCOUNTERS]]
 
     @cached_property
     def share_left_out(self) -> float:
-        """The share of the encounters over the domain in which the original vehicle is not safe, so
-        that they do not count; 0 where encounters are listed.
-        """
-        if not len(self.characteristics.scenario):
-            return 0.0
-        originals = self._originals
-        is_possible = self.region.feasible(originals.settings)
+        """The share of unsafe originals in encounters over the domain; 0 where these are listed."""
+        is_possible = self.region.feasible(self._originals.settings)
         if not is_possible.any():
             return 0.0
-        return float(np.mean(~originals.valid[is_possible]))
+        return float(np.mean(~self._originals.valid[is_possible]))
 
     @cached_property
     def _originals(self) -> Evaluations:
-        """Evaluations of the original vehicle in encounters over the domain."""
+        """Evaluations of originals in encounters over the domain; none where these are listed."""
+        if not len(self.characteristics.scenario):
+            return Evaluations.none(len(self.characteristics), METRICS)
         # Of few simulations an eighth chooses encounters, and the others are of vehicles there.
         settings = sobol_settings(self.characteristics, self.at_most(CANDIDATES, 8))
         originals = self.characteristics.with_original_vehicle(settings)
@@ -460,8 +453,13 @@ class Evaluator:
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""
         # The interval may be no multiple of this step.
-        metrics = replace_in(self.study.metrics, sampling_interval=None)
-        return self.for_study(replace_in(self.study, step_length=step, metrics=metrics))
+        return self.for_study(
+            replace_in(
+                self.study,
+                step_length=step,
+                metrics=replace_in(self.study.metrics, sampling_interval=None),
+            )
+        )
 
     def end(self) -> None:
         """Have user code simulate again what it began with: an error if it does not repeat it."""
@@ -495,6 +493,7 @@ def open_evaluator(
     if pool is not None:
         yield Evaluator(study, pool, progress)
         return
-    assemble(study)  # before workers start
+    # An error comes before workers start.
+    assemble(study)
     with open_pool(jobs, cluster) as new_pool:
         yield Evaluator(study, new_pool, progress)

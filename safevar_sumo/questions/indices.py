@@ -15,6 +15,7 @@ from safevar_sumo.metrics import F_SAFE, Unsafe
 from safevar_sumo.questions.answer import (
     HIGH,
     LOW,
+    AnswerTable,
     Column,
     Columns,
     tabulate,
@@ -40,8 +41,8 @@ OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsa
 """What varies, by the beginning of the names of its columns; another measure may stand in place of
 the safety degree.
 """
-OF_WHAT = "of_what"
-"""The attribute of the table that says what varies, as `OUTPUTS` does."""
+MAX_DECIDING = 5
+"""Number of characteristics that one screen names."""
 UNDEFINED = ("", "undefined here")
 """SALib's key and the meaning of an index that does not exist."""
 Indices = Mapping[str, FloatArray]
@@ -83,10 +84,10 @@ def design_of(evaluator: Evaluator, model: VariationModel) -> Evaluations:
 
 def sobol_indices(
     evaluator: Evaluator, evaluations: Evaluations, criterion: Unsafe, confidence: float
-) -> pd.DataFrame:
+) -> tuple[AnswerTable, str]:
     """Sobol indices, first order and total, of independent characteristics, from Saltelli's design;
     undefined where nothing varies, or too few settings are unsafe or safe. Base points with a
-    setting that could not be simulated do not count.
+    setting that could not be simulated do not count. And the name of the measure that varies.
     """
     from SALib.analyze import sobol as analysis
 
@@ -111,9 +112,9 @@ def sobol_indices(
 
 def given_data_indices(
     evaluator: Evaluator, evaluations: Evaluations, criterion: Unsafe, confidence: float
-) -> pd.DataFrame:
+) -> tuple[AnswerTable, str]:
     """The first-order index from any sample of vehicles: the share of the variance that knowing a
-    characteristic removes, with what depends on it.
+    characteristic removes, with what depends on it. And the name of the measure that varies.
     """
     from SALib.analyze import delta as analysis
 
@@ -146,7 +147,7 @@ def _table(
     criterion: Unsafe,
     indices_of: Callable[[FloatArray], Indices],
     kinds: dict[str, tuple[str, str]],
-) -> pd.DataFrame:
+) -> tuple[AnswerTable, str]:
     """A row for each characteristic, the one that decides most of the measure first; `kinds` maps
     an index to SALib's key and its meaning. Readers see the name of a measure other than the safety
     degree above its column.
@@ -189,8 +190,9 @@ def _table(
                 "-", f"share of the variance of {of_what}: {meaning}", ".2f"
             )
             if output == "degree":
-                head = f"{of_what.removeprefix('the ')}: {index}"
-                column = column._replace(head=head)
+                column = column._replace(
+                    head=f"{of_what.removeprefix('the ')}: {index}"
+                )
             else:
                 column = column._replace(is_detail=True)
             columns |= with_interval(name, column)
@@ -201,8 +203,8 @@ def _table(
     frame = frame.sort_values(
         largest, ascending=False, kind="stable", ignore_index=True
     )
+    title = "What decides: shares of the variance (Sobol indices)"
     table = tabulate(
-        "What decides: shares of the variance (Sobol indices)", columns, frame
+        title, columns, frame, lead_rows=range(min(MAX_DECIDING, len(names)))
     )
-    table.attrs[OF_WHAT] = output_names
-    return table
+    return table, output_names["degree"]

@@ -141,8 +141,9 @@ def evaluate_sets(
     evaluations = []
     for k, fitted_study in enumerate(studies_of_sets(study)):
         called = f"{study.source}: spread: set {k}" if k else study.source
-        origin = replace(fitted_study.origin, called=called)
-        system = assemble(replace(fitted_study, origin=origin))
+        system = assemble(
+            replace(fitted_study, origin=replace(fitted_study.origin, called=called))
+        )
         evaluations.append(drive_and_score(system, settings))
     return evaluations
 

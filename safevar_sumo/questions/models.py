@@ -96,7 +96,7 @@ class Models(NamedTuple):
     """
 
     members: tuple[Model, ...]
-    left_out: tuple[Model, ...]
+    exclusions: tuple[Model, ...]
 
     @property
     def own(self) -> Model:

@@ -155,7 +155,8 @@ def options_of(function: Callable[..., Any]) -> list[Option]:
     for parameter in inspect.signature(function).parameters.values():
         if parameter.kind is parameter.KEYWORD_ONLY:
             hint = parameter.annotation
-            if isinstance(hint, str):  # where the module postpones annotations
+            # The module postpones annotations.
+            if isinstance(hint, str):
                 hint = eval(hint, names)
             meaning = " ".join(texts.get(parameter.name, "").split())
             options.append(_option(parameter, hint, meaning))

@@ -9,21 +9,29 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.metrics.unsafe import SHARE_DECIMALS
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import models_of
-from safevar_sumo.questions.sampling import clopper_pearson
+from safevar_sumo.questions.sampling import share_with_interval
 from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import interval_in_words, percentage
-from safevar_sumo.records import BoolArray, FloatArray, JsonObject, NamedValues
+from safevar_sumo.records import (
+    BoolArray,
+    Evaluations,
+    FloatArray,
+    JsonObject,
+    NamedValues,
+)
 from safevar_sumo.study import Study
 
 STAGE = "check other parameter sets"
 """Phase of progress."""
-INTERVALS = "by_set_intervals"
-"""The number of an answer that has the intervals."""
+BY_SET, INTERVALS = "by_set", "by_set_intervals"
+"""The numbers of an answer that have the shares, and their intervals."""
 VEHICLES = 400
 """Number of vehicles that are simulated with each set."""
 ONE_SET = Sentence(
@@ -41,6 +49,25 @@ SAME_SHARE = Sentence(
     "The share of unsafe vehicles is {least} in each of the {sets} parameter sets of the vehicle"
     " model (alternative calibrations; at most {most} vehicles with each set).",
 )
+
+
+def simulate_sample(
+    evaluator: Evaluator, model: VariationModel, number: int, stage: str
+) -> Evaluations:
+    """Evaluations of vehicles that vary as a study states.
+
+    Raises
+    ------
+    SimulationError
+        If none of them could be simulated.
+    """
+    vehicles = model.draw(number, np.random.default_rng(evaluator.seed))
+    evaluations = evaluator.evaluate(vehicles, stage)
+    if not evaluations.valid.any():
+        raise SimulationError(
+            f"study {evaluator.study.name!r}: none of {number} vehicles could be simulated"
+        )
+    return evaluations
 
 
 def planned_over_sets(
@@ -93,20 +120,18 @@ class SharesOverSets(NamedTuple):
             for model in models.members:
                 runs = model.evaluator.evaluate(settings[is_chosen], STAGE)
                 of_runs = unsafe.runs(runs).mean(axis=0)
-                rows.append([_share(of_runs[group & runs.valid]) for group in members])
+                for group in members & runs.valid:
+                    count = round(float(of_runs[group].sum()), SHARE_DECIMALS)
+                    rows.append(share_with_interval(count, int(group.sum())))
         table = np.array(rows).reshape(-1, len(members), 3)
         return cls(evaluator.study, table[..., 0], table[..., 1:])
 
-    def of_all(self, share: float) -> list[float]:
-        """The share of all vehicles, by the number of the set; `share` where a single set was asked
-        about.
+    def numbers(self, share: float) -> JsonObject:
+        """The shares of all vehicles and their intervals, by the number of the set; `share` alone
+        where a single set was asked about.
         """
-        return self.shares[:, 0].tolist() or [share]
-
-    @property
-    def numbers(self) -> JsonObject:
-        """The intervals of the shares of all vehicles, by the number of the set."""
-        return {INTERVALS: self.intervals[:, 0].tolist()}
+        shares = self.shares[:, 0].tolist() or [share]
+        return {BY_SET: shares, INTERVALS: self.intervals[:, 0].tolist()}
 
     def ends(
         self, group: int, facts: Sequence[float]
@@ -134,11 +159,10 @@ class SharesOverSets(NamedTuple):
             self._in_words, (np.nanargmin(shares), np.nanargmax(shares))
         )
         template = SAME_SHARE if smallest == greatest else SHARES
-        sets = len(shares)
         yield template(
             least=smallest,
             greatest=greatest,
-            sets=sets,
+            sets=len(shares),
             most=VEHICLES,
         )
 
@@ -150,11 +174,3 @@ class SharesOverSets(NamedTuple):
         name = f"set {number}, " if is_apart else ""
         interval = f"95 % confidence interval {interval_in_words(low, high)}"
         return f"{percentage(self.shares[number, 0])} % ({name}{interval})"
-
-
-def _share(of_runs: FloatArray) -> tuple[float, float, float]:
-    """The unsafe share of vehicles, each by the share of its runs, with its interval."""
-    if not len(of_runs):
-        return np.nan, np.nan, np.nan
-    count = round(float(of_runs.sum()), SHARE_DECIMALS)
-    return count / len(of_runs), *clopper_pearson(count, len(of_runs))

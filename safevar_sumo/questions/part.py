@@ -142,10 +142,10 @@ def study_up_to(study: Study, end: UpperEnd) -> Study:
         in_ranges = ", with --ranges" if name in study.axes else ""
         raise InputError(OPTION, problem, f"an axis whose values are listed{in_ranges}")
     check_name(OPTION, problem, name, axes)
-    if name not in study.ranges:
-        return _ranges_up_to(_lists_up_to(study, name, high), name, high)
-    domain = study.ranges[name]
-    if not domain.lower < high <= domain.upper:
+    domain = study.ranges.get(name)
+    if domain is None:
+        study = _lists_up_to(study, name, high)
+    elif not domain.lower < high <= domain.upper:
         raise InputError(
             OPTION,
             f"{end} is outside the domain of study {study.name!r}",
@@ -189,8 +189,10 @@ def _ranges_up_to(study: Study, name: str, high: float) -> Study:
         # A list may end where the range begins.
         if axis.range.lower >= high:
             return {**axes, name: axis.at}
-        original = min(axis.range.original, high)
-        return {**axes, name: replace(axis, upper=high, original=original)}
+        return {
+            **axes,
+            name: replace(axis, upper=high, original=min(axis.range.original, high)),
+        }
 
     def begins_below(test: MatrixTest) -> bool:
         domain = study.ranges_of(test).get(name)

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.part import at_point
-from safevar_sumo.questions.sampling import clopper_pearson
+from safevar_sumo.questions.sampling import share_with_interval
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.study import ModelTable
@@ -63,30 +63,22 @@ def assess_sample(
     return assess_collisions(evaluator, sample), len(distinct)
 
 
-def avoided_shares(verdicts: pd.DataFrame) -> pd.Series[float]:
-    """The share that each driver avoids of the collisions on which he has a verdict; without a
-    verdict no share.
-    """
-    return verdicts.drop(columns="point").mean().dropna()
-
-
 def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
     """A row of `COLUMNS` for each driver, if a collision was simulated; `verdicts` are those of
     `assess_sample`.
     """
     # What each driver avoids, of the collisions with a verdict.
     rows = []
-    share_of = avoided_shares(verdicts)
     drivers = [*TITLES, *(name for name in OF_LANES if name in verdicts)]
     for driver in drivers if len(verdicts) else ():
         number = int(verdicts[driver].count())
         avoided = int(verdicts[driver].sum())
-        low = high = share_of.get(driver)
-        if number and len(verdicts) < collisions:
-            low, high = clopper_pearson(avoided, number)
+        share, low, high = share_with_interval(avoided, number)
+        if len(verdicts) == collisions:
+            low = high = share
         points = list(filter(None, verdicts["point"][verdicts[driver].isna()].unique()))
         counts = (driver, avoided, number - avoided, len(verdicts) - number)
-        rows.append((*counts, share_of.get(driver), low, high, points))
+        rows.append((*counts, share, low, high, points))
     shares = dict.fromkeys(("share", "share_low", "share_high"), float)
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype(shares)
 
@@ -159,7 +151,7 @@ def _assess_at_point(
         # In a searched scenario the original meets each encounter: where it is unsafe, the setting
         # is infeasible.
         has_verdict = is_searched or avoided[0] == 1
-        verdicts.append(avoided[1:] if has_verdict else np.full(len(settings), np.nan))
+        verdicts.append(np.where(has_verdict, avoided[1:], np.nan))
     return np.column_stack(verdicts)
 
 
@@ -179,10 +171,7 @@ def approach_parameters(system: System) -> JsonObject | None:
         return {}
     if len(system.characteristics.scenario):
         return None
-    end = min(
-        int(np.argmax(speed)),
-        int(np.argmax(is_braking)) if is_braking.any() else len(speed),
-    )
+    end = min(int(np.argmax(speed)), int(np.argmax([*is_braking, True])))
     return {
         "cruise_speed": float(speed.max()),
         "start_throttle": trace.throttle[:end, 0].tolist(),

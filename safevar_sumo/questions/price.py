@@ -58,13 +58,13 @@ class Account:
     ----------
     phases
         Their progress.
-    asked
+    allowance
         The largest number that the user allows; None if he says nothing.
     questions
         Number of questions of a page, which share the time.
     is_question
         Whether a question asks, which says first what it costs.
-    most
+    limit
         The largest number of simulations; None if there is none.
     spent, minimum
         Simulations so far; the least number for an answer.
@@ -76,10 +76,10 @@ class Account:
     """
 
     phases: Phases
-    asked: int | None = None
+    allowance: int | None = None
     questions: int = 1
     is_question: bool = False
-    most: int | None = None
+    limit: int | None = None
     spent: int = 0
     minimum: int = 0
     effort: float = 1.0
@@ -90,9 +90,9 @@ class Account:
     @property
     def left(self) -> float:
         """Simulations that may follow."""
-        if self.most is None:
+        if self.limit is None:
             return float("inf")
-        return self.most - self.spent
+        return self.limit - self.spent
 
     @property
     def undefined_in_words(self) -> str:
@@ -111,7 +111,7 @@ class Account:
             If they are more than may follow.
         """
         self.spent += simulations
-        bound = self.asked if self.most is None else self.most
+        bound = self.allowance if self.limit is None else self.limit
         if bound is not None and self.spent > bound:
             raise InputError(
                 "simulations",
@@ -122,7 +122,7 @@ class Account:
     def require(self, minimum: int) -> None:
         """Refuse fewer simulations than the least number for an answer."""
         self.minimum = minimum
-        self._refuse_few(self.asked)
+        self._refuse_few(self.allowance)
 
     def _refuse_few(self, number: int | None) -> None:
         """Refuse a number of simulations below the least one."""
@@ -141,12 +141,12 @@ class Account:
         """
         # A number that is stated holds for all: the check, and what is repeated at the end.
         parts = 0
-        allowance = self.asked
+        allowance = self.allowance
         if allowance is not None and seconds is not None:
             parts = sum(spare(allowance, self.minimum))
-        self.most = allowance
+        self.limit = allowance
         if allowance is not None and allowance >= expected + parts:
-            self.most = None
+            self.limit = None
             # Half of what is more than usual: some searches take longer than they are expected to.
             effort = allowance / (2 * (expected + parts))
             self.effort = min(max(self.effort, effort), MOST_EFFORT)
@@ -154,13 +154,12 @@ class Account:
             return
         longest = LONGEST / self.questions
         if allowance is None and expected * seconds > longest:
-            self.most = round_down(longest / seconds)
-            parts = sum(spare(self.most, self.minimum))
-        if self.most is not None:
-            self.spent += parts
+            self.limit = round_down(longest / seconds)
+            parts = sum(spare(self.limit, self.minimum))
         words = _price(expected, seconds)
-        if self.most is not None:
-            price = _price(min(expected, self.most), seconds).removeprefix("about ")
+        if self.limit is not None:
+            self.spent += parts
+            price = _price(min(expected, self.limit), seconds).removeprefix("about ")
             words = f"at most {price}, of about {expected:,.0f} in full"
         words += f" (one takes {seconds:.2g} s"
         if checked and allowance is None:
@@ -168,7 +167,7 @@ class Account:
         elif checked:
             words += f", with {checked:,} for a check of the class, which is shorter than usual"
         print_text(Console(file=sys.stderr), f"{words})")
-        self._refuse_few(self.most)
+        self._refuse_few(self.limit)
 
 
 def round_down(number: float) -> int:

@@ -8,6 +8,7 @@ import json
 import re
 import zlib
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from html import escape
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -20,7 +21,7 @@ from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.questions.tables import (
     LATEX_PREAMBLE,
     MAX_LEAD_ROWS,
-    Frames,
+    AnswerTable,
     csv_cell,
     html_table,
     latex_notes,
@@ -61,49 +62,47 @@ class Screen(NamedTuple):
         The one table; empty if there is none.
     notes
         What the answer is valid for, how it was tested, and remarks.
-    others
+    tables
         Other tables by name.
     """
 
     sentences: list[str]
     unsaid: int
-    lead: pd.DataFrame
+    lead: AnswerTable
     notes: list[str]
-    others: Frames
+    tables: dict[str, AnswerTable]
 
 
 def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
-    """The one screen of an answer, whose table has at most so many rows, unless it is shown whole:
-    its attribute `shown_whole` is the number of rows up to which it is.
-    """
+    """The one screen of an answer, whose table has at most so many rows, or is shown whole."""
     # Sentences of the verdict by kind.
-    said = Verdict.of(answer.verdict).sentences
+    sentences_by_kind = Verdict.of(answer.verdict).sentences
     tested = Verdict.of(answer.tested).sentences
-    sentences = [text for kind, text in said if kind != "note"]
-    notes = [text for kind, text in said if kind == "note"]
+    sentences = [text for kind, text in sentences_by_kind if kind != "note"]
+    notes = [text for kind, text in sentences_by_kind if kind == "note"]
     if tested:
         notes.insert(1, f"Tested: {tested[0].text}")
         notes += [text for kind, text in tested[1:] if kind == "note"]
 
     # The lead, and what it does not show.
-    lead = pd.DataFrame()
-    others = dict(answer.tables)
-    name = next(iter(others), "") if answer.lead == "" else answer.lead or ""
-    if name not in answer.folded and len(others.get(name, ())):
-        _, table = next(reader_tables(name, others.pop(name)))
-        rows_of_few = table.attrs.get("shown_whole", 0)
-        is_short = len(table) <= rows_of_few
-        lead = lead_table(table, rows_of_few if is_short else max_rows)
-        cut = len(table.attrs.get("lead_rows", table)) - len(lead)
+    lead = AnswerTable(pd.DataFrame())
+    tables = dict(answer.tables.records)
+    name = next(iter(tables), "") if answer.lead == "" else answer.lead or ""
+    if name not in answer.folded and len(answer.tables.get(name, ())):
+        _, table = next(reader_tables(name, tables.pop(name)))
+        if len(table.frame) <= table.shown_whole:
+            max_rows = table.shown_whole
+        lead = lead_table(table, max_rows)
+        cut = len(table.lead_rows or table.frame) - len(lead.frame)
         if cut > 0:
             notes.insert(0, f"{cut} more rows: --details.")
     unsaid = max(len(sentences) - MAX_SENTENCES, 0)
-    return Screen(sentences[:MAX_SENTENCES], unsaid, lead, notes, others)
+    return Screen(sentences[:MAX_SENTENCES], unsaid, lead, notes, tables)
 
 
 def _more(answer: Answer, screen: Screen) -> str:
     """The last line: what else there is, and the next question."""
-    names = [name for name, frame in screen.others.items() if len(frame)]
+    names = [name for name, table in screen.tables.items() if len(table.frame)]
     contents = []
     if screen.unsaid:
         contents.append(number_of(screen.unsaid, "more sentence"))
@@ -141,11 +140,10 @@ def print_answer(answer: Answer, console: Console, *, details: bool) -> None:
 
 def _print_whole(answer: Answer, max_rows: int, console: Console) -> None:
     print_text(console, answer.verdict)
-    for frame in _short_tables(answer).values():
-        cut = len(frame) - max_rows
-        part = frame[:max_rows]
-        part.attrs = {**frame.attrs, "bars": frame.attrs.get("bars", ())[:max_rows]}
-        _print_table(console, part)
+    for table in _short_tables(answer).values():
+        cut = len(table.frame) - max_rows
+        part = table.with_rows(table.frame[:max_rows])
+        _print_table(console, replace(part, bars=table.bars[:max_rows]))
         if cut > 0:
             print_text(console, f"{cut} more rows: --details.")
     for text in _details_in_words(answer):
@@ -160,8 +158,8 @@ def _print_screen(answer: Answer, max_rows: int, console: Console) -> None:
         print_text(console, text)
 
 
-def _print_table(console: Console, frame: pd.DataFrame) -> None:
-    for part in terminal_tables(frame, console.width):
+def _print_table(console: Console, table: AnswerTable) -> None:
+    for part in terminal_tables(table, console.width):
         if isinstance(part, str):
             print_text(console, part)
         elif part.row_count:
@@ -227,11 +225,11 @@ def _latex(answer: Answer) -> str:
     """All tables that are short, with remarks below them."""
     parts = [LATEX_PREAMBLE]
     notes = []
-    for name, frame in _short_tables(answer).items():
+    for name, table in _short_tables(answer).items():
         if name == "remarks":
-            notes.append(latex_notes(frame.iloc[:, -1]))
+            notes.append(latex_notes(table.frame.iloc[:, -1]))
         else:
-            parts.append(latex_table(_label_of(answer, name), frame))
+            parts.append(latex_table(_label_of(answer, name), table))
     if answer.tested:
         notes.append(latex_notes([_tested_in_words(answer)]))
     return "\n".join(parts + notes)
@@ -246,9 +244,9 @@ def _details_in_words(answer: Answer) -> Iterator[str]:
     if answer.tested:
         yield _tested_in_words(answer)
     long = [
-        f"{name} ({len(frame):,} rows)"
-        for name, frame in _shown_tables(answer).items()
-        if len(frame) > MAX_ROWS
+        f"{name} ({len(table.frame):,} rows)"
+        for name, table in _shown_tables(answer).items()
+        if len(table.frame) > MAX_ROWS
     ]
     folded = [name for name in answer.folded if len(answer.tables.get(name, ()))]
     sentences = []
@@ -260,30 +258,31 @@ def _details_in_words(answer: Answer) -> Iterator[str]:
         yield " ".join(sentences)
 
 
-def _shown_tables(answer: Answer) -> Frames:
+def _shown_tables(answer: Answer) -> dict[str, AnswerTable]:
     """The tables of all details, by name; without remarks on others, and without a table of no
     remark.
     """
-    tables = {**answer.tables}
+    tables = {**answer.tables.records}
     for name in answer.folded:
         tables.pop(name, None)
     remarks = tables.pop("remarks", None)
     if remarks is not None:
-        if "table" in remarks:
-            remarks = remarks[~remarks["table"].isin(answer.folded)]
+        rows = remarks.frame
+        if "table" in rows:
+            rows = rows[~rows["table"].isin(answer.folded)]
             # "all" would be read as a part of the remark.
-            remarks = remarks.replace({"table": {"all": ""}})
-        if not remarks.empty:
-            tables["remarks"] = remarks
-    parts = Frames()
-    for name, frame in tables.items():
-        parts |= reader_tables(name, frame)
+            rows = rows.replace({"table": {"all": ""}})
+        if not rows.empty:
+            tables["remarks"] = remarks.with_rows(rows)
+    parts = dict[str, AnswerTable]()
+    for name, table in tables.items():
+        parts |= reader_tables(name, table)
     return parts
 
 
-def _short_tables(answer: Answer) -> Frames:
+def _short_tables(answer: Answer) -> dict[str, AnswerTable]:
     tables = _shown_tables(answer).items()
-    return {name: frame for name, frame in tables if len(frame) <= MAX_ROWS}
+    return {name: table for name, table in tables if len(table.frame) <= MAX_ROWS}
 
 
 def _label_of(answer: Answer, table: str) -> str:

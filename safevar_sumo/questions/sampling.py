@@ -80,3 +80,10 @@ def clopper_pearson(
         confidence, method="exact"
     )
     return float(interval.low), float(interval.high)
+
+
+def share_with_interval(count: float, total: float) -> list[float]:
+    """A share, and the ends of its interval; undefined of nothing."""
+    if not total:
+        return [math.nan] * 3
+    return [count / total, *clopper_pearson(count, total)]

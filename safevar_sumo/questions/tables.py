@@ -1,5 +1,5 @@
-"""The tables of answers: frames with units and meanings, and how readers see them as text, HTML and
-LaTeX.
+"""The tables of answers: frames with units and meanings, and how readers see these tables as text,
+HTML and LaTeX.
 """
 
 from __future__ import annotations
@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from html import escape
 from itertools import product, takewhile
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from safevar_sumo.errors import printable
-from safevar_sumo.questions.bars import LEGEND
+from safevar_sumo.questions.bars import LEGEND, Bar
 from safevar_sumo.questions.changes import NUMBER_PATTERN
 from safevar_sumo.shipped import shipped_table
 from safevar_sumo.terminal import WholeTable
@@ -72,8 +73,6 @@ Columns = dict[str, Column | str]
 """Columns by name; a text is the meaning of one without a unit."""
 Rows = Sequence[tuple[Any, ...]]
 """The rows of a table."""
-Frames = dict[str, pd.DataFrame]
-"""Tables by name."""
 
 
 class Wide(NamedTuple):
@@ -88,26 +87,61 @@ class Wide(NamedTuple):
     head: str = "{}"
 
 
+@dataclass(frozen=True)
+class AnswerTable:
+    """A table of an answer.
+
+    Attributes
+    ----------
+    frame
+        The rows.
+    words
+        What readers see in place of the texts that are its keys.
+    lead_rows
+        The places of the rows that one screen shows, the most important first; by default all.
+    shown_whole
+        The number of rows up to which one screen shows all of them.
+    bars
+        A bar for each row.
+    """
+
+    frame: pd.DataFrame
+    title: str = ""
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    wide: Wide | None = None
+    words: Mapping[str, str] = field(default_factory=dict)
+    lead_rows: Sequence[int] = ()
+    shown_whole: int = 0
+    bars: Sequence[Bar] = ()
+
+    def with_rows(self, frame: pd.DataFrame) -> AnswerTable:
+        """The table with other rows."""
+        return replace(self, frame=frame)
+
+
+class Frames(dict[str, pd.DataFrame]):
+    """The frames of tables by name; `records` has the tables themselves."""
+
+    def __init__(self, records: Mapping[str, AnswerTable]) -> None:
+        super().__init__({name: table.frame for name, table in records.items()})
+        self.records = records
+
+
 def tabulate(
     title: str,
     columns: Mapping[str, Column | str],
     rows: pd.DataFrame | Iterable[Sequence[Any] | dict[str, Any]],
-    *,
-    wide: Wide | None = None,
-    words: Mapping[str, str] | None = None,
-) -> pd.DataFrame:
-    """A table of an answer: a frame whose `attrs` hold its title and its columns' units and
-    meanings.
+    **layout: Any,
+) -> AnswerTable:
+    """A table of an answer, whose `layout` are further attributes of `AnswerTable`.
 
     A column `x` whose interval stands in `x_low` and `x_high` is declared once; `columns` may name
-    the ends, too. Readers see the `words` in place of the texts that are their keys.
+    the ends, too.
     """
     named = {}
     for name, column in columns.items():
         named[name] = Column("", column) if isinstance(column, str) else column
-    frame = pd.DataFrame(rows, columns=list(named))
-    frame.attrs = {"title": title, "columns": named, "wide": wide, "words": words or {}}
-    return frame
+    return AnswerTable(pd.DataFrame(rows, columns=list(named)), title, named, **layout)
 
 
 def with_interval(name: str, column: Column) -> dict[str, Column]:
@@ -132,10 +166,6 @@ def shipped_columns(command: str) -> dict[str, dict[str, Column]]:
     """The columns of a command's tables, by table."""
     tables = shipped_table("questions/columns.toml")[command]
     return {name: columns_from(table) for name, table in tables.items()}
-
-
-def columns_of(frame: pd.DataFrame) -> dict[str, Column]:
-    return dict(frame.attrs.get("columns", {}))
 
 
 def plain(value: Any) -> Any:
@@ -197,27 +227,26 @@ def csv_cell(value: Any) -> Any:
     return printable(value)
 
 
-def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    """The tables that readers see in place of a frame, by name: itself, or those that `Wide`
+def reader_tables(name: str, table: AnswerTable) -> Iterator[tuple[str, AnswerTable]]:
+    """The tables that readers see in place of a table, by name: itself, or those that `Wide`
     describes.
     """
-    wide = frame.attrs.get("wide")
-    columns = columns_of(frame)
+    frame = table.frame
+    columns = table.columns
+    wide = table.wide
     if wide is None or frame.empty:
-        yield name, frame
+        yield name, table
         return
 
     # A table for each value, with a column for each head.
     heads = frame[wide.by].unique()
-    title = frame.attrs["title"]
-    words = frame.attrs["words"]
     for value in wide.values:
         ends = ("",) if value in frame else (LOW, HIGH)
         value_columns = [f"{value}{end}" for end in ends]
         column = columns[value_columns[0]]
         reader_heads = {label: columns[label] for label in wide.labels}
         for head, end in product(heads, ends):
-            text = words.get(str(head), wide.head.format(head))
+            text = table.words.get(str(head), wide.head.format(head))
             reader_heads[f"{text}{end}"] = column._replace(unit="")
 
         # A row for each combination of labels.
@@ -225,13 +254,16 @@ def reader_tables(name: str, frame: pd.DataFrame) -> Iterator[tuple[str, pd.Data
         for labels, group in frame.groupby(list(wide.labels), sort=False):
             by_head = group.set_index(wide.by)[value_columns].reindex(heads)
             rows.append((*labels, *by_head.to_numpy().ravel()))
-        heading = title
+        heading = table.title
         if len(wide.values) > 1:
             # A pair of columns differs in the first word: lowest and highest value.
             meanings = [columns[name].meaning.partition(" ") for name in value_columns]
             beginnings, _, endings = zip(*meanings, strict=True)
-            heading = f"{title}: {' and '.join(beginnings)} {endings[0]}"
-        yield f"{name}-{value}", tabulate(heading, reader_heads, rows, words=words)
+            heading += f": {' and '.join(beginnings)} {endings[0]}"
+        yield (
+            f"{name}-{value}",
+            tabulate(heading, reader_heads, rows, words=table.words),
+        )
 
 
 class _ReaderColumn(NamedTuple):
@@ -251,21 +283,22 @@ class _ReaderColumn(NamedTuple):
         return max(map(len, self.texts), default=0) > LONG_TEXT
 
 
-def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
+def reader_columns(table: AnswerTable) -> Iterator[_ReaderColumn]:
     """The columns of a table for readers: an interval stands behind its value unless that is exact,
     or alone.
     """
-    columns = columns_of(frame)
+    frame = table.frame
     for name in map(str, frame):
         base = re.sub(f"({LOW}|{HIGH})$", "", name)
-        column = columns.get(name, Column("", ""))
+        column = table.columns[name]
         ends = [f"{base}{LOW}", f"{base}{HIGH}"]
         is_end = base != name
         is_with_value = is_end and (base in frame or name == ends[1])
         if not column.is_shown or is_with_value:
             continue
         values = frame[ends if is_end else [name]]
-        if len(frame) and values.isna().all(axis=None):  # undefined in every row
+        # A column that is undefined in every row is left out.
+        if len(frame) and values.isna().all(axis=None):
             continue
         head = column.head or base.replace("_", " ")
         if column.unit not in ("", "-") and not column.unit.startswith("as "):
@@ -274,20 +307,19 @@ def reader_columns(frame: pd.DataFrame) -> Iterator[_ReaderColumn]:
             list(filter(frame.__contains__, (name, *ends))),
             head,
             column.meaning,
-            _texts_of(frame, name, ends, column.number_format),
+            _texts_of(table, name, ends),
             pd.api.types.is_numeric_dtype(frame[name]),
         )
 
 
-def _texts_of(
-    frame: pd.DataFrame, name: str, ends: list[str], number_format: str
-) -> list[str]:
+def _texts_of(table: AnswerTable, name: str, ends: list[str]) -> list[str]:
     """The cells of a column for readers, with the interval between its ends if there is one."""
-    words = frame.attrs.get("words", {})
+    frame = table.frame
+    number_format = table.columns[name].number_format
     texts = []
     for value in frame[name]:
         text = cell_text(value, number_format)
-        texts.append(words.get(text, text))
+        texts.append(table.words.get(text, text))
     if ends[0] not in frame:
         return texts
     is_exact = frame[ends[0]] == frame[ends[1]]
@@ -300,26 +332,23 @@ def _texts_of(
     return texts
 
 
-def lead_table(frame: pd.DataFrame, max_rows: int) -> pd.DataFrame:
+def lead_table(table: AnswerTable, max_rows: int) -> AnswerTable:
     """The rows and columns of a table that one screen shows: at most so many of the most important
     rows, and no column that says the same in each of them, or nothing.
     """
-    rows = frame.attrs.get("lead_rows", range(len(frame)))
-    lead = frame.iloc[list(rows)[:max_rows]]
-    declared = columns_of(frame)
+    rows = table.lead_rows or range(len(table.frame))
+    lead = table.frame.iloc[list(rows)[:max_rows]]
     names = list[str]()
     number = 0
-    for column in reader_columns(lead):
+    for column in reader_columns(table.with_rows(lead)):
         is_same = len(lead) > 1 and len(set(column.texts)) == 1
         says_something = not is_same and not set(column.texts) <= {"-", "0"}
-        is_detail = declared.get(column.names[0], Column("", "")).is_detail
+        is_detail = table.columns[column.names[0]].is_detail
         is_label = not names and len(lead) > 1
         if not is_detail and (is_label or says_something) and number < MAX_LEAD_COLUMNS:
             names += column.names
             number += 1
-    lead = lead[list(dict.fromkeys(names))]
-    lead.attrs = {**frame.attrs, "bars": ()}
-    return lead
+    return replace(table, frame=lead[list(dict.fromkeys(names))], bars=())
 
 
 def _interval_text(low: Any, high: Any, number_format: str) -> str:
@@ -331,19 +360,19 @@ def _interval_text(low: Any, high: Any, number_format: str) -> str:
     return forms.get((texts[0] == "-", texts[1] == "-"), "{0} to {1}").format(*texts)
 
 
-def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | str]:
+def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str]:
     """The table; columns that do not fit stand in further tables, in which the first columns of
     text are repeated, and long texts in lines of their own.
     """
     # Long texts stand below a table.
-    all_columns = list(reader_columns(frame))
+    all_columns = list(reader_columns(table))
     columns = list[_ReaderColumn]()
     long_columns = list[_ReaderColumn]()
     least_width = 1
     for column in all_columns:
         (long_columns if column.is_long else columns).append(column)
         least_width += max(_least_width(column), LEAST_TEXT * column.is_long)
-    title = frame.attrs.get("title", "")
+    title = table.title
     has_numbers = any(column.is_number for column in columns)
     if long_columns and len(columns) < 2 and not has_numbers:
         yield title  # lines say it all
@@ -367,7 +396,7 @@ def terminal_tables(frame: pd.DataFrame, width: int) -> Iterator[WholeTable | st
         blocks[-1].append(column)
 
     # Bars, blocks, and long texts.
-    bars = [bar.blocks for bar in frame.attrs.get("bars", ())]
+    bars = [bar.blocks for bar in table.bars]
     if bars and columns:
         yield WholeTable(
             title,
@@ -389,14 +418,14 @@ def _least_width(column: _ReaderColumn) -> int:
     return 1 + max(map(len, words), default=0)
 
 
-def html_table(frame: pd.DataFrame) -> str:
+def html_table(table: AnswerTable) -> str:
     """A table with a caption, in which a screen reader finds the headings; texts have the class
     `label`.
     """
     # Heads and cells, with the head that a phone shows beside each cell.
     heads = ""
-    rows = [""] * len(frame)
-    for column in reader_columns(frame):
+    rows = [""] * len(table.frame)
+    for column in reader_columns(table):
         css = "" if column.is_number else ' class="label"'
         head = escape(column.head)
         heads += f'<th scope="col"{css} title="{escape(column.meaning)}">{head}</th>'
@@ -406,43 +435,42 @@ def html_table(frame: pd.DataFrame) -> str:
     # Bars in a column of their own.
     if not heads or not rows:
         return ""
-    title = escape(frame.attrs.get("title", ""))
+    title = escape(table.title)
     legend = ""
-    if bars := frame.attrs.get("bars"):
+    if table.bars:
         legend = f" <small>({LEGEND['html']})</small>"
         head = f'<th scope="col" class="label" title="{LEGEND["html"]}">range</th>'
         heads = f"{head}{heads}"
-        for row, bar in enumerate(bars):
+        for row, bar in enumerate(table.bars):
             cell = f'<td class="label" data-head="range">{bar.svg}</td>'
             rows[row] = f"{cell}{rows[row]}"
     body = "\n".join(f"<tr>{row}</tr>" for row in rows)
-    table = (
+    html = (
         f"<table><caption>{title}{legend}</caption><thead><tr>{heads}</tr></thead>"
         f"<tbody>\n{body}\n</tbody></table>"
     )
-    return f'<div class="wide" role="region" tabindex="0" aria-label="{title}">{table}</div>'
+    return f'<div class="wide" role="region" tabindex="0" aria-label="{title}">{html}</div>'
 
 
-def latex_table(label: str, frame: pd.DataFrame) -> str:
+def latex_table(label: str, table: AnswerTable) -> str:
     """A booktabs table that fits into the line."""
     # Cells and columns by kind.
     readable = pd.DataFrame()
     alignment = ""
-    for column in reader_columns(frame):
+    for column in reader_columns(table):
         readable[column.head] = column.texts
         text_alignment = "p{6cm}" if column.is_long else "l"
         alignment += "r" if column.is_number else text_alignment
     style = readable.style.hide().format(_escaped_for_latex)
     style = style.format_index(_escaped_for_latex, axis=1)
-    caption = _escaped_for_latex(frame.attrs.get("title", ""))
-    table = style.to_latex(
+    latex = style.to_latex(
         hrules=True,
         column_format=alignment,
-        caption=caption,
+        caption=_escaped_for_latex(table.title),
         label=f"tab:{label}",
         position="htbp",
     )
-    return table.replace(r"\begin{tabular}", FIT_BEGIN + r"\begin{tabular}").replace(
+    return latex.replace(r"\begin{tabular}", FIT_BEGIN + r"\begin{tabular}").replace(
         r"\end{tabular}", r"\end{tabular}}"
     )
 

@@ -104,7 +104,7 @@ def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
         study=study,
         verdict=verdict,
         numbers={**numbers},
-        tables={"agreement": table},
+        tables={"agreement": tabulate("Agreement with the reference", COLUMNS, table)},
         draw=partial(
             _draw, f"{study.title}\nagainst {reference.name}", data, evaluations
         ),
@@ -168,7 +168,7 @@ def measure_agreement(
                 *measures,
             )
         )
-    return tabulate("Agreement with the reference", COLUMNS, rows)
+    return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
 def defined_pairs(

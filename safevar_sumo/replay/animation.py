@@ -124,9 +124,10 @@ def animate(comparison: Comparison, path: Path) -> None:
             film.save(file, PillowWriter(fps), dpi=DPI)  # type: ignore[arg-type]
             return
         page = template_environment().get_template("animation.html.j2")
-        player = player_of(comparison, 1, MAX_FRAMES, DPI)
         text = page.render(
-            title=comparison.title, changes=comparison.changes, player=player
+            title=comparison.title,
+            changes=comparison.changes,
+            player=player_of(comparison, 1, MAX_FRAMES, DPI),
         )
         file.write_text(printable(text), encoding="utf-8", newline="\n")
 

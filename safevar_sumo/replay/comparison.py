@@ -207,11 +207,9 @@ def films_along(trace: Trace) -> dict[str, Film]:
 
 def lane_below(trace: Trace) -> DrawnLane:
     """The lane on which they are drawn."""
-    ends = (
-        float(trace.position.min()) - ROAD_BEHIND,
-        float(trace.position.max()) + ROAD_AHEAD,
-    )
-    return DrawnLane("road", np.array([[ends[0], 0.0], [ends[1], 0.0]]), LANE_WIDTH)
+    rear = trace.position.min() - ROAD_BEHIND
+    front = trace.position.max() + ROAD_AHEAD
+    return DrawnLane("road", np.array([[rear, 0.0], [front, 0.0]]), LANE_WIDTH)
 
 
 def comparison_of(simulation: Simulation) -> Comparison:

@@ -108,21 +108,16 @@ class Poses(NamedTuple):
             return 0.0
         return self.length * WHEELBASE / 2
 
-    def places(self, distance: float = 0.0) -> list[tuple[float, float, float, float]]:
+    def places(self, distance: float = 0.0) -> list[list[float]]:
         """Time [s], x, y [m] and heading [rad] of the point at this distance behind the middle
         [m].
         """
         x = self.x - distance * np.cos(self.heading)
         y = self.y - distance * np.sin(self.heading)
-        return list(
-            zip(
-                self.time.tolist(),
-                x.tolist(),
-                y.tolist(),
-                self.heading.tolist(),
-                strict=True,
-            )
-        )
+        places: list[list[float]] = np.column_stack(
+            [self.time, x, y, self.heading]
+        ).tolist()
+        return places
 
 
 def poses_of(comparison: Comparison) -> list[Poses]:
@@ -258,6 +253,7 @@ def carla_scene(
     row = comparison.rows[-1]
     trace = comparison.runs.trace
     vut, *actors = poses_of(comparison)
+    _, *start = vut.places()[0]
     samples = slice(0, comparison.moments[row].end + 1)
     commands = zip(trace.throttle[samples, row], trace.brake[samples, row], strict=True)
     pedals = [{"throttle": throttle, "brake": brake} for throttle, brake in commands]
@@ -268,11 +264,7 @@ def carla_scene(
         "blueprint": BLUEPRINT,
         **physics,
         "step": trace.step,
-        "start": {
-            "x": float(vut.x[0]),
-            "y": float(vut.y[0]),
-            "heading": float(vut.heading[0]),
-        },
+        "start": dict(zip(("x", "y", "heading"), start, strict=True)),
         "start_speed": float(trace.speed[0, row]),
         "route": np.stack([vut.x, vut.y], axis=1).tolist(),
         "pedals": pedals,

@@ -48,12 +48,9 @@ def draw_comparison(comparison: Comparison) -> Figure:
         axes = figure.subplots(2, 2, sharex=True).ravel()
 
     runs = comparison.runs
-    divergence = find_divergence(comparison.runs)
+    divergence_time = find_divergence(comparison.runs)
     trace = runs.trace
     ttc = runs.time_to_collision
-    divergence_time = None
-    if divergence is not None:
-        divergence_time = float(trace.time[divergence])
     quantities = {
         "speed [m/s]": trace.speed,
         "gap to the obstacle [m]": np.where(np.isfinite(trace.gap), trace.gap, np.nan),
@@ -205,8 +202,8 @@ def _draw_legend(
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
 
 
-def find_divergence(runs: SimulationRuns) -> int | None:
-    """The first sample at which the speeds of the original and the changed vehicle have diverged;
+def find_divergence(runs: SimulationRuns) -> float | None:
+    """The time from which on the speeds of the original and the changed vehicle have diverged [s];
     None if they never do, or if nothing is changed.
     """
     trace = runs.trace
@@ -214,7 +211,7 @@ def find_divergence(runs: SimulationRuns) -> int | None:
         np.ptp(trace.speed, axis=1) > MIN_DIVERGENCE
     )
     if have_diverged.any():
-        return int(np.argmax(have_diverged))
+        return float(trace.time[np.argmax(have_diverged)])
     return None
 
 

@@ -7,9 +7,9 @@ import pandas as pd
 
 from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import STOPPING_DISTANCE
-from safevar_sumo.questions.answer import Answer, Columns, tabulate
+from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
 from safevar_sumo.questions.sentence import Sentence, Verdict, answer, evidence
-from safevar_sumo.questions.tables import shipped_columns
+from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.words import (
     EXACT,
     change_texts,
@@ -86,18 +86,21 @@ def answer_of_setting(
     results = [
         (name, unit, original[name], simulated[name]) for name, unit in units.items()
     ]
-    frame = _without_repetition(
-        tabulate("How both simulations end", RESULTS, results), simulation
-    )
-    names = frame["result"]
-    frame.attrs["words"] = {name: name.replace("_", " ") for name in names}
-    frame.attrs["lead_rows"] = np.flatnonzero(~names.isin(OF_SEARCH)).tolist()
-    tables = {"characteristics": _characteristics(simulation), "results": frame}
+    tables = {
+        "characteristics": _characteristics(simulation),
+        "results": tabulate(
+            "How both simulations end",
+            _without_repetition(RESULTS, simulation),
+            results,
+            words={name: name.replace("_", " ") for name in units},
+            lead_rows=[row for row, name in enumerate(units) if name not in OF_SEARCH],
+        ),
+    }
 
     sentences = _verdict(simulation, len(system.matrix))
     if system.matrix:
         tables["points"], failing = _points(system, setting)
-        is_changed = simulation.setting != simulation.original.setting
+        is_changed = simulation.row > 0
         vehicle = f"The {'changed' if is_changed else 'original'} vehicle"
         points = points_in_words(vehicle, failing, len(system.matrix))
         sentences.append(evidence(points))
@@ -129,29 +132,30 @@ def answer_of_setting(
     )
 
 
-def _points(system: System, setting: FloatArray) -> tuple[pd.DataFrame, list[str]]:
+def _points(system: System, setting: FloatArray) -> tuple[AnswerTable, list[str]]:
     """The table of the points of a matrix, of which the worst ones lead, and the points at which a
     setting fails.
     """
     results = list(simulate_all_points(system, setting[None]))
     records = map(point_record, results)
     # Side and place of a contact are columns of their own.
-    points = [{**row, **row.get("contact", {})} for row in records]
-    table = tabulate("Test cases, worst first", POINTS, pd.DataFrame(points))
-    table.attrs["lead_rows"] = np.argsort(table[SAFETY_DEGREE], kind="stable").tolist()
+    points = pd.DataFrame([{**row, **row.get("contact", {})} for row in records])
+    worst = np.argsort(points[SAFETY_DEGREE], kind="stable").tolist()
+    table = tabulate("Test cases, worst first", POINTS, points, lead_rows=worst)
     return table, [result.point.name for result in results if _fails(system, result)]
 
 
-def _without_repetition(frame: pd.DataFrame, simulation: Simulation) -> pd.DataFrame:
-    """A table whose readers see the values of the original vehicle once if nothing is changed."""
-    if simulation.row == 0:
-        columns = frame.attrs["columns"]
-        for name in {"simulated", "changed"} & set(columns):
-            columns[name] = columns[name]._replace(is_shown=False)
-    return frame
+def _without_repetition(
+    columns: dict[str, Column], simulation: Simulation
+) -> dict[str, Column]:
+    """Columns that show the values of the original vehicle once if nothing is changed."""
+    if simulation.row:
+        return columns
+    names = columns.keys() & {"simulated", "changed"}
+    return columns | {name: columns[name]._replace(is_shown=False) for name in names}
 
 
-def _characteristics(simulation: Simulation) -> pd.DataFrame:
+def _characteristics(simulation: Simulation) -> AnswerTable:
     pairs = zip(
         CharacteristicSet.of(simulation.study), simulation.setting.values(), strict=True
     )
@@ -159,16 +163,15 @@ def _characteristics(simulation: Simulation) -> pd.DataFrame:
         (item.name, item.unit, item.original, value, value != item.original, item.words)
         for item, value in pairs
     )
-    return _without_repetition(
-        tabulate(simulation.study.title, CHARACTERISTICS, rows), simulation
-    )
+    columns = _without_repetition(CHARACTERISTICS, simulation)
+    return tabulate(simulation.study.title, columns, rows)
 
 
 def _verdict(simulation: Simulation, point_count: int) -> list[Sentence]:
     """How the simulated vehicle and, if it differs, the original end; of a matrix in the worst of
     its test cases.
     """
-    is_changed = simulation.setting != simulation.original.setting
+    is_changed = simulation.row > 0
     test = simulation.pair.point.name
     templates = words.ORIGINAL, words.CHANGED
     if point_count > 1:

@@ -371,8 +371,8 @@ def verify(
                     rows.append(compare_claim(packed.case.study.name, claim))
 
     claims = tabulate("Claims", CLAIMS, rows)
-    counts = Counter(claims["verdict"])
-    number = len(claims)
+    counts = Counter(claims.frame["verdict"])
+    number = len(rows)
     parts = _not_compared(description, studies.values())
     if counts[UNCHECKED]:
         parts.append("how many simulations had which outcome (--search compares it)")

@@ -25,7 +25,7 @@ from safevar_sumo.questions.catalogue import description_of
 from safevar_sumo.questions.explain.failures import REASONS
 from safevar_sumo.questions.model_spread import compute_model_spreads
 from safevar_sumo.questions.sentence import Verdict, answer
-from safevar_sumo.questions.tables import shipped_columns
+from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.words import counted_in_words, number_of
 from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.reference.agreement import shipped_agreement
@@ -169,7 +169,7 @@ def tested(study: ReportedStudy) -> Answer:
     )
 
 
-def _remarks(texts: Sequence[str]) -> pd.DataFrame:
+def _remarks(texts: Sequence[str]) -> AnswerTable:
     return tabulate(
         "Remarks", {"remark": "what to bear in mind"}, [(text,) for text in texts]
     )
@@ -239,7 +239,7 @@ def trust(study: ReportedStudy) -> Answer:
     they leave out.
     """
     case = study.case
-    tables = dict[str, pd.DataFrame]()
+    tables = dict[str, AnswerTable]()
     sentences = [
         "The simulations of this study were not compared with published ones. Nobody knows whether"
         " another simulator or a real vehicle behaves in the same way."

@@ -110,7 +110,7 @@ def test_behind_a_leader_both_times_to_collision_are_one_to_the_bit(
 
 
 def test_the_table_of_metrics_says_that_there_are_two_times_to_collision() -> None:
-    title = list_models("metrics").tables["metrics"].attrs["title"]
+    title = list_models("metrics").tables.records["metrics"].title
     assert (
         "TET and TIT use TTC = L_s / v_L; ttc_min and drac use TTC_p = gap / (v - u)"
         in title

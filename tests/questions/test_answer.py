@@ -39,15 +39,16 @@ from tests.in_process import refused
 from tests.manual import files_of
 
 COLUMNS = {
-    "part": Column("", "part of the vehicle"),
+    "part": "part of the vehicle",
     **with_interval("length", Column("m", "its length", ".2f")),
     "age": Column("s", "its age"),
-    "changes": Column("", "what is changed"),
+    "changes": "what is changed",
 }
 ROWS = [
     ("a < b & 1 %", 1.234, 1.0, np.inf, np.nan, {"mass": 2600.0}),
     ("c_d", np.nan, np.nan, np.nan, np.nan, {}),
 ]
+TABLES = {"parts": tabulate("Parts & ages", COLUMNS, ROWS)}
 ANSWER = Answer(
     question="parts",
     study=load_study("smoke"),
@@ -57,7 +58,7 @@ ANSWER = Answer(
         "interval": (0.1, np.nan),
         "driven": True,
     },
-    tables={"parts": tabulate("Parts & ages", COLUMNS, ROWS)},
+    tables=TABLES,
 )
 
 
@@ -96,10 +97,10 @@ def test_readers_see_units_and_intervals_and_no_column_without_values() -> None:
 def test_readers_are_told_of_a_table_that_is_too_long_for_them() -> None:
     frame = tabulate(
         "Many",
-        {"number": Column("", "it")},
+        {"number": "it"},
         [(number,) for number in range(MAX_ROWS + 1)],
     )
-    long = replace(ANSWER, tables={**ANSWER.tables, "many": frame})
+    long = replace(ANSWER, tables={**TABLES, "many": frame})
     for form in ("text", "html"):
         shown = long.render(form, details=True)
         assert f"--format csv --table NAME: many ({MAX_ROWS + 1} rows)" in shown
@@ -111,7 +112,7 @@ def test_readers_are_told_of_a_table_that_is_too_long_for_them() -> None:
 def test_one_screen_has_as_many_rows_as_there_are_lines_for() -> None:
     """The first ones; a column that says the same in each row is left out."""
     rows = [(str(row), "words " * 40, "same") for row in range(15)]
-    columns = {name: Column("", name) for name in ("name", "text", "constant")}
+    columns = {name: name for name in ("name", "text", "constant")}
     answer = replace(ANSWER, tables={"long": tabulate("Long", columns, rows)})
     text = answer.render("text")
     assert len(text.splitlines()) <= MAX_LINES
@@ -131,8 +132,8 @@ def test_one_screen_has_as_many_rows_as_there_are_lines_for() -> None:
 
 @pytest.mark.parametrize(("number", "shown"), [(13, 13), (50, 50), (51, 12)])
 def test_a_list_of_up_to_50_cars_is_whole(number: int, shown: int) -> None:
-    table = tabulate("Cars", {"car": ""}, [[f"<{row}>"] for row in range(number)])
-    table.attrs["shown_whole"] = SHOWN_WHOLE
+    rows = [[f"<{row}>"] for row in range(number)]
+    table = tabulate("Cars", {"car": ""}, rows, shown_whole=SHOWN_WHOLE)
     answer = Answer(
         question="",
         study=load_study("smoke"),
@@ -188,11 +189,8 @@ def test_a_long_table_has_a_column_for_each_value_and_its_intervals() -> None:
     frame = tabulate(
         "Lengths", columns, rows, wide=Wide(["part"], "by", ["length"], "to {:g} km/h")
     )
-    page = (
-        replace(ANSWER, tables={"lengths": frame})
-        .render("html")
-        .partition("<details>")[0]
-    )
+    answer = replace(ANSWER, tables={"lengths": frame})
+    page = answer.render("html").partition("<details>")[0]
     assert re.findall("<th.*?>([^<]*)</th>", page) == [
         "part",
         "to 20 km/h",
@@ -206,14 +204,7 @@ def test_a_long_table_has_a_column_for_each_value_and_its_intervals() -> None:
         "up to 2",
         "-",
     ]
-    assert (
-        len(
-            replace(ANSWER, tables={"lengths": frame}).to_dict()["tables"]["lengths"][
-                "rows"
-            ]
-        )
-        == 4
-    )
+    assert len(answer.to_dict()["tables"]["lengths"]["rows"]) == 4
 
 
 def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
@@ -235,7 +226,7 @@ def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
 
 @pytest.mark.parametrize("form", ["text", "csv", "latex", "html"])
 def test_no_control_character_of_a_name_reaches_a_reader(form: str) -> None:
-    columns = {"name": Column("", "it\x1b]0;x\x07")}
+    columns = {"name": "it\x1b]0;x\x07"}
     names = tabulate("Names\x1b[2J", columns, [("\x1b[31mred\u202e\r\x9b",)])
     answer = replace(ANSWER, verdict="Old\x1b[2J parts.", tables={"names": names})
     printed = answer.render(form)
@@ -256,7 +247,7 @@ def test_a_spreadsheet_calculates_no_cell_of_a_csv() -> None:
         "-inf",
         "a=1",
     ]
-    names = tabulate("Names", {"name": Column("", "it")}, [(cell,) for cell in cells])
+    names = tabulate("Names", {"name": "it"}, [(cell,) for cell in cells])
     printed = replace(ANSWER, tables={"names": names}).render("csv")
     cells_there = pd.read_csv(io.StringIO(printed), dtype=str)["name"].tolist()
     assert cells_there == [
@@ -271,28 +262,27 @@ def test_a_spreadsheet_calculates_no_cell_of_a_csv() -> None:
 
 
 def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
-    other = tabulate("Others", {"name": Column("", "it")}, [("none",)])
+    other = tabulate("Others", {"name": "it"}, [("none",)])
     rows = [("parts", "one is old"), ("others", "none is"), ("all", "they are made up")]
-    remarks = tabulate(
-        "Remarks", {"table": Column("", "table"), "remark": Column("", "remark")}, rows
-    )
+    remarks = tabulate("Remarks", {"table": "table", "remark": "remark"}, rows)
     answer = replace(
-        ANSWER, tables={**ANSWER.tables, "others": other, "remarks": remarks}
+        ANSWER, tables={**TABLES, "others": other, "remarks": remarks}
     ).only("parts")
     assert list(answer.tables) == ["parts", "remarks"]
     assert [*answer.tables["remarks"]["remark"]] == ["one is old", "they are made up"]
     long = tabulate(
         "Remarks",
-        {"remark": Column("", "remark")},
+        {"remark": "remark"},
         [("All of them are made up. " * 5,)],
     )
     assert "made up. \n" in replace(ANSWER, tables={"remarks": long}).render(
         "text", details=True
     )
     assert "Others" not in ANSWER.render("latex", "parts")
+    on_others = remarks.frame[remarks.frame["table"] == "others"]
     others = replace(
         answer,
-        tables={**answer.tables, "remarks": remarks[remarks["table"] == "others"]},
+        tables={**answer.tables.records, "remarks": remarks.with_rows(on_others)},
     )
     assert r"\noindent{\footnotesize one is old\par}" in answer.render("latex"), (
         "no table, whose label would repeat"
@@ -307,10 +297,8 @@ def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
 
 
 def test_readers_see_folded_tables_only_if_they_ask() -> None:
-    other = tabulate("Others", {"name": Column("", "it")}, [("none",)])
-    answer = replace(
-        ANSWER, tables={**ANSWER.tables, "others": other}, folded=("others",)
-    )
+    other = tabulate("Others", {"name": "it"}, [("none",)])
+    answer = replace(ANSWER, tables={**TABLES, "others": other}, folded=("others",))
     for form in ("text", "latex", "html"):
         assert "Others" not in answer.render(form, details=True)
         assert "Others" in answer.render(form, "others")

@@ -95,7 +95,7 @@ def test_what_cannot_be_simulated_or_is_infeasible_leaves_everything() -> None:
         lambda rows: rows[:, 0] > 9,
     )
     evaluator = Evaluator(study, plant)
-    evaluator.account.most = 12
+    evaluator.account.limit = 12
     oracle = Oracle([Model(0, evaluator, Unsafe(keep=0.5))], Unsafe(), between=False)
     (encounter,) = oracle.listed()
     vehicles = np.array([[9.5, 8.0], [0.5, 8.0], [5.0, 8.0], [5.0, 0.25], [5.0, 3.0]])

@@ -34,7 +34,7 @@ from safevar_sumo.questions.explain.tables import (
     CAUSE_COLUMNS,
     printed_limits,
 )
-from safevar_sumo.questions.tables import cell_text, columns_of
+from safevar_sumo.questions.tables import cell_text
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
 from safevar_sumo.sumo.matrix import drive_and_score
@@ -135,14 +135,14 @@ def test_every_boundary_is_unsafe_as_it_is_printed(
     case: Case, explained: Answer
 ) -> None:
     """Also each change alone at its boundary."""
-    table = explained.tables["causes"]
-    columns = columns_of(table)
+    table = explained.tables.records["causes"]
     typed = []
-    for row in table.to_dict("records"):
+    for row in table.frame.to_dict("records"):
         boundary, alone = (
             dict(
                 re.findall(
-                    r"(\w+) ([\d.]+)", cell_text(row[name], columns[name].number_format)
+                    r"(\w+) ([\d.]+)",
+                    cell_text(row[name], table.columns[name].number_format),
                 )
             )
             for name in ("boundary", "single_boundary")

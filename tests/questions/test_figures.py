@@ -10,26 +10,27 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.answer import Answer, Column, tabulate, with_interval
+from safevar_sumo.questions.answer import Answer, AnswerTable
 from safevar_sumo.questions.explain import draw_needed
 from safevar_sumo.questions.explain.smallest import draw_staircase
 
 STUDY: Any = SimpleNamespace(name="made-up")
 
 
-def answer_with(**tables: pd.DataFrame) -> Answer:
-    numbers = {"analysed": 7}
-    return Answer(question="", study=STUDY, verdict="", numbers=numbers, tables=tables)
+def answer_with(**frames: pd.DataFrame) -> Answer:
+    return Answer(
+        question="",
+        study=STUDY,
+        verdict="",
+        numbers={"analysed": 7},
+        tables={name: AnswerTable(frame, "Ages") for name, frame in frames.items()},
+    )
 
 
 def test_intervals_are_drawn_around_their_values_from_the_top_down() -> None:
-    columns = {
-        "part": "it",
-        **with_interval("the_age", Column("s", "its age")),
-        "mass": "kg",
-    }
+    columns = ["part", "the_age", "the_age_low", "the_age_high", "mass"]
     rows = [("a$", 2.0, 1.0, 5.0, 3.0), ("b", 4.0, 3.5, 4.25, 3.0)]
-    frame = tabulate("Ages", columns, rows)
+    frame = pd.DataFrame(rows, columns=columns)
     figure = answer_with(ages=frame).figure()
     (axis,) = figure.axes
     ((values, _, (bars,)),) = axis.containers

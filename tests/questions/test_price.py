@@ -144,19 +144,19 @@ def test_a_quick_explanation_announces_an_eighth_of_a_whole_one(
 
 
 def test_more_simulations_than_are_planned_are_a_bound_too() -> None:
-    account = Account(Phases(show_no_progress), asked=120)
+    account = Account(Phases(show_no_progress), allowance=120)
     account.open(100, None)
-    assert account.most is None
+    assert account.limit is None
     account.spend(120)
     with pytest.raises(InputError, match="120 do not suffice: 121"):
         account.spend(1)
 
 
 def test_many_more_simulations_search_more_and_not_roughly() -> None:
-    for asked, effort in ((120, 1.0), (1000, 5.0), (10**9, 8.0)):
-        account = Account(Phases(show_no_progress), asked=asked)
+    for allowance, effort in ((120, 1.0), (1000, 5.0), (10**9, 8.0)):
+        account = Account(Phases(show_no_progress), allowance=allowance)
         account.open(100, None)
-        assert (account.most, account.effort) == (None, effort)
+        assert (account.limit, account.effort) == (None, effort)
 
 
 COUNTED = """
@@ -229,14 +229,14 @@ def test_what_takes_long_by_default_is_limited_and_said_first(
     account = Account(Phases(show_no_progress), minimum=2201)
     with pytest.raises(InputError, match="an answer takes at least 2,201"):
         account.open(10_000, 0.4)
-    assert account.most == 2200
+    assert account.limit == 2200
     assert (
         "at most 2,200 simulations, about 0:14:40, of about 10,000"
         in capsys.readouterr().err
     )
     other = Account(Phases(show_no_progress))
     other.open(1000, 0.4)
-    assert other.most is None
+    assert other.limit is None
     assert "about 1,000 simulations, about 0:06:40" in capsys.readouterr().err
     assert round_down(0.2) == 1
 

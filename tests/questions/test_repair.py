@@ -34,6 +34,7 @@ from safevar_sumo.questions.repair.problem import (
     RepairProblem,
     parameters_of,
 )
+from safevar_sumo.questions.tables import AnswerTable
 from safevar_sumo.questions.tolerance.oracle import Oracle, product_of
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.study import FreeParameter
@@ -360,7 +361,7 @@ def test_the_verdict_names_the_worst_vehicle_of_a_kept_promise(
     assert (
         "None of 5 worn vehicles that were sampled afterwards is unsafe" in kept.tested
     )
-    table = pd.DataFrame({"parameters": [{"standing_gap": 3.25}]})
+    table = AnswerTable(pd.DataFrame({"parameters": [{"standing_gap": 3.25}]}))
     # A study that results alone hold has no file to extend.
     for study in (kept.study, replace_in(kept.study, name="lost")):
         write_repair(

@@ -248,12 +248,11 @@ def test_only_an_interval_above_all_others_decides(of_b: float, said: str) -> No
             "unsafe_total": [1.37, 0.0],
         }
     )
-    frame.attrs = {"of_what": OUTPUTS}
     names = {"a": "a", "b": "b"}
-    (told,) = influence_in_words(frame, 120, 0.95, names)
+    (told,) = influence_in_words(frame, OUTPUTS["degree"], 120, 0.95, names)
     assert said in told.text
     frame["unsafe_total"] = np.nan
-    _, unknown = influence_in_words(frame, 1, 0.95, names)
+    _, unknown = influence_in_words(frame, "", 1, 0.95, names)
     assert "at least 100 unsafe and 100 safe vehicles are needed" in unknown.text
 
 

@@ -124,7 +124,7 @@ def smallest_of(
 ) -> tuple[Smallest, str]:
     """The answer about a region, with at most so many simulations, and its sentences."""
     evaluator = made_up_evaluator(n, region)
-    evaluator.account.most = most
+    evaluator.account.limit = most
     smallest = Smallest.of(evaluator, COLLISION, 0)
     return smallest, Verdict(smallest_sentences(smallest, evaluator, COLLISION))
 

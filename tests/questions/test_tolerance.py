@@ -246,7 +246,7 @@ def test_the_worst_clearance_is_what_is_left_beside_the_margin_of_its_set() -> N
 
 def test_few_simulations_claim_nothing_of_a_set_that_they_do_not_reach() -> None:
     own = made_up_model(2, nowhere)
-    own.evaluator.account.most = 600
+    own.evaluator.account.limit = 600
     models = Models((own, own._replace(fit=1)), ())
     limits = find_limits(asked_of(models, Unsafe(), [0, 1], {}, at_tests=True))
     assert [*limits.attacks] == [0]

@@ -78,6 +78,12 @@ def answer_of(
     )
 
 
+def with_table(limits: Answer, row: tuple[object, ...]) -> Answer:
+    """Limits that were searched in ranges, too."""
+    ranges = tabulate("Ranges", IN_RANGES, [row])
+    return replace(limits, tables={**limits.tables.records, "ranges": ranges})
+
+
 def speed_of(up_to: float | None = 40.0, study: Study = STUDY) -> Answer:
     """How fast vehicles within the limits may drive."""
     row = (
@@ -268,9 +274,8 @@ def test_a_sheet_has_the_reason_of_no_answer_and_there_is_none_if_nobody_asked()
 def test_wider_tests_stand_on_the_sheet_and_their_codes_are_the_engineers(
     kept: bool, found: str
 ) -> None:
-    answer = answer_of()
     row = ("CPNCO up to 60 km/h", kept, "A child is hit.", None, None)
-    answer.tables["ranges"] = tabulate("Ranges", IN_RANGES, [row])
+    answer = with_table(answer_of(), row)
     foreman, _, engineer = sheet_with(answer).partition(
         "For the manufacturer's engineer"
     )
@@ -294,9 +299,8 @@ def test_one_greatest_speed_of_all_vehicles_within_the_limits_in_tests_without_c
 
 
 def test_a_failure_in_the_ranges_lowers_the_greatest_speed() -> None:
-    answer = answer_of()
     row = ("up to 60 km/h", False, "A child is hit.", {"speed": 36.2}, None)
-    answer.tables["ranges"] = tabulate("Ranges", IN_RANGES, [row])
+    answer = with_table(answer_of(), row)
     sheet = sheet_with(answer, speed=speed_of())
     assert "Greatest speed: 36 km/h (simulated" in sheet
     assert "a vehicle within these limits fails above the greatest speed." in sheet
@@ -382,7 +386,7 @@ def sheet_of_shipped(name: str) -> str:
     )
     if in_ranges := study_in_ranges(study):
         row = (scope_of(in_ranges), False, "A child is hit. " * 20, {}, None)
-        limits.tables["ranges"] = tabulate("Ranges", IN_RANGES, [row])
+        limits = with_table(limits, row)
     own = replace(limits, study=study)
     has_speed = speed_values(reported(own))
     return html_of(reported(own, speed=speed_of(study=study) if has_speed else None))

@@ -295,8 +295,9 @@ def test_algorithms_are_compared_after_equal_numbers_of_simulations(
         evaluations=seen,
         finished=[*product(journals, (0, 1, 2))],
     )
-    table = answer_questions([case], Choices(alpha=0.05), ["budget"]).tables["budget"]
-    assert "; 95 % intervals)" in table.attrs["title"]
+    tables = answer_questions([case], Choices(alpha=0.05), ["budget"]).tables
+    assert "; 95 % intervals)" in tables.records["budget"].title
+    table = tables["budget"]
     names = [
         "simulations",
         "effect_size",

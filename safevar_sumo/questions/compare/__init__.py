@@ -67,7 +67,7 @@ from safevar_sumo.questions.research_questions.statistics import (
 )
 from safevar_sumo.questions.sentence import Sentence, Verdict, answer, note
 from safevar_sumo.questions.subject import study_in
-from safevar_sumo.questions.tables import shipped_columns
+from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.tolerance.asked import usual_alone
 from safevar_sumo.questions.tolerance.oracle import STAGE
 from safevar_sumo.questions.words import UNSAFE_MEANS, counted_in_words, join_phrases
@@ -171,11 +171,12 @@ def compare(
 
     # What differs: settings, limits, the original vehicles, safety degrees.
     alone = limits_of_both(evaluators, criteria, restriction, at_tests=at_tests)
+    changes = alone.frame["change"]
     of_originals, of_new_cars = compare_originals(evaluators, originals, criteria)
     differences = [
         *of_new_cars,
         *compare_counts(counts),
-        *compare_limits(alone, evaluator.characteristics),
+        *compare_limits(alone.frame, evaluator.characteristics),
         *compare_values(tested.p, tested.a12),
     ]
     lacks = [*missing_in_words(*evaluators, titles)]
@@ -192,13 +193,13 @@ def compare(
         **counts,
         "p": tested.p,
         "a12": tested.a12,
-        "limits_grown": int(alone["change"].isin([GROWN, BOTH]).sum()),
-        "limits_shrunk": int(alone["change"].isin([SHRUNK, BOTH]).sum()),
+        "limits_grown": int(changes.isin([GROWN, BOTH]).sum()),
+        "limits_shrunk": int(changes.isin([SHRUNK, BOTH]).sum()),
         "outside": outside,
         "not_simulated": int((~pairs.are_valid).sum()) - pairs.number_infeasible,
         **of_originals,
     }
-    summary = summary_of(numbers, tested.pairs, titles)
+    summary = summary_of(numbers, tested.pairs.frame, titles)
     table = _table(common, settings)
     reason = second.no_verdict if second.no_verdict != evaluator.no_verdict else ""
     notes = [criteria[0].remark, *counted_in_words(study, pairs.number_infeasible)]
@@ -289,7 +290,7 @@ def _settings_frame(
     )
 
 
-def _table(common: CommonDomain, settings: pd.DataFrame) -> pd.DataFrame:
+def _table(common: CommonDomain, settings: pd.DataFrame) -> AnswerTable:
     """The table of settings, those first that are unsafe in one system only."""
     members = common.evaluators[0].characteristics.members
     columns = {
@@ -320,7 +321,7 @@ class _PairedTest(NamedTuple):
 
     p: float
     a12: float
-    pairs: pd.DataFrame
+    pairs: AnswerTable
     groups: str
 
 
@@ -398,7 +399,7 @@ def _test_in_words(tested: _PairedTest, titles: Mapping[str, str]) -> str:
     if np.isnan(tested.p):
         return words.NO_TEST.text
     return words.TEST(
-        number=len(tested.pairs),
+        number=len(tested.pairs.frame),
         groups=tested.groups,
         p=tested.p,
         a12=tested.a12,

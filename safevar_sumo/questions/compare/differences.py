@@ -29,7 +29,7 @@ from safevar_sumo.questions.repair.price import (
 from safevar_sumo.questions.research_questions.statistics import ALPHA
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.questions.sentence import Sentence
-from safevar_sumo.questions.tables import shipped_columns
+from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.tolerance.asked import Asked, asked_of
 from safevar_sumo.questions.tolerance.search import alone_with_own_set
 from safevar_sumo.questions.words import count_in_words, join_phrases
@@ -69,7 +69,7 @@ class Difference(NamedTuple):
 
 def summary_of(
     numbers: JsonObject, pairs: pd.DataFrame, titles: Mapping[str, str]
-) -> pd.DataFrame:
+) -> AnswerTable:
     """The table of what is compared: the new car, changed cars, needless braking, and limits."""
     number_in_both = numbers["both"]
     values: JsonObject = {
@@ -128,7 +128,7 @@ def limits_of_both(
     limits: Mapping[str, Limit],
     *,
     at_tests: bool,
-) -> pd.DataFrame:
+) -> AnswerTable:
     """The table of limits alone with the study's own set, as in `tolerance`, within the user's
     limits; no interval where the original is unsafe.
     """

@@ -51,7 +51,7 @@ from safevar_sumo.questions.explain.tell import (
     smallest_sentences,
 )
 from safevar_sumo.questions.options import Range
-from safevar_sumo.questions.over_sets import INTERVALS, planned_over_sets
+from safevar_sumo.questions.over_sets import BY_SET, INTERVALS, planned_over_sets
 from safevar_sumo.questions.preventability import (
     COLUMNS as DRIVER_COLUMNS,
     FULL,
@@ -92,7 +92,7 @@ LATER = {REFERENCE_DRIVERS: 3000, OTHER_SETS: 1000, BOUNDARIES: 3000}
         "failures",
         "other_outcomes",
         "left_out",
-        "by_set",
+        BY_SET,
         INTERVALS,
         "original_outcome",
         "original_degree",
@@ -208,7 +208,9 @@ def explain(
         **_collision_numbers(verdicts, collisions if has_drivers else None),
         **(smallest.numbers if smallest is not None else {}),
     }
-    leading = failure_sentences(evaluator, population, tables["causes"], len(sample))
+    leading = failure_sentences(
+        evaluator, population, tables["causes"].frame, len(sample)
+    )
     if smallest is not None:
         leading = smallest_sentences(smallest, evaluator, population.unsafe)
     notes = other_sentences(study, population, complete, verdicts)
@@ -235,7 +237,9 @@ def _plan(subject: Subject, evaluator: Evaluator, fits: int) -> int:
         limit = evaluator.scaled(LIMIT)
         planned = {TO_EXPLAIN: float(len(subject.solutions))}
     later = {name: evaluator.scaled(number) for name, number in LATER.items()}
-    evaluator.begin({**planned, SUBSETS: limit / points, **later}, least=LEAST_SETTINGS)
+    evaluator.begin(
+        {**planned, SUBSETS: limit / points, **later}, minimum=LEAST_SETTINGS
+    )
     return limit
 
 
@@ -250,7 +254,9 @@ def _counts(
     original = population.original
     over_sets = population.over_sets
     failures = population.unsafe.number(runs)
-    share = failures / max(len(runs), 1)
+    by_set: JsonObject = dict.fromkeys((BY_SET, INTERVALS))
+    if over_sets is not None:
+        by_set = over_sets.numbers(failures / max(len(runs), 1))
     omissions = 0
     if (
         isinstance(subject, Case)
@@ -264,8 +270,7 @@ def _counts(
         "failures": failures,
         "other_outcomes": population.otherwise,
         "left_out": omissions,
-        "by_set": None if over_sets is None else over_sets.of_all(share),
-        INTERVALS: None if over_sets is None else over_sets.numbers[INTERVALS],
+        **by_set,
         "original_outcome": str(original.outcome[0]),
         "original_degree": float(original.f_safe[0]),
         "analysed": analysed,

@@ -102,7 +102,8 @@ def enumerate_causes(
     changes = _changes(members, share)
     columns = {column for column, _ in changes}
     room = limit // (1 + len(evaluator.critical_encounters))
-    effects = dict.fromkeys(changes, np.inf)  # what each leaves by itself
+    # What each change leaves by itself.
+    effects = dict.fromkeys(changes, np.inf)
     causes = list[Cause]()
     simulated, existing = dict[int, int](), dict[int, int]()
     containing = dict[int, list[Combination]]()

@@ -24,7 +24,7 @@ from safevar_sumo.questions.explain.tables import (
     STAIRCASE_COLUMNS,
     sureness,
 )
-from safevar_sumo.questions.tables import Frames, tabulate
+from safevar_sumo.questions.tables import AnswerTable, tabulate
 from safevar_sumo.records import JsonObject
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class Smallest(NamedTuple):
         return dict(zip(SMALLEST_NUMBERS, values, strict=True))
 
 
-def smallest_tables(smallest: Smallest | None) -> Frames:
+def smallest_tables(smallest: Smallest | None) -> dict[str, AnswerTable]:
     """The tables of causes and of the staircase; empty where the original itself is unsafe."""
     rows = []
     for step in smallest.steps if smallest else ():
@@ -147,7 +147,8 @@ def draw_staircase(answer: Answer) -> Figure:
             textcoords="offset points",
             fontsize=size,
         )
-    axis.set_xlim(0, 125)  # with room for names at the right
+    # With room for names at the right.
+    axis.set_xlim(0, 125)
     axis.set_xticks(range(0, 101, 20))
     axis.grid(visible=False, axis="x")
     axis.set_ylim(0.5, max(fewest, default=1) + 1.6)

@@ -35,7 +35,7 @@ from safevar_sumo.questions.preventability import (
     has_reference_drivers,
 )
 from safevar_sumo.questions.tables import (
-    Frames,
+    AnswerTable,
     shipped_columns,
     tabulate,
 )
@@ -101,7 +101,7 @@ def causes_table(
     solutions: pd.DataFrame,
     causes_of: Sequence[Sequence[Cause]],
     distinct: pd.DataFrame,
-) -> pd.DataFrame:
+) -> AnswerTable:
     """A row of `CAUSE_COLUMNS` for each cause of each chosen failure: first the most frequent of
     the robust ones, whose shares are in `distinct`, then the others, the most robust one first.
     """
@@ -152,15 +152,9 @@ def causes_table(
     columns = {**CAUSE_COLUMNS}
     for name in () if study.ranges else OF_ENCOUNTER:
         del columns[name]
-    table = tabulate(
-        "Minimal causes: smallest sets of changes that are unsafe",
-        columns,
-        frame,
-    )
-    table.attrs["lead_rows"] = np.flatnonzero(
-        ~frame["boundary"].astype(str).duplicated()
-    ).tolist()
-    return table
+    title = "Minimal causes: smallest sets of changes that are unsafe"
+    is_new = ~frame["boundary"].astype(str).duplicated()
+    return tabulate(title, columns, frame, lead_rows=np.flatnonzero(is_new).tolist())
 
 
 def printed_limits(
@@ -237,7 +231,7 @@ def statistics_tables(
     verdicts: pd.DataFrame,
     collisions: int,
     distinct: pd.DataFrame,
-) -> Frames:
+) -> dict[str, AnswerTable]:
     """The tables of characteristics, of drivers and of distinct causes."""
     return {
         "characteristics": tabulate(

@@ -102,8 +102,7 @@ def _leading_of_study(
         yield words.GAP(share=percentage(leading["safe_again"]))
     is_checked = pd.notna(leading["robust_share"])
     if is_checked and leading["causes"] != leading["boundary"]:
-        changes = values_in_words(members, leading["causes"])
-        yield words.CHECKED_WITH(changes=changes)
+        yield words.CHECKED_WITH(changes=values_in_words(members, leading["causes"]))
     if leading["unsafe_runs"] < 1:
         yield words.RUNS(share=percentage(leading["unsafe_runs"]))
     yield from _sureness(leading)
@@ -204,8 +203,7 @@ def failure_sentences(
     unsafe = population.unsafe
     original = population.original
     if not evaluator.study.ranges and unsafe.of(original)[0]:
-        breach = unsafe.breach_in_words(original)
-        yield words.ALREADY_UNSAFE(breach=breach)
+        yield words.ALREADY_UNSAFE(breach=unsafe.breach_in_words(original))
         yield answer(unsafe.smaller_demand(original))
         return
     if causes.empty and unsafe.number(population.evaluations):
@@ -232,9 +230,8 @@ def failure_sentences(
         yield words.ENCOUNTER(values=values)
     if analysed > 1 and pd.notna(leading["share"]):
         number = round(leading["share"] * analysed)
-        count = count_in_words(number, analysed)
         yield words.SHARE(
-            count=count,
+            count=count_in_words(number, analysed),
             have="has" if number <= 1 else "have",
         )
     yield from _beyond(evaluator, unsafe, boundary, place)
@@ -314,9 +311,8 @@ def avoidance(verdicts: pd.DataFrame) -> Iterator[Sentence]:
         if number < len(verdicts):
             collisions = f"{number:,} collisions with a verdict ({len(verdicts):,} were examined)"
         if number:
-            avoided = int(verdicts[name].sum())
             yield template(
-                avoided=avoided,
+                avoided=int(verdicts[name].sum()),
                 collisions=collisions,
             )
 

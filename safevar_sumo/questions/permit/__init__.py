@@ -184,7 +184,7 @@ def permit(
         evaluator, search, fleet, candidates, with_repairs=has_repairs
     )
     # Further simulations, where their number has no limit.
-    is_free = not limits and evaluator.account.asked is evaluator.left is None
+    is_free = not limits and evaluator.account.allowance is evaluator.left is None
     ends = None
     if is_free:
         of_cars = zip(candidates, fleet.measured, permits, strict=True)
@@ -201,7 +201,7 @@ def permit(
         permits=permits,
         repaired=repaired,
         is_quick=quick,
-        is_rough=quick or evaluator.account.most is not None,
+        is_rough=quick or evaluator.account.limit is not None,
         is_box=bool(limits),
         ends=ends,
     ).answer()

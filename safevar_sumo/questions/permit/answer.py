@@ -93,12 +93,11 @@ class PermitAnswer:
         columns = _in_unit(CARS, span)
         if self._is_test:
             columns["up_to"] = columns["up_to"]._replace(head="passes the test up to")
-        cars = tabulate("The cars, first those that may not drive", columns, rows)
+        cars = pd.DataFrame(rows, columns=list(columns))
         counts = Counter(cars["verdict"])
         ordered = cars.sort_values(
             "up_to", kind="stable", na_position="first", ignore_index=True
         )
-        ordered.attrs = {**cars.attrs, "shown_whole": SHOWN_WHOLE}
         claim = self.study
         if span.ending:
             claim = study_up_to(claim, UpperEnd(span.name, span.high))
@@ -139,7 +138,12 @@ class PermitAnswer:
                 "rough": self.is_rough,
             },
             tables={
-                "cars": ordered,
+                "cars": tabulate(
+                    "The cars, first those that may not drive",
+                    columns,
+                    ordered,
+                    shown_whole=SHOWN_WHOLE,
+                ),
                 "sets": tabulate(
                     "By parameter set",
                     _in_unit(SETS, span),

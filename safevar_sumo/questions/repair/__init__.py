@@ -149,7 +149,7 @@ def repair(
     searches = USUAL_ROUNDS * (OF_ROUND + problem.oracle.fits.count(0))
     rounds = searches * problem.budget / len(evaluator.system.points)
     usual = round(rounds + MOST_CHANGED * usual_test(problem, len(models.members)))
-    evaluator.begin({ROUNDS_STAGE: usual}, least=usual)
+    evaluator.begin({ROUNDS_STAGE: usual}, minimum=usual)
     cases_today, is_repairable = _worst_first(problem, _first_cases(problem, subject))
     survivors = Survivors([], len(models.members), ())
     if is_repairable.any():

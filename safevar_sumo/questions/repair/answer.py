@@ -169,8 +169,8 @@ def _tested(
         )
     if survivors.broken:
         yield words.BROKEN(sets=fit_names(survivors.broken))
-    if models.left_out and number > 1:
-        sets = fit_names([model.fit for model in models.left_out])
+    if models.exclusions and number > 1:
+        sets = fit_names([model.fit for model in models.exclusions])
         yield words.LEFT_OUT(sets=sets)
     yield condition(remark_on_phases(models.own.in_phases))
 

@@ -213,13 +213,14 @@ def answer_questions(
     """
     # Each table, of every case that can answer it.
     words = titles_of(cases)
-    frames = {}
+    tables = {}
     remarks = []
     errors = []
     for name in names:
         title, compute, columns, wide = TABLES[name]
         title = title.format(level=f"{100 - 100 * choices.alpha:g}")
-        label = next(iter(columns))  # of the case
+        # The first column names the case.
+        label = next(iter(columns))
         if name == CAUSES and not choices.causes:
             continue
         if name in CHOSEN:
@@ -238,12 +239,12 @@ def answer_questions(
                     remarks.append((name, f"{beginning}{note}"))
         of_case = columns[label]._replace(is_shown=len(cases) > 1)
         rows = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
-        frames[name] = tabulate(
+        tables[name] = tabulate(
             title, {**columns, label: of_case}, rows, wide=wide, words=words
         )
 
     # Nothing at all is an error; remarks stand once.
-    if errors and all(frame.empty for frame in frames.values()):
+    if errors and all(table.frame.empty for table in tables.values()):
         raise errors[0]
     sentences = [*chain.from_iterable(map(_verdict, cases))]
     of_all = []
@@ -257,7 +258,7 @@ def answer_questions(
         ]
     on_all = product(["all"], filter(None, of_all))
     different = dict.fromkeys([*on_all, *remarks])
-    frames["remarks"] = tabulate("Remarks", REMARKS, [*different])
+    tables["remarks"] = tabulate("Remarks", REMARKS, [*different])
     return Answer(
         question="tables",
         study=cases[0].study,
@@ -267,7 +268,7 @@ def answer_questions(
             "solutions": sum(len(case.solutions) for case in cases),
             "alpha": choices.alpha,
         },
-        tables=frames,
+        tables=tables,
         draw=lambda answer: next(iter(draw_figures(cases).values())),
     )
 
@@ -291,10 +292,9 @@ def _verdict(case: Case) -> Iterator[Sentence]:
     except UnanswerableError:
         return
     less_safe = LESS_SAFE[bool(case.study.ranges)]
-    total = len(case.solutions_of(NSGA2))
     yield less_safe(
         count=critical,
-        total=total,
+        total=len(case.solutions_of(NSGA2)),
         algorithm=case.title_of(NSGA2),
     )
     yield from map(note, demanded_in_words(case.study))
@@ -368,7 +368,8 @@ def _on_pooled_tests(
             )
     if table == "rq1":
         values = pd.Series(case.original, dtype=float)
-        if case.study.ranges:  # in a solution's encounter
+        # In a solution's encounter only this value is known.
+        if case.study.ranges:
             values = values.where(values.index == SAFETY_DEGREE)
         omitted = [*values.index[values.isna()]]
         if omitted:

@@ -86,7 +86,8 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
         If there are no evaluations or no solutions, or a single algorithm.
     """
     # Every run within each budget, also if it has no valid setting there.
-    tests = rq2_runs(case, choices)  # raises if there is a single algorithm
+    # It raises if there is a single algorithm.
+    tests = rq2_runs(case, choices)
     count = tests["p_value"].count()
     reference = reference_front(case)
     unsafe = case.unsafe

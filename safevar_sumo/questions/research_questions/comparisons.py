@@ -20,7 +20,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import product
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +60,6 @@ MARKS = {"large": "L", "medium": "M", "small": "S", "negligible": ""}
 """Magnitudes of effects in a table for a paper."""
 Samples = Mapping[tuple[str, str], "pd.Series[float]"]
 """Values by algorithm and name of a metric or quality indicator."""
-NOTHING: Samples = MappingProxyType({})
 
 
 class Choices(NamedTuple):
@@ -72,7 +70,7 @@ class Choices(NamedTuple):
 
     algorithm: str = ""
     alpha: float = ALPHA
-    causes: Mapping[str, pd.DataFrame] = MappingProxyType({})
+    causes: Mapping[str, pd.DataFrame] = {}
 
 
 DEFAULT = Choices()
@@ -122,7 +120,7 @@ def rq1_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 
 
 def rq2_runs(
-    case: Case, choices: Choices = DEFAULT, further: Samples = NOTHING
+    case: Case, choices: Choices = DEFAULT, further: Samples | None = None
 ) -> pd.DataFrame:
     """Compare one algorithm with every other by Mann-Whitney U, with one value per run: indicators,
     metrics' means over solutions and, if they were counted, distinct minimal causes.
@@ -131,7 +129,8 @@ def rq2_runs(
     are as in `rq1_runs`, for all tests of RQ2.
     """
     tests = compare_over_runs(case, choices, further)
-    opponents_of(case, choices.algorithm)  # raises if RQ2 has no answer
+    # It raises if RQ2 has no answer.
+    opponents_of(case, choices.algorithm)
     return tests[tests.index == "RQ2"]
 
 
@@ -175,7 +174,7 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 
 
 def compare_over_runs(
-    case: Case, choices: Choices = DEFAULT, further: Samples = NOTHING
+    case: Case, choices: Choices = DEFAULT, further: Samples | None = None
 ) -> pd.DataFrame:
     """Every test of RQ1 and, if it has an answer, of RQ2 over runs, also of `further` samples; the
     index is the question, RQ1 or RQ2.
@@ -240,14 +239,7 @@ def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
         rows.append((algorithm, metric, len(values), values.median(), *interval))
     return pd.DataFrame(
         rows,
-        columns=[
-            "algorithm",
-            "metric",
-            "runs",
-            "median",
-            "median_low",
-            "median_high",
-        ],
+        columns=["algorithm", "metric", "runs", "median", "median_low", "median_high"],
     )
 
 
@@ -259,7 +251,8 @@ def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
     UnanswerableError
         If they were not counted, or the solutions belong to no run.
     """
-    case.runs_of(NSGA2)  # raises if the solutions are imported
+    # It raises if the solutions are imported.
+    case.runs_of(NSGA2)
     if case.name not in choices.causes:
         raise UnanswerableError(
             case.name,
@@ -281,7 +274,8 @@ def opponents_of(case: Case, algorithm: str) -> tuple[str, list[str]]:
     case.require_solutions()
     if not algorithm:
         algorithm = NSGA2 if NSGA2 in case.algorithms else case.algorithms[0]
-    case.solutions_of(algorithm)  # raises if there are none
+    # Without them it raises.
+    case.solutions_of(algorithm)
     opponents = [name for name in case.algorithms if name != algorithm]
     if not opponents:
         example = "rs"
@@ -325,11 +319,15 @@ def _test_original(
 
 
 def _test_opponents(
-    case: Case, choices: Choices, *, over_runs: bool = False, further: Samples = NOTHING
+    case: Case,
+    choices: Choices,
+    *,
+    over_runs: bool = False,
+    further: Samples | None = None,
 ) -> list[JsonObject]:
     """A row for each baseline and metric, also of `further` samples."""
     algorithm, opponents = opponents_of(case, choices.algorithm)
-    samples = {**_samples(case, choices, over_runs), **further}
+    samples = {**_samples(case, choices, over_runs), **(further or {})}
     # Whether larger values speak for an algorithm: a better front, more unsafe solutions, or more
     # causes.
     directions = {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
@@ -379,7 +377,8 @@ def _values(
     values = solutions[metric.name].astype(float)
     if not over_runs:
         return values
-    case.runs_of(algorithm)  # raises if there are none
+    # Without them it raises.
+    case.runs_of(algorithm)
     return values.groupby(solutions["run"]).agg(
         lambda sample: np.mean(sample.to_numpy())
     )

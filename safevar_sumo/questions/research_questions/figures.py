@@ -77,7 +77,8 @@ def draw_pareto_fronts(case: Case) -> Figure:
     UnanswerableError
         If there is no solution.
     """
-    reference_front(case)  # raises if there is no solution
+    # It raises if there is no solution.
+    reference_front(case)
 
     # The front of each algorithm.
     objectives = case.scoring.objectives
@@ -261,7 +262,8 @@ def draw_changed_characteristics(case: Case) -> Figure:
     """
     import seaborn as sns
 
-    _critical_changes(case)  # raises if there are none
+    # Without them it raises.
+    _critical_changes(case)
 
     # Shares by characteristic and number of changes, the most frequent first.
     shares = rq32(case)

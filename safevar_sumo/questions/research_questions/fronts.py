@@ -116,7 +116,8 @@ def frames_of_runs(
     for algorithm in case.algorithms:
         runs += product([algorithm], case.runs_of(algorithm))
     if not runs:
-        case.require_solutions()  # says that no run is finished
+        # It says that no run is finished.
+        case.require_solutions()
     if not groups.keys() & set(runs):
         raise UnanswerableError(
             case.name, "has no evaluations", "results with the journals of their runs"

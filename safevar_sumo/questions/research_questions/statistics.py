@@ -141,24 +141,22 @@ def signed_rank_test(x: ArrayLike, y: ArrayLike = 0.0) -> TwoSampleTest:
     pairs = zip(_decimals(x), _decimals(np.broadcast_to(y, np.shape(x))), strict=True)
     differences = np.array([value - baseline for value, baseline in pairs], float)
 
-    # No test of undefined or equal values.
+    # No test of undefined values.
     if not differences.size or np.isnan(differences).any():
         return TwoSampleTest(np.nan, np.nan, None, differences.size, 0, None)
-    if not differences.any():
-        return TwoSampleTest(
-            1.0, 0.5, magnitude_of(0.5), differences.size, 1, EXACT_SIGNED_TEST
-        )
 
     # The effect, and the exact test if no values are tied.
     effect = float(np.mean(differences > 0) + np.mean(differences == 0) / 2)
-    is_distinct = has_distinct_values([0.0, *np.abs(differences)])
-    is_exact = differences.size <= MAX_EXACT_RUNS and is_distinct
-    name, method = ASYMPTOTIC_SIGNED_TEST, "approx"
-    if is_exact:
-        name, method = EXACT_SIGNED_TEST, "exact"
-    test = scipy.stats.wilcoxon(differences, correction=not is_exact, method=method)
+    p_value, name = 1.0, EXACT_SIGNED_TEST
+    if differences.any():
+        is_distinct = has_distinct_values([0.0, *np.abs(differences)])
+        is_exact = differences.size <= MAX_EXACT_RUNS and is_distinct
+        method = "exact" if is_exact else "approx"
+        test = scipy.stats.wilcoxon(differences, correction=not is_exact, method=method)
+        p_value = float(test.pvalue)
+        name = EXACT_SIGNED_TEST if is_exact else ASYMPTOTIC_SIGNED_TEST
     return TwoSampleTest(
-        float(test.pvalue), effect, magnitude_of(effect), differences.size, 1, name
+        p_value, effect, magnitude_of(effect), differences.size, 1, name
     )
 
 

@@ -15,9 +15,7 @@ from itertools import product
 
 import numpy as np
 import pandas as pd
-from numpy.random import default_rng
 
-from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import HIGH, LOW, Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
@@ -26,7 +24,6 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.indices import (
     LEAST_VEHICLES,
     MIN_OUTCOMES,
-    OF_WHAT,
     OUTPUTS,
     SENSITIVITY,
     design_of,
@@ -36,9 +33,11 @@ from safevar_sumo.questions.indices import (
 )
 from safevar_sumo.questions.options import Count, Fraction
 from safevar_sumo.questions.over_sets import (
+    BY_SET,
     INTERVALS,
     SharesOverSets,
     planned_over_sets,
+    simulate_sample,
 )
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.risk import words
@@ -64,8 +63,6 @@ RARE = 1e-4
 MAX_RIVALS = 3
 """Largest number of characteristics that the verdict names beside the one with the largest share.
 """
-MAX_DECIDING = 5
-"""Number of characteristics that one screen names."""
 COLUMNS = [
     "characteristic",
     *map("".join, product(OUTPUTS, ("_first", "_total"), ("", LOW, HIGH))),
@@ -80,7 +77,7 @@ COLUMNS = [
     "probability",
     "interval",
     "confidence",
-    "by_set",
+    BY_SET,
     INTERVALS,
     lead="sensitivity",
     next="explain",
@@ -118,33 +115,29 @@ def risk(
     has_design = not (model.region or study.ranges)
     of_design = has_design * size_of_design(evaluator)
     phases = planned_over_sets(study, SAMPLING, samples) | {SENSITIVITY: of_design}
-    evaluator.begin(phases, least=LEAST_SETTINGS)
+    evaluator.begin(phases, minimum=LEAST_SETTINGS)
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
     if evaluator.left is not None:
         # Few simulations are for the design only where it takes at most half of them.
         has_design = has_design and 2 * of_design <= evaluator.left
         samples = min(samples, evaluator.left - has_design * of_design)
-    vehicles = model.draw(samples, default_rng(study.search.seed))
-    evaluations = evaluator.evaluate(vehicles, SAMPLING)
+    evaluations = simulate_sample(evaluator, model, samples, SAMPLING)
 
     # How many are unsafe.
     simulated = evaluations.take(evaluations.valid)
     failures = criterion.number(simulated)
     total = len(simulated)
-    if not total:
-        raise SimulationError(
-            f"study {study.name!r}: none of {samples} vehicles could be simulated"
-        )
 
     # With which probability, also in other parameter sets, and which characteristics decide.
     low, high = clopper_pearson(failures, total, confidence)
     over_sets = SharesOverSets.of(evaluator, criterion, evaluations.settings)
     if has_design:
         design = design_of(evaluator, model)
-        table = sobol_indices(evaluator, design, criterion, confidence)
+        table, measure = sobol_indices(evaluator, design, criterion, confidence)
     else:
-        table = given_data_indices(evaluator, simulated, criterion, confidence)
+        table, measure = given_data_indices(evaluator, simulated, criterion, confidence)
+    indices = table.frame
     numbers = {
         "unsafe": str(criterion),
         "samples": total,
@@ -152,8 +145,7 @@ def risk(
         "probability": failures / total,
         "interval": [low, high],
         "confidence": confidence,
-        "by_set": over_sets.of_all(failures / total),
-        **over_sets.numbers,
+        **over_sets.numbers(failures / total),
     }
 
     # In words.
@@ -163,12 +155,11 @@ def risk(
         sentences.append(words.UNKNOWN_INFLUENCE(least=LEAST_VEHICLES))
     else:
         names = {item.name: item.short_name for item in evaluator.characteristics}
-        sentences += influence_in_words(table, failures, confidence, names)
+        sentences += influence_in_words(indices, measure, failures, confidence, names)
     sentences += over_sets.sentences()
     counted = counted_in_words(study, omissions)
     sentences += notes_on(criterion, *counted, *constraints_in_words(study))
-    table.attrs["lead_rows"] = range(min(MAX_DECIDING, len(table)))
-    has_shares = table.drop(columns="characteristic").notna().any(axis=None)
+    has_shares = indices.drop(columns="characteristic").notna().any(axis=None)
     return Answer(
         question="risk",
         study=study,
@@ -213,25 +204,31 @@ def _share_in_words(
 
 
 def influence_in_words(
-    table: pd.DataFrame, failures: float, confidence: float, names: Mapping[str, str]
+    indices: pd.DataFrame,
+    measure: str,
+    failures: float,
+    confidence: float,
+    names: Mapping[str, str],
 ) -> Iterator[Sentence]:
-    """Which characteristic has the largest influence on the table's measure, if the interval of its
+    """Which characteristic has the largest influence on the measure, if the interval of its
     share of the variance is above those of all others, or which may; `names` are those of
     sentences.
     """
-    if table.empty:
+    if indices.empty:
         return
-    index = "total" if table["degree_total"].notna().any() else "first"
+    index = "total" if indices["degree_total"].notna().any() else "first"
 
     # The largest share, of all orders if it is known.
-    share, low, high = (100 * table[f"degree_{index}{end}"] for end in ("", LOW, HIGH))
-    name, *rivals = table["characteristic"].map(names)[~(high < low[0])]
+    share, low, high = (
+        100 * indices[f"degree_{index}{end}"] for end in ("", LOW, HIGH)
+    )
+    name, *rivals = indices["characteristic"].map(names)[~(high < low[0])]
     template = words.UNCERTAIN_INFLUENCE if rivals else words.LARGEST_INFLUENCE
     if np.isnan(share[0]):
         template = words.NO_INFLUENCE
     yield template(
         name=name,
-        measure=table.attrs[OF_WHAT]["degree"],
+        measure=measure,
         share=share[0],
         low=low[0],
         high=high[0],
@@ -240,5 +237,5 @@ def influence_in_words(
     )
 
     # Without the outcome's own shares, what decides it is unknown.
-    if failures and table[f"unsafe_{index}"].isna().all():
+    if failures and indices[f"unsafe_{index}"].isna().all():
         yield words.FEW_OUTCOMES(least=MIN_OUTCOMES)

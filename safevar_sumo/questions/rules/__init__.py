@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.errors import SimulationError
 from safevar_sumo.metrics.unsafe import SHARE_DECIMALS
 from safevar_sumo.questions.answer import (
     Answer,
@@ -27,13 +26,15 @@ from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.options import Count
 from safevar_sumo.questions.over_sets import (
+    BY_SET,
     INTERVALS,
     SharesOverSets,
     planned_over_sets,
+    simulate_sample,
 )
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.rules import words
-from safevar_sumo.questions.sampling import clopper_pearson
+from safevar_sumo.questions.sampling import clopper_pearson, share_with_interval
 from safevar_sumo.questions.sentence import Sentence, Verdict
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.variation import VariationModel, sampled_in_words
@@ -77,7 +78,7 @@ row 1.
     "failures",
     "share",
     "interval",
-    "by_set",
+    BY_SET,
     INTERVALS,
     lead="rules",
     next="explain",
@@ -109,15 +110,15 @@ def rules(
     study = evaluator.study
     characteristics = evaluator.characteristics
     evaluator.begin(
-        planned_over_sets(study, SAMPLED_STAGE, samples), least=LEAST_SETTINGS
+        planned_over_sets(study, SAMPLED_STAGE, samples), minimum=LEAST_SETTINGS
     )
 
     # One half of the vehicles yields the rules, the other half tests them.
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
-    rng = np.random.default_rng(study.search.seed)
-    vehicles = VariationModel(study).draw(samples, rng)
-    evaluations = evaluator.evaluate(vehicles, SAMPLED_STAGE)
+    model = VariationModel(study)
+    evaluations = simulate_sample(evaluator, model, samples, SAMPLED_STAGE)
+    vehicles = evaluations.settings
     is_first_half = np.arange(len(evaluations)) < len(evaluations) // 2
     training = evaluations.take(evaluations.valid & is_first_half)
     testing = evaluations.take(evaluations.valid & ~is_first_half)
@@ -125,10 +126,6 @@ def rules(
     unsafe_in_test = criterion.runs(testing).mean(axis=0)
     total = len(training) + len(testing)
     failures = criterion.number(evaluations.take(evaluations.valid))
-    if not total:
-        raise SimulationError(
-            f"study {study.name!r}: none of {len(evaluations)} vehicles could be simulated"
-        )
 
     # Rules are boxes in which unsafe vehicles are dense; with repeats, each run is a vehicle.
     trained = np.tile(training.settings, (len(of_runs), 1))
@@ -158,8 +155,7 @@ def rules(
         "failures": failures,
         "share": failures / total,
         "interval": [low, high],
-        "by_set": over_sets.of_all(failures / total),
-        **over_sets.numbers,
+        **over_sets.numbers(failures / total),
     }
     counted = counted_in_words(study, int(evaluations.infeasible.sum()))
     sentences = [
@@ -233,13 +229,9 @@ def shares(
     """
     is_inside = is_within(box, settings)
     count = round(float(unsafe[is_inside].sum()), SHARE_DECIMALS)
-    values = []
-    for total in (int(is_inside.sum()), round(float(unsafe.sum()), SHARE_DECIMALS)):
-        if total:
-            values += [count / total, *clopper_pearson(count, total)]
-        else:
-            values += [np.nan] * 3
-    return values
+    total = round(float(unsafe.sum()), SHARE_DECIMALS)
+    density = share_with_interval(count, int(is_inside.sum()))
+    return density + share_with_interval(count, total)
 
 
 def _boxes(
@@ -336,7 +328,8 @@ def _boxes_of_leaves(
     """The boxes of a tree's leaves below a node, whose own box is `box`, each with its share of
     unsafe settings.
     """
-    if tree.children_left[node] < 0:  # a leaf
+    # A leaf has no condition.
+    if tree.children_left[node] < 0:
         counts = tree.value[node][0]
         yield box, float(counts[-1] / counts.sum())
         return
@@ -344,16 +337,10 @@ def _boxes_of_leaves(
     # Both sides of the node's condition.
     column = int(tree.feature[node])
     threshold = lower[column] + tree.threshold[node] * width[column]
-    upper_part = box.copy()
-    upper_part[0, column] = threshold
-    yield from _boxes_of_leaves(
-        tree, int(tree.children_right[node]), upper_part, lower, width
-    )
-    lower_part = box.copy()
-    lower_part[1, column] = threshold
-    yield from _boxes_of_leaves(
-        tree, int(tree.children_left[node]), lower_part, lower, width
-    )
+    for end, children in enumerate((tree.children_right, tree.children_left)):
+        part = box.copy()
+        part[end, column] = threshold
+        yield from _boxes_of_leaves(tree, int(children[node]), part, lower, width)
 
 
 def _drop_useless_conditions(

@@ -163,7 +163,7 @@ def tolerance(
     smaller = smaller_cuts(base.study, end)
     usual = _usual_settings(evaluator, len(columns), fits)
     planned = {name: (1 + len(smaller)) * number for name, number in usual.items()}
-    evaluator.begin(planned, least=1 + 2 * len(columns) * LEAST_VALUES)
+    evaluator.begin(planned, minimum=1 + 2 * len(columns) * LEAST_VALUES)
     is_few = evaluator.left is not None
     if is_few and fits is None:
         # Few simulations do not suffice for other parameter sets.

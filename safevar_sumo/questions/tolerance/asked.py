@@ -249,7 +249,7 @@ def asked_of(
         avoided=np.zeros((0, len(vehicle))),
         effort=effort_of(evaluator, oracle.available, len(columns)),
         seed=evaluator.seed,
-        exclusions=models.left_out,
+        exclusions=models.exclusions,
     )
 
 

@@ -15,7 +15,12 @@ from safevar_sumo.questions.counterexamples import Failure, describe, limit_text
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.part import scope_of
 from safevar_sumo.questions.sentence import Sentence, Verdict, condition, note
-from safevar_sumo.questions.tables import Rows, shipped_columns, tabulate
+from safevar_sumo.questions.tables import (
+    AnswerTable,
+    Rows,
+    shipped_columns,
+    tabulate,
+)
 from safevar_sumo.questions.tolerance import words
 from safevar_sumo.questions.tolerance.oracle import Oracle
 from safevar_sumo.questions.tolerance.told import (
@@ -161,7 +166,7 @@ def _failures(facts: Told) -> tuple[str, ...]:
     return (words.ROUGH,) if facts.is_rough and facts.stated else ()
 
 
-def _limits_table(facts: Told) -> pd.DataFrame:
+def _limits_table(facts: Told) -> AnswerTable:
     """The row of each characteristic that varies; the screen shows those that are limited."""
     rows = [_limits_row(facts, column) for column in facts.columns]
     # Joint limits lead, without those of each alone.
@@ -170,20 +175,20 @@ def _limits_table(facts: Told) -> pd.DataFrame:
     texts = [text for row in rows if (text := row["fails_first"])]
     events = {text: text.removeprefix("the vehicle ") for text in texts}
     cells = [[*row.values()] for row in rows]
-    table = tabulate(
-        LIMITS_TITLE,
-        columns,
-        cells,
-        words=events,
-    )
+    frame = pd.DataFrame(cells, columns=list(columns))
     members = [facts.members[column] for column in facts.columns]
     domains = [(item.lower, item.upper) for item in members]
-    joint = table[["together_low", "together_high"]].to_numpy(float)
+    joint = frame[["together_low", "together_high"]].to_numpy(float)
     is_open = (joint == np.array(domains)).all(axis=1)
-    if not is_open.all():
-        table.attrs["lead_rows"] = np.flatnonzero(~is_open).tolist()
-    table.attrs["bars"] = bars_of(table, domains)
-    return table
+    return tabulate(
+        LIMITS_TITLE,
+        columns,
+        frame,
+        words=events,
+        # Without limits one screen shows all.
+        lead_rows=np.flatnonzero(~is_open).tolist(),
+        bars=bars_of(frame, domains),
+    )
 
 
 def _limits_row(facts: Told, column: int) -> JsonObject:
