@@ -165,7 +165,7 @@ def test_a_beginning_is_rounded_to_the_unsafe_side() -> None:
     assert smallest.table["begins_at"].tolist() == [0.31]
     assert "a at 6.55 N m, 31 % of the way" in verdict
     assert "if each change goes 10 to 30 % of the way" in verdict
-    assert "other parameter sets, at these values: a at 10 N m." in verdict
+    assert "the cause has these values: a at 10 N m." in verdict
 
 
 def test_a_cause_begins_where_none_of_its_parts_is_unsafe() -> None:
