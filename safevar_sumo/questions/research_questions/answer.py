@@ -127,7 +127,8 @@ def tables(
             table,
             {**TABLES, "remarks": REMARKS},
         )
-    cases = _cases_of(results)
+    directories = _directories_of(results)
+    cases = load_cases(directories)
     if algorithm:
         labels = set[str]()
         for case in cases:
@@ -156,7 +157,7 @@ def tables(
     if figures is not None:
         save_figures(cases, figures)
     words = [PROGRAM_COMMAND, "tables"]
-    words += [quote(str(getattr(source, "directory", source))) for source in results]
+    words += map(quote, map(str, directories))
     for name, value in options.items():
         if value not in ("", ALPHA, 0):
             words += [f"--{name}", quote(str(value))]
@@ -176,14 +177,11 @@ def figures(*results: Results | str | Path) -> dict[str, Figure]:
     InputError
         If no figure can be drawn.
     """
-    return draw_figures(_cases_of(results))
+    return draw_figures(load_cases(_directories_of(results)))
 
 
-def _cases_of(results: Sequence[Results | str | Path]) -> list[Case]:
-    directories: list[Any] = [
-        getattr(source, "directory", source) for source in results
-    ]
-    return load_cases(directories)
+def _directories_of(results: Sequence[Results | str | Path]) -> list[Any]:
+    return [getattr(source, "directory", source) for source in results]
 
 
 def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
