@@ -6,7 +6,7 @@ An ADS may drive N vehicles at once, or one vehicle (`ScalarAds`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
@@ -14,7 +14,15 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.errors import missing_extra
-from safevar_sumo.plugins import SHARE, TRUTH, Returned, UserCode, open_rows, quoted
+from safevar_sumo.plugins import (
+    SHARE,
+    TRUTH,
+    Contract,
+    Returned,
+    UserCode,
+    open_rows,
+    quoted,
+)
 from safevar_sumo.records import (
     BoolArray,
     Command,
@@ -60,7 +68,7 @@ class Ads:
     recognition_delay = hesitation = 0.0
     tau_parameter = ""
     max_vehicles: int | None = None
-    RETURNS: ClassVar[Mapping[str, Returned]] = {
+    RETURNS: ClassVar[Contract] = {
         "drive": Returned(({"throttle": SHARE, "brake": SHARE}, {}), like=0),
         "warns": Returned(({"": TRUTH},)),
     }
@@ -110,6 +118,10 @@ class FullBrake(Ads):
         return memory, memory
 
 
+Pedals = tuple[float, float]
+"""Throttle and brake, each in [0, 1]."""
+
+
 class ScalarAds(ABC):
     """Base of an ADS for one vehicle; every simulated vehicle gets its own instance.
 
@@ -130,14 +142,14 @@ class ScalarAds(ABC):
         self.step = step
 
     @abstractmethod
-    def drive(self, observation: Observation) -> tuple[float, float]:
+    def drive(self, observation: Observation) -> Pedals:
         """Command throttle and brake, each in [0, 1], from an observation whose fields are
         numbers.
         """
 
     def pedals(
         self, acceleration: Quantity, speed: Quantity, trim: Trim | None = None
-    ) -> tuple[float, float]:
+    ) -> Pedals:
         """Throttle and brake with which the original vehicle has an acceleration [m/s^2] at a
         speed [m/s] on a dry, level road.
 
@@ -191,7 +203,7 @@ class PerVehicleAds(Ads):
     def warns(self, memory: list[ScalarAds]) -> BoolArray:
         return np.array([bool(driver.warns) for driver in memory], bool)
 
-    def _checked_pedals(self, command: Any) -> tuple[float, float]:
+    def _checked_pedals(self, command: Any) -> Pedals:
         if type(command) is tuple and len(command) == 2:
             throttle, brake = command
             # The fast path: this runs for every vehicle in every step.

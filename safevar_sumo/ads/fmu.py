@@ -15,7 +15,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from safevar_sumo.ads.base import ScalarAds, Trim, trim_at
+from safevar_sumo.ads.base import Pedals, ScalarAds, Trim, trim_at
 from safevar_sumo.errors import InputError, check_name, missing_extra, unknown_name
 from safevar_sumo.output import MAX_UNPACKED, read_file
 from safevar_sumo.plugins import UserCode
@@ -77,7 +77,7 @@ class Fmu:
             if size > MAX_UNPACKED:
                 raise ValueError(f"unpacked it has {size / 1e9:.1f} GB")
             extract(path, self._folder.name)
-            self._model: Any = read_model_description(self._folder.name, validate=False)
+            self._model = read_model_description(self._folder.name, validate=False)
         except ImportError:
             raise missing_extra("", f"{path} needs FMPy", "fmu") from None
         # FMPy may raise anything about a user's file.
@@ -201,7 +201,7 @@ class FmuAds(ScalarAds):
         self._end = weakref.finalize(self, _free, self._slave)
         self._end.atexit = False
 
-    def drive(self, observation: Observation) -> tuple[float, float]:
+    def drive(self, observation: Observation) -> Pedals:
         outputs = self._fmu.code.call(
             "doStep",
             self._step,

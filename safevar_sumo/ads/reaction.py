@@ -105,6 +105,10 @@ class Reaction(NamedTuple):
         return self.leader_deceleration > ANY_BRAKING + DECELERATION_ROUNDING
 
 
+Reacted = tuple[Command, Reaction]
+"""What a driver does at a step, and what it remembers for the next one."""
+
+
 class Danger(NamedTuple):
     """What a reference driver sees as a danger, and how it brakes for it; arrays have shape (N,).
 
@@ -188,7 +192,7 @@ class ReferenceDriver(
         memory: Reaction,
         danger: Danger,
         start: StartThrottle = (),
-    ) -> tuple[Command, Reaction]:
+    ) -> Reacted:
         """Hold the cruise speed, or answer a danger.
 
         The driver releases the accelerator when it sees a danger, and brakes when the reaction time

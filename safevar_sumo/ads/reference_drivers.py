@@ -20,11 +20,12 @@ from safevar_sumo.ads.reaction import (
     HARDEST_BRAKING,
     LEAST_DIVISOR,
     Danger,
+    Reacted,
     Reaction,
     ReferenceDriver,
     StartThrottle,
 )
-from safevar_sumo.records import KMH_PER_MS, Command, FloatArray, Observation
+from safevar_sumo.records import KMH_PER_MS, FloatArray, Observation
 
 UNLIMITED_BRAKING = 1e6
 """Deceleration beyond every brake [m/s^2]; it presses the pedal fully."""
@@ -48,9 +49,7 @@ class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
 
     start_throttle: StartThrottle = ()
 
-    def drive(
-        self, observation: Observation, memory: Reaction
-    ) -> tuple[Command, Reaction]:
+    def drive(self, observation: Observation, memory: Reaction) -> Reacted:
         is_in_way = is_in_the_way(observation, self.corridor)
         memory = self.watch_leader(observation, memory, is_in_way)
         is_present = is_in_way & (observation.closing_speed > 0)
@@ -83,9 +82,7 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
     reaction_time: NonNegativeParameter = 0.35
     margin: NonNegativeParameter = 0.1
 
-    def drive(
-        self, observation: Observation, memory: Reaction
-    ) -> tuple[Command, Reaction]:
+    def drive(self, observation: Observation, memory: Reaction) -> Reacted:
         depth = depth_in_the_way(observation, self.corridor)
 
         # Towards somebody who does not brake, the time to collision decides.
@@ -146,9 +143,7 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
     braking: PositiveParameter = HARDEST_BRAKING
     leader_deceleration: PositiveParameter = HARDEST_BRAKING
 
-    def drive(
-        self, observation: Observation, memory: Reaction
-    ) -> tuple[Command, Reaction]:
+    def drive(self, observation: Observation, memory: Reaction) -> Reacted:
         depth = depth_in_the_way(observation, self.corridor)
         memory = self.watch_leader(observation, memory, depth >= 0)
         lacking = (
@@ -201,9 +196,7 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     leader_deceleration: PositiveParameter = 7.0
     margin: NonNegativeParameter = 2.0
 
-    def drive(
-        self, observation: Observation, memory: Reaction
-    ) -> tuple[Command, Reaction]:
+    def drive(self, observation: Observation, memory: Reaction) -> Reacted:
         depth = depth_in_the_way(observation, self.corridor)
         memory = self.watch_leader(observation, memory, depth >= 0)
         gap = np.where(depth >= 0, observation.gap, np.inf)

@@ -286,7 +286,7 @@ def journal_progress(
     """A function that shows the evaluations that runs have asked for, as their journals tell; of
     those that have not finished, all others are to come.
     """
-    readers = list[JournalReader]()
+    readers = []
     for key in keys:
         file = journal_file(directory, str(key))
         readers.append(JournalReader(file, study.search.evaluations))

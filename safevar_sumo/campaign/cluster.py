@@ -6,7 +6,7 @@ import logging
 import pickle
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any
 
 import portalocker
 
+from safevar_sumo.campaign.local import Work
 from safevar_sumo.errors import (
     MAX_JOBS,
     InputError,
@@ -64,7 +65,7 @@ def connect(address: str) -> Iterator[Any]:
         yield client
 
 
-def everywhere(client: Any, function: Callable[..., Any], *arguments: Any) -> None:
+def everywhere(client: Any, function: Work, *arguments: Any) -> None:
     """Carry out a function in each worker of a cluster; raises its error."""
     try:
         client.run(_carry_out, pickle.dumps((function, arguments)), "")
@@ -86,7 +87,7 @@ class ClusterWorker:
         self._executor = client.get_executor(pure=False)
         self._command = client.id
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    def submit(self, function: Work, *arguments: Any) -> Future[Any]:
         # Dask's own serialization turns records into lists.
         future: Future[Any] = self._executor.submit(
             _carry_out, pickle.dumps((function, arguments)), self._command

@@ -17,6 +17,7 @@ import numpy as np
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.ads.varied import VariedAds
+from safevar_sumo.campaign.local import Work
 from safevar_sumo.campaign.pool import Pool, WorkerLostError
 from safevar_sumo.errors import (
     EnvironmentFault,
@@ -105,7 +106,7 @@ def _assemble_packed(packed_study: bytes) -> System:
 
 
 def carry_out(
-    function: Callable[..., Any],
+    function: Work,
     jobs: Sequence[tuple[Any, ...]],
     pool: Pool,
     look: Callable[[Sequence[int]], None] = lambda ended: None,

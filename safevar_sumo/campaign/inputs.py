@@ -34,7 +34,7 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
         "platform": PLATFORM,
     }
     versions = {}
-    libraries = set[str]()
+    libraries = set()
     for scenario in (point.scenario for point in system.points):
         if scenario.version:
             versions[f"version of {type(scenario).__name__}"] = str(scenario.version)

@@ -41,6 +41,10 @@ CLOSING_TIME = 5.0
 """Time that it has for this [s]; then it is killed."""
 
 
+Work = Callable[..., Any]
+"""What a worker carries out."""
+
+
 class ProcessWorker:
     """A process that starts at once. It is spawned, because libsumo must not be forked, and ends
     with this process.
@@ -75,7 +79,7 @@ class ProcessWorker:
         # of time.
         self._executor._result_queue._writer.close()  # type: ignore[attr-defined]
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    def submit(self, function: Work, *arguments: Any) -> Future[Any]:
         return self._executor.submit(function, *arguments)
 
     def cause_of_death(self, error: BaseException) -> str:

@@ -18,6 +18,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Protocol
 
 from safevar_sumo.campaign import cluster as dask, local
+from safevar_sumo.campaign.local import Work
 from safevar_sumo.errors import MAX_JOBS, InputError, SafevarError
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins.process import MAX_DEATHS
@@ -38,7 +39,7 @@ class WorkerLostError(SafevarError):
 class Worker(Protocol):
     """An executor with one worker."""
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+    def submit(self, function: Work, *arguments: Any) -> Future[Any]:
         """Begin a job."""
 
     def cause_of_death(self, error: BaseException) -> str:
@@ -90,11 +91,11 @@ class Pool:
         self.simulated = self.failed = self.checked = 0
         self.spare: tuple[int, int] | None = None
         self.shared: dict[bytes, dict[bytes, Evaluations]] | None = None
-        self.on_cluster: Callable[..., None] | None = None
+        self.on_cluster: Work | None = None
 
     def map(
         self,
-        function: Callable[..., Any],
+        function: Work,
         jobs: Sequence[tuple[Any, ...]],
         look: Callable[[Sequence[int]], None] = lambda ended: None,
     ) -> list[Any]:
@@ -154,7 +155,7 @@ class Pool:
         return sum(len(list(folder.iterdir())) > MAX_DEATHS for folder in folders)
 
     def everywhere(
-        self, function: Callable[..., Any], *arguments: Any, limit: int | None = None
+        self, function: Work, *arguments: Any, limit: int | None = None
     ) -> None:
         """Carry out a function in each worker that has started and lives, or in so many of them."""
         places = list(self._started)[:limit]
@@ -167,9 +168,7 @@ class Pool:
         while self._started:
             self._started.popitem()[1].end()
 
-    def _begin(
-        self, place: int, function: Callable[..., Any], job: tuple[Any, ...]
-    ) -> Future[Any]:
+    def _begin(self, place: int, function: Work, job: tuple[Any, ...]) -> Future[Any]:
         if place in self._started:
             # Its process may have died between two jobs.
             with suppress(BrokenExecutor):

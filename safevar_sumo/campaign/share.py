@@ -98,7 +98,7 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
     study = task.study
     refuse_changed_inputs(study, system_of(study), share.manifest)
     with about(study.source), ExitStack() as stack:
-        runs = list[Run]()
+        runs = []
         for key in share.keys:
             run = closing(_begin(task, share, key))
             runs.append(stack.enter_context(run))

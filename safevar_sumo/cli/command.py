@@ -82,7 +82,7 @@ class _Command(click.Command):
         meanings = {option.name: option.meaning for option in COMMON_OPTIONS}
         lines = []
         for title, names in COMMON_NAMES.items():
-            flags = list[str]()
+            flags = []
             for name in names:
                 meaning = meanings.get(name, "")
                 if name in options and str(options[name].help).startswith(meaning):

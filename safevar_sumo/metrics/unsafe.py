@@ -52,6 +52,10 @@ LEAST = 1e-9
 """The least by which what is unsafe is beyond a limit, in its unit."""
 
 
+ColumnOf = Callable[[str], Quantity]
+"""A function that returns the values of a metric by its name."""
+
+
 @dataclass(frozen=True)
 class Unsafe:
     """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with
@@ -181,7 +185,7 @@ class Unsafe:
         """
         return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
 
-    def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
+    def _holds(self, outcome: Any, column: ColumnOf) -> Quantity:
         collides = outcome == COLLISION
         if not self.distance:
             return collides
@@ -365,7 +369,7 @@ class UnsafeDegree(UnsafeStated):
             " collision counts collisions alone."
         )
 
-    def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
+    def _holds(self, outcome: Any, column: ColumnOf) -> Quantity:
         return column(F_SAFE.name) < self.degree
 
     def value(self, robustness: float) -> float:
@@ -420,12 +424,12 @@ class UnsafeMetric(UnsafeStated):
             return str(self.bound)
         return f"{self.bound}, or a collision"
 
-    def _holds(self, outcome: Any, column: Callable[[str], Quantity]) -> Quantity:
+    def _holds(self, outcome: Any, column: ColumnOf) -> Quantity:
         if self.stands_alone:
             return self._is_beyond(column)
         return (outcome == COLLISION) | self._is_beyond(column)
 
-    def _is_beyond(self, column: Callable[[str], Quantity]) -> Quantity:
+    def _is_beyond(self, column: ColumnOf) -> Quantity:
         measure, comparison, limit = self.bound
         return COMPARISONS[comparison](column(measure), limit)
 

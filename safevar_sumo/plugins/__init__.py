@@ -5,6 +5,7 @@ from safevar_sumo.plugins.contract import (
     POSITIVE as POSITIVE,
     SHARE as SHARE,
     TRUTH as TRUTH,
+    Contract as Contract,
     Legal as Legal,
     Returned as Returned,
     UserCode as UserCode,

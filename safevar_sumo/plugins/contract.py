@@ -314,6 +314,10 @@ class Returned(NamedTuple):
         return self.then(code, method, result, *arguments)
 
 
+Contract = Mapping[str, Returned]
+"""What the methods of a class may return, by their names."""
+
+
 def _shape_of(argument: Any) -> tuple[int, ...]:
     """The shape of an array, of the speeds or pedals of a record, or of the speeds in a world."""
     if hasattr(argument, "speeds"):

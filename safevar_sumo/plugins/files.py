@@ -54,7 +54,7 @@ def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
     A module is a file; of a package every file counts.
     """
     own_folders = (*folders, os.getcwd())
-    paths = set[Path]()
+    paths = set()
     visited = {PACKAGE.name, *sys.stdlib_module_names}
     waiting = [(module, (*own_folders, *sys.path)) for module in modules]
     while waiting:

@@ -191,7 +191,7 @@ def defer_interrupts() -> Iterator[None]:
     """
     waiting = list[int]()
     is_main = threading.current_thread() is threading.main_thread()
-    handlers = dict[int, Any]()
+    handlers = {}
     for interrupt in INTERRUPTS if is_main else ():
         # A handler that was not set from Python could not be set again.
         if signal.getsignal(interrupt) is not None:

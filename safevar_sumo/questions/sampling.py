@@ -8,10 +8,9 @@ from enum import IntEnum
 from numpy.random import Generator, default_rng
 
 from safevar_sumo.records import FloatArray
+from safevar_sumo.study import Interval as Interval
 from safevar_sumo.vehicles import CharacteristicSet
 
-Interval = tuple[float, float]
-"""Lower and upper end."""
 CONFIDENCE = 0.95
 """Confidence level of the intervals of shares, unless an option sets another level."""
 

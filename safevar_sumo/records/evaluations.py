@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.records.driving import BoolArray, FloatArray, TextArray
+from safevar_sumo.records.driving import BoolArray, FloatArray, IntArray, TextArray
 from safevar_sumo.records.runs import Outcome
 from safevar_sumo.study import SAFETY_DEGREE
 
@@ -40,7 +40,7 @@ class Evaluations:
     f_diff: FloatArray
     f_num_diff: FloatArray
     reasons: Mapping[bytes, str] = field(default_factory=dict)
-    worst_points: npt.NDArray[np.intp] | None = None
+    worst_points: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.settings)
@@ -51,7 +51,7 @@ class Evaluations:
         return self.metrics[SAFETY_DEGREE]
 
     @property
-    def points(self) -> npt.NDArray[np.intp]:
+    def points(self) -> IntArray:
         """`worst_points`; without a matrix the only point, 0."""
         if self.worst_points is None:
             return np.zeros(len(self), np.intp)
@@ -138,9 +138,7 @@ class Evaluations:
         """The metrics of the first setting."""
         return {name: float(values[0]) for name, values in self.metrics.items()}
 
-    def take(
-        self, rows: Sequence[int] | npt.NDArray[np.intp] | BoolArray
-    ) -> Evaluations:
+    def take(self, rows: Sequence[int] | IntArray | BoolArray) -> Evaluations:
         """The evaluations of `rows`, in that order."""
         columns = {name: getattr(self, name)[rows] for name in COLUMNS}
         columns["metrics"] = {

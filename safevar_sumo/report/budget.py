@@ -31,7 +31,7 @@ def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str,
     """
     costly = []
     free = []
-    samples = set[tuple[str, ...]]()
+    samples = set()
     replays = 0
     if system.mover.takes_long:
         replays = simulations // PART_OF_REPLAYS

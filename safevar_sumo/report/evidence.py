@@ -142,7 +142,7 @@ def evidence(
     how = {"jobs": jobs, "cluster": cluster}
     directories = dict.fromkeys(map(Path, results))
     studies = []
-    files = dict[str, bytes]()
+    files = {}
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
         for number, directory in enumerate(directories, 1):
             part = simulations and simulations // len(directories)
@@ -258,7 +258,7 @@ def _files_of_user(
     places = study.origin.places
     names = [name for name in named if not is_of_shipped_network(name)]
     # What a study names beside itself is there in a pack, too.
-    outside = list[str]()
+    outside = []
     for name in (*data_files(study), *dict(fmus_of(study)).values()):
         path_beside = os.path.abspath(Path(places[0], name))
         if not Path(path_beside).is_relative_to(places[0]):

@@ -28,6 +28,7 @@ from safevar_sumo.report.budget import SPEED
 from safevar_sumo.report.sections import ReportedStudy, name_and_sentence
 from safevar_sumo.scenarios import SPEED_DIMENSION
 from safevar_sumo.scenarios.euro_ncap import TESTS
+from safevar_sumo.study import Interval
 from safevar_sumo.vehicles import VEHICLES, Characteristic
 
 PARTS: Columns = {
@@ -262,7 +263,7 @@ def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
     return "The study names no item that a workshop can measure."
 
 
-def _together(item: Characteristic, row: JsonObject | None) -> tuple[float, float]:
+def _together(item: Characteristic, row: JsonObject | None) -> Interval:
     """The joint limits of an item; one whose limits were not asked for, and one without room, stays
     as in the original.
     """

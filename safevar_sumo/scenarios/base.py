@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from safevar_sumo.plugins import TRUTH, Legal, Returned, UserCode, quoted
+from safevar_sumo.plugins import TRUTH, Contract, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import (
     ALL_TRUE,
     ZERO,
@@ -333,7 +333,7 @@ class WorldScenario(Scenario):
     """
 
     __slots__ = ()
-    RETURNS: ClassVar[Mapping[str, Returned]] = {
+    RETURNS: ClassVar[Contract] = {
         "lanes": Returned(then=check_changes),
         "actors": Returned(then=check_changes),
         "begin": Returned(like=0),

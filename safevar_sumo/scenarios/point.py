@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from safevar_sumo.records import Quantity
 from safevar_sumo.scenarios.base import Scenario
-from safevar_sumo.study import Constraint, Domain, Weather
+from safevar_sumo.study import Constraint, Domains, Weather
 
 SPEED_DIMENSION = "speed"
 """The parameter by which `permit` asks, and that a scope names first."""
@@ -27,7 +27,7 @@ class Point(NamedTuple):
     parameters: tuple[tuple[str, Any], ...] = ()
     allowed_impact_speed: float = 0.0
     phase: Quantity = 0.0
-    ranges: Mapping[str, Domain] | None = None
+    ranges: Domains | None = None
     constraints: tuple[Constraint, ...] = ()
 
     def own(self, values: Mapping[str, Quantity]) -> dict[str, Quantity]:

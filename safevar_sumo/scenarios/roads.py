@@ -98,7 +98,7 @@ class Frame(NamedTuple):
         dir_x, dir_y = self.direction
         return (positions[:, 1] - y) * dir_x - (positions[:, 0] - x) * dir_y
 
-    def lane_coordinates(self, point: Coordinates) -> tuple[float, float]:
+    def lane_coordinates(self, point: Coordinates) -> Coordinates:
         """Distances of one point along the lane and to its left [m]."""
         positions = np.array([point])
         return self.along(positions).item(), self.left(positions).item()

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from safevar_sumo.plugins import SHARE, Legal, Returned, UserCode, quoted
+from safevar_sumo.plugins import SHARE, Contract, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import FloatArray, NamedValues, Outcome, Trace
 from safevar_sumo.scenarios.base import Mover, Scenario
 from safevar_sumo.study import SAFETY_DEGREE
@@ -55,6 +55,8 @@ OUTCOMES = [outcome.value for outcome in list(Outcome)[:6]]
 """How a run may end: all but failures of the simulator and settings that are not simulated."""
 ENDS_APART = (Outcome.PASSED, Outcome.STOPPED, Outcome.TIMEOUT)
 """Outcomes of runs in which nothing was touched."""
+StatedRun = Mapping[str, Any]
+"""What a simulator states of a run, by the names of quantities and metrics."""
 MOST_DECELERATION = 20.0
 """Largest change of the speed in a second that every trace may have [m/s^2]."""
 SLACK, CREEPS = 0.1, 1.0
@@ -67,9 +69,7 @@ STEP_TOLERANCE = 1e-6
 """Largest difference between two time steps of a trace [s]."""
 
 
-def check_result(
-    code: UserCode, method: str, result: Any, setting: Any
-) -> Mapping[str, Any]:
+def check_result(code: UserCode, method: str, result: Any, setting: Any) -> StatedRun:
     """Refuse a result that lacks a quantity, has an unknown one, or has illegal numbers.
 
     Arrays have float elements afterwards. A result without `time` is one of a rig that logs no
@@ -104,8 +104,8 @@ def check_result(
 
 
 def _checked_trace(
-    code: UserCode, method: str, result: Mapping[str, Any], has_collided: bool
-) -> Mapping[str, Any]:
+    code: UserCode, method: str, result: StatedRun, has_collided: bool
+) -> StatedRun:
     """The columns of a trace, each of shape (T,), and what it says of a collision."""
     sampled = SAMPLED | ALSO_SAMPLED
     legal_keys = {**sampled, **OF_COLLISION, OUTCOME: None}
@@ -215,7 +215,7 @@ def unit_contradiction(trace: Trace) -> str:
 
 
 def _checked_metrics(
-    code: UserCode, method: str, result: Mapping[str, Any], has_collided: bool
+    code: UserCode, method: str, result: StatedRun, has_collided: bool
 ) -> Mapping[str, float]:
     """The metrics of a run without a trace; NaN is one that is undefined."""
     values = {name: value for name, value in result.items() if name != OUTCOME}
@@ -227,7 +227,7 @@ def _checked_metrics(
 
 
 def _numbers(
-    code: UserCode, method: str, values: Mapping[str, Any], legal: Mapping[str, Legal]
+    code: UserCode, method: str, values: StatedRun, legal: Mapping[str, Legal]
 ) -> NamedValues:
     return {
         name: float(code.check_numbers(method, name, value, (), legal[name]))
@@ -251,9 +251,7 @@ class Simulator(Scenario):
     """
 
     __slots__ = ()
-    RETURNS: ClassVar[Mapping[str, Returned]] = {
-        "simulate": Returned(then=check_result)
-    }
+    RETURNS: ClassVar[Contract] = {"simulate": Returned(then=check_result)}
     mover: ClassVar[Mover] = OWN_SIMULATOR
     UNITS: ClassVar[Mapping[str, str]]
     OPTIONAL: ClassVar[tuple[str, ...]] = ()
@@ -262,7 +260,7 @@ class Simulator(Scenario):
     duration: float = 60.0
 
     @abstractmethod
-    def simulate(self, setting: Mapping[str, float]) -> Mapping[str, Any]:
+    def simulate(self, setting: Mapping[str, float]) -> StatedRun:
         """Simulate one vehicle in this scenario.
 
         `setting` has the value of each characteristic in its unit. The result depends on it and on

@@ -8,7 +8,7 @@ scenario needs to know a road.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.errors import InputError, one_of
-from safevar_sumo.plugins import Legal, Returned, UserCode, quoted
+from safevar_sumo.plugins import Contract, Legal, Returned, UserCode, quoted
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Quantity
 from safevar_sumo.scenarios.base import (
     MAX_TEST_SPEED,
@@ -222,7 +222,7 @@ class TrackScenario(Scenario):
         departs.
     """
 
-    RETURNS: ClassVar[Mapping[str, Returned]] = {"tracks": Returned(then=check_tracks)}
+    RETURNS: ClassVar[Contract] = {"tracks": Returned(then=check_tracks)}
     reactive_actors = False
     goes_on = True
     network = "along"

@@ -5,7 +5,7 @@ processes and files.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -15,6 +15,7 @@ import numpy as np
 from safevar_sumo.errors import subject
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import (
+    Contract,
     Legal,
     Returned,
     UserCode,
@@ -187,9 +188,7 @@ class Algorithm:
     __slots__ = ()
     title: str = ""
     stops_by_itself: ClassVar[bool] = False
-    RETURNS: ClassVar[Mapping[str, Returned]] = {
-        "search": Returned(like=0, then=check_search)
-    }
+    RETURNS: ClassVar[Contract] = {"search": Returned(like=0, then=check_search)}
 
     @abstractmethod
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:

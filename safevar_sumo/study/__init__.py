@@ -4,6 +4,8 @@ from safevar_sumo.study.characteristics import (
     CharacteristicTable as CharacteristicTable,
     Constraint as Constraint,
     Domain as Domain,
+    Domains as Domains,
+    Interval as Interval,
     Limit as Limit,
     Precision as Precision,
     limits_of as limits_of,

@@ -61,6 +61,12 @@ class Domain(Table, frozen=True, kw_only=True):
             )
 
 
+Interval = tuple[float, float]
+"""A smallest and a largest value."""
+Domains = Mapping[str, Domain]
+"""Domains by the names of their characteristics."""
+
+
 class Precision(Table, frozen=True, kw_only=True):
     """A precision states how exactly a characteristic is measured. Two measurements of one vehicle
     may differ by `value`, in the characteristic's unit. `source` says where this value comes from,
@@ -102,7 +108,7 @@ def _number_within(lower: float, upper: float, row: Domain) -> str:
     return f"a number in [{lower:g}, {upper:g}]{unit_text(row.unit)}"
 
 
-def _check_characteristic(key: str, name: str, rows: Mapping[str, Domain]) -> None:
+def _check_characteristic(key: str, name: str, rows: Domains) -> None:
     check_name("", f"{key}{name}: there is no such characteristic", name, rows)
 
 
@@ -159,9 +165,7 @@ class Fixed(_Distribution, frozen=True, kw_only=True, tag="fixed"):
 Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
 
 
-def check_variation(
-    rows: Mapping[str, Domain], variation: Mapping[str, Distribution]
-) -> None:
+def check_variation(rows: Domains, variation: Mapping[str, Distribution]) -> None:
     """Refuse distributions that do not fit the characteristics' domains."""
     for name, distribution in variation.items():
         _check_characteristic("variation.", name, rows)
@@ -233,7 +237,7 @@ class Constraint(Table, frozen=True, kw_only=True):
         return re.sub("^- ", "-", text.removeprefix("+ "))
 
     @property
-    def ends(self) -> tuple[float, float]:
+    def ends(self) -> Interval:
         """The bounds; infinite where none is stated."""
         low = -math.inf if self.at_least is None else self.at_least
         return low, math.inf if self.at_most is None else self.at_most
@@ -248,13 +252,13 @@ class Constraint(Table, frozen=True, kw_only=True):
         low, high = self.ends
         return (total >= low) & (total <= high)
 
-    def unit_of(self, rows: Mapping[str, Domain]) -> str:
+    def unit_of(self, rows: Domains) -> str:
         """The unit of the sum; `rows` are the characteristics of the vehicle."""
         if self.unit is not None:
             return self.unit
         return next((rows[name].unit for name in self.sum if name in rows), "-")
 
-    def bounds_in_words(self, rows: Mapping[str, Domain]) -> str:
+    def bounds_in_words(self, rows: Domains) -> str:
         """The bounds in words."""
         unit = unit_text(self.unit_of(rows))
         bounds = {"at least": self.at_least, "at most": self.at_most}
@@ -283,9 +287,7 @@ def check_bounds(at_least: float | None, at_most: float | None) -> None:
         )
 
 
-def check_constraints(
-    rows: Mapping[str, Domain], constraints: Sequence[Constraint]
-) -> None:
+def check_constraints(rows: Domains, constraints: Sequence[Constraint]) -> None:
     """Refuse constraints that name unknown characteristics or add quantities of different units."""
     for index, constraint in enumerate(constraints):
         key = f"constraints[{index}]"
@@ -329,7 +331,7 @@ class Limit(Table, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         check_bounds(self.at_least, self.at_most)
 
-    def interval(self, row: Domain) -> tuple[float, float]:
+    def interval(self, row: Domain) -> Interval:
         """The limited interval [unit]; a side without a limit ends with the domain."""
         low, high = self.at_least, self.at_most
         if low is None:
@@ -348,7 +350,7 @@ class UnmeasuredValue(Table, frozen=True, kw_only=True):
     source: LongText = ""
 
 
-def check_unmeasured(rows: Mapping[str, Domain], values: Mapping[str, float]) -> None:
+def check_unmeasured(rows: Domains, values: Mapping[str, float]) -> None:
     """Refuse values of unknown characteristics, or outside of their domains."""
     for name, value in values.items():
         _check_characteristic("unmeasured.", name, rows)
@@ -363,7 +365,7 @@ def check_unmeasured(rows: Mapping[str, Domain], values: Mapping[str, float]) ->
 
 def limits_of(
     texts: Iterable[str],
-    rows: Mapping[str, Domain],
+    rows: Domains,
     stated: Mapping[str, Limit] | None = None,
 ) -> dict[str, Limit]:
     """Limits by characteristic, in the order of `rows`: those of `texts`, such as `treadDepth >=
@@ -397,9 +399,7 @@ def limits_of(
     return {name: limits[name] for name in rows if name in limits}
 
 
-def check_limits(
-    rows: Mapping[str, Domain], limits: Mapping[str, Limit], table: str = ""
-) -> None:
+def check_limits(rows: Domains, limits: Mapping[str, Limit], table: str = "") -> None:
     """Refuse limits of unknown characteristics, outside the domain, or that exclude the
     original.
     """

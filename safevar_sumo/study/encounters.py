@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import product
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -13,6 +13,7 @@ from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.study.characteristics import (
     Constraint,
     Domain,
+    Domains,
     ShortText,
     check_constraints,
     mistake,
@@ -266,7 +267,7 @@ class Encounters(Table, frozen=True, kw_only=True):
     matrix: Annotated[MatrixTable | None, PART_OF_SYSTEM, OF_SCENARIO] = None
     constraints: list[Constraint] = []
 
-    def check_axes(self, characteristics: Mapping[str, Domain]) -> None:
+    def check_axes(self, characteristics: Domains) -> None:
         """Refuse axes that something else sets, too, and what is about ranges without any."""
         axes = self._named_axes
         for name, axis in axes:
@@ -393,7 +394,7 @@ class Encounters(Table, frozen=True, kw_only=True):
         """The study with other axes of each test, and of all; lists alone are written as such."""
 
         def changed(over: Axes) -> Axes:
-            axes: Axes = {}
+            axes = {}
             for name, axis in as_axes(change(as_axes(over))).items():
                 is_list = axis == AxisTable(at=axis.at)
                 axes[name] = axis.at if is_list else axis

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -90,7 +89,7 @@ def data_files(study: Study) -> dict[str, str]:
 
 def _scenario_files(study: Study) -> list[str]:
     """The values of the parameter `file` of shipped scenarios, in all tests."""
-    texts = list[Any]()
+    texts = []
     for test in study.tests or [MatrixTest(name="it")]:
         if ":" not in (test.model or study.scenario.model):
             axes = study.axes_of(test)

@@ -159,7 +159,7 @@ def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
     of its own table, else of another table in the whole one.
     """
     names = [name for name in kind.__struct_fields__ if name != NO_KEY]
-    places = dict[str, str]()
+    places = {}
     for field in msgspec.structs.fields(table):
         if field.name != NO_KEY:
             record = getattr(field.type, "__origin__", field.type)

@@ -48,7 +48,7 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
     settings = np.tile(settings, (system.repeats, 1))
 
     # In an invalid test the speed is not that of the test: metrics of its run say nothing.
-    metrics = dict[str, FloatArray]()
+    metrics = {}
     with user_errors(system.source):
         for name, measure in system.measuring.measures.items():
             if measure.of == "settings":

@@ -4,7 +4,7 @@ first.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import reduce
 from operator import itemgetter
 from typing import NamedTuple, Protocol
@@ -28,6 +28,9 @@ from safevar_sumo.scenarios.roads import NETWORK_KEY, Frame, World
 from safevar_sumo.scenarios.tracks import corners_of
 from safevar_sumo.vehicles import SumoType
 
+Hits = dict[int, float]
+"""The speeds of the vehicles that hit somebody, by their numbers [m/s]."""
+
 
 class VehicleStates(NamedTuple):
     """Where N vehicles under test are: their front bumpers, shape (N, 2) [m], their speeds, shape
@@ -37,7 +40,7 @@ class VehicleStates(NamedTuple):
 
     fronts: FloatArray
     speeds: FloatArray
-    hits: Mapping[int, float]
+    hits: Hits
 
 
 class Body(NamedTuple):
@@ -127,6 +130,10 @@ class Film(NamedTuple):
         return np.arctan2(self.motion[..., 3], self.motion[..., 2])
 
 
+Films = dict[str, Film]
+"""The films of actors by their names."""
+
+
 class VehicleWorld(Protocol):
     """N vehicles under test: on a lane, in a recorded scene or in SUMO."""
 
@@ -200,9 +207,7 @@ class FirstContacts:
             np.full(n, "", dtype="U5"), np.full(n, np.nan), np.zeros(n)
         )
 
-    def count(
-        self, world: VehicleWorld, hits: Mapping[int, float], scene: Scene
-    ) -> dict[int, float]:
+    def count(self, world: VehicleWorld, hits: Hits, scene: Scene) -> Hits:
         """Process the hits of one sample; returns those that are collisions: speeds [m/s] by
         vehicle number.
         """

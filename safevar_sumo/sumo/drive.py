@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from safevar_sumo.records import (
     Trace,
 )
 from safevar_sumo.scenarios import VUT, Point, Scene
-from safevar_sumo.sumo.bodies import FirstContacts, VehicleStates, VehicleWorld
+from safevar_sumo.sumo.bodies import FirstContacts, Hits, VehicleStates, VehicleWorld
 from safevar_sumo.sumo.driving_robot import DrivingRobot
 from safevar_sumo.sumo.perception import (
     Observer,
@@ -260,7 +260,7 @@ class _Log:
         self._frame = world.frame
         self._positions = np.zeros((capacity, world.n, 2))
 
-        self._columns = dict[str, Any]()
+        self._columns = {}
         for field in fields(Trace):
             if field.name not in OF_ALL_RUNS:
                 # Truths keep one byte instead of eight.
@@ -317,7 +317,7 @@ class _Outcomes:
         self,
         speed: FloatArray,
         over: BoolArray,
-        collisions: dict[int, float],
+        collisions: Hits,
         is_last: BoolArray | bool,
     ) -> BoolArray:
         """Process one sample; returns for which vehicles the sample is part of the run."""

@@ -67,7 +67,7 @@ class DrivingRobot:
             speed = np.asarray(point.scenario.test_speed, dtype=float)
             speeds.append(np.broadcast_to(speed, size))
         self._test_speed = np.concatenate(speeds)
-        self.has_test_speed: BoolArray = ~np.isnan(self._test_speed)
+        self.has_test_speed = ~np.isnan(self._test_speed)
         """Which vehicles are in a scenario with a `test_speed`."""
         self._is_driving = self.has_test_speed.copy()
         self._is_needed = bool(self.has_test_speed.any())

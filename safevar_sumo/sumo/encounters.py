@@ -35,7 +35,7 @@ from safevar_sumo.scenarios import (
     searchable_in,
 )
 from safevar_sumo.scenarios.roads import Frame
-from safevar_sumo.study import PHASE, WORST, Domain, Study, unit_text
+from safevar_sumo.study import PHASE, WORST, Domains, Study, unit_text
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.network import networks_for
 from safevar_sumo.sumo.recording import Recording
@@ -82,7 +82,7 @@ def check_domains(study: Study, points: tuple[Point, ...]) -> None:
         _check_corners(study, point, ranges)
 
 
-def _check_corners(study: Study, point: Point, ranges: Mapping[str, Domain]) -> None:
+def _check_corners(study: Study, point: Point, ranges: Domains) -> None:
     """Refuse ranges of a point in which the encounter at a corner is impossible."""
     ends = [(domain.lower, domain.upper) for domain in ranges.values()]
     corners = [dict(zip(ranges, corner, strict=True)) for corner in product(*ends)]
@@ -119,19 +119,19 @@ def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
     return point._replace(scenario=scenario, weather=weather, phase=phase)
 
 
-def original_encounter(point: Point, ranges: Mapping[str, Domain]) -> Point:
+def original_encounter(point: Point, ranges: Domains) -> Point:
     """A point at the original values of its own ranges, or of all."""
     return encounter(point, _originals(_ranges_of(point, ranges)))
 
 
-def _ranges_of(point: Point, ranges: Mapping[str, Domain]) -> Mapping[str, Domain]:
+def _ranges_of(point: Point, ranges: Domains) -> Domains:
     """A point's own ranges, or all."""
     if point.ranges is None:
         return ranges
     return point.ranges
 
 
-def _originals(ranges: Mapping[str, Domain]) -> dict[str, Quantity]:
+def _originals(ranges: Domains) -> dict[str, Quantity]:
     return {name: domain.original for name, domain in ranges.items()}
 
 

@@ -403,7 +403,7 @@ def networks_for(scenarios: Sequence[Scenario]) -> list[NetworkFiles]:
     """The networks of several scenarios, whose files are read once per network; raises the errors
     of `network_for`.
     """
-    opened = dict[str, NetworkFiles]()
+    opened = {}
     networks = []
     for scenario in scenarios:
         if scenario.network not in opened:

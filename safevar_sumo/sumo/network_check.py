@@ -265,7 +265,7 @@ def _check_lanes(
     file: Path, routes: Iterable[ElementTree.Element], roads: ElementTree.Element
 ) -> None:
     """Refuse a sloping or slippery road of the vehicle under test."""
-    names = set[str]()
+    names = set()
     for route, name in product(routes, ("edges", "from", "via", "to")):
         names |= {*route.get(name, "").split()}
     lanes = list[ElementTree.Element]()
@@ -273,7 +273,7 @@ def _check_lanes(
         if edge.get("id") in names:
             lanes += edge.iter("lane")
     for lane in lanes:
-        heights = list[float]()
+        heights = []
         for point in lane.get("shape", "").split():
             # A point is x,y or x,y,z.
             _, _, z, *_ = f"{point},0".split(",")

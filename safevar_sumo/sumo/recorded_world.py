@@ -21,6 +21,7 @@ from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.sumo.bodies import (
     Body,
     BodyPairs,
+    Hits,
     VehicleStates,
     distance_covered,
     find_overlaps,
@@ -191,7 +192,7 @@ class RecordedWorld:
 
     turn_back = walk
 
-    def _hits(self, is_open: BoolArray) -> dict[int, float]:
+    def _hits(self, is_open: BoolArray) -> Hits:
         """Speeds [m/s] of the vehicles of open runs whose body overlaps another actor's, by vehicle
         number.
 

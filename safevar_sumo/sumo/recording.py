@@ -23,7 +23,7 @@ from safevar_sumo.records import FloatArray, IntArray, Quantity
 from safevar_sumo.scenarios import VUT, Lane, Point, Scenario, WorldScenario
 from safevar_sumo.scenarios.roads import lane_through
 from safevar_sumo.shipped import PACKAGE
-from safevar_sumo.sumo.bodies import Film
+from safevar_sumo.sumo.bodies import Films
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
 from safevar_sumo.sumo.engine import open_world, step_of
 from safevar_sumo.sumo.network import (
@@ -103,7 +103,7 @@ class Recording:
     along: FloatArray
     lanes: dict[str, tuple[tuple[float, float], ...]]
     first_lanes: dict[str, str]
-    tracks: dict[str, Film]
+    tracks: Films
 
     def lane(self, lane: str) -> Lane:
         """A lane by its id."""
@@ -243,11 +243,11 @@ def _play(
         )
 
 
-def _tracks(scenario: WorldScenario, world: SumoWorld) -> dict[str, Film]:
+def _tracks(scenario: WorldScenario, world: SumoWorld) -> Films:
     """How all actors except the vehicle under test move."""
     length = round(scenario.duration / world.step_length) + 1
 
-    tracks = dict[str, Film]()
+    tracks = Films()
     memory = world.begin(scenario)
     for sample in range(length):
         world.film(tracks, sample, length)

@@ -47,6 +47,7 @@ from safevar_sumo.scenarios.simulated import (
     OUTCOME,
     STRUCK_SPEED,
     TIME,
+    StatedRun,
 )
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.sumo.encounters import encounter
@@ -63,7 +64,6 @@ SEVERITY = [
 ]
 """Outcomes of the rounds of a setting, the worst first."""
 COLLISION = Unsafe()
-StatedRun = Mapping[str, Any]
 """What a simulator states of a run."""
 _steps = WeakKeyDictionary[type, dict[str, float]]()
 """The time step of each class, as this process has loaded it, at each point [s]."""
@@ -362,7 +362,7 @@ def joined(
     is_unsafe = (COLLISION if is_of_shares else criterion).of(evaluations)
     metrics[UNSAFE_SHARE.name] = mean(is_unsafe.astype(float))
     means_alone = {*METRICS, UNSAFE_SHARE.name} - {SAFETY_DEGREE}
-    rounds = dict[str, FloatArray]()
+    rounds = {}
     for name, values in evaluations.metrics.items():
         if name not in means_alone:
             for number, row in enumerate(values.reshape(repeats, n), 1):

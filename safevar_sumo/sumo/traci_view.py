@@ -110,12 +110,12 @@ class SensedTraffic:
 
     def record_step(self) -> None:
         """Record the traffic of this step; must be called in every later step."""
-        names: dict[tuple[int, str], list[str]] = defaultdict(list)
+        names = defaultdict(list)
         for domain in SENSED:
             for id_ in getattr(self._world.api, domain).getIDList():
                 copy, name = copy_and_name(id_)
                 names[copy, domain].append(name)
-        self.seen = list[Snapshot]()
+        self.seen = []
         reaches = self._sensors.reach.tolist()
         scales = self._sensors.scale.tolist()
         for copy, past in enumerate(self._past):
@@ -393,7 +393,7 @@ class TraciView:
         functions = {_constant(name): function for name, function in VARIABLES.items()}
         if requested is None:
             requested = map(_constant, DEFAULT_VARIABLES)
-        variables: Variables = {}
+        variables = {}
         for number in requested:
             if functions.get(number) not in CALLS[domain]:
                 raise refused(
@@ -411,7 +411,7 @@ class TraciView:
         """The variables of an actor, by default of all actors, as the sensors report them; none of
         one that they do not see.
         """
-        values: dict[str, dict[int, Value]] = {}
+        values = {}
         ids = self._ids(domain)
         for (of_domain, id_), variables in self._subscriptions.items():
             if of_domain == domain and id_ in ids:

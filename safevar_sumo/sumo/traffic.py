@@ -25,6 +25,7 @@ from safevar_sumo.sumo.bodies import (
     TOUCH,
     Body,
     BodyPairs,
+    Hits,
     VehicleStates,
     distance_between,
     find_overlaps,
@@ -79,7 +80,7 @@ class Traffic:
         self.n = len(group)
         self.step = step
         # None: all vehicles share a column, or each has its own, so that no index is needed.
-        self.group: IntArray | None = group if 1 < n_groups < self.n else None
+        self.group = group if 1 < n_groups < self.n else None
         self._points = points
         self._n_encounters = n_encounters
         self._sample = 0
@@ -102,7 +103,7 @@ class Traffic:
         self._counts = [np.atleast_2d(body.level == highest_level) for body in bodies]
         self._is_avoidable = [bool(body.is_avoidable.any()) for body in bodies]
         screens = [body for body in bodies if body.track.kind == SCREEN]
-        self._encountered = list[int]()
+        self._encountered = []
         self._hides = list[int]()
         for k, body in enumerate(bodies):
             # Who is met comes first; scenery is seen only where there is nobody else.
@@ -267,7 +268,7 @@ class Traffic:
 
     def hits(
         self, sample: int, front: FloatArray, speed: FloatArray, is_open: BoolArray
-    ) -> dict[int, float]:
+    ) -> Hits:
         """Speeds [m/s] of the vehicles of open runs that touch a body, by number; the sample is
         that of `observe`.
         """

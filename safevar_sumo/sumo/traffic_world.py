@@ -18,7 +18,7 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Track
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import PERSONS, SCREEN
-from safevar_sumo.sumo.bodies import BodyPairs, Film, VehicleStates
+from safevar_sumo.sumo.bodies import BodyPairs, Films, Hits, VehicleStates
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.moving import Sampled, row
@@ -139,10 +139,10 @@ class TrafficWorld(SumoWorld):
     def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
         return self._lane.bodies(vehicles)
 
-    def _hits(self, is_open: BoolArray) -> dict[int, float]:
+    def _hits(self, is_open: BoolArray) -> Hits:
         return {}
 
-    def film(self, tracks: dict[str, Film], sample: int, length: int) -> None:
+    def film(self, tracks: Films, sample: int, length: int) -> None:
         """Nobody is filmed without a size."""
         super().film(tracks, sample, length)
         for actor in self._actors:

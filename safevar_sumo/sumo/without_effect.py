@@ -31,7 +31,7 @@ def without_effect(system: System) -> list[str]:
     if not system.mover.has("a driving system"):
         return noise_remarks(system.characteristics, system.points)
     uses_traci = isinstance(system.ads, TraciController)
-    acting = set[str]()
+    acting = set()
     if uses_traci:
         acting |= {*ACTING_ATTRIBUTES}
         if _has_tau(system):

@@ -14,7 +14,7 @@ from safevar_sumo.records import BoolArray, FloatArray, FloatOrArray
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.scenarios.roads import Frame, lane_through
-from safevar_sumo.sumo.bodies import Body, BodyPairs, Film, VehicleStates
+from safevar_sumo.sumo.bodies import Body, BodyPairs, Film, Films, Hits, VehicleStates
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import SumoType
 
@@ -176,7 +176,7 @@ class SumoWorld:
         self._fronts[copies] = list(map(self._get_position, self.driving))
         return VehicleStates(self._fronts, self._speeds, self._hits(is_open))
 
-    def _hits(self, is_open: BoolArray) -> dict[int, float]:
+    def _hits(self, is_open: BoolArray) -> Hits:
         """Speeds [m/s] of the vehicles under test of open runs that collide in this step, by copy.
 
         On a junction SUMO's collider is the vehicle that must yield (`MSLane::detectCollisions`):
@@ -271,7 +271,7 @@ class SumoWorld:
             for id_ in domain.getIDList()
         }
 
-    def film(self, tracks: dict[str, Film], sample: int, length: int) -> None:
+    def film(self, tracks: Films, sample: int, length: int) -> None:
         """Write the motion of all actors on the road, by name, at one of `length` samples."""
         for id_, (place, angle) in self.actor_poses().items():
             copy, name = copy_and_name(id_)

@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import FINITE, POSITIVE, SHARE, Legal, Returned
+from safevar_sumo.plugins import FINITE, POSITIVE, SHARE, Contract, Legal, Returned
 from safevar_sumo.records import (
     GRAVITY,
     BoolArray,
@@ -169,7 +169,7 @@ class Vehicle:
     """
 
     __slots__ = ()
-    RETURNS: ClassVar[Mapping[str, Returned]] = {
+    RETURNS: ClassVar[Contract] = {
         "prepare": Returned(like=0),
         # The last field, tau, may be None.
         "sumo_type": Returned((dict.fromkeys(SumoType._fields[:-1], POSITIVE),)),

@@ -22,6 +22,7 @@ from safevar_sumo.records import BoolArray, FloatArray, NamedValues, Quantity
 from safevar_sumo.study import (
     PHASE,
     PHASE_DECIMALS,
+    Interval,
     Precision,
     Study,
     plain_values,
@@ -99,7 +100,7 @@ class Characteristic:
             return 0.0
         return self.precision.value
 
-    def measured(self, value: float) -> tuple[float, float]:
+    def measured(self, value: float) -> Interval:
         """The least and greatest value of the domain that a measured one may really be."""
         ends = np.round([value - self.error, value + self.error], 12)
         low, high = np.clip(ends, self.lower, self.upper).tolist()
@@ -155,7 +156,7 @@ class Characteristic:
         )
         return original if is_beyond else rounded
 
-    def rounded_inwards(self, interval: tuple[float, float]) -> tuple[float, float]:
+    def rounded_inwards(self, interval: Interval) -> Interval:
         """An interval around the original, rounded inwards; ends of the domain stay."""
         low, high = interval
         if low > self.lower:
