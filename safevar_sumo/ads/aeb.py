@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.ads.base import (
     CORRIDOR,
@@ -31,6 +31,7 @@ from safevar_sumo.records import (
     Nominal,
     Observation,
 )
+from safevar_sumo.study import Table
 
 LEAST_DECELERATION = 0.5
 """Smallest deceleration of an obstacle that counts as braking [m/s^2]."""
@@ -65,7 +66,7 @@ class _Memory(NamedTuple):
     warns: BoolArray
 
 
-class Aeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Aeb(Ads, Table, frozen=True, kw_only=True):
     """Holds its speed; brakes in part, then fully, when the gap to an obstacle in its way falls
     below its braking distances.
 
@@ -241,7 +242,7 @@ class _AutowareMemory(NamedTuple):
     decision_time: FloatArray
 
 
-class AutowareAeb(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class AutowareAeb(Ads, Table, frozen=True, kw_only=True):
     """Holds its speed until an obstacle in its way is nearer than the distance of Autoware's
     emergency braking; then stops with a target acceleration, reached with a target jerk.
 

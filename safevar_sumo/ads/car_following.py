@@ -8,7 +8,7 @@ from abc import abstractmethod
 from typing import Annotated
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.ads.base import (
     CORRIDOR,
@@ -21,6 +21,7 @@ from safevar_sumo.ads.base import (
     trim_at,
 )
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
+from safevar_sumo.study import Table
 
 # Defaults of MSCFModel_ACC: the gain of the speed error [1/s]; for each other mode the gains of
 # speed [1/s] and gap [1/s^2]; and thresholds.
@@ -35,7 +36,7 @@ LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
 LAST_DECELERATION = 0.5
 
 
-class CarFollowing(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CarFollowing(Ads, Table, frozen=True, kw_only=True):
     """Base of models that compute an acceleration from gap and speeds; obstacles beside the way are
     ignored.
     """
@@ -159,7 +160,7 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
         )
 
 
-class Krauss(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Krauss(Ads, Table, frozen=True, kw_only=True):
     """SUMO's default model (Krauss 1998; `MSCFModel_Krauss`).
 
     The model never drives so fast that the original vehicle could not stop before an obstacle ahead

@@ -7,7 +7,7 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.ads.base import Ads, DelayLine
 from safevar_sumo.records import (
@@ -18,6 +18,7 @@ from safevar_sumo.records import (
     Nominal,
     Observation,
 )
+from safevar_sumo.study import Table
 
 WidePositive = Annotated[float, Meta(gt=0, le=1e5)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -56,7 +57,7 @@ class _ApolloMemory(NamedTuple):
     creeping_time: FloatArray
 
 
-class Apollo(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Apollo(Ads, Table, frozen=True, kw_only=True):
     """Apollo (Baidu): plans its stop and follows it through a calibration table.
 
     Cruises, plans a comfortable stop before the obstacle, creeps to the end of the stop and holds.
@@ -236,7 +237,7 @@ class _RailsMemory(NamedTuple):
     hesitation_line: DelayLine
 
 
-class WorldOnRails(Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class WorldOnRails(Ads, Table, frozen=True, kw_only=True):
     """World On Rails (Chen, Koltun, Kraehenbuehl 2021): a vision policy at 20 Hz.
 
     The system brakes fully for a near obstacle in its corridor. If no obstacle is near in its

@@ -7,7 +7,7 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.ads.base import (
     CORRIDOR,
@@ -29,6 +29,7 @@ from safevar_sumo.records import (
     Nominal,
     Observation,
 )
+from safevar_sumo.study import Table
 
 HARDEST_BRAKING = 0.774 * GRAVITY
 """Deceleration of the competent and careful driver [m/s^2] (UN R157, annex 4, appendix 3)."""
@@ -139,9 +140,7 @@ class Danger(NamedTuple):
     longest: FloatArray | float = np.inf
 
 
-class ReferenceDriver(
-    Ads, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
-):
+class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):
     """Base of the drivers: a driver feels how the vehicle coasts, and brakes by what its
     deceleration lacks.
 

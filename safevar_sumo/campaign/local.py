@@ -27,7 +27,7 @@ from safevar_sumo.plugins.process import (
     MARK,
     REPRODUCED_BY,
     end_children,
-    set_variables,
+    temporary_entries,
     this_process,
 )
 from safevar_sumo.plugins.time_limit import TIMEOUT_MARK
@@ -66,11 +66,14 @@ class ProcessWorker:
         arguments = (ImportPath.here(), last_words, self._mark)
         self._executor = ProcessPoolExecutor(1, context, _begin_work, arguments)
         variables = {MARK: self._mark, "PYTHONHASHSEED": "0"}
+        # A spawned process would run the main module again; scripts then need no `if __name__ ==
+        # "__main__"`.
+        hidden_main = {"__main__": ModuleType("__main__")}
         with (
-            _hide_main(),
+            temporary_entries(sys.modules, hidden_main),
             _show_package(),
             _block_interrupts(),
-            set_variables(variables),
+            temporary_entries(os.environ, variables),
         ):
             # The first job starts the process.
             self._executor.submit(os.getpid)
@@ -162,19 +165,6 @@ def _end_with_caller() -> None:
         os.kill(os.getpid(), CLOSING_SIGNAL)
         time.sleep(CLOSING_TIME)
     os._exit(1)
-
-
-@contextmanager
-def _hide_main() -> Iterator[None]:
-    """Hide the main module, which a spawned process would run again; scripts then need no `if
-    __name__ == "__main__"`.
-    """
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import inspect
 import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from types import MappingProxyType, ModuleType
 from typing import Any, NamedTuple
 
@@ -335,7 +335,6 @@ def only_from(folder: str) -> Iterator[None]:
     without their folder are those of one folder, the working directory; only libraries are imported
     from elsewhere.
     """
-    place = os.getcwd()
     path = ImportPath.here()
     modules = dict(sys.modules)
     users = {
@@ -346,11 +345,10 @@ def only_from(folder: str) -> Iterator[None]:
     for name in users:
         del sys.modules[name]
     ImportPath([*filter(_is_of_libraries, path.folders), folder], []).inherit()
-    os.chdir(folder)
     try:
-        yield
+        with chdir(folder):
+            yield
     finally:
-        os.chdir(place)
         path.inherit()
         for name in sys.modules.keys() - modules.keys():
             if is_user_file(file_of_module(name)):

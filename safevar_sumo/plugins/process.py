@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -96,18 +96,20 @@ def note_work(text: str) -> None:
 
 
 @contextmanager
-def set_variables(values: Mapping[str, str]) -> Iterator[None]:
-    """Within the block, environment variables have these values, also for child processes."""
-    earlier_values = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
+def temporary_entries(
+    mapping: MutableMapping[str, Any], entries: Mapping[str, Any]
+) -> Iterator[None]:
+    """Within the block, a mapping, such as the environment, has these entries."""
+    earlier_values = {name: mapping.get(name) for name in entries}
+    mapping.update(entries)
     try:
         yield
     finally:
         for name, value in earlier_values.items():
             if value is None:
-                os.environ.pop(name, None)
+                mapping.pop(name, None)
             else:
-                os.environ[name] = value
+                mapping[name] = value
 
 
 @contextmanager

@@ -62,7 +62,7 @@ VEHICLE_SPEED = searched(10.0, 130.0, "km/h", "speed of the vehicle at the start
 """The mark of the vehicle's speed, which a study may search."""
 
 
-class TargetAhead(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class TargetAhead(ProtocolTest, frozen=True, kw_only=True):
     """Base of a scenario with a target ahead in the vehicle's lane; for its parameters see
     `ProtocolTest`.
 

@@ -136,7 +136,7 @@ class _Start(NamedTuple):
         )
 
 
-class Crossing(ProtocolTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Crossing(ProtocolTest, frozen=True, kw_only=True):
     """A target crosses the lane ahead of the moving vehicle, and is hit at the impact location if
     nobody brakes.
 

@@ -164,7 +164,7 @@ def lateral_offset(location: Quantity, width: float) -> Quantity:
     return (location / 100 - 0.5) * width
 
 
-class ProtocolTest(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ProtocolTest(LaneTest, frozen=True, kw_only=True):
     """Base of the protocol's scenarios, with the parameters that all of them have; for others see
     `LaneTest`.
 

@@ -45,7 +45,7 @@ LateralSpeed = Annotated[
 ]
 
 
-class LaneChange(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LaneChange(LaneTest, frozen=True, kw_only=True):
     """Base of both scenarios: a car changes the lane, `side` of the vehicle's; for other parameters
     see `LaneTest`.
     """
@@ -81,7 +81,7 @@ class LaneChange(LaneTest, frozen=True, kw_only=True, forbid_unknown_fields=True
         return -1.0
 
 
-class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CutIn(LaneChange, frozen=True, kw_only=True):
     """A car in the next lane moves into the vehicle's lane, and may brake there.
 
     Parameters
@@ -157,7 +157,7 @@ class CutIn(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return [Track("target", "car", *CAR, x, y, 1.0, 0.0, speed)]
 
 
-class CutOut(LaneChange, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CutOut(LaneChange, frozen=True, kw_only=True):
     """A leader at the vehicle's speed leaves the lane and reveals a standing car.
 
     Parameters

@@ -8,7 +8,7 @@ from itertools import product
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError
@@ -36,7 +36,7 @@ from safevar_sumo.scenarios.base import (
 )
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.roads import NETWORK_KEY, Frame, Roads, World
-from safevar_sumo.study import searched
+from safevar_sumo.study import Table, searched
 
 _Positive = Annotated[float, Meta(gt=0, le=3600)]
 ROUNDING = 1e-6
@@ -93,9 +93,7 @@ class _Memory(NamedTuple):
     has_turned: BoolArray
 
 
-class PedestrianCrossing(
-    WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
-):
+class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
     """A pedestrian crosses the lane at right angles, turns round and walks back, without reacting
     to the vehicle.
 
@@ -305,9 +303,7 @@ class _Parked(NamedTuple):
     length: FloatArray
 
 
-class LeadVehicleStopped(
-    WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
-):
+class LeadVehicleStopped(WorldScenario, Table, frozen=True, kw_only=True):
     """The vehicle starts at rest and drives up to vehicles that are parked in both lanes.
 
     Parameters

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from msgspec import Struct
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.output import read_file
@@ -17,6 +16,7 @@ from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.ahead import VEHICLE_SPEED
 from safevar_sumo.scenarios.base import Grade
 from safevar_sumo.scenarios.tracks import Speed, Track, TrackScenario
+from safevar_sumo.study import Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,14 +33,7 @@ DIGITS = 9
 """Decimals of places [m] and directions: the last bits of a sine differ between machines."""
 
 
-class RecordedTracks(
-    TrackScenario,
-    Struct,
-    dict=True,
-    frozen=True,
-    kw_only=True,
-    forbid_unknown_fields=True,
-):
+class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True):
     """Others move as a table says, whatever the vehicle does. It begins at the first row of `ego`,
     with that body's size, and drives straight on. For `speed` and `grade` see `LaneTest`.
 

@@ -5,17 +5,16 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.records import STANDSTILL, Encounter, Trace
 from safevar_sumo.scenarios.base import VUT, Grade, Scene, WorldScenario, XmlChanges
 from safevar_sumo.scenarios.roads import Frame, Roads, World
 from safevar_sumo.scenarios.tracks import KMH, Speed
+from safevar_sumo.study import Table
 
 
-class Stop(
-    WorldScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
-):
+class Stop(WorldScenario, Table, frozen=True, kw_only=True):
     """The vehicle brakes fully from a speed until it stands; the driving system is not asked.
 
     The metric `stopping_distance` says how far it went from the first brake force on.

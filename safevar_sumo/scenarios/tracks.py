@@ -13,7 +13,7 @@ from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.errors import InputError, one_of
 from safevar_sumo.plugins import Contract, Legal, Returned, UserCode, quoted
@@ -26,7 +26,7 @@ from safevar_sumo.scenarios.base import (
     as_text,
 )
 from safevar_sumo.scenarios.roads import Roads
-from safevar_sumo.study import PHASE, free_parameters
+from safevar_sumo.study import PHASE, Table, free_parameters
 
 KMH = 1 / KMH_PER_MS
 """m/s per km/h."""
@@ -302,9 +302,7 @@ class TrackScenario(Scenario):
         }
 
 
-class LaneTest(
-    TrackScenario, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
-):
+class LaneTest(TrackScenario, Table, frozen=True, kw_only=True):
     """Base of tests on a straight lane, at whose speed a robot holds the vehicle until its driving
     system acts.
 

@@ -7,19 +7,17 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 from numpy.random import Generator
 
 from safevar_sumo.metrics import F_DIFF, F_NUM_DIFF, Scoring
 from safevar_sumo.metrics.base import F_SAFE
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Algorithm, Problem, Search
-from safevar_sumo.study import ORIGINAL_DEGREE
+from safevar_sumo.study import ORIGINAL_DEGREE, Table
 
 
-class RandomSearch(
-    Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
-):
+class RandomSearch(Algorithm, Table, frozen=True, kw_only=True):
     """Samples vehicles uniformly in the domains; the result is the non-dominated archive of all
     simulations.
     """
@@ -42,9 +40,7 @@ MAX_REDRAWS = 100
 PositiveCount = Annotated[int, Meta(ge=1, le=1_000_000)]
 
 
-class SafeFuzzer(
-    Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
-):
+class SafeFuzzer(Algorithm, Table, frozen=True, kw_only=True):
     """Changes a few characteristics of the original vehicle, to values in ranges that become
     narrower around less safe vehicles.
 

@@ -16,10 +16,11 @@ from typing import Annotated
 import moocore
 import numpy as np
 from deap import base, tools
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Algorithm, Problem, Search
+from safevar_sumo.study import Table
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 DistributionIndex = Annotated[float, Meta(ge=0, le=1000)]
@@ -73,7 +74,7 @@ class Individual(list[float]):
     has_failed: bool = False
 
 
-class Nsga2(Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Nsga2(Algorithm, Table, frozen=True, kw_only=True):
     """Elitist search by Pareto rank and crowding distance, with as many offspring as individuals.
 
     NSGA-II combines values before the filter, which resets small changes to the original value;

@@ -13,13 +13,13 @@ from typing import Annotated, Any, ClassVar
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, Meta, Struct, UnsetType
+from msgspec import UNSET, Meta, UnsetType
 from numpy.random import Generator, default_rng
 
 from safevar_sumo.errors import InputError, check_name, describe_error, missing_extra
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Algorithm, Problem, Search
-from safevar_sumo.study import PYMOO, label_of
+from safevar_sumo.study import PYMOO, Table, label_of
 
 MODULES = {
     "moo.age": "AGEMOEA",
@@ -96,9 +96,7 @@ FAILED = 1e9
 """Objectives and violation, for pymoo, of a setting that could not be scored."""
 
 
-class PymooAlgorithm(
-    Algorithm, Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
-):
+class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
     """An algorithm of pymoo; its fields are those arguments of pymoo's class that are plain values.
 
     A population that has a size by default has the study's. `ref_dirs` are reference directions, or

@@ -36,6 +36,7 @@ from safevar_sumo.study.file import (
 from safevar_sumo.study.marks import (
     WHOLE as WHOLE,
     WITHOUT_EFFECT as WITHOUT_EFFECT,
+    Table as Table,
     keys_with as keys_with,
     with_effect as with_effect,
 )

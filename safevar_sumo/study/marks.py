@@ -13,7 +13,9 @@ from msgspec import Meta, Struct
 
 
 class Table(Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of a study file; a key that is unknown is a mistake."""
+    """A table of a study file, or the parameters of a model in it; a key that is unknown is a
+    mistake.
+    """
 
 
 def _mark(name: str) -> Meta:

@@ -24,7 +24,7 @@ from safevar_sumo.plugins.process import (
     MAX_DEATHS,
     REPRODUCED_BY,
     note_work,
-    set_variables,
+    temporary_entries,
     this_process,
 )
 from safevar_sumo.plugins.time_limit import end_if_longer
@@ -89,7 +89,7 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
             point, dict(zip(searched, values, strict=True))
         ).scenario
         with (
-            set_variables({MARK: this_process.mark}),
+            temporary_entries(os.environ, {MARK: this_process.mark}),
             user_errors(system.source),
             _attempt(f"{command} {point.name}", system),
             end_if_longer(system.time_limit),

@@ -23,6 +23,7 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.ads.base import Trim, pedals_for, trim_at
 from safevar_sumo.errors import subject
 from safevar_sumo.plugins import user_error_of, user_errors
+from safevar_sumo.plugins.process import temporary_entries
 from safevar_sumo.records import Command, Nominal, Observation
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.bodies import VehicleWorld
@@ -145,16 +146,9 @@ def substitute_traci() -> Iterator[None]:
     controllers.
     """
     real_traci()
-    modules = {name: sys.modules.get(name) for name in ("traci", "libsumo")}
-    sys.modules.update(dict.fromkeys(modules, traci_module()))
-    try:
+    modules = dict.fromkeys(("traci", "libsumo"), traci_module())
+    with temporary_entries(sys.modules, modules):
         yield
-    finally:
-        for name, module in modules.items():
-            if module is None:
-                del sys.modules[name]
-            else:
-                sys.modules[name] = module
 
 
 @cache
