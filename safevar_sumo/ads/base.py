@@ -225,16 +225,18 @@ class PerVehicleAds(Ads):
         return float(throttle), float(brake)
 
 
-def interpolate_tables(
-    table_speeds: FloatArray, speed: Quantity, *tables: FloatArray
-) -> list[FloatArray]:
-    """Tables over equally spaced speeds, interpolated linearly at `speed`."""
+def pedal_tables_at(nominal: Nominal, speed: Quantity) -> list[FloatArray]:
+    """The tables of coasting and of full throttle, interpolated linearly at `speed`; their speeds
+    are equally spaced.
+    """
+    tables = nominal.tables()
     # Just before the last row at most, so that there is a next one.
-    position = np.minimum(speed / table_speeds[1], len(table_speeds) - 1.001)
+    position = np.minimum(speed / tables.speeds[1], len(tables.speeds) - 1.001)
     row = position.astype(np.intp)
     share = position - row
     next_row = row + 1
-    values = ((table[row], table[next_row]) for table in tables)
+    columns = tables.coasting, tables.full_throttle
+    values = ((table[row], table[next_row]) for table in columns)
     return [low + (high - low) * share for low, high in values]
 
 
@@ -301,9 +303,7 @@ NO_TRIM = Trim(np.zeros(()), np.zeros(()))
 def trim_at(nominal: Nominal, observation: Observation) -> Trim:
     """The trim of a driver who already holds the speed of a rolling vehicle; 0 at standstill."""
     is_rolling = observation.speed > 0
-    coasting, full_throttle = interpolate_tables(
-        nominal.speeds, observation.speed, nominal.coasting, nominal.full_throttle
-    )
+    coasting, full_throttle = pedal_tables_at(nominal, observation.speed)
     holding_throttle = coasting / (full_throttle + coasting)
     # Negative: it would have to push the vehicle.
     holding_brake = -coasting / nominal.braking
@@ -332,9 +332,7 @@ def pedals_for(
     """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle
     and a trim.
     """
-    coasting, full_throttle = interpolate_tables(
-        nominal.speeds, speed, nominal.coasting, nominal.full_throttle
-    )
+    coasting, full_throttle = pedal_tables_at(nominal, speed)
     excess = acceleration + coasting - nominal.braking * pedal_trim.brake
     brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)
     throttle = (acceleration + coasting) / (

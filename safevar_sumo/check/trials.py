@@ -284,17 +284,9 @@ def _try(
         progress("vehicles", number, total)
         expected_outputs = {name: values[rows] for name, values in outputs.items()}
         for row, difference in differences(expected_outputs, other_run(rows)):
-            changes = _changes(characteristics, settings[rows[row]])
-            yield Finding(check, f"{difference} {circumstance}", "", changes, expected)
-
-
-def _changes(characteristics: CharacteristicSet, setting: FloatArray) -> str:
-    changes = [
-        f"{characteristic.name} = {value:g}"
-        for characteristic, value in zip(characteristics, setting, strict=True)
-        if value != characteristic.original
-    ]
-    return ", ".join(changes) or "the original vehicle"
+            changes = characteristics.changes_in_words(settings[rows[row]])
+            vehicle = changes or "the original vehicle"
+            yield Finding(check, f"{difference} {circumstance}", "", vehicle, expected)
 
 
 def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:

@@ -202,10 +202,8 @@ class FirstContacts:
 
     def __init__(self, n: int, is_tested: BoolArray) -> None:
         self._is_tested = is_tested
-        self._was_inside = np.zeros(n, dtype=bool)
-        self.first = Contact(
-            np.full(n, "", dtype="U5"), np.full(n, np.nan), np.zeros(n)
-        )
+        self._was_inside = np.zeros(n, bool)
+        self.first = Contact(np.full(n, "", "U5"), np.full(n, np.nan), np.zeros(n))
 
     def count(self, world: VehicleWorld, hits: Hits, scene: Scene) -> Hits:
         """Process the hits of one sample; returns those that are collisions: speeds [m/s] by

@@ -76,9 +76,9 @@ def drive(
     memory = ads.start(n, system.nominal._replace(length=length, width=width), step)
     perception = Perception([point.weather for point in points], step, size)
     robot = DrivingRobot(points, vehicle, prepared, state, step)
-    is_tested = np.zeros(n, dtype=bool)
-    may_go_on = np.zeros(n, dtype=bool)
-    last_sample = np.zeros(n, dtype=int)
+    is_tested = np.zeros(n, bool)
+    may_go_on = np.zeros(n, bool)
+    last_sample = np.zeros(n, int)
     for k, point in enumerate(points):
         group = slice(k * size, (k + 1) * size)
         is_tested[group] = point.scenario.is_hit_in_front
@@ -204,11 +204,8 @@ def _check_finite(
     if is_finite.all():
         return
     for copy in open_rows(~is_finite)[:1]:
-        changes = []
-        for member, value in zip(characteristics, settings[copy], strict=True):
-            if value != member.original:
-                changes.append(f"{member.name} = {value:g}")
-        values = ", ".join(changes) or "the original's values"
+        changes = characteristics.changes_in_words(settings[copy])
+        values = changes or "the original's values"
         raise InputError(
             "vehicle",
             f"its speed is {speed[copy]} with {values}",
@@ -305,13 +302,13 @@ class _Outcomes:
     """
 
     def __init__(self, n: int) -> None:
-        self.is_open = np.ones(n, dtype=bool)
-        self.is_checked = np.ones(n, dtype=bool)
+        self.is_open = np.ones(n, bool)
+        self.is_checked = np.ones(n, bool)
         self.collision_speed = np.full(n, np.nan)
         self.warning_ttc = np.full(n, np.nan)
-        self._has_moved = np.zeros(n, dtype=bool)
-        self._has_stopped = np.zeros(n, dtype=bool)
-        self._is_over = np.zeros(n, dtype=bool)
+        self._has_moved = np.zeros(n, bool)
+        self._has_stopped = np.zeros(n, bool)
+        self._is_over = np.zeros(n, bool)
 
     def note_sample(
         self,
@@ -349,7 +346,7 @@ class _Outcomes:
 
     def classify(self) -> TextArray:
         """The outcomes of all runs, once no run is open."""
-        outcome = np.full(len(self.is_open), Outcome.TIMEOUT.value, dtype="U16")
+        outcome = np.full(len(self.is_open), Outcome.TIMEOUT.value, "U16")
         outcome[self._is_over] = Outcome.PASSED
         outcome[self._has_stopped] = Outcome.STOPPED
         outcome[~self._has_moved] = Outcome.NEVER_MOVED

@@ -64,7 +64,7 @@ class DrivingRobot:
         speeds = []
         for point in points:
             # Without a test the speed is None, which becomes NaN.
-            speed = np.asarray(point.scenario.test_speed, dtype=float)
+            speed = np.asarray(point.scenario.test_speed, float)
             speeds.append(np.broadcast_to(speed, size))
         self._test_speed = np.concatenate(speeds)
         self.has_test_speed = ~np.isnan(self._test_speed)

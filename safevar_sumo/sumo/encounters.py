@@ -205,7 +205,7 @@ def met_at(point: Point, system: System, settings: FloatArray) -> BoolArray:
     """
     members = system.characteristics.scenario
     if not len(members):
-        return np.ones(len(settings), dtype=bool)
+        return np.ones(len(settings), bool)
     encounters = np.clip(system.split(settings)[1], members.lower, members.upper)
     return np.broadcast_to(point.meets(members.columns(encounters)), len(settings))
 

@@ -28,7 +28,7 @@ class LaneWorld:
     def enter(
         self, types: SumoType | None, *, keeps_drivers: bool = False
     ) -> VehicleStates:
-        return self._motion(np.ones(self.n, dtype=bool))
+        return self._motion(np.ones(self.n, bool))
 
     def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
         covered = distance_covered(self._speed, speeds, self.step_length)

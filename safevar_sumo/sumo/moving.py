@@ -209,7 +209,7 @@ def _joined(tracks: Sequence[Track], width: int) -> Track:
     """A body of K scenarios as one track with columns, of at least this width for each."""
     columns = []
     for values in zip(*(track[2:] for track in tracks), strict=True):
-        parts = [np.atleast_2d(np.asarray(value, dtype=float)) for value in values]
+        parts = [np.atleast_2d(np.asarray(value, float)) for value in values]
         length = max(map(len, parts))
         widened = [
             np.broadcast_to(part, (length, max(width, part.shape[1]))) for part in parts

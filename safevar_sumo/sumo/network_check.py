@@ -384,7 +384,7 @@ def _first_difference(network: NetworkFiles) -> tuple[str, float]:
     with open_world(copied_network(network, 2), 2) as world:
         world.enter(None)
         for step in range(1, N_STEPS + 1):
-            world.step(np.zeros(2), np.ones(2, dtype=bool))
+            world.step(np.zeros(2), np.ones(2, bool))
             poses = world.actor_poses()
             for name in sorted({id_.partition(".")[2] for id_ in poses}):
                 if poses.get(f"0.{name}") != poses.get(f"1.{name}"):

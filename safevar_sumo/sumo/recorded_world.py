@@ -60,7 +60,7 @@ class RecordedWorld:
         n_scenes = np.size(recording.speed)
         self._size = size
         self._scene = recording
-        self._is_person = np.array([film.is_person for film in films], dtype=bool)
+        self._is_person = np.array([film.is_person for film in films], bool)
         self._sizes = np.array([(film.length, film.width) for film in films]).reshape(
             -1, 2
         )
@@ -92,7 +92,7 @@ class RecordedWorld:
         self.n = size * n_scenes
         self.step_length = recording.step_length
         self.sample = 0
-        self._lane_number = np.zeros(self.n, dtype=np.intp)
+        self._lane_number = np.zeros(self.n, np.intp)
         self._lane_position = np.repeat(recording.start, size)
         self._lanes = recording.way.at(self._lane_number)
         self._now = self._moment(np.repeat(recording.speed, size))
@@ -104,7 +104,7 @@ class RecordedWorld:
         self, types: SumoType | None, *, keeps_drivers: bool = False
     ) -> VehicleStates:
         """All vehicles have departed, and their types do not limit the commanded speeds."""
-        return self._moved(np.ones(self.n, dtype=bool))
+        return self._moved(np.ones(self.n, bool))
 
     def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
         """Simulate one step, in which the vehicles whose runs are open reach `speeds` [m/s] at a
@@ -257,7 +257,7 @@ class RecordedWorld:
         """Which vehicles overlap their actor among the pairs that are checked. Two parallel
         vehicles must overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
         """
-        overlaps = np.zeros(len(vehicles), dtype=bool)
+        overlaps = np.zeros(len(vehicles), bool)
         (pairs,) = np.nonzero(is_checked)
         if len(pairs):
             obstacles = self._actors(vehicles[pairs], actors[pairs])

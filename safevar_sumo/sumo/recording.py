@@ -253,7 +253,7 @@ def _tracks(scenario: WorldScenario, world: SumoWorld) -> Films:
         world.film(tracks, sample, length)
         _, memory = scenario.observe(world, world.step_length, memory)
         if sample < length - 1:
-            world.step(np.zeros(1), np.ones(1, dtype=bool))
+            world.step(np.zeros(1), np.ones(1, bool))
     return {
         name: track._replace(motion=track.motion[:, 0])
         for name, track in tracks.items()
@@ -284,7 +284,7 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
     shapes = list(map(api.lane.getShape, lanes))
     if api.vehicle.getLateralLanePosition(vut) or {*map(len, shapes)} != {2}:
         return None
-    starts, ends = np.array(shapes, dtype=float).transpose(1, 0, 2)
+    starts, ends = np.array(shapes, float).transpose(1, 0, 2)
     vector = ends - starts
     lengths = np.array(list(map(api.lane.getLength, lanes)), dtype=float)
     shape_length = np.sqrt((vector * vector).sum(axis=1))

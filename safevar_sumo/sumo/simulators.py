@@ -287,7 +287,7 @@ def _runs_of(
 
     def number(name: str, of: Sequence[StatedRun] = results) -> FloatArray:
         """What results state, shape (N,), NaN where they do not."""
-        return np.array([result.get(name, np.nan) for result in of], dtype=float)
+        return np.array([result.get(name, np.nan) for result in of], float)
 
     def is_missing(name: str) -> BoolArray:
         return np.array([name not in trace for trace in traces])

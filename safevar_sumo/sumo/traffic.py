@@ -120,7 +120,7 @@ class Traffic:
         front = motion.fronts[np.newaxis, :, 0]
         speed = motion.speeds[np.newaxis]
         samples = slice(self._sample, self._sample + 1)
-        closes = np.zeros(self.n, dtype=bool)
+        closes = np.zeros(self.n, bool)
         for k in self._encountered:
             distance, rate, counts = self._approach(k, samples, front, speed)
             closes |= (counts & (rate > STEADY) & (distance < OVERTIME * rate))[0]
@@ -341,7 +341,7 @@ class Traffic:
         n_rows = max(BLOCK // trace.speed.shape[1], 1)
         distance = np.full(shape, np.inf)
         closing = np.full(shape, np.nan)
-        in_conflict = np.zeros(shape, dtype=bool)
+        in_conflict = np.zeros(shape, bool)
         for start in range(0, shape[0], n_rows):
             samples = slice(start, min(start + n_rows, shape[0]))
             front, speed = trace.position[samples], trace.speed[samples]

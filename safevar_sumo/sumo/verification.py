@@ -62,7 +62,7 @@ def drive_again(
     ):
         motion = enter(on_road, vehicles, world).motion
         observer = observer_of(point.scenario, world, traffic)
-        is_open = np.ones(n, dtype=bool)
+        is_open = np.ones(n, bool)
         frame = world.frame
         contacts = FirstContacts(n, np.full(n, point.scenario.is_hit_in_front))
         for sample in range(len(trace.time)):

@@ -120,7 +120,7 @@ class SumoWorld:
             # SUMO drew a factor for each vehicle.
             for id_ in ids:
                 self.api.vehicle.setSpeedFactor(id_, vehicletype.getSpeedFactor(id_))
-        return self._motion(np.ones(self.n, dtype=bool))
+        return self._motion(np.ones(self.n, bool))
 
     def _depart(self) -> None:
         """Insert all actors, whose bodies are rectangles, and take control of the vehicles under

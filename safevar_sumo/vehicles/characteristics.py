@@ -249,11 +249,8 @@ class CharacteristicSet:
 
     def options(self, setting: FloatArray) -> str:
         """The options of `simulate` that give a setting, shape (n,)."""
-        words = [
-            f"--set {item.name}={value!r}"
-            for item, value in zip(self.members, setting.tolist(), strict=True)
-            if value != item.original
-        ]
+        changes = self._changes_of(setting)
+        words = [f"--set {name}={value!r}" for name, value in changes.items()]
         if ((setting < self.lower) | (setting > self.upper)).any():
             words.append("--beyond")
         return " ".join(words)
@@ -331,6 +328,15 @@ class CharacteristicSet:
     def named(self, setting: FloatArray) -> NamedValues:
         """The values of a setting, shape (n,), by name."""
         return dict(zip(self.names, setting.tolist(), strict=True))
+
+    def _changes_of(self, setting: FloatArray) -> NamedValues:
+        pairs = zip(self.members, setting.tolist(), strict=True)
+        return {item.name: value for item, value in pairs if value != item.original}
+
+    def changes_in_words(self, setting: FloatArray) -> str:
+        """The changed values of a setting, shape (n,); "" if none is changed."""
+        changes = self._changes_of(setting)
+        return ", ".join(f"{name} = {value:g}" for name, value in changes.items())
 
     def encounter_of(self, setting: FloatArray) -> NamedValues:
         """The values of a setting's encounter, by name."""
