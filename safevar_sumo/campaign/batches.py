@@ -115,7 +115,7 @@ def evaluate_all(
         return _evaluate_shared(
             study, settings, pool, finish, verified, selection, begin
         )
-    opened = _opened_by(study, pool)
+    opened = opened_by(study, pool)
     system = system_of(study)
     if packed_study not in pool.inputs:
         pool.inputs[packed_study] = manifest_now(study, system, opened)
@@ -201,7 +201,7 @@ def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:
     """Forget what an interrupted command has simulated if the original vehicle, which has just been
     simulated again, does otherwise than then.
     """
-    opened = _opened_by(study, pool)
+    opened = opened_by(study, pool)
     if cache := cache_of(study, opened):
         key = hashlib.sha256(b"original" + cache.key_of(study, opened)).digest()
         cached = evaluations_in(cache.get(key))
@@ -222,14 +222,7 @@ def repeat_first_batches(study: Study, pool: Pool) -> None:
         pool.everywhere(repeat_first_batch, study, limit=limit)
 
 
-def check_simulator(study: Study, pool: Pool) -> None:
-    """Check the class of a simulator of the user's own, as `check_code` does, unless the pool has
-    checked it.
-    """
-    _opened_by(study, pool)
-
-
-def _opened_by(study: Study, pool: Pool) -> list[str]:
+def opened_by(study: Study, pool: Pool) -> list[str]:
     """The names of the files that the user code of a study opens. A study's code is checked once in
     a pool, whatever else of the study questions vary.
     """
@@ -352,7 +345,7 @@ def ask_why_no_verdict(
     """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker;
     "" if they do. `begin` is called before anything is simulated.
     """
-    opened = _opened_by(study, pool)
+    opened = opened_by(study, pool)
     cache = cache_of(study, opened)
     key = b""
     if cache:
@@ -368,4 +361,4 @@ def ask_why_no_verdict(
 
 
 def _why_no_verdict(task: Task) -> str:
-    return why_no_verdict(system_of(task.study)) or ""
+    return why_no_verdict(system_of(task.study))

@@ -194,7 +194,6 @@ TTC_MIN = Measure(
     name="ttc_min",
     title="least TTC along the path",
     unit="s",
-    more_is_unsafe=False,
     over_collisions=False,
     function=least_time_to_collision,
     needs=OF_APPROACH,
@@ -253,9 +252,9 @@ def post_encroachment_time(
     rate = np.where(leaves, speed, crossing)
     passes = (runs.outcome == Outcome.PASSED) & (lateral_gap >= 0)
     is_defined = passes & (leaves | comes) & (rate > STANDSTILL)
-    return np.asarray(
-        np.divide(way, rate, out=np.full_like(way, np.nan), where=is_defined)
-    )
+    times = np.full(way.shape, np.nan)
+    np.divide(way, rate, out=times, where=is_defined)
+    return times
 
 
 def reaction_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
@@ -313,10 +312,9 @@ def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> Floa
     is_counted = is_braking[1:]
     sample_count = np.count_nonzero(is_counted, axis=0)
     deceleration_sum = sum_in_order(np.where(is_counted, decelerations, 0.0))
-    undefined = np.full_like(deceleration_sum, np.nan)
-    return np.asarray(
-        np.divide(deceleration_sum, sample_count, out=undefined, where=sample_count > 0)
-    )
+    means = np.full_like(deceleration_sum, np.nan)
+    np.divide(deceleration_sum, sample_count, out=means, where=sample_count > 0)
+    return means
 
 
 AVE_DECE = Measure(
@@ -332,16 +330,12 @@ AVE_DECE = Measure(
 )
 
 
-def _undefined_share(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """NaN, shape (N,): a single run has no share."""
-    return np.full(len(runs), np.nan)
-
-
 UNSAFE_SHARE = Measure(
     name="unsafe_share",
     title="share of unsafe runs",
     unit="-",
     more_is_unsafe=True,
-    function=_undefined_share,
+    # A single run has no share.
+    function=lambda runs, _: np.full(len(runs), np.nan),
     description="Share of the repeats of a run that are unsafe by the study's own criterion.",
 )

@@ -15,9 +15,9 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.campaign.batches import (
     ask_why_no_verdict,
-    check_simulator,
     compile_vehicle,
     evaluate_all,
+    opened_by,
     repeat_first_batches,
     spare,
 )
@@ -175,7 +175,7 @@ class Evaluator:
             if self.system.mover.takes_long:
                 if account.allowance is not None:
                     self._pool.spare = spare(account.allowance, account.minimum)
-                check_simulator(self.study, self._pool)
+                opened_by(self.study, self._pool)
             seconds = seconds_of_simulation(self.study, self.system, self._pool)
             account.open(expected * self._each, seconds, self._pool.checked)
             if seconds is not None:

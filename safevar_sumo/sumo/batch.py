@@ -190,7 +190,7 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
         points = system.at_encounters(encounters[distinct]).points
         n_encounters = len(distinct)
         starts = n_encounters * np.arange(len(points))
-        group = (starts[:, np.newaxis] + np.ravel(group)).ravel()
+        group = (starts[:, None] + np.ravel(group)).ravel()
     step = system.scenes.step_of(points[0].scenario)
     last_sample = max(float(np.max(last_sample_of(point, step))) for point in points)
     n_samples = round(last_sample + longer / step) + 1

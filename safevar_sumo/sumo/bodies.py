@@ -65,15 +65,15 @@ class Body(NamedTuple):
         speed: FloatArray | float,
     ) -> Body:
         """The body whose front's middle is at `front`, or M such bodies."""
-        middle = front - along * (np.asarray(length)[..., np.newaxis] / 2)
+        middle = front - along * (np.asarray(length)[..., None] / 2)
         return cls(middle, along, length, width, speed, np.zeros_like(speed))
 
     @property
     def velocity(self) -> FloatArray:
         """Velocities of M bodies in columns, shape (M, 2) [m/s]."""
         along, across = _axes_of(self)
-        drift = np.asarray(self.drift)[..., np.newaxis]
-        return np.asarray(along * self.speed[:, np.newaxis] + across * drift)
+        drift = np.asarray(self.drift)[..., None]
+        return np.asarray(along * self.speed[:, None] + across * drift)
 
     @classmethod
     def columns(cls, bodies: Sequence[Body]) -> Body:

@@ -184,7 +184,7 @@ def where_met(system: System, setting: FloatArray) -> System:
     InputError
         If there is none.
     """
-    settings = setting[np.newaxis]
+    settings = setting[None]
     points = tuple(
         point
         for point in system.points
@@ -217,7 +217,7 @@ def in_place_of_unmet(
     members = system.characteristics
     originals = _originals(point.ranges or {})
     original = np.array([originals.get(item.name, item.original) for item in members])
-    return np.where(is_met[:, np.newaxis] | members.of_vehicle, settings, original)
+    return np.where(is_met[:, None] | members.of_vehicle, settings, original)
 
 
 def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:

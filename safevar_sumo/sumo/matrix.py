@@ -276,7 +276,7 @@ def worst_point(system: System, setting: FloatArray) -> Point:
     """The worst point of a setting, shape (n,); see `worst_points`."""
     if not system.matrix:
         return system.points[0]
-    at_points = evaluate_points(system, setting[np.newaxis])
+    at_points = evaluate_points(system, setting[None])
     return system.points[int(worst_points(system, at_points)[0])]
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 import re
 import subprocess
-import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -55,16 +54,6 @@ SOURCE_OPTION = re.compile(
 )
 """Options of netconvert, and of SUMO beside the network and its traffic, that name files to read.
 """
-LOAD = """
-import sys, libsumo
-try:
-    libsumo.start(["sumo", *sys.argv[1:]])
-    libsumo.simulationStep(1.0)
-    libsumo.close()
-except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
-    sys.exit(f"Error: {error}")
-"""
-"""A program that loads a network in SUMO and simulates its first second."""
 DIGEST_LENGTH, MESSAGE_LENGTH = 16, 500
 """Numbers of characters of a digest, and of a program's message, that are used."""
 Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
@@ -314,13 +303,6 @@ def program_of_sumo(name: str, source: object) -> str:
     except ImportError:
         raise missing_extra(source, f"needs SUMO's program {name}", "sumo") from None
     return str(Path(sumo.SUMO_HOME) / "bin" / name)
-
-
-def load_in_sumo(folder: Path, *arguments: str) -> tuple[int, str]:
-    """Load a network in a SUMO process of its own, as some crash SUMO, and simulate a second;
-    return its exit code, and its errors and warnings.
-    """
-    return run_program(folder, sys.executable, "-P", "-c", LOAD, *arguments)
 
 
 def run_program(folder: Path, *command: str) -> tuple[int, str]:

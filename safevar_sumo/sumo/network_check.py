@@ -5,6 +5,7 @@ studies cannot use.
 from __future__ import annotations
 
 import re
+import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable
 from functools import lru_cache, partial
@@ -32,9 +33,9 @@ from safevar_sumo.sumo.network import (
     cache_folder_name,
     copied_network,
     is_shipped,
-    load_in_sumo,
     open_network,
     options_in,
+    run_program,
 )
 
 SHORTEST_STEP, LONGEST_STEP = 0.001, 1.0
@@ -45,6 +46,16 @@ MAX_SLOPE = 0.005
 N_STEPS = 600
 """Number of steps in which the traffic of two copies is compared."""
 WARNINGS_FILE = "warnings.txt"
+LOAD = """
+import sys, libsumo
+try:
+    libsumo.start(["sumo", *sys.argv[1:]])
+    libsumo.simulationStep(1.0)
+    libsumo.close()
+except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
+    sys.exit(f"Error: {error}")
+"""
+"""A program that loads a network in SUMO and simulates its first second."""
 DRIVER_ATTRIBUTES = re.compile(
     "carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
     "|actionStepLength|startupDelay|delta|stepping|minGapLat|maxSpeedLat|latAlignment"
@@ -331,24 +342,16 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
     two copies.
     """
     legal = "options and traffic that SUMO loads without an error"
-    files = (
-        "-c",
-        OPTIONS_FILE,
-        "-n",
-        str(built_network(network).absolute()),
-        "-r",
-        TRAFFIC_FILE,
-    )
-    fixed_options = own_options(options_in(network.path(OPTIONS_FILE)))
-    exit_code, messages = load_in_sumo(
-        network.folder,
-        *files,
-        "--begin",
-        "0",
-        "--no-step-log",
-        "true",
-        *as_arguments(fixed_options),
-    )
+    options = {
+        "configuration-file": OPTIONS_FILE,
+        "net-file": str(built_network(network).absolute()),
+        "route-files": TRAFFIC_FILE,
+        "begin": "0",
+        "no-step-log": "true",
+        **own_options(options_in(network.path(OPTIONS_FILE))),
+    }
+    command = (sys.executable, "-P", "-c", LOAD, *as_arguments(options))
+    exit_code, messages = run_program(network.folder, *command)
     if exit_code != 0:
         raise InputError(
             network.folder,

@@ -32,7 +32,7 @@ OCCLUDED = {
     "obstacle": 0.0,
 }
 """What is observed of an occluded obstacle [m, m/s]."""
-_UNSEEN = np.array([*OCCLUDED.values()])[:, np.newaxis]
+_UNSEEN = np.array([*OCCLUDED.values()])[:, None]
 
 
 class Observer(Protocol):

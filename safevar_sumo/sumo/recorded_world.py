@@ -205,7 +205,7 @@ class RecordedWorld:
         self._struck = {}
         if (self._now.fronts @ self._scene.along).max() < self._at_sample(self._begins):
             return {}
-        vehicles, actors = np.nonzero(self._is_near() & is_open[:, np.newaxis])
+        vehicles, actors = np.nonzero(self._is_near() & is_open[:, None])
         if not len(vehicles):
             return {}
 
@@ -235,7 +235,7 @@ class RecordedWorld:
         middles = self._now.fronts - self._scene.along * (self._scene.length / 2)
         offsets = (
             middles.reshape(-1, self._size, 1, 2)
-            - self._at_sample(self._middles)[:, np.newaxis]
+            - self._at_sample(self._middles)[:, None]
         )
         dx, dy = offsets.reshape(self.n, -1, 2).transpose(2, 0, 1)
         east, north = self._scene.along
@@ -243,8 +243,7 @@ class RecordedWorld:
         across = np.abs(dy * east - dx * north)
         covered = np.maximum(self._before.speeds, self._now.speeds) * self.step_length
         return np.asarray(
-            (across < self._reach[1])
-            & (along < self._reach[0] + covered[:, np.newaxis])
+            (across < self._reach[1]) & (along < self._reach[0] + covered[:, None])
         )
 
     def _overlaps(

@@ -82,7 +82,7 @@ class LaneSequence(NamedTuple):
         lanes, shape (N,) [m].
         """
         share = lane_position * self.stretch / self.shape_length
-        return self.origin + self.vector * share[:, np.newaxis]
+        return self.origin + self.vector * share[:, None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,7 +288,7 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
     vector = ends - starts
     lengths = np.array(list(map(api.lane.getLength, lanes)), dtype=float)
     shape_length = np.sqrt((vector * vector).sum(axis=1))
-    direction = vector / shape_length[:, np.newaxis]
+    direction = vector / shape_length[:, None]
     largest_turn = np.abs(direction - direction[0]).max()
     largest_gap = np.abs(starts[1:] - ends[:-1]).max(initial=0.0)
     if largest_turn > STRAIGHTNESS or largest_gap > STRAIGHTNESS:

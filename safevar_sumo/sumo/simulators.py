@@ -317,7 +317,7 @@ def _runs_of(
             lateral=nothing,
             lateral_speed=nothing,
             gear=nothing,
-            active=samples[:, np.newaxis] < lengths,
+            active=samples[:, None] < lengths,
             **columns,
         ),
         encounter=Encounter(

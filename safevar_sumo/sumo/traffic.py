@@ -92,7 +92,7 @@ class Traffic:
 
     def _place(self, n_samples: int) -> None:
         """Place all bodies at this number of samples."""
-        times = (np.arange(n_samples) * self.step).astype(float)[:, np.newaxis]
+        times = (np.arange(n_samples) * self.step).astype(float)[:, None]
         vehicle = self._vehicle_body(np.zeros(1), np.zeros(1))
         self.tracks = tracks_of(
             self._points, times, self._n_encounters, self.step, vehicle
@@ -117,8 +117,8 @@ class Traffic:
         """Which vehicles would touch a body within `OVERTIME` at their closing speeds, at the
         sample of the last `observe`.
         """
-        front = motion.fronts[np.newaxis, :, 0]
-        speed = motion.speeds[np.newaxis]
+        front = motion.fronts[None, :, 0]
+        speed = motion.speeds[None]
         samples = slice(self._sample, self._sample + 1)
         closes = np.zeros(self.n, bool)
         for k in self._encountered:

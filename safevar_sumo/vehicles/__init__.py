@@ -130,8 +130,5 @@ def _accelerations(speeds: list[float]) -> FloatArray:
         return np.zeros(len(SPEEDS))
     times = np.interp(SPEEDS[reached], distinct_speeds, samples * STEP)
     accelerations = np.diff(SPEEDS[reached]) / np.diff(times)
-    return np.asarray(
-        accelerations[
-            np.clip(np.arange(len(SPEEDS)) - reached[0], 0, len(accelerations) - 1)
-        ]
-    )
+    rows = np.clip(np.arange(len(SPEEDS)) - reached[0], 0, len(accelerations) - 1)
+    return np.asarray(accelerations[rows])

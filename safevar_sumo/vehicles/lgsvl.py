@@ -439,9 +439,8 @@ def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
     slip = PEAK_SLIP * grip_share / (1 + np.sqrt(1 - grip_share))
     slow_rim = speed + SLIP_FLOOR * slip
     driving_rim = np.where(slow_rim <= SLIP_FLOOR, slow_rim, speed / (1 - slip))
-    return np.asarray(
-        np.where(force < 0, speed - np.maximum(speed, SLIP_FLOOR) * slip, driving_rim)
-    )
+    braking_rim = speed - np.maximum(speed, SLIP_FLOOR) * slip
+    return np.asarray(np.where(force < 0, braking_rim, driving_rim))
 
 
 def _tyre_stiffness(
