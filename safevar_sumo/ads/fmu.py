@@ -218,7 +218,7 @@ class FmuAds(ScalarAds):
         self._trim = self._trim or trim_at(self.nominal, observation)
         return self.pedals(outputs["acceleration"], observation.speed, self._trim)
 
-    def _step(self, values: Mapping[str, float]) -> NamedValues:
+    def _step(self, values: NamedValues) -> NamedValues:
         """Advance the instance with observed values; returns its outputs."""
         slave = self._slave
         time = self._calls * self.step

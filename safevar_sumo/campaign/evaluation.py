@@ -6,7 +6,7 @@ SUMO.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import lru_cache
@@ -28,7 +28,14 @@ from safevar_sumo.errors import (
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.plugins.process import REPRODUCED_BY
 from safevar_sumo.plugins.time_limit import end_if_longer
-from safevar_sumo.records import Evaluations, FloatArray, IntArray, Outcome, differences
+from safevar_sumo.records import (
+    Evaluations,
+    FloatArray,
+    IntArray,
+    NamedValues,
+    Outcome,
+    differences,
+)
 from safevar_sumo.study import Study, user_code_names
 from safevar_sumo.sumo.matrix import MAX_COPIES, drive_and_score
 from safevar_sumo.sumo.system import System, assemble, simulate_command
@@ -271,7 +278,7 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     )
 
 
-def with_parameters(study: Study, values: Mapping[str, float]) -> Study:
+def with_parameters(study: Study, values: NamedValues) -> Study:
     """A study with other values of parameters of its ADS."""
     ads = replace_in(study.ads, parameters={**study.ads.parameters, **values})
     return replace_in(study, ads=ads)

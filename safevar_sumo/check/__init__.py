@@ -24,6 +24,7 @@ from safevar_sumo.plugins import Lookup, unload_user_modules
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import WHOLE, Study, keys_with, user_code, without_skipping
+from safevar_sumo.study.encounters import Parameters
 from safevar_sumo.sumo.empty_road import Reason, find_problems, sentence_on
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
@@ -84,7 +85,7 @@ def study_to_check(name: str) -> Study:
     if not is_ads:
         return read_study(name)
     # The study has data about an ADS of its own.
-    no_data: dict[str, Any] = {key: {} for key in keys_with(WHOLE, Study)}
+    no_data: Parameters = {key: {} for key in keys_with(WHOLE, Study)}
     return read_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data)
 
 

@@ -41,6 +41,7 @@ from safevar_sumo.report.budget import REPLAYS
 from safevar_sumo.report.pack import (
     DESCRIPTION,
     PACK,
+    FileContents,
     PackedManifest,
     PackedStudy,
     json_of,
@@ -120,7 +121,7 @@ class Packed:
     def __init__(
         self,
         packed: PackedStudy,
-        files: dict[str, bytes],
+        files: FileContents,
         places: Sequence[str],
         jobs: int | None,
         progress: Progress,

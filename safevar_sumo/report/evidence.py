@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -65,6 +65,7 @@ from safevar_sumo.report.pack import (
     DESCRIPTION,
     PACK,
     Description,
+    FileContents,
     PackedManifest,
     PackedStudy,
     digest_of,
@@ -167,7 +168,7 @@ def _pack_study(
     how: JsonObject,
     progress: Progress,
     simulations: int | None,
-) -> tuple[PackedStudy, dict[str, bytes]]:
+) -> tuple[PackedStudy, FileContents]:
     """The description of a study in a pack, and its files."""
     case = study_or_case(directory, results_only=True)
     assert isinstance(case, Case)
@@ -233,12 +234,12 @@ def _pack_study(
     return msgspec.structs.replace(described, simulations=packed.simulations()), files
 
 
-def _with_lists(questions: Sequence[str]) -> tuple[list[str], dict[str, bytes]]:
+def _with_lists(questions: Sequence[str]) -> tuple[list[str], FileContents]:
     """Questions about the lists of cars as a pack holds them, and these lists by their names in the
     pack.
     """
     packed = []
-    lists = dict[str, bytes]()
+    lists = FileContents()
     for text in questions:
         if path := list_in(text):
             name = f"{LISTS}/{len(lists) + 1}.csv"
@@ -251,7 +252,7 @@ def _with_lists(questions: Sequence[str]) -> tuple[list[str], dict[str, bytes]]:
 
 def _files_of_user(
     study: Study, named: Iterable[str], questions: Sequence[str]
-) -> dict[str, bytes]:
+) -> FileContents:
     """The user's files that the results depend on, the files of the user's questions, and the views
     of networks, without which SUMO does not start, by their names in a pack.
     """
@@ -421,7 +422,7 @@ def _not_compared(description: Description, studies: Iterable[Packed]) -> list[s
 def _unpack(
     path: Path,
     described: PackedStudy,
-    files: Mapping[str, bytes],
+    files: FileContents,
     folder: Path,
     jobs: int | None,
     progress: Progress,

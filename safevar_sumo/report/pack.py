@@ -9,7 +9,6 @@ import stat
 import sys
 import zipfile
 import zlib
-from collections.abc import Mapping
 from hashlib import file_digest, sha256
 from importlib.metadata import version
 from pathlib import Path, PurePosixPath
@@ -26,6 +25,8 @@ from safevar_sumo.results.identity import PACKAGES
 from safevar_sumo.study import Study
 
 DESCRIPTION = "pack.json"
+FileContents = dict[str, bytes]
+"""What files hold, by their names."""
 MAX_FILES = 10_000
 MAX_EVALUATIONS = 100_000_000
 MORE_IN_DIRECTORY, DIRECTORY_END = 16, 22
@@ -82,9 +83,7 @@ class Description(Struct, frozen=True, forbid_unknown_fields=True):
     studies: Annotated[list[PackedStudy], Meta(min_length=1)]
 
 
-def write_pack(
-    path: Path, studies: list[PackedStudy], files: Mapping[str, bytes]
-) -> None:
+def write_pack(path: Path, studies: list[PackedStudy], files: FileContents) -> None:
     """Write a pack; equal contents give equal bytes."""
     described = msgspec.json.encode(
         Description(versions_here(), digests_of(files), studies)
@@ -126,7 +125,7 @@ def json_of(content: bytes) -> Any:
     return value
 
 
-def digests_of(files: Mapping[str, bytes]) -> dict[str, str]:
+def digests_of(files: FileContents) -> dict[str, str]:
     """The sha256 of files, by name."""
     return {name: sha256(files[name]).hexdigest() for name in sorted(files)}
 
@@ -137,7 +136,7 @@ def digest_of(path: Path) -> str:
         return file_digest(file, "sha256").hexdigest()
 
 
-def read_pack(path: Path) -> tuple[Description, dict[str, bytes]]:
+def read_pack(path: Path) -> tuple[Description, FileContents]:
     """Read a pack into memory.
 
     Raises

@@ -39,7 +39,7 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
         ) from None
     question = find_question(name)
 
-    values = dict[str, Any]()
+    values = JsonObject()
     waiting = iter(words)
     options = {option.flag: option for option in (*question.options, SIMULATIONS)}
     for flag in waiting:

@@ -47,3 +47,7 @@ class Point(NamedTuple):
         for constraint in self.constraints:
             holds &= constraint.allows(values)
         return holds
+
+
+Points = tuple[Point, ...]
+"""The points of a matrix, or the only one of a study without a matrix."""

@@ -154,7 +154,7 @@ def _checked_trace(
 def _contradiction(
     outcome: str,
     columns: Mapping[str, FloatArray],
-    ends: Mapping[str, float],
+    ends: NamedValues,
     step: float,
 ) -> str:
     """What a trace says of the end of its run that its samples exclude, by more than may happen
@@ -216,7 +216,7 @@ def unit_contradiction(trace: Trace) -> str:
 
 def _checked_metrics(
     code: UserCode, method: str, result: StatedRun, has_collided: bool
-) -> Mapping[str, float]:
+) -> StatedRun:
     """The metrics of a run without a trace; NaN is one that is undefined."""
     values = {name: value for name, value in result.items() if name != OUTCOME}
     legal = dict.fromkeys(values, Legal(infinite=True, undefined=True))

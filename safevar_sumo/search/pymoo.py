@@ -20,6 +20,7 @@ from safevar_sumo.errors import InputError, check_name, describe_error, missing_
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search.base import Algorithm, Problem, Search
 from safevar_sumo.study import PYMOO, Table, label_of
+from safevar_sumo.study.encounters import Parameters
 
 MODULES = {
     "moo.age": "AGEMOEA",
@@ -72,7 +73,7 @@ others.
 MAX_DIRECTIONS = 100_000
 """Largest number of reference directions, and of individuals."""
 DirectionCount = Annotated[int, Meta(ge=1, le=MAX_DIRECTIONS)]
-TYPES: dict[str, Any] = {
+TYPES: Parameters = {
     "ref_dirs": DirectionCount | list[list[float]],
     "ref_points": list[list[float]],
     "pop_per_ref_point": DirectionCount,
@@ -176,7 +177,7 @@ class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
         if PYMOO_ALGORITHMS[self.name].startswith("moo."):
             objectives = len(problem.scoring.objectives)
         defaults = _plain_arguments(self.name)
-        arguments = dict[str, Any]()
+        arguments = Parameters()
         if isinstance(defaults.get("pop_size"), int):
             arguments["pop_size"] = problem.population
         for name in defaults:
@@ -330,7 +331,7 @@ def _class_of(name: str) -> Any:
     )
 
 
-def _plain_arguments(name: str) -> dict[str, Any]:
+def _plain_arguments(name: str) -> Parameters:
     """Arguments of an algorithm's class and its bases that a file can give, with their default
     values.
     """

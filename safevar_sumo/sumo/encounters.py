@@ -34,6 +34,7 @@ from safevar_sumo.scenarios import (
     WorldScenario,
     searchable_in,
 )
+from safevar_sumo.scenarios.point import Points
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.study import PHASE, WORST, Domains, Study, unit_text
 from safevar_sumo.sumo.bodies import Film
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from safevar_sumo.sumo.system import System
 
 
-def check_domains(study: Study, points: tuple[Point, ...]) -> None:
+def check_domains(study: Study, points: Points) -> None:
     """Refuse a range of a parameter that a test's scenario does not have or in which its weathers
     differ, a range that is wider than the scenario's, and ranges in which an encounter is
     impossible.

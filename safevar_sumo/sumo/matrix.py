@@ -23,6 +23,7 @@ from safevar_sumo.records import (
     finite_or_none,
 )
 from safevar_sumo.scenarios import Point, TrackScenario
+from safevar_sumo.scenarios.point import Points
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE
 from safevar_sumo.sumo.batch import drive_all, reason_against_scenes, score
@@ -251,7 +252,7 @@ def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResul
     """
     n = len(settings)
 
-    groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
+    groups: Iterable[Points] = ((point,) for point in system.points)
     searched = system.characteristics.scenario.names
     if not reason_against_scenes(system) and (not searched or [*searched] == [PHASE]):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
@@ -280,7 +281,7 @@ def worst_point(system: System, setting: FloatArray) -> Point:
     return system.points[int(worst_points(system, at_points)[0])]
 
 
-def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
+def _group_points(system: System, size: int) -> Iterator[Points]:
     """Yield groups of at most `size` points that may share a batch, sorted by duration: those whose
     scenarios are tracks around equal vehicles; any other point is alone. Where one batch does not
     hold all points, those of a batch have equally many bodies: others would carry bodies that they

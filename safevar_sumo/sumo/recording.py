@@ -21,7 +21,7 @@ from safevar_sumo.errors import subject
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import FloatArray, IntArray, Quantity
 from safevar_sumo.scenarios import VUT, Lane, Point, Scenario, WorldScenario
-from safevar_sumo.scenarios.roads import lane_through
+from safevar_sumo.scenarios.roads import Coordinates, lane_through
 from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.sumo.bodies import Films
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
@@ -101,7 +101,7 @@ class Recording:
     width: float
     way: LaneSequence
     along: FloatArray
-    lanes: dict[str, tuple[tuple[float, float], ...]]
+    lanes: dict[str, tuple[Coordinates, ...]]
     first_lanes: dict[str, str]
     tracks: Films
 

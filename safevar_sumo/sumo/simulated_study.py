@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.scenarios import Point, Scenario
 from safevar_sumo.scenarios.base import Mover
 from safevar_sumo.study import Study
+from safevar_sumo.study.encounters import Parameters
 from safevar_sumo.vehicles import CharacteristicSet
 
 NOISE = re.compile("noise|noisy|dropout|jitter")
@@ -30,7 +30,7 @@ def check_tables(study: Study, mover: Mover) -> None:
     InputError
         With the first such key.
     """
-    entries: dict[str, Any] = {
+    entries: Parameters = {
         "vehicle.model": study.vehicle.model,
         "vehicle.parameters": study.vehicle.parameters,
         "ads.model": study.ads.model,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from hashlib import sha256
@@ -36,6 +36,7 @@ from safevar_sumo.records import (
     Encounter,
     Evaluations,
     FloatArray,
+    NamedValues,
     Outcome,
     SimulationRuns,
     Trace,
@@ -109,7 +110,7 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
 class _Setting(dict[str, float]):
     """A setting that knows which of its values were read."""
 
-    def __init__(self, values: Mapping[str, float]) -> None:
+    def __init__(self, values: NamedValues) -> None:
         super().__init__(values)
         self.unread = {*values}
 

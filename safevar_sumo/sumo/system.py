@@ -19,6 +19,7 @@ from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import VUT, Point, TrackScenario, WorldScenario, weather_of
 from safevar_sumo.scenarios.base import Mover, Part
 from safevar_sumo.scenarios.declared import with_ranges
+from safevar_sumo.scenarios.point import Points
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import WORST, MetricsTable, Study
 from safevar_sumo.sumo.bodies import SceneWorld
@@ -68,7 +69,7 @@ class System:
     characteristics: CharacteristicSet
     vehicle: Vehicle
     ads: Ads
-    points: tuple[Point, ...]
+    points: Points
     metrics_table: MetricsTable
     nominal: Nominal
     measuring: Measuring
@@ -85,7 +86,7 @@ class System:
     criterion: Unsafe
 
     @property
-    def matrix(self) -> tuple[Point, ...]:
+    def matrix(self) -> Points:
         """The points of a matrix, which have names; none in a study with a single scenario."""
         return tuple(point for point in self.points if point.name)
 
@@ -200,7 +201,7 @@ def assemble(study: Study) -> System:
         return _assemble(study)
 
 
-def _original_points(study: Study, lookup: Lookup, single: Point) -> tuple[Point, ...]:
+def _original_points(study: Study, lookup: Lookup, single: Point) -> Points:
     """The points in the original encounter, where encounters are ranges; `single` is that without
     a matrix. Ranges have to be possible, also where listed encounters alone are met.
     """

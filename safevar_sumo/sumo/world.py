@@ -13,7 +13,7 @@ from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import BoolArray, FloatArray, FloatOrArray
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
-from safevar_sumo.scenarios.roads import Frame, lane_through
+from safevar_sumo.scenarios.roads import Coordinates, Frame, lane_through
 from safevar_sumo.sumo.bodies import Body, BodyPairs, Film, Films, Hits, VehicleStates
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import SumoType
@@ -261,7 +261,7 @@ class SumoWorld:
         self._persons[actor] = positions
         return positions
 
-    def actor_poses(self) -> dict[str, tuple[tuple[float, float], float]]:
+    def actor_poses(self) -> dict[str, tuple[Coordinates, float]]:
         """All actors on the road, by id: the place of the front, or of a person [m], and the
         heading clockwise from north [degrees].
         """
