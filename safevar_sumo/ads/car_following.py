@@ -36,6 +36,10 @@ LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
 LAST_DECELERATION = 0.5
 
 
+_Following = tuple[Nominal, Trim | None]
+"""What a driver remembers: the vehicle, and the pedals that held its speed at the start."""
+
+
 class CarFollowing(Ads, Table, frozen=True, kw_only=True):
     """Base of models that compute an acceleration from gap and speeds; obstacles beside the way are
     ignored.
@@ -46,14 +50,12 @@ class CarFollowing(Ads, Table, frozen=True, kw_only=True):
     standing_gap: Annotated[float, Meta(ge=0, le=100)] = 2.5
     corridor: PositiveParameter = CORRIDOR
 
-    def start(
-        self, n: int, nominal: Nominal, step: float
-    ) -> tuple[Nominal, Trim | None]:
+    def start(self, n: int, nominal: Nominal, step: float) -> _Following:
         return nominal, None
 
     def drive(
-        self, observation: Observation, memory: tuple[Nominal, Trim | None]
-    ) -> tuple[Command, tuple[Nominal, Trim | None]]:
+        self, observation: Observation, memory: _Following
+    ) -> tuple[Command, _Following]:
         nominal, trim = memory
         initial_trim = trim_at(nominal, observation) if trim is None else trim
         gap = np.where(

@@ -24,6 +24,7 @@ from safevar_sumo.records import (
     Evaluations,
     FloatArray,
     JsonObject,
+    NamedValues,
     Observation,
     Outcome,
     SimulationRuns,
@@ -155,7 +156,7 @@ class Simulation:
         return replace(self, row=0, reset_values={})
 
     @property
-    def setting(self) -> dict[str, float]:
+    def setting(self) -> NamedValues:
         """The simulated value of every characteristic in its table unit."""
         return self.pair.system.characteristics.named(self.evaluation.settings[0])
 
@@ -185,12 +186,12 @@ class Simulation:
         return float(self.evaluation.collision_speed[0])
 
     @property
-    def metrics(self) -> dict[str, float]:
+    def metrics(self) -> NamedValues:
         """Safety metrics by name, in the units that `list` prints; NaN where undefined."""
         return self.evaluation.first_metrics
 
     @property
-    def objectives(self) -> dict[str, float]:
+    def objectives(self) -> NamedValues:
         """f_safe [m, or -m/s on a collision], and of the filtered setting f_diff [fraction] and
         f_num_diff [characteristics]; all are minimised.
         """

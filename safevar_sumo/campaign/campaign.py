@@ -22,7 +22,7 @@ from safevar_sumo.campaign.evaluation import (
     verify_settings,
 )
 from safevar_sumo.campaign.inputs import manifest_now
-from safevar_sumo.campaign.pool import Pool
+from safevar_sumo.campaign.pool import Look, Pool
 from safevar_sumo.campaign.runs import (
     MAX_REPEATED,
     RunKey,
@@ -282,7 +282,7 @@ def repeat_in_sumo(
 
 def journal_progress(
     study: Study, keys: Sequence[RunKey], directory: Path, progress: Progress
-) -> Callable[[Sequence[int]], None]:
+) -> Look:
     """A function that shows the evaluations that runs have asked for, as their journals tell; of
     those that have not finished, all others are to come.
     """

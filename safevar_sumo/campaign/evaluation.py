@@ -6,7 +6,7 @@ SUMO.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import lru_cache
@@ -18,7 +18,7 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.campaign.local import Work
-from safevar_sumo.campaign.pool import Pool, WorkerLostError
+from safevar_sumo.campaign.pool import Look, Pool, WorkerLostError
 from safevar_sumo.errors import (
     EnvironmentFault,
     SafevarError,
@@ -116,7 +116,7 @@ def carry_out(
     function: Work,
     jobs: Sequence[tuple[Any, ...]],
     pool: Pool,
-    look: Callable[[Sequence[int]], None] = lambda ended: None,
+    look: Look = lambda ended: None,
 ) -> list[Any]:
     """The results of a function for the arguments of each job: a task, and what to compute.
 

@@ -24,6 +24,8 @@ from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins.process import MAX_DEATHS
 from safevar_sumo.records import Evaluations, JsonObject
 
+Look = Callable[[Sequence[int]], None]
+"""A function that is told the numbers of jobs that have just ended."""
 SECONDS_BETWEEN_LOOKS = 0.5
 """Longest time between two looks at the jobs under way [s]."""
 
@@ -97,7 +99,7 @@ class Pool:
         self,
         function: Work,
         jobs: Sequence[tuple[Any, ...]],
-        look: Callable[[Sequence[int]], None] = lambda ended: None,
+        look: Look = lambda ended: None,
     ) -> list[Any]:
         """The results of a function for the arguments of each job, in their order; a job whose
         worker dies is carried out once more.

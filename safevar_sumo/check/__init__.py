@@ -6,7 +6,7 @@ depend on its setting alone, and does every call keep its contract? Nothing belo
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import nullcontext
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from safevar_sumo.ads import ADS
 from safevar_sumo.check.trials import (
     Finding,
+    Findings,
     find_unused,
     try_algorithm,
     try_simulations,
@@ -150,7 +151,7 @@ def refuse_defects(study: Study, limit: int | None = None) -> None:
         )
 
 
-def find_defects(study: Study, **how: Any) -> Iterator[Finding]:
+def find_defects(study: Study, **how: Any) -> Findings:
     """The first defect of what is simulated, all of it in one trial, and of each user algorithm;
     for `how` see `try_simulations`.
     """
@@ -164,8 +165,8 @@ def find_defects(study: Study, **how: Any) -> Iterator[Finding]:
 
 
 def _first_defect(
-    study: Study, names: Mapping[str, str], findings: Iterator[Finding]
-) -> Iterator[Finding]:
+    study: Study, names: Mapping[str, str], findings: Findings
+) -> Findings:
     """The first of the findings about user code, or the error that it raises; `names` are its names
     by their keys.
     """

@@ -79,6 +79,10 @@ class Finding(NamedTuple):
         return line
 
 
+Findings = Iterator[Finding]
+"""Findings, each of which is computed when it is asked for."""
+
+
 class Extent(NamedTuple):
     """How many vehicles are simulated, of how many if time allows, at how many points of the study,
     and how long that takes [s].
@@ -97,7 +101,7 @@ def try_simulations(
     progress: Progress = show_no_progress,
     tell: Callable[[Extent], None] = lambda extent: None,
     limit: int | None = None,
-) -> Iterator[Finding]:
+) -> Findings:
     """Simulate a study with the original vehicle, the corners of the domains and random settings:
     so many `vehicles`, by default as many as the time allows, in a simulator of the user's own with
     at most so many simulations. `tell` is called with their number.
@@ -167,7 +171,7 @@ def try_simulations(
             yield Finding("contract", problem, "", setting, reacts)
 
 
-def try_original(system: System, runs: SimulationRuns) -> Iterator[Finding]:
+def try_original(system: System, runs: SimulationRuns) -> Findings:
     """What is wrong in the run of the original vehicle: units of a simulator of the user's own, and
     metrics that change with a quantity that they do not state.
     """
@@ -199,7 +203,7 @@ def try_original(system: System, runs: SimulationRuns) -> Iterator[Finding]:
                 yield Finding("contract", got, "", "the original vehicle", expected)
 
 
-def find_unused(study: Study) -> Iterator[Finding]:
+def find_unused(study: Study) -> Findings:
     """Metrics that the study names and that are undefined in all of a few runs, and characteristics
     that a simulator of the user's own reads in none of them.
     """
@@ -238,7 +242,7 @@ def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
     return number, number * seconds
 
 
-def try_algorithm(study: Study, name: str) -> Iterator[Finding]:
+def try_algorithm(study: Study, name: str) -> Findings:
     """Let an algorithm search twice, the second time after another run."""
     outputs = _search(study, name, seeds=(1,))
     repeated = _search(study, name, seeds=(2, 1))
@@ -260,7 +264,7 @@ def _try(
     settings: FloatArray,
     progress: Progress,
     expected: str,
-) -> Iterator[Finding]:
+) -> Findings:
     """Compare a run of all settings with other runs; `load` loads all user code again."""
     run = load()
     all_rows = np.arange(len(settings))

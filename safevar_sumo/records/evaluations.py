@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from safevar_sumo.records.driving import BoolArray, FloatArray, IntArray, TextArray
+from safevar_sumo.records.driving import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    NamedValues,
+    TextArray,
+)
 from safevar_sumo.records.runs import Outcome
 from safevar_sumo.study import SAFETY_DEGREE
 
@@ -134,7 +140,7 @@ class Evaluations:
         return rounds
 
     @property
-    def first_metrics(self) -> dict[str, float]:
+    def first_metrics(self) -> NamedValues:
         """The metrics of the first setting."""
         return {name: float(values[0]) for name, values in self.metrics.items()}
 

@@ -62,6 +62,10 @@ VEHICLE_SPEED = searched(10.0, 130.0, "km/h", "speed of the vehicle at the start
 """The mark of the vehicle's speed, which a study may search."""
 
 
+SpeedOfTime = Callable[[Quantity], Quantity]
+"""The speed of a target at a time [m/s, s]."""
+
+
 class TargetAhead(ProtocolTest, frozen=True, kw_only=True):
     """Base of a scenario with a target ahead in the vehicle's lane; for its parameters see
     `ProtocolTest`.
@@ -87,7 +91,7 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True):
         raise NotImplementedError
 
     @property
-    def target_speed_at(self) -> Callable[[Quantity], Quantity]:
+    def target_speed_at(self) -> SpeedOfTime:
         """The target's speed [m/s] as a function of the time [s]."""
         raise NotImplementedError
 
@@ -178,7 +182,7 @@ class Along(TargetAhead, frozen=True, kw_only=True):
         )
 
     @property
-    def target_speed_at(self) -> Callable[[Quantity], Quantity]:
+    def target_speed_at(self) -> SpeedOfTime:
         """The target's speed [m/s] as a function of the time [s]."""
         return self._profile.speed_at
 
@@ -309,7 +313,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         return defaults.get(self.pre_crash, self.speed) * KMH
 
     @property
-    def target_speed_at(self) -> Callable[[Quantity], Quantity]:
+    def target_speed_at(self) -> SpeedOfTime:
         """The target's speed [m/s] as a function of the time [s]."""
         first_speed = self._target_speed
         brakes_at = self.brakes_at

@@ -182,6 +182,10 @@ ScenarioMemory = Any
 """What a scenario remembers of a run: an object of its own class with named attributes."""
 
 
+Quantities = Mapping[str, Quantity]
+"""Values of a scenario's parameters by name: numbers, or arrays with a value for each encounter."""
+
+
 class Layout(NamedTuple):
     """Where the actors of N runs are whose scenarios differ in parameters that a study searches.
 
@@ -284,7 +288,7 @@ class Scenario:
         """By default in a test at its speed."""
         return self.test_speed is not None
 
-    def at(self, values: Mapping[str, Quantity]) -> Scenario:
+    def at(self, values: Quantities) -> Scenario:
         """This scenario at other values of parameters, created anew."""
         create: Any = dataclasses.replace
         if isinstance(self, msgspec.Struct):

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from safevar_sumo.records import Quantity
-from safevar_sumo.scenarios.base import Scenario
+from safevar_sumo.scenarios.base import Quantities, Scenario
 from safevar_sumo.study import Constraint, Domains, Weather
 
 SPEED_DIMENSION = "speed"
@@ -30,13 +29,13 @@ class Point(NamedTuple):
     ranges: Domains | None = None
     constraints: tuple[Constraint, ...] = ()
 
-    def own(self, values: Mapping[str, Quantity]) -> dict[str, Quantity]:
+    def own(self, values: Quantities) -> dict[str, Quantity]:
         """Those of the values that are of parameters of this point."""
         if self.ranges is None:
             return dict(values)
         return {name: value for name, value in values.items() if name in self.ranges}
 
-    def meets(self, values: Mapping[str, Quantity]) -> Quantity:
+    def meets(self, values: Quantities) -> Quantity:
         """Whether the encounters with these values are some of this point's, of shape (N,), or one
         truth for all.
         """

@@ -74,6 +74,10 @@ class Individual(list[float]):
     has_failed: bool = False
 
 
+Individuals = list[Individual]
+"""A population, or a part of it."""
+
+
 class Nsga2(Algorithm, Table, frozen=True, kw_only=True):
     """Elitist search by Pareto rank and crowding distance, with as many offspring as individuals.
 
@@ -105,7 +109,7 @@ class Nsga2(Algorithm, Table, frozen=True, kw_only=True):
                 min(problem.population, problem.evaluations), rng
             )
         offspring = list(map(Individual, generation.tolist()))
-        survivors = list[Individual]()
+        survivors = Individuals()
         used = 0
 
         while offspring:
@@ -159,11 +163,9 @@ class Reproduction:
                 self._random_state = random.getstate()
                 random.setstate(state_of_caller)
 
-    def draw_offspring(
-        self, population: list[Individual], number: int
-    ) -> list[Individual]:
+    def draw_offspring(self, population: Individuals, number: int) -> Individuals:
         """Draw `number` new individuals, in pairs: two tournaments, crossover, mutation."""
-        offspring = list[Individual]()
+        offspring = Individuals()
         operators = self._operators
         domains = (self._lower, self._upper)
         with self._randomness():
@@ -186,7 +188,7 @@ class Reproduction:
                 offspring += self._feasible_children(pair)
         return offspring[:number]
 
-    def _feasible_children(self, children: list[Individual]) -> list[Individual]:
+    def _feasible_children(self, children: Individuals) -> Individuals:
         """The children that satisfy the study's constraints; the caller draws again for those that
         do not.
 
@@ -232,7 +234,7 @@ def request_evaluations(
     return len(individuals)
 
 
-def select_survivors(individuals: list[Individual], number: int) -> list[Individual]:
+def select_survivors(individuals: Individuals, number: int) -> Individuals:
     """Select the best `number` by rank, then by crowding distance, as DEAP's slower `selNSGA2`
     does; sets their `standing`: the rank, from 0, then the negative crowding distance. Infeasible
     individuals follow all feasible ones, each in a rank of its own, by their violation (constrained
@@ -258,7 +260,7 @@ def select_survivors(individuals: list[Individual], number: int) -> list[Individ
     return [*best, *infeasible][:number]
 
 
-def sort_into_fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
+def sort_into_fronts(individuals: Sequence[Individual]) -> list[Individuals]:
     """Group individuals by non-domination rank; each front keeps the given order."""
     if not individuals:
         return []
@@ -266,13 +268,13 @@ def sort_into_fronts(individuals: Sequence[Individual]) -> list[list[Individual]
     ranks = moocore.pareto_rank(
         [individual.fitness.wvalues for individual in individuals], maximise=True
     ).tolist()
-    fronts: list[list[Individual]] = [[] for _ in range(max(ranks) + 1)]
+    fronts: list[Individuals] = [[] for _ in range(max(ranks) + 1)]
     for individual, rank in zip(individuals, ranks, strict=True):
         fronts[rank].append(individual)
     return fronts
 
 
-def run_tournament(population: list[Individual], size: int = 2) -> Individual:
+def run_tournament(population: Individuals, size: int = 2) -> Individual:
     """The best, by standing, of `size` individuals drawn without replacement; chance decides
     ties.
     """

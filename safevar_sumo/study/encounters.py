@@ -100,6 +100,10 @@ class AxisTable(Table, frozen=True, kw_only=True):
         return Domain(**fields)
 
 
+AxisTables = dict[str, AxisTable]
+"""Axes by their names."""
+
+
 def axis_of(domain: Domain) -> AxisTable:
     """An axis whose range is a domain."""
     return AxisTable(**asdict(domain))
@@ -169,7 +173,7 @@ def are_numbers(values: Iterable[object]) -> bool:
     return all(type(value) in (int, float) for value in values)
 
 
-def as_axes(over: Parameters) -> dict[str, AxisTable]:
+def as_axes(over: Parameters) -> AxisTables:
     """Axes as tables."""
     axes = dict(over)
     for name, at in over.items():
@@ -178,12 +182,12 @@ def as_axes(over: Parameters) -> dict[str, AxisTable]:
     return axes
 
 
-def _ranges_of(axes: Iterable[tuple[str, AxisTable]]) -> dict[str, Domain]:
+def _ranges_of(axes: Iterable[tuple[str, AxisTable]]) -> Domains:
     """The ranges of axes that have one."""
     return {name: axis.range for name, axis in axes if axis.range is not None}
 
 
-def _lists_of(axes: dict[str, AxisTable]) -> Axes:
+def _lists_of(axes: AxisTables) -> Axes:
     """The lists of axes that have one."""
     return {name: axis.at for name, axis in axes.items() if axis.at}
 
@@ -220,7 +224,7 @@ class MatrixTest(Table, frozen=True, kw_only=True):
                 raise mistake(f"{name} is in parameters and in over", "one of them")
 
     @property
-    def axes(self) -> dict[str, AxisTable]:
+    def axes(self) -> AxisTables:
         """The axes of `over`."""
         return as_axes(self.over)
 
@@ -329,7 +333,7 @@ class Encounters(Table, frozen=True, kw_only=True):
         """The tests; None for the encounters of a study without any."""
         return [*self.tests] or [None]
 
-    def axes_of(self, test: MatrixTest | None) -> dict[str, AxisTable]:
+    def axes_of(self, test: MatrixTest | None) -> AxisTables:
         """The axes of a test, its own first; those of all tests, unless it has values of them."""
         shared = as_axes(self.scenario.over)
         if test is None:
@@ -346,7 +350,7 @@ class Encounters(Table, frozen=True, kw_only=True):
         axes = self.axes_of(test).items()
         return {name: axis.at for name, axis in axes if axis.at and name not in ranges}
 
-    def ranges_of(self, test: MatrixTest | None) -> dict[str, Domain]:
+    def ranges_of(self, test: MatrixTest | None) -> Domains:
         """The axes of a test of which any value may occur."""
         if self.encounters == TESTS:
             return {}
@@ -358,7 +362,7 @@ class Encounters(Table, frozen=True, kw_only=True):
         return bool(_ranges_of(self._named_axes))
 
     @property
-    def ranges(self) -> dict[str, Domain]:
+    def ranges(self) -> Domains:
         """Of which parameters of its encounter each setting has a value beside the vehicle: the
         axes of all tests whose values may be any, each as wide as in its widest test; those of
         [scenario.over] alone come last.
@@ -390,7 +394,7 @@ class Encounters(Table, frozen=True, kw_only=True):
                 points.append(point)
         return points
 
-    def mapped(self, change: Callable[[dict[str, AxisTable]], Axes]) -> Self:
+    def mapped(self, change: Callable[[AxisTables], Axes]) -> Self:
         """The study with other axes of each test, and of all; lists alone are written as such."""
 
         def changed(over: Axes) -> Axes:

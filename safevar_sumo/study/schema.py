@@ -15,7 +15,7 @@ from safevar_sumo.study.characteristics import (
     CharacteristicTable,
     Constraint,
     Distribution,
-    Domain,
+    Domains,
     Limit,
     PositiveNumber,
     UnmeasuredValue,
@@ -237,7 +237,7 @@ class Study(Encounters, frozen=True, kw_only=True):
     step_length: Annotated[float, Meta(ge=0.001, le=1)] | None = None
     published: Annotated[dict[str, float], WITHOUT_EFFECT, OF_SYSTEM, WHOLE] = {}
     repeatability: Annotated[
-        dict[str, Annotated[float, Meta(gt=0, le=1e6)]],
+        dict[str, PositiveNumber],
         WITHOUT_EFFECT,
         OF_SYSTEM,
         WHOLE,
@@ -300,7 +300,7 @@ class Study(Encounters, frozen=True, kw_only=True):
         ]
 
     @property
-    def domains(self) -> dict[str, Domain]:
+    def domains(self) -> Domains:
         """What a search varies: the vehicle's characteristics, then parameters of encounters."""
         return {**self.vehicle.characteristics, **self.ranges}
 

@@ -4,7 +4,7 @@ SUMO.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 
@@ -23,6 +23,7 @@ from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.drive import Listener, drive, last_sample_of
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import (
+    Create,
     Start,
     open_in_process,
     open_varied_world,
@@ -38,7 +39,7 @@ from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
 from safevar_sumo.sumo.traffic import OVERTIME, Traffic
 from safevar_sumo.sumo.traffic_world import TrafficWorld, start_frame
-from safevar_sumo.sumo.world import Api, SumoWorld
+from safevar_sumo.sumo.world import SumoWorld
 
 
 @np.errstate(all="ignore")
@@ -226,7 +227,7 @@ def open_points_world(
     networks = networks_for(scenarios)
 
     # SUMO cannot drive along tracks: bodies on them are put at their places.
-    create: Callable[[Api, int], SumoWorld] = SumoWorld
+    create: Create = SumoWorld
     if traffic is not None:
         speeds = _start_speeds(system.at_encounters(encounters).points, n)
         create = partial(

@@ -8,7 +8,7 @@ one, in which each vehicle starts elsewhere and meets a target that moves otherw
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING
@@ -34,6 +34,7 @@ from safevar_sumo.scenarios import (
     WorldScenario,
     searchable_in,
 )
+from safevar_sumo.scenarios.base import Quantities
 from safevar_sumo.scenarios.point import Points
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.study import PHASE, WORST, Domains, Study, unit_text
@@ -103,7 +104,7 @@ def _check_corners(study: Study, point: Point, ranges: Domains) -> None:
         ) from None
 
 
-def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
+def encounter(point: Point, values: Quantities) -> Point:
     """A point at other values of its own parameters, numbers, or arrays for N vehicles; its
     scenario is the same object if only weather and phase vary.
     """

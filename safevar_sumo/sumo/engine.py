@@ -118,6 +118,8 @@ def open_window(options: Sequence[str]) -> Iterator[Api]:
         yield api
 
 
+Create = Callable[[Api, int], SumoWorld]
+"""A function that returns the world of a simulation, with so many copies of the vehicle."""
 Start = Callable[[Sequence[str]], AbstractContextManager[Api]]
 """What starts SUMO with options: `open_in_process` or `open_window`."""
 
@@ -127,7 +129,7 @@ def open_world(
     files: CopiedNetwork,
     n: int,
     step: float | None = None,
-    create: Callable[[Api, int], SumoWorld] = SumoWorld,
+    create: Create = SumoWorld,
     start: Start = open_in_process,
 ) -> Iterator[SumoWorld]:
     """Start SUMO on `n` copies of a network and its traffic, with a time step of `step` [s], by
@@ -142,7 +144,7 @@ def open_world(
 def open_varied_world(
     networks: Sequence[NetworkFiles],
     step: float | None,
-    create: Callable[[Api, int], SumoWorld],
+    create: Create,
     start: Start,
 ) -> Iterator[SumoWorld]:
     """Start SUMO on a copy of one network for each of N traffics; see `open_world`."""

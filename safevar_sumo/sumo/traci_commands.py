@@ -10,7 +10,9 @@ from typing import Any
 
 from safevar_sumo.errors import InputError
 
-DRIVER_COMMANDS: Mapping[str, tuple[str]] = {
+Names = Mapping[str, tuple[str, ...]]
+"""Names of arguments by function, or of functions by domain."""
+DRIVER_COMMANDS: Names = {
     "setAccel": ("accel",),
     "setDecel": ("decel",),
     "setEmergencyDecel": ("decel",),
@@ -20,7 +22,7 @@ DRIVER_COMMANDS: Mapping[str, tuple[str]] = {
     "setSpeedFactor": ("factor",),
 }
 """Commands that change attributes of SUMO's driver: SUMO carries them out."""
-COMMANDS: Mapping[str, tuple[str, ...]] = {
+COMMANDS: Names = {
     "setSpeed": ("speed",),
     "slowDown": ("speed", "duration"),
     "setAcceleration": ("acceleration", "duration"),
@@ -40,7 +42,7 @@ MOTION = (
     "getLaneID",
     "getLanePosition",
 )
-SENSED: Mapping[str, tuple[str, ...]] = {
+SENSED: Names = {
     "vehicle": (
         *MOTION,
         "getLaneIndex",
@@ -86,7 +88,7 @@ OWN = (
 )
 """Functions that return values of the vehicle under test alone."""
 SUBSCRIPTIONS = ("subscribe", "getSubscriptionResults", "getAllSubscriptionResults")
-CALLS: Mapping[str, tuple[str, ...]] = {
+CALLS: Names = {
     "vehicle": (*LISTS, *SENSED["vehicle"], *CONSTANT, *OWN, *COMMANDS, *SUBSCRIPTIONS),
     "person": (*LISTS, *MOTION, *CONSTANT, *SUBSCRIPTIONS),
     "simulation": (

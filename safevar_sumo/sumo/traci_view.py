@@ -38,6 +38,8 @@ Value = Any
 Arguments = tuple[Value, ...]
 ActorValues = dict[str, Value]
 """What TraCI's functions return of an actor, by function; its length, too."""
+Actors = dict[str, dict[str, ActorValues]]
+"""Their values by domain and name."""
 Variables = dict[int, tuple[str, Arguments]]
 """Requested variables, each with its function and that function's arguments after the actor's id.
 """
@@ -86,7 +88,7 @@ class Snapshot(NamedTuple):
     """
 
     vehicle: ActorValues
-    actors: Mapping[str, dict[str, ActorValues]]
+    actors: Actors
     leader: tuple[str, float] | None
 
 
@@ -133,7 +135,7 @@ class SensedTraffic:
         vut = copied_id(copy, VUT)
         if vut not in self._world.driving:
             return Snapshot({}, {domain: {} for domain in SENSED}, None)
-        actors: dict[str, dict[str, ActorValues]] = {}
+        actors: Actors = {}
         for domain, functions in SENSED.items():
             functions_of_domain = getattr(api, domain)
             actors[domain] = {}
@@ -160,7 +162,7 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
     vehicle = snapshot.vehicle
     if not vehicle or (reach == math.inf and scale == 1):
         return snapshot
-    actors: dict[str, dict[str, ActorValues]] = {}
+    actors: Actors = {}
     for domain, members in snapshot.actors.items():
         actors[domain] = {}
         for name, values in members.items():

@@ -64,6 +64,9 @@ TORQUE_IDLE, TORQUE_BEND = map(np.array, (0.4, 2.4))  # of maxMotorTorque (assum
 SUBSTEPS = 2
 
 
+_Share = Annotated[float, Meta(ge=0, le=1)]
+
+
 class _Prepared(NamedTuple):
     """Constants of a run, SI except engine speeds in r/min; shape (N,) or ().
 
@@ -158,8 +161,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     }
 
     pedal_lag: Annotated[float, Meta(ge=0)]
-    wheel_mass_share: Annotated[float, Meta(ge=0, le=1)]
-    wheel_damping_share: Annotated[float, Meta(ge=0, le=1)]
+    wheel_mass_share: _Share
+    wheel_damping_share: _Share
     steering_design_angle: Annotated[float, Meta(gt=0, lt=90)] = 39.4
 
     def prepare(

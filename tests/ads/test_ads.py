@@ -158,7 +158,7 @@ def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None
         assert command.throttle.tolist() == pytest.approx(expected)
         assert command.brake.tolist() == [1.0, 0.0, 0.0]
     assert memory[0].nominal.mass == nominal.mass
-    assert not memory[0].nominal.tables().speeds.flags.writeable
+    assert not nominal.tables().speeds.flags.writeable
     assert memory[0].step == STEP
 
 
