@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from html import unescape
 from pathlib import Path
 from typing import Any, get_args
@@ -57,15 +58,16 @@ def on_page_content(html: str, **_: Any) -> str:
         convert,  # the rest of this module works without it
     )
 
+    def formula(display: str, match: re.Match[str]) -> str:
+        return str(convert(unescape(match[1].strip()), display=display))
+
     for mark, display in (
         (r"\\\((.*?)\\\)</span>", "inline"),
         (r"\\\[(.*?)\\\]</div>", "block"),
     ):
         html = re.sub(
             rf'<(?:span|div) class="arithmatex">{mark}',
-            lambda match, display=display: convert(
-                unescape(match[1].strip()), display=display
-            ),
+            partial(formula, display),
             html,
             flags=re.DOTALL,
         )
@@ -170,7 +172,7 @@ def study_keys() -> str:
     return "\n".join(parts)
 
 
-def models(classes: dict[str, Any]) -> Callable[[], str]:
+def models(classes: Mapping[str, Any]) -> Callable[[], str]:
     """Every model of a kind with its parameters."""
 
     def text() -> str:

@@ -23,7 +23,8 @@ from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.reference.rows import ReferenceData, evaluations_of, read_reference
 from safevar_sumo.scenarios.declared import read_study
-from safevar_sumo.search import Nsga2, Problem
+from safevar_sumo.search import Problem
+from safevar_sumo.search.genetic import Nsga2
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.vehicles import CharacteristicSet
 

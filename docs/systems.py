@@ -33,7 +33,7 @@ def limits_of(study: sv.Study) -> dict[str, str]:
     row = {"new": f"keeps {degree:.2f} m"}
     answer = sv.tolerance(study, unsafe="collision", fits=0)
     for one in answer.table("limits").itertuples():
-        domain = study.vehicle.characteristics[one.characteristic]
+        domain = study.vehicle.characteristics[str(one.characteristic)]
         ends = [
             (one.alone_low, domain.lower, one.together_low),
             (one.alone_high, domain.upper, one.together_high),
