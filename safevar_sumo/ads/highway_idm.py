@@ -4,7 +4,7 @@ the acceleration that it commands.
 
 from __future__ import annotations
 
-from safevar_sumo.ads.base import CORRIDOR, Pedals, ScalarAds, is_in_the_way, library
+from safevar_sumo.ads.base import CORRIDOR, ScalarAds, is_in_the_way, library
 from safevar_sumo.records import Observation
 
 ROAD_LENGTH = 10_000.0
@@ -42,7 +42,7 @@ class HighwayIdm(ScalarAds):
             vehicles.IDMVehicle(road, [0.0, 0.0]) for _ in range(2)
         )
 
-    def drive(self, observation: Observation) -> Pedals:
+    def drive(self, observation: Observation) -> tuple[float, float]:
         me = self._me
         front = self._front
         me.speed = float(observation.speed)

@@ -17,6 +17,7 @@ from safevar_sumo.records import (
     Evaluations,
     FloatArray,
     SimulationRuns,
+    nans,
 )
 from safevar_sumo.study import ORIGINAL_DEGREE, MetricsTable
 
@@ -126,7 +127,7 @@ class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         says; NaN where a run lacks what it needs.
         """
         rows = np.flatnonzero(~runs.lacking(*self.quantities))
-        values = np.full(len(runs), np.nan)
+        values = nans(len(runs))
         if len(rows) == len(values):
             values = self.function(runs, thresholds)
         elif len(rows):

@@ -18,6 +18,7 @@ from safevar_sumo.records import (
     FloatArray,
     Outcome,
     SimulationRuns,
+    nans,
 )
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
@@ -252,7 +253,7 @@ def post_encroachment_time(
     rate = np.where(leaves, speed, crossing)
     passes = (runs.outcome == Outcome.PASSED) & (lateral_gap >= 0)
     is_defined = passes & (leaves | comes) & (rate > STANDSTILL)
-    times = np.full(way.shape, np.nan)
+    times = nans(way.shape)
     np.divide(way, rate, out=times, where=is_defined)
     return times
 
@@ -336,6 +337,6 @@ UNSAFE_SHARE = Measure(
     unit="-",
     more_is_unsafe=True,
     # A single run has no share.
-    function=lambda runs, _: np.full(len(runs), np.nan),
+    function=lambda runs, _: nans(len(runs)),
     description="Share of the repeats of a run that are unsafe by the study's own criterion.",
 )

@@ -25,6 +25,7 @@ from safevar_sumo.records.driving import (
     Quantity as Quantity,
     TextArray as TextArray,
     finite_or_none as finite_or_none,
+    nans as nans,
 )
 from safevar_sumo.records.evaluations import (
     ROUNDING as ROUNDING,

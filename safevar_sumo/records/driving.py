@@ -52,6 +52,11 @@ for _constant in (ZERO, ALL_TRUE, UNDEFINED):
     _constant.flags.writeable = False
 
 
+def nans(shape: int | tuple[int, ...]) -> FloatArray:
+    """An array of undefined values."""
+    return np.full(shape, np.nan)
+
+
 def finite_or_none(value: float) -> float | None:
     """Make a number fit for JSON, which has neither NaN nor infinities: such a number becomes
     None.

@@ -15,6 +15,7 @@ from safevar_sumo.records.driving import (
     IntArray,
     NamedValues,
     TextArray,
+    nans,
 )
 from safevar_sumo.records.runs import Outcome
 from safevar_sumo.study import SAFETY_DEGREE
@@ -86,7 +87,7 @@ class Evaluations:
         """
         if name in ("f_safe", "f_diff", "f_num_diff"):
             return np.asarray(getattr(self, name))
-        return self.metrics.get(name, np.full(len(self), np.nan))
+        return self.metrics.get(name, nans(len(self)))
 
     @property
     def collided(self) -> BoolArray:
@@ -178,7 +179,7 @@ class Evaluations:
         cls, settings: FloatArray, outcome: str, metrics: Iterable[str], **further: Any
     ) -> Evaluations:
         """Evaluations of settings that were not simulated, all with one outcome."""
-        undefined = np.full(len(settings), np.nan)
+        undefined = nans(len(settings))
         return cls(
             settings=settings,
             outcome=np.full(len(settings), outcome, "U16"),

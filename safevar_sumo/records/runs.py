@@ -22,6 +22,7 @@ from safevar_sumo.records.driving import (
     FloatArray,
     IntArray,
     TextArray,
+    nans,
 )
 
 
@@ -293,7 +294,7 @@ class SimulationRuns:
         """
         trace = self.trace
         if not len(trace.time):
-            return np.full(len(self), np.nan)
+            return nans(len(self))
 
         vehicles = np.arange(len(self.collision_speed))
         last_sample = trace.last_active

@@ -19,7 +19,7 @@ from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import read_file
 from safevar_sumo.questions.subject import Results, load
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome, nans
 from safevar_sumo.results import UNKNOWN, write_imported
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import SAFETY_DEGREE, StudyLike
@@ -154,7 +154,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     if skipped := np.count_nonzero(~is_in_domain):
         warn(f"{path}: {skipped} rows with values outside the domains are left out")
 
-    undefined = np.full(len(table), np.nan)
+    undefined = nans(len(table))
     metrics = {name: numbers.get(name, undefined)[is_in_domain] for name in COLUMNS}
     metrics["ave_dece"] = np.abs(metrics["ave_dece"])
     # In the paper a collision has no TET and TIT.

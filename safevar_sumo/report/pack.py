@@ -20,8 +20,10 @@ from msgspec import Meta, Struct
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Scoring
 from safevar_sumo.output import MAX_UNPACKED, read_file, whole_file
+from safevar_sumo.plugins import Files
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results.identity import PACKAGES
+from safevar_sumo.results.manifest import OriginalRecord
 from safevar_sumo.study import Study
 
 DESCRIPTION = "pack.json"
@@ -67,11 +69,11 @@ class PackedManifest(Struct, frozen=True, forbid_unknown_fields=True):
 
     format: int
     study: Study
-    files: dict[str, str]
+    files: Files
     results: int
     platform: PackedPlatform
     versions: dict[str, str]
-    original: dict[str, bool | float | str | None]
+    original: OriginalRecord
     scoring: Scoring | None = None
 
 
@@ -79,7 +81,7 @@ class Description(Struct, frozen=True, forbid_unknown_fields=True):
     """The file `pack.json`; `files` are the sha256 of all other files of the pack, by name."""
 
     versions: dict[str, str]
-    files: dict[str, str]
+    files: Files
     studies: Annotated[list[PackedStudy], Meta(min_length=1)]
 
 

@@ -13,6 +13,7 @@ from msgspec import Struct
 
 from safevar_sumo.errors import InputError, SafevarError, about
 from safevar_sumo.output import read_file, whole_file
+from safevar_sumo.plugins import Files
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results.identity import FORMAT
 from safevar_sumo.study import Study, convert_table
@@ -134,6 +135,10 @@ def write_manifest(directory: Path, manifest: JsonObject) -> None:
     )
 
 
+OriginalRecord = dict[str, bool | float | str | None]
+"""The results of the original vehicle by name."""
+
+
 class _Manifest(Struct):
     """What a reader of a manifest relies on; imported results have neither `files` nor
     `folders`.
@@ -141,8 +146,8 @@ class _Manifest(Struct):
 
     study: Study
     versions: dict[str, str]
-    original: dict[str, bool | float | str | None]
-    files: dict[str, str] = {}
+    original: OriginalRecord
+    files: Files = {}
     folders: list[str] = []
 
 

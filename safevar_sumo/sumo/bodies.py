@@ -21,6 +21,7 @@ from safevar_sumo.records import (
     IntArray,
     Quantity,
     TextArray,
+    nans,
 )
 from safevar_sumo.scenarios import Scene, Track, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
@@ -203,7 +204,7 @@ class FirstContacts:
     def __init__(self, n: int, is_tested: BoolArray) -> None:
         self._is_tested = is_tested
         self._was_inside = np.zeros(n, bool)
-        self.first = Contact(np.full(n, "", "U5"), np.full(n, np.nan), np.zeros(n))
+        self.first = Contact(np.full(n, "", "U5"), nans(n), np.zeros(n))
 
     def count(self, world: VehicleWorld, hits: Hits, scene: Scene) -> Hits:
         """Process the hits of one sample; returns those that are collisions: speeds [m/s] by

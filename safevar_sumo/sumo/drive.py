@@ -27,6 +27,7 @@ from safevar_sumo.records import (
     SimulationRuns,
     TextArray,
     Trace,
+    nans,
 )
 from safevar_sumo.scenarios import VUT, Point, Scene
 from safevar_sumo.sumo.bodies import FirstContacts, Hits, VehicleStates, VehicleWorld
@@ -304,8 +305,8 @@ class _Outcomes:
     def __init__(self, n: int) -> None:
         self.is_open = np.ones(n, bool)
         self.is_checked = np.ones(n, bool)
-        self.collision_speed = np.full(n, np.nan)
-        self.warning_ttc = np.full(n, np.nan)
+        self.collision_speed = nans(n)
+        self.warning_ttc = nans(n)
         self._has_moved = np.zeros(n, bool)
         self._has_stopped = np.zeros(n, bool)
         self._is_over = np.zeros(n, bool)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.records import BoolArray, FloatArray, IntArray
+from safevar_sumo.records import BoolArray, FloatArray, IntArray, nans
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.scenarios.roads import Frame
@@ -64,7 +64,7 @@ class RecordedWorld:
         self._sizes = np.array([(film.length, film.width) for film in films]).reshape(
             -1, 2
         )
-        self._motion = np.full((n_samples, n_scenes, len(films), 5), np.nan)
+        self._motion = nans((n_samples, n_scenes, len(films), 5))
         for actor, film in enumerate(films):
             self._motion[: len(film.motion), :, actor] = film.motion.reshape(
                 len(film.motion), -1, 5

@@ -40,6 +40,7 @@ from safevar_sumo.records import (
     Outcome,
     SimulationRuns,
     Trace,
+    nans,
 )
 from safevar_sumo.scenarios import Simulator
 from safevar_sumo.scenarios.simulated import (
@@ -280,7 +281,7 @@ def _runs_of(
         """A quantity of all runs, shape (T, N), NaN where a run does not have it; after its end, a
         run keeps its last value.
         """
-        values = np.full((len(samples), len(traces)), np.nan)
+        values = nans((len(samples), len(traces)))
         for row, trace in enumerate(traces):
             if name in trace:
                 values[:, row] = trace[name][np.minimum(samples, lengths[row] - 1)]

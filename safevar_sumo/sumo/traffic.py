@@ -17,6 +17,7 @@ from safevar_sumo.records import (
     IntArray,
     Quantity,
     Trace,
+    nans,
 )
 from safevar_sumo.scenarios import Point, Scene, Track, TrackScenario
 from safevar_sumo.scenarios.roads import Frame
@@ -340,7 +341,7 @@ class Traffic:
         shape = trace.speed.shape
         n_rows = max(BLOCK // trace.speed.shape[1], 1)
         distance = np.full(shape, np.inf)
-        closing = np.full(shape, np.nan)
+        closing = nans(shape)
         in_conflict = np.zeros(shape, bool)
         for start in range(0, shape[0], n_rows):
             samples = slice(start, min(start + n_rows, shape[0]))

@@ -13,7 +13,14 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.plugins import user_errors
-from safevar_sumo.records import ROUNDING, FloatArray, IntArray, Outcome, SimulationRuns
+from safevar_sumo.records import (
+    ROUNDING,
+    FloatArray,
+    IntArray,
+    Outcome,
+    SimulationRuns,
+    nans,
+)
 from safevar_sumo.sumo.batch import (
     drive_all,
     observer_of,
@@ -49,9 +56,7 @@ def drive_again(
     """
     trace = runs.trace
     n = len(runs)
-    values = {
-        name: np.full(trace.speed.shape, np.nan) for name in (*COMPARED, "collision")
-    }
+    values = {name: nans(trace.speed.shape) for name in (*COMPARED, "collision")}
     vehicles, encounters = system.split(settings)
     on_road = system.at_encounters(encounters)
     point = on_road.points[0]
@@ -148,7 +153,7 @@ def _compare(
     difference.
     """
     trace = runs.trace
-    collision = np.full(trace.speed.shape, np.nan)
+    collision = nans(trace.speed.shape)
     collision[trace.last_active, np.arange(len(settings))] = runs.collision_speed
     recorded = {
         name: np.broadcast_to(getattr(trace, name), trace.speed.shape)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError
-from safevar_sumo.records import BoolArray, FloatArray, FloatOrArray
+from safevar_sumo.records import BoolArray, FloatArray, FloatOrArray, nans
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.scenarios.roads import Coordinates, Frame, lane_through
@@ -63,7 +63,7 @@ class SumoWorld:
         """Places of persons by actor; beside vehicles that have left the road the last ones, if a
         person has left, too.
         """
-        self._commanded_speeds = np.full(n, np.nan)
+        self._commanded_speeds = nans(n)
         self._struck_ids: dict[int, str] = {}
         """Ids of the actors that the vehicles under test collided with last, by copy."""
 
@@ -277,7 +277,7 @@ class SumoWorld:
             copy, name = copy_and_name(id_)
             domain = self._domain_of(id_)
             if name not in tracks:
-                motion = np.full((length, self.n, 5), np.nan)
+                motion = nans((length, self.n, 5))
                 tracks[name] = Film(
                     motion,
                     domain is self.api.person,

@@ -19,6 +19,7 @@ from safevar_sumo.records import (
     FloatArray,
     FloatOrArray,
     Observation,
+    nans,
 )
 
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
@@ -283,7 +284,7 @@ class SimulatedVehicle(Vehicle):
 
     def sumo_type(self, prepared: Characteristics) -> SumoType:
         """Undefined: no vehicle of SUMO's stands for it."""
-        undefined = np.full(1, np.nan)
+        undefined = nans(1)
         return SumoType(undefined, undefined, undefined, undefined, undefined)
 
 
