@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from functools import reduce
 from typing import Any
 
-from safevar_sumo.ads.base import CORRIDOR, Pedals, ScalarAds, is_in_the_way, library
+from safevar_sumo.ads.base import CORRIDOR, ScalarAds, is_in_the_way, library
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Observation
 from safevar_sumo.shipped import shipped_table
@@ -88,7 +88,7 @@ class AdRss(ScalarAds):
             self._library = library("ad_rss", "ad-rss", "ad_rss")
         self._rule: _Rule | None = None
 
-    def drive(self, observation: Observation) -> Pedals:
+    def drive(self, observation: Observation) -> tuple[float, float]:
         if self.cruise_speed is None:
             self.cruise_speed = float(observation.speed)
         self._rule = self._rule or _Rule(self._library, self)
