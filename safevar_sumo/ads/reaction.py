@@ -223,8 +223,8 @@ class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):
         is_aware = is_endangered | (is_known & is_same & blocks)
         # The time for which a new danger has lasted [s]: that since `nearness` was 0 in this step.
         old_nearness = np.where(is_same, memory.nearness, 0.0)
-        least = np.full_like(observation.gap, -LARGEST_GAP)
-        nearness = np.maximum(danger.nearness, least)
+        lower_limit = np.full_like(observation.gap, -LARGEST_GAP)
+        nearness = np.maximum(danger.nearness, lower_limit)
         rise = np.maximum(nearness, LEAST_DIVISOR)
         part_of_step = 1 / (1 - np.minimum(old_nearness, 0.0) / rise)
         new_time = np.maximum(
