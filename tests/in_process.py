@@ -29,6 +29,7 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.terminal import show_no_progress
 from tests.made_up import MISSING
+from tests.manual import PROGRAM
 
 SLOW = pytest.mark.slow
 LONG = (
@@ -110,9 +111,9 @@ class CommandOutput(NamedTuple):
     stderr: str
 
 
-def run(*arguments: str, expect: int | None = 0) -> CommandOutput:
-    """Run a command as a user types it; its exit code must be `expect`, unless that is None.
-    Afterwards, unload modules that it took from the test's folder.
+def run(typed: str, *arguments: str, expect: int | None = 0) -> CommandOutput:
+    """Run a command as a user types it, with further arguments; its exit code must be `expect`,
+    unless that is None. Afterwards, unload modules that it took from the test's folder.
     """
     out = io.StringIO()
     err = io.StringIO()
@@ -125,7 +126,7 @@ def run(*arguments: str, expect: int | None = 0) -> CommandOutput:
         redirect_stderr(err),
         pytest.MonkeyPatch.context() as patch,
     ):
-        patch.setattr(sys, "argv", ["safevar-sumo", *arguments])
+        patch.setattr(sys, "argv", ["safevar-sumo", *shlex.split(typed), *arguments])
         patch.setattr(
             os, "_exit", sys.exit
         )  # the program calls it if a thread still runs; this process must continue
@@ -145,21 +146,21 @@ def run(*arguments: str, expect: int | None = 0) -> CommandOutput:
     return CommandOutput(out.getvalue(), err.getvalue())
 
 
-def json_of(*arguments: str, expect: int = 0) -> Any:
+def json_of(typed: str, *arguments: str, expect: int = 0) -> Any:
     """The JSON that a command prints."""
-    return json.loads(run(*arguments, "--json", expect=expect).stdout)
+    return json.loads(run(typed, *arguments, "--json", expect=expect).stdout)
 
 
 def numbers_of(command: str) -> Any:
     """The numbers of a printed command."""
-    return json_of(*shlex.split(command)[3:])["numbers"]
+    return json_of(command.removeprefix(PROGRAM))["numbers"]
 
 
-def refused(*arguments: str, message: tuple[str, ...]) -> None:
+def refused(typed: str, *message: str) -> None:
     """The command must end with exit code 2 and print, warnings, notes and progress apart, all of
     `message` in one or two lines that are not too long, or a line for each mistake.
     """
-    output = run(*arguments, expect=2)
+    output = run(typed, expect=2)
     for part in message:
         assert part in output.stderr, output.stderr
     assert "Traceback" not in output.stderr

@@ -163,7 +163,7 @@ def test_numbers_that_its_library_refuses_are_refused_without_its_log(
         file.write(
             f'extends = "wear_rss"\nname = "own"\n[ads.parameters]\n{name} = {value}\n'
         )
-    first, second = run("simulate", "own.toml", expect=2).stderr.strip().splitlines()
+    first, second = run("simulate own.toml", expect=2).stderr.strip().splitlines()
     assert first.endswith(f"own.toml: ads.parameters.{name} = {float(value):g}")
     assert second == f"expected: {legal}"
     assert capfd.readouterr().err.count("[error]") == 0

@@ -379,22 +379,22 @@ def test_a_driving_system_that_does_not_end_is_a_finding_in_time(
         "from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
         "    def drive(self, seen):\n        while True:\n            pass\n"
     )
-    output = run("check", "mine:Mine", expect=1).stdout
+    output = run("check mine:Mine", expect=1).stdout
     assert "took longer than the time limit of 0.5 s" in " ".join(output.split())
 
 
 def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) -> None:
     (in_tmp / "mine.py").write_text(DEFECTS["out of range"].module)
     (in_tmp / "mine.toml").write_text(STUDY_OF["ads"])
-    answer = json.loads(run("check", "mine.toml", "--json", expect=1).stdout)
+    answer = json.loads(run("check mine.toml --json", expect=1).stdout)
     assert answer["numbers"]["passed"] is False
     (finding,) = answer["tables"]["findings"]["rows"]
     assert {"finding", "where", "input", "expected"} <= set(finding)
-    text = run("check", "mine:Mine", "--format", "csv", expect=1).stdout
+    text = run("check mine:Mine --format csv", expect=1).stdout
     assert "ads.model = 'mine:Mine' returned brake = 100.0 from drive" in text
     assert "mine.py:11" in text
     (in_tmp / "mine.py").write_text(SCALAR.replace("BODY", "self.far = seen.gap"))
-    passed = json_of("check", "mine.toml")
+    passed = json_of("check mine.toml")
     assert (passed["numbers"]["passed"], passed["tables"]["findings"]["rows"]) == (
         True,
         [],
@@ -404,11 +404,11 @@ def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) 
 @SLOW
 @pytest.mark.parametrize(
     ("longest", "options", "vehicles"),
-    [(1e6, (), 100), (0.0, (), 3), (0.0, ("--vehicles", "7"), 7)],
+    [(1e6, "", 100), (0.0, "", 3), (0.0, "--vehicles 7", 7)],
 )
 def test_it_says_how_many_vehicles_it_has_simulated_and_what_it_has_not_tried(
     longest: float,
-    options: tuple[str, ...],
+    options: str,
     vehicles: int,
     in_tmp: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -418,7 +418,7 @@ def test_it_says_how_many_vehicles_it_has_simulated_and_what_it_has_not_tried(
     (in_tmp / "mine.py").write_text(SCALAR.replace("BODY", "pass"))
     test = '[[matrix.tests]]\nname = "it"\nover = { turns_after = [0.5, 0.6, 0.7, 0.8, 0.9] }\n'
     (in_tmp / "mine.toml").write_text(STUDY_OF["ads"] + test)
-    answer = json_of("check", "mine.toml", *options)
+    answer = json_of(f"check mine.toml {options}")
     assert answer["numbers"] == {"passed": True, "vehicles": vehicles, "points": 3}
     assert (
         f"{vehicles} vehicles in 3 test cases of the study. The check left out 2 further test"

@@ -5,6 +5,7 @@ and kill; no command outlives its test, however the test ends.
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -33,7 +34,7 @@ running = []
 """Processes that a test has started."""
 
 
-def started(*arguments: str, batch: int | None = None, **options: object) -> Process:
+def started(typed: str, batch: int | None = None, **options: object) -> Process:
     """Start a command in its own process group and with Ctrl-C as a shell does, whatever this
     process ignores; with `batch`, in batches of at most so many settings.
     """
@@ -42,7 +43,7 @@ def started(*arguments: str, batch: int | None = None, **options: object) -> Pro
     )
     running.append(
         subprocess.Popen(
-            [sys.executable, *program, *arguments],
+            [sys.executable, *program, *shlex.split(typed)],
             stdout=subprocess.PIPE,  # type: ignore[call-overload]
             stderr=subprocess.PIPE,
             text=True,
@@ -112,9 +113,9 @@ def killed(process: Process) -> None:
     until(lambda: not left_of_group(process))
 
 
-def study(*arguments: str, expect: int = 0) -> str:
+def study(typed: str, expect: int = 0) -> str:
     """Search the small study in this process, without a summary; returns the text on stderr."""
-    return run("study", "small.toml", "--quiet", *arguments, expect=expect).stderr
+    return run(f"study small.toml --quiet {typed}", expect=expect).stderr
 
 
 def solutions(out: str | Path) -> bytes:

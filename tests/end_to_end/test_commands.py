@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("small")
 
 @pytest.mark.parametrize("study", ["rain", "lgsvl", "native"])
 def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> None:
-    run("simulate", study, "--trace", "trace.csv")
+    run(f"simulate {study} --trace trace.csv")
     frame = pd.read_csv("trace.csv")
     assert list(frame.columns) == [
         "time [s]",
@@ -63,24 +63,14 @@ def test_a_title_is_no_markup(in_tmp: Path) -> None:
     Path("mine.toml").write_text(
         'extends = "smoke"\nname = "mine"\ntitle = "[red]x[/blue] {$"\n'
     )
-    assert "[red]x[/blue]" in run("simulate", "mine.toml", "--details").stdout
-    run(
-        "study",
-        "mine.toml",
-        "--evaluations",
-        "10",
-        "--runs",
-        "1",
-        "--algorithms",
-        "rs",
-        "--quiet",
-    )
+    assert "[red]x[/blue]" in run("simulate mine.toml --details").stdout
+    run("study mine.toml --evaluations 10 --runs 1 --algorithms rs --quiet")
 
 
 @SLOW
 def test_a_study_ends_with_a_summary(in_tmp: Path) -> None:
-    assert "Next: python -m safevar_sumo explain smoke" in run("study", "smoke").stdout
-    output = run("study", "smoke", "--details").stdout
+    assert "Next: python -m safevar_sumo explain smoke" in run("study smoke").stdout
+    output = run("study smoke --details").stdout
     for part in (
         "NSGA-II",
         "None of the 8 tests of RQ1 can be significant: after Holm's correction, a test needs at",
@@ -97,7 +87,7 @@ def test_parts_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     assert not Path("out/solutions.csv").exists()
     assert len(load_runs("out").solutions.groupby(["algorithm", "run"])) == 6
     before = written(Path("out"))
-    study("--out", "out")
+    study("--out out")
     assert written(Path("out")) == before, "nothing was left to simulate"
     assert solutions("out") == solutions(whole)
     sv.run("small.toml", "alone", only=keys[1:2])
@@ -112,23 +102,14 @@ def test_parts_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
 
 @SLOW
 def test_results_of_another_size_are_continued_with_a_warning(copied: Path) -> None:
-    assert "warning" not in study("--out", "out")
-    longer = study("--out", "out", "--evaluations", "160")
+    assert "warning" not in study("--out out")
+    longer = study("--out out --evaluations 160")
     assert (
         "out: each run had 150 evaluations before and has 160 now: an id such as nsga2:0:0 may name"
         " another solution" in longer
     )
     assert "left out" not in longer
-    fewer = study(
-        "--out",
-        "out",
-        "--evaluations",
-        "160",
-        "--runs",
-        "1",
-        "--algorithms",
-        "nsga2,rs",
-    )
+    fewer = study("--out out --evaluations 160 --runs 1 --algorithms nsga2,rs")
     assert (
         "out: earlier runs are left out of the results: nsga2-01, rs-01, safe_fuzzer-00,"
         " safe_fuzzer-01" in fewer
@@ -141,10 +122,10 @@ def test_the_end_of_a_study_counts_what_was_simulated_and_quiet_prints_only_what
     whole: Path,
 ) -> None:
     simulated = len(load_runs(whole).evaluations)
-    again = ("study", "small.toml", "--out", str(whole))
-    assert run(*again, "--quiet").stdout == ""
-    assert json_of(*again, "--quiet")["numbers"]["evaluations"] == simulated
-    assert "NSGA-II" in run(*again, "--quiet", "--table", "algorithms").stdout
+    again = f"study small.toml --out {whole} --quiet"
+    assert run(again).stdout == ""
+    assert json_of(again)["numbers"]["evaluations"] == simulated
+    assert "NSGA-II" in run(f"{again} --table algorithms").stdout
 
 
 ADS = """
@@ -226,11 +207,11 @@ def test_code_and_named_files_count_and_every_command_that_simulates_results_ref
         Path(name).write_text(text)
     Path("elsewhere").mkdir()
     monkeypatch.chdir("elsewhere")
-    run("study", "../mine.toml", "--out", "../out", "--quiet")
+    run("study ../mine.toml --out ../out --quiet")
     assert {*files, "my_ads.py", "my_map.py"} <= set(
         read_manifest(Path("../out"))["files"]
     )
-    run("study", "../mine.toml", "--out", "../out", "--runs", "2", "--quiet")
+    run("study ../mine.toml --out ../out --runs 2 --quiet")
     listed = [
         path.relative_to("../out").as_posix()
         for path in Path("../out").rglob("*")
@@ -267,7 +248,7 @@ def test_a_search_says_how_fast_an_original_collides(in_tmp: Path) -> None:
         'name = "fog"\nroad_friction = 1.0\nvisibility = 1.0\nrecognition_delay = 1.5'
     )
     Path("late.toml").write_text(f'extends = "smoke"\n[weather]\n{weather}\n')
-    searched = run("study", "late.toml", "--runs", "1", "--evaluations", "10", "--json")
+    searched = run("study late.toml --runs 1 --evaluations 10 --json")
     speed = sv.simulate("late.toml").collision_speed
     assert speed > 1
     breach = f"collides at {speed:.2f} m/s"
@@ -276,15 +257,7 @@ def test_a_search_says_how_fast_an_original_collides(in_tmp: Path) -> None:
         f"The original vehicle is already unsafe: it {breach}."
     )
     demanded = run(
-        "study",
-        "smoke",
-        "--runs",
-        "1",
-        "--evaluations",
-        "10",
-        "--json",
-        "--unsafe",
-        "ave_dece >= 2",
+        "study smoke --runs 1 --evaluations 10 --json --unsafe 'ave_dece >= 2'"
     )
     verdict = json.loads(demanded.stdout)["verdict"]
     assert verdict.startswith(

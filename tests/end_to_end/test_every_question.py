@@ -39,7 +39,7 @@ WORN = {"worn": "brakeTorque=0.55", "carla": "tireFric=1", "lgsvl": "tire_fricti
 
 def answered(typed: str, *, must: bool = False) -> str:
     """The screen that a command prints; empty if the question is refused with a reason."""
-    output = run(*shlex.split(typed), expect=None)
+    output = run(typed, expect=None)
     text = output.stdout
     assert "Traceback" not in output.stderr, output.stderr
     if not text:
@@ -205,7 +205,7 @@ def test_every_question_about_each_kind_of_study_has_an_answer_or_a_reason(
     # The usual questions where they take little time, as none has an answer.
     ask = "" if name == "stop" else '--ask "rules --samples 16"'
     answered(f"evidence results {ask} --out it.zip", must=True)
-    assert json_of("verify", "it.zip", "--run-code")["numbers"]["passed"]
+    assert json_of("verify it.zip --run-code")["numbers"]["passed"]
 
 
 @SLOW
@@ -228,4 +228,4 @@ def test_the_speed_of_a_packed_sheet_is_that_of_its_own_limits() -> None:
             b"<dt>Greatest speed</dt><dd>The car is safe from 30 up to 60 km/h, the highest"
             in pack.read("1-july/report.html")
         )
-    assert json_of("verify", "it.zip")["numbers"]["passed"]
+    assert json_of("verify it.zip")["numbers"]["passed"]

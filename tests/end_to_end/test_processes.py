@@ -43,13 +43,13 @@ def test_killed_six_times_at_random_moments_and_resumed(whole: Path) -> None:
     moments = random.Random(4)
     for _ in range(6):
         before = written(OUT)
-        process = started("study", "small.toml", "--out", "out", "--jobs", "1", batch=1)
+        process = started("study small.toml --out out --jobs 1", batch=1)
         until(lambda: written(OUT) > before, process)  # noqa: B023
         time.sleep(moments.uniform(0, 0.1))
         assert process.poll() is None, "the study is too short to be killed so often"
         killed(process)
     assert not (OUT / "solutions.csv").exists()
-    run("study", "small.toml", "--quiet", "--out", "out")
+    run("study small.toml --quiet --out out")
     assert solutions(OUT) == solutions(whole)
 
 
@@ -67,9 +67,7 @@ def assert_ends_with_the_results(process: Process, whole: Path) -> None:
 @SLOW
 @pytest.mark.parametrize("when", ["mid-run", "loading", "twice"])
 def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
-    process = started(
-        "study", "rain", "--out", "out", "--jobs", "1", "--engine", "sumo"
-    )
+    process = started("study rain --out out --jobs 1 --engine sumo")
     if when == "loading":
         until(
             lambda: any(
@@ -98,17 +96,7 @@ def test_sigterm_ends_everything_as_ctrl_c_does_and_leaves_nothing(
 ) -> None:
     Path("temporary").mkdir()
     environment = {**os.environ, "TMPDIR": str(in_tmp / "temporary")}
-    process = started(
-        "study",
-        "rain",
-        "--out",
-        "out",
-        "--jobs",
-        "1",
-        "--engine",
-        "sumo",
-        env=environment,
-    )
+    process = started("study rain --out out --jobs 1 --engine sumo", env=environment)
     until_it_writes(process)
     process.terminate()
     errors = ended(process, 130)
@@ -186,7 +174,7 @@ def test_a_worker_that_hangs_does_not_outlive_a_killed_study() -> None:
     Path("dozing.toml").write_text(
         'extends = "small.toml"\nname = "dozing"\n[ads]\nmodel = "my_ads:Dozing"\n'
     )
-    process = started("study", "dozing.toml", "--out", "out")
+    process = started("study dozing.toml --out out")
     until(Path("dozing").exists, process)
     killed(process)
 
@@ -215,7 +203,7 @@ def test_user_code_that_its_workers_die_of_is_an_error_with_its_line(
         'extends = "small.toml"\nname = "deadly"\n[ads]\nmodel ='
         ' "my_ads:Deadly"\n[search]\ntime_limit = 5.0\n'
     )
-    process = started("study", "deadly.toml", "--out", "out", "--jobs", "1", batch=1)
+    process = started("study deadly.toml --out out --jobs 1", batch=1)
     until_it_writes(process)
     Path("now").touch()
     errors = ended(process, 2)
@@ -305,9 +293,7 @@ def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
         ),
         workers[0],
     )
-    process = started(
-        "study", "small.toml", "--cluster", address, "--out", "out", batch=1
-    )
+    process = started(f"study small.toml --cluster {address} --out out", batch=1)
     until(lambda: written(OUT) > 0 and all(busy(one) for one in workers), process)
     assert process.poll() is None, "too late: the study is over"
     killed(workers[0])
@@ -353,35 +339,20 @@ def test_questions_on_a_cluster_have_the_bytes_of_one_process(
         "rules wall.toml --samples 500",
         "tolerance wall.toml --simulations 300",
     ):
-        alone = run(*command.split(), "--jobs", "1", "--fresh")
-        there = run(*command.split(), "--cluster", address, "--fresh")
+        alone = run(f"{command} --jobs 1 --fresh")
+        there = run(f"{command} --cluster {address} --fresh")
         assert there.stdout == alone.stdout, command
     assert {*Path("numbers").read_text().split()} == {"0", "1"}
-    run("study", "wall.toml", "--out", "walls")
+    run("study wall.toml --out walls")
     for command in ("report walls --out", "evidence walls --out"):
         ending = "html" if "report" in command else "zip"
-        run(
-            *command.split(),
-            f"1.{ending}",
-            "--jobs",
-            "1",
-            "--ask",
-            "rules --samples 300",
-        )
-        run(
-            *command.split(),
-            f"2.{ending}",
-            "--cluster",
-            address,
-            "--ask",
-            "rules --samples 300",
-        )
+        asked = "--ask 'rules --samples 300'"
+        run(f"{command} 1.{ending} --jobs 1 {asked}")
+        run(f"{command} 2.{ending} --cluster {address} {asked}")
         assert Path(f"1.{ending}").read_bytes() == Path(f"2.{ending}").read_bytes()
 
     # A worker dies at work.
-    process = started(
-        "rules", "wall.toml", "--samples", "900", "--cluster", address, "--json"
-    )
+    process = started(f"rules wall.toml --samples 900 --cluster {address} --json")
     time.sleep(3)
     killed(workers[0])
     process.wait(60)
@@ -402,7 +373,7 @@ def test_a_worker_with_another_file_ends_a_question(
     wrong = "safevar_sumo.campaign.batches"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(f"{wrong}.package_digest", lambda: "other")
-        refused("risk", "wall.toml", "--cluster", address, message=("has other code",))
+        refused(f"risk wall.toml --cluster {address}", "has other code")
     with pytest.MonkeyPatch.context() as patch:
         now = batches.manifest_now
 
@@ -412,4 +383,4 @@ def test_a_worker_with_another_file_ends_a_question(
 
         patch.setattr(f"{wrong}.manifest_now", edited)
         told = ("version of numpy was '1.0'", "a worker has another one")
-        refused("risk", "wall.toml", "--cluster", address, message=told)
+        refused(f"risk wall.toml --cluster {address}", *told)

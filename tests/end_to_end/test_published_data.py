@@ -48,7 +48,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @SLOW
 def test_validate_agrees_perfectly_with_itself(data: Path) -> None:
-    output = json_of("validate", "sun", str(data))
+    output = json_of(f"validate sun {data}")
     assert (output["question"], output["study"], output["numbers"]["rows"]) == (
         "validate",
         "sun",
@@ -74,13 +74,13 @@ def test_validate_agrees_perfectly_with_itself(data: Path) -> None:
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A study of two algorithms and two runs, as the command leaves it."""
     place = tmp_path_factory.mktemp("study") / "small"
-    run("study", "smoke", "--evaluations", "100", "--out", str(place), "--quiet")
+    run(f"study smoke --evaluations 100 --out {place} --quiet")
     return place
 
 
 @SLOW
 def test_figures_are_png_and_pdf_files(results: Path, in_tmp: Path) -> None:
-    run("tables", str(results), "--figures", "pictures", "--plot", "counts.svg")
+    run(f"tables {results} --figures pictures --plot counts.svg")
     files = sorted(Path("pictures").iterdir())
     assert len(files) == 10
     starts = {".png": b"\x89PNG", ".pdf": b"%PDF"}
@@ -95,22 +95,20 @@ def test_figures_are_png_and_pdf_files(results: Path, in_tmp: Path) -> None:
 def test_tables_prints_what_answers_the_questions_and_all_of_them_if_asked(
     results: Path,
 ) -> None:
-    short, whole = (
-        run("tables", str(results), *more).stdout for more in ((), ("--details",))
-    )
+    short, whole = (run(f"tables {results}{end}").stdout for end in ("", " --details"))
     for title in ("RQ2 over runs", "RQ3.1", "Medians over runs"):
         assert title not in short
         assert title in whole
     assert len(short.splitlines()) <= 30
     assert "By --table NAME: rq1, rq2." in whole
-    assert "RQ1 as published" in run("tables", str(results), "--table", "rq1").stdout
-    assert "rq3.2" in json_of("tables", str(results))["tables"]
+    assert "RQ1 as published" in run(f"tables {results} --table rq1").stdout
+    assert "rq3.2" in json_of(f"tables {results}")["tables"]
 
 
 def test_imported_solutions_are_filtered_and_counted_anew(
     data: Path, in_tmp: Path
 ) -> None:
-    run("import", "sun", "--out", "imported", "--nsga2", str(data), "--rs", str(data))
+    run(f"import sun --out imported --nsga2 {data} --rs {data}")
     assert sorted(path.name for path in Path("imported").iterdir()) == [
         "manifest.json",
         "solutions.csv",
@@ -121,7 +119,7 @@ def test_imported_solutions_are_filtered_and_counted_anew(
     pd.read_csv(data).assign(
         mass=lambda rows: rows["mass"].where(rows.index > 0, 9e9)
     ).to_csv("heavy.csv", index=False)
-    output = run("import", "sun", "--out", "imported", "--rs", "heavy.csv")
+    output = run("import sun --out imported --rs heavy.csv")
     assert "1 rows with values outside the domains are left out" in output.stderr
     assert "39 solutions" in output.stdout
     original = CharacteristicSet.of(load_study("sun")).original
@@ -142,31 +140,28 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(
     shutil.copytree(results, "part")
     Path("part/runs/rs-01.jsonl").unlink()
     Path("part/solutions.csv").unlink()
-    output = json_of("tables", "part")
+    output = json_of("tables part")
     assert "incomplete: 1 of 2 runs of rs are finished" in str(
         output["tables"]["remarks"]
     )
-    assert (
-        "1 of 2 runs of rs"
-        in run("rules", "part", "--samples", "64", "--jobs", "1").stderr
-    )
+    assert "1 of 2 runs of rs" in run("rules part --samples 64 --jobs 1").stderr
     records = output["tables"]["rq2"]["rows"]
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
     assert "budget" not in output["tables"]
-    assert {*json_of("tables", "part", "--table", "budget")["tables"]} == {
+    assert {*json_of("tables part --table budget")["tables"]} == {
         "budget",
         "remarks",
     }
     Path("part/runs/rs-00.jsonl").unlink()
-    assert "only nsga2" in run("tables", "part", "--table", "rq2").stdout
-    refused("tables", "part", "--table", "budget", message=("only nsga2",))
+    assert "only nsga2" in run("tables part --table rq2").stdout
+    refused("tables part --table budget", "only nsga2")
     for path in Path("part/runs").glob("nsga2-*"):
         path.write_bytes(path.read_bytes()[:-20])
-    told = ("no run is finished", "`study` goes on where it was interrupted")
-    refused("tables", "part", message=told)
+    goes_on = "`study` goes on where it was interrupted"
+    refused("tables part", "no run is finished", goes_on)
     for path in Path("part/runs").glob("nsga2-*"):
         path.unlink()
-    answer = run("explain", "part", "--jobs", "1")
+    answer = run("explain part --jobs 1")
     assert "none of the examined vehicles is unsafe" in answer.stdout
     assert "nan %" not in answer.stdout
     assert answer.stderr.count("warning") == 1, (

@@ -121,7 +121,7 @@ def test_a_lone_surrogate_in_an_error_of_the_user_can_be_printed(
         SCALAR
         + "    def drive(self, seen):\n        raise ValueError('bad \\ud800 text')\n"
     )
-    assert run("check", str(folder / "mine.toml"), expect=1).stdout.encode()
+    assert run(f"check {folder / 'mine.toml'}", expect=1).stdout.encode()
 
 
 PRESSED = (
@@ -172,8 +172,7 @@ def test_a_command_is_interrupted_by_ctrl_c(
     mine(SCALAR + PRESSED.format(name))
     with handled_by_default(name):
         assert (
-            "interrupted"
-            in run("simulate", str(folder / "mine.toml"), expect=130).stderr
+            "interrupted" in run(f"simulate {folder / 'mine.toml'}", expect=130).stderr
         )
 
 

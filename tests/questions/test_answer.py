@@ -367,11 +367,9 @@ def test_the_question_that_the_manual_adds_from_outside(
     assert "Unsafe at an end of the domain: " in failed.output
     assert "failed: unsafe_ends = " in failed.output
     refused(
-        "rules",
-        "smoke",
-        "--samples",
-        "0",
-        message=("--samples: 0", "a whole number from 1 to 100,000,000"),
+        "rules smoke --samples 0",
+        "--samples: 0",
+        "a whole number from 1 to 100,000,000",
     )
     answer = json.loads(
         CliRunner().invoke(commands, [*command, "--format", "json"]).stdout

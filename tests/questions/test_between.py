@@ -157,8 +157,8 @@ def test_limits_hold_at_whole_speeds_between_the_tests(ahead: Study) -> None:
     """Corners and random cars: what the original survives with a parameter set, all of them survive
     with it.
     """
-    options = "--characteristics", "treadDepth,sensorLatency", "--fits", "3"
-    limits = json_of("tolerance", "ahead.toml", *options)["tables"]["limits"]
+    options = "--characteristics treadDepth,sensorLatency --fits 3"
+    limits = json_of(f"tolerance ahead.toml {options}")["tables"]["limits"]
     members = assemble(ahead).characteristics
     ends = np.array([members.original, members.original])
     for row in limits["rows"]:

@@ -78,24 +78,23 @@ def test_in_a_matrix_the_point_counts_that_is_worst_by_the_measure() -> None:
 @SLOW
 def test_every_question_takes_an_own_metric(folder: Path) -> None:
     searched(load_study("tiny.toml"), folder / "results")
-    few = ("--characteristics", "tireFric,maxBrakeTorque")
     for typed in (
-        ("risk", "tiny.toml", "--samples", "256"),
-        ("rules", "tiny.toml", "--samples", "256"),
-        ("explain", "results", "--fits", "0", "--top", "1"),
-        ("compare", "tiny.toml", "tiny.toml", "--samples", "64"),
-        ("tolerance", "tiny.toml", "--quick", *few),
-        ("repair", "tiny.toml", "--fits", "0", "--promise", "tireFric >= 3"),
+        "risk tiny.toml --samples 256",
+        "rules tiny.toml --samples 256",
+        "explain results --fits 0 --top 1",
+        "compare tiny.toml tiny.toml --samples 64",
+        "tolerance tiny.toml --quick --characteristics tireFric,maxBrakeTorque",
+        "repair tiny.toml --fits 0 --promise 'tireFric >= 3'",
     ):
-        answer = json_of(*typed, "--unsafe", "hardest > 6.8")
+        answer = json_of(f"{typed} --unsafe 'hardest > 6.8'")
         assert answer["numbers"]["unsafe"] == "hardest > 6.8", typed
         assert "hardest > 6.8" in answer["verdict"], typed
 
 
 @SLOW
 def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
-    criterion = ("--unsafe", "hardest > 6.8")
-    studied = json_of("study", "tiny.toml", "--out", "results", "--quiet", *criterion)
+    criterion = "--unsafe 'hardest > 6.8'"
+    studied = json_of(f"study tiny.toml --out results --quiet {criterion}")
     counts = re.search(
         r"(\d+) of the ([\d,]+) different vehicles .* are unsafe\. .*hardest > 6.8, or a col",
         studied["verdict"],
@@ -108,11 +107,11 @@ def test_a_study_its_page_and_its_pack_take_an_own_metric(folder: Path) -> None:
         == ((solutions["hardest"] > 6.8) | (solutions["outcome"] == "collision")).sum()
     )
     assert re.search(r"The changed vehicle has hardest [\d.]+", studied["verdict"])
-    ask = ("--ask", "risk --samples 64", *criterion)
-    run("report", "results", "--out", "page.html", *ask)
+    ask = f"--ask 'risk --samples 64' {criterion}"
+    run(f"report results --out page.html {ask}")
     assert "--unsafe &#39;hardest &gt; 6.8&#39;" in (folder / "page.html").read_text()
-    run("evidence", "results", "--out", "pack.zip", *ask)
-    verified = json_of("verify", "pack.zip", "--run-code")
+    run(f"evidence results --out pack.zip {ask}")
+    verified = json_of("verify pack.zip --run-code")
     assert verified["numbers"]["passed"], verified["tables"]["claims"]
 
 
@@ -142,8 +141,10 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
 
     monkeypatch.setattr(Evaluator, "evaluate", noted)
     own = "rules --samples 64 --unsafe below=0.9"
-    asked = ("--ask", "rules --samples 64", "--ask", "rules --samples 32", "--ask", own)
-    run("evidence", "results", "--out", "pack.zip", *asked, "--unsafe", "drac > 5")
+    run(
+        "evidence results --out pack.zip --unsafe 'drac > 5' --ask 'rules --samples 64' "
+        f"--ask 'rules --samples 32' --ask '{own}'"
+    )
     assert stages.count(STAGE) == 2, (
         "to choose questions, and for all answers and the page"
     )
@@ -151,10 +152,9 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
         (name,) = (name for name in pack.namelist() if name.endswith("answers.json"))
         packed = json.loads(pack.read(name))[-1]
     assert (
-        packed["numbers"]
-        == json_of(*own.replace("rules", "rules results").split())["numbers"]
+        packed["numbers"] == json_of(own.replace("rules", "rules results"))["numbers"]
     )
-    assert json_of("verify", "pack.zip")["numbers"]["passed"]
+    assert json_of("verify pack.zip")["numbers"]["passed"]
 
 
 @SLOW
@@ -163,9 +163,7 @@ def test_an_undefined_measure_is_counted(folder: Path) -> None:
         HARDEST_BRAKING.replace("return np.where", "return np.nan * np.where")
     )
     (folder / "mine.toml").write_text(STUDY.replace("hardest_braking", "nowhere"))
-    verdict = json_of(
-        "risk", "mine.toml", "--samples", "64", "--unsafe", "hardest > 6.8"
-    )["verdict"]
+    verdict = json_of("risk mine.toml --samples 64 --unsafe 'hardest > 6.8'")["verdict"]
     (counts,) = re.findall(
         r"hardest is undefined, without a collision, in ([\d,]+) of ([\d,]+) simulated",
         verdict,

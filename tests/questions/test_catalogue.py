@@ -22,9 +22,7 @@ tau = { meaning = "", measurement = "" }
 
 
 def rows_of(study: str) -> dict[str, Any]:
-    rows = json_of("list", "characteristics", study)["tables"]["characteristics"][
-        "rows"
-    ]
+    rows = json_of(f"list characteristics {study}")["tables"]["characteristics"]["rows"]
     return {row["name"]: row for row in rows}
 
 
@@ -42,7 +40,7 @@ def test_texts_of_a_study_are_listed_and_affect_no_evaluation(tmp_path: Path) ->
         >= {**own, "unit": "kg", "lower": 1300, "upper": 2100}.items()
     )
     assert rows["tau"]["short_name"] == "tau", "without any text, its key is its name"
-    printed = run("list", "characteristics", str(file)).stdout
+    printed = run(f"list characteristics {file}").stdout
     assert "weighbridge" in printed
     assert "trailer" in printed
     keys = [

@@ -154,14 +154,10 @@ def test_a_version_whose_failing_tests_were_deleted_is_not_released(
         "matrix": {"tests": [table]},
     }
     Path("version.toml").write_text(tomli_w.dumps(version))
-    answer = json_of(
-        "compare", "autoware_july", "version.toml", "--samples", "8", expect=4
-    )
+    answer = json_of("compare autoware_july version.toml --samples 8", expect=4)
     assert answer["numbers"]["decision"] == "decide"
     assert "version lacks the test case (CCRs, speed 40, clear)" in answer["verdict"]
-    reverse = json_of(
-        "compare", "version.toml", "autoware_july", "--samples", "8", expect=4
-    )
+    reverse = json_of("compare version.toml autoware_july --samples 8", expect=4)
     assert "version lacks the test case" in reverse["verdict"]
 
 
@@ -236,7 +232,7 @@ def test_none_of_four_worse_versions_is_released(
 
 @SLOW
 def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
-    answer = json_of("compare", "smoke", "smoke", "--samples", "100")
+    answer = json_of("compare smoke smoke --samples 100")
     numbers, limits = answer["numbers"], answer["tables"]["limits"]["rows"]
     assert (numbers["only_a_unsafe"], numbers["only_b_unsafe"]) == (0, 0)
     assert (numbers["p"], numbers["a12"], numbers["settings"]) == (1.0, 0.5, 100)
@@ -308,22 +304,17 @@ def test_a_report_of_two_results_compares_them(
 ) -> None:
     dry, wet = map(str, weathers)
     page = (
-        run("report", dry, wet, "--ask", "compare", "--out", "it.html")
+        run(f"report {dry} {wet} --ask compare --out it.html")
         and Path("it.html").read_text()
     )
     assert sv.compare(dry, wet, pool=POOL).render("html").replace("^2", "²") in page
     assert "<h3>Compare</h3>" in page.partition('class="front')[0], "it stands first"
     assert f"python -m safevar_sumo compare {dry} {wet}" in page
     refused(
-        "report",
-        dry,
-        "--ask",
-        "compare",
-        "--out",
-        "it.html",
-        message=("--ask: compare cannot be asked about 1",),
+        f"report {dry} --ask compare --out it.html",
+        "--ask: compare cannot be asked about 1",
     )
-    refused("report", dry, dry, "--out", "it.html", message=("twice",))
+    refused(f"report {dry} {dry} --out it.html", "twice")
 
 
 @SLOW
@@ -332,5 +323,5 @@ def test_what_a_person_has_to_decide_passes_no_gate_and_counts_have_no_exponent(
 ) -> None:
     decided = "DECIDE", [Sentence("answer", "DECIDE: B is both.")]
     monkeypatch.setattr("safevar_sumo.questions.compare._decide", lambda *_: decided)
-    run("compare", "smoke", "smoke", "--samples", "8", "--jobs", "1", expect=4)
+    run("compare smoke smoke --samples 8 --jobs 1", expect=4)
     assert cell_text(1259.0, ".3g") == "1,259"

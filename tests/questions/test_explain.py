@@ -40,7 +40,7 @@ from safevar_sumo.results import handles_of, solutions_frame
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.conftest import FITS
-from tests.in_process import InlinePool, json_of
+from tests.in_process import InlinePool, json_of, numbers_of
 from tests.questions.conftest import (
     ORIGINAL,
     Plant,
@@ -167,20 +167,15 @@ def test_the_fewest_changes_collide_as_they_are_printed_and_no_fewer_of_them_do(
     slippery: Path, case: Case
 ) -> None:
     """In the verdict of `study`, as `simulate` chooses them, and typed as the verdict says."""
-    verdict = json_of(
-        "study", str(slippery.parent / "slippery.toml"), "--out", str(slippery)
-    )["verdict"]
+    verdict = json_of(f"study {slippery.parent / 'slippery.toml'} --out {slippery}")[
+        "verdict"
+    ]
     command = verdict.partition(
         "This command simulates the vehicle: python -m safevar_sumo "
     )[2].partition(". ")[0]
     command = command.rstrip(".")
-    typed, chosen = (
-        json_of(*one)["numbers"]
-        for one in (
-            command.split(),
-            ("simulate", str(slippery), "--solution", "fewest"),
-        )
-    )
+    typed = numbers_of(command)
+    chosen = numbers_of(f"simulate {slippery} --solution fewest")
     assert (
         f"The changed vehicle collides at {-typed['safety_degree']:.2f} m/s" in verdict
     )
@@ -195,9 +190,7 @@ def test_the_fewest_changes_collide_as_they_are_printed_and_no_fewer_of_them_do(
             for name, value in values.items()
             if name != left_out
         ]
-        assert (
-            json_of("simulate", str(slippery), *rest)["numbers"]["outcome"] == "stopped"
-        )
+        assert json_of(f"simulate {slippery}", *rest)["numbers"]["outcome"] == "stopped"
 
 
 def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(

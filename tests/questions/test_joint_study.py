@@ -87,12 +87,12 @@ def _few_encounters(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_question_says_which_encounters_count(typed: str) -> None:
-    assert re.search(QUESTIONS[typed], json_of(*typed.split())["verdict"])
+    assert re.search(QUESTIONS[typed], json_of(typed)["verdict"])
 
 
 def test_results_are_asked_about_in_the_encounters_of_their_study() -> None:
     told = "--ranges: of results, whose encounters are those of their study"
-    refused("risk", "results", "--ranges", message=(told,))
+    refused("risk results --ranges", told)
 
 
 def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_same_encounter(
@@ -104,7 +104,7 @@ def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_s
     values = [
         f"--set={name}={float(row[name])!r}" for name in case.characteristics.names
     ]
-    answer = json_of("simulate", "results", *values)
+    answer = json_of("simulate results", *values)
     degrees = next(
         one
         for one in answer["tables"]["results"]["rows"]
@@ -115,9 +115,9 @@ def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_s
         row["safety_degree"],
     )
     assert "A search would leave this encounter out: the" in answer["verdict"]
-    rows = json_of("study", "tiny.toml", "--status", "--out", "results")["tables"][
-        "algorithms"
-    ]["rows"]
+    rows = json_of("study tiny.toml --status --out results")["tables"]["algorithms"][
+        "rows"
+    ]
     safe = drawn[drawn["original_safety_degree"] >= limit]
     expected = [
         ((safe["outcome"] == "collision") & (safe["algorithm"] == name)).sum()
@@ -178,7 +178,7 @@ def test_a_search_without_a_solution_says_why_and_suggests_nothing_that_is_refus
     (folder / "far.toml").write_text(
         'extends = "tiny.toml"\nname = "far"\nscenario.margin = 40\nsearch.evaluations = 10\n'
     )
-    text = run("study", "far.toml", "--out", "far").stdout
+    text = run("study far.toml --out far").stdout
     assert "The search returned no vehicle: the original vehicle keeps at least" in text
     assert "Next: a smaller scenario.margin" in text
     assert "explain" not in text
@@ -239,7 +239,7 @@ def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
 
 
 def test_changes_are_those_of_the_vehicle(case: Case) -> None:
-    tables = json_of("tables", "results")["tables"]
+    tables = json_of("tables results")["tables"]
     solutions = case.solutions[case.solutions["algorithm"] == "nsga2"]
     critical = solutions[
         solutions["safety_degree"] < solutions["original_safety_degree"]
@@ -258,7 +258,7 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(
     (folder / "wider.toml").write_text(
         STUDY.replace("lower = 8, upper = 18", "lower = 10, upper = 20")
     )
-    answer = json_of("compare", "results", "wider.toml", "--samples", "64", expect=4)
+    answer = json_of("compare results wider.toml --samples 64", expect=4)
     assert re.search(LEFT_OUT.format(r"[\d,]+"), answer["verdict"])
     assert answer["numbers"]["margin"] == 0.1, "as in tolerance"
     assert answer["numbers"]["only_a_unsafe"] == answer["numbers"]["only_b_unsafe"] == 0
@@ -271,8 +271,7 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(
 
 @SLOW
 def test_the_page_replays_causes_in_their_encounters() -> None:
-    ask = ("--ask", "explain --quick --top 2", "--jobs", "1")
-    run("report", "results", "--out", "page.html", *ask)
+    run("report results --out page.html --ask 'explain --quick --top 2' --jobs 1")
     page = Path("page.html").read_text()
     replays = re.findall(r"<summary>(Only [^<]*)</summary>", page)
     assert replays

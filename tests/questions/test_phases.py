@@ -147,8 +147,8 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
 
 @SLOW
 def test_a_car_may_not_drive_where_it_fails_at_another_phase() -> None:
-    car = ["--set", "brakeTorque=0.93", "--others", "new", "--margin", "0.3"]
-    (row,) = json_of("permit", "autoware_july", *car)["tables"]["cars"]["rows"]
+    typed = "permit autoware_july --set brakeTorque=0.93 --others new --margin 0.3"
+    (row,) = json_of(typed)["tables"]["cars"]["rows"]
     assert row["phase"] > 0
 
     # The failure of the worst brake torque that this may be is none at phase 0.
@@ -158,9 +158,9 @@ def test_a_car_may_not_drive_where_it_fails_at_another_phase() -> None:
 
 
 def test_simulate_takes_a_phase_and_says_where_there_is_none() -> None:
-    answer = json_of("simulate", "autoware_july", "--set", "phase=0.37124")
+    answer = json_of("simulate autoware_july --set phase=0.37124")
     assert "0.3712 steps" in answer["verdict"]
-    refused("simulate", "rain", "--set", "phase=0.5", message=("has no phase",))
+    refused("simulate rain --set phase=0.5", "has no phase")
 
 
 @dataclass(frozen=True)

@@ -18,16 +18,8 @@ from tests.in_process import SLOW, InlinePool, run
 @SLOW
 def test_a_rough_tolerance_calls_no_limit_kept() -> None:
     """It says what was tested, and ends with code 3: a gate must not pass by it."""
-    asked = (
-        "tolerance",
-        "smoke",
-        "--quick",
-        "--limits",
-        "mass <= 2500",
-        "--unsafe",
-        "collision",
-    )
-    done = run(*asked, "--json", expect=3)
+    asked = "tolerance smoke --quick --limits 'mass <= 2500' --unsafe collision --json"
+    done = run(asked, expect=3)
     answer = json.loads(done.stdout)
     assert answer["verdict"].startswith("Rough answer (--quick")
     assert [answer["numbers"][name] for name in ("rough", "kept", "fits_tried")] == [
@@ -87,5 +79,5 @@ def test_on_a_terminal_the_rough_answer_comes_first(
 
 def test_rough_means_the_same_everywhere() -> None:
     for command in ("tolerance", "repair", "explain", "report"):
-        said = " ".join(run(command, "--help-all").stdout.split())
+        said = " ".join(run(f"{command} --help-all").stdout.split())
         assert "with at most an eighth of the usual simulations." in said

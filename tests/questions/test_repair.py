@@ -293,15 +293,7 @@ def test_a_promise_that_is_kept_already_writes_no_file(
     planted.write_text(STUDY.replace("gap = 12.0, always", "gap = 30.0, always"))
     out = tmp_path / "kept.toml"
     done = run(
-        "repair",
-        str(planted),
-        "--promise",
-        "grip>=7.9",
-        "--change",
-        "gap",
-        "--out",
-        str(out),
-        "--json",
+        f"repair {planted} --promise 'grip>=7.9' --change gap --out {out} --json"
     )
     answer = json.loads(done.stdout)
     assert answer["numbers"]["repairs"] == 0

@@ -242,7 +242,7 @@ def test_few_settings_find_the_causes_of_shipped_studies(
 @SLOW
 def test_the_answer_leads_with_the_smallest_changes() -> None:
     """Of rain: one pair, one of three, two of four (the enumeration of another implementation)."""
-    answer = json_of("explain", "rain", "--fits", "2", "--jobs", "1")
+    answer = json_of("explain rain --fits 2 --jobs 1")
     rows = answer["tables"]["causes"]["rows"]
     assert sorted(row["size"] for row in rows if row["size"] < 5) == [2, 3, 4, 4]
     (pair,) = (row for row in rows if row["size"] == 2)

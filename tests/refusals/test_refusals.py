@@ -15,7 +15,6 @@ Each `[[refused]]` of a table beside this file is one mistake:
 
 from __future__ import annotations
 
-import shlex
 import shutil
 import tomllib
 from collections.abc import Callable, Iterator
@@ -88,8 +87,5 @@ def test_what_is_wrong_is_refused(
     if "{results}" in typed:
         typed = typed.replace("{results}", str(request.getfixturevalue("slippery")))
     named = [row["in"]] if "in" in row and row["in"] in typed else []
-    refused(
-        *shlex.split(typed),
-        message=(*named, *([told] if isinstance(told, str) else told)),
-    )
+    refused(typed, *named, *([told] if isinstance(told, str) else told))
     assert files_in(in_tmp) == before

@@ -35,7 +35,7 @@ SCENES = {
     "car_to_car": ("euro_ncap_car_to_car", "CCRm, speed 40, impact_location 50, clear"),
     "lead_vehicle_stopped": ("lgsvl", ""),
 }
-HANDLE = ("--solution", "made:0:0")
+HANDLE = "--solution made:0:0"
 
 
 def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]:
@@ -76,17 +76,8 @@ def exported(
     study, point = SCENES[request.param]
     results, system, setting = results_of(study, tmp_path_factory.mktemp(request.param))
     out = results.with_name("out")
-    chosen = ("--point", point) if point else ()
-    done = run(
-        "export",
-        str(results),
-        *HANDLE,
-        *chosen,
-        "--to",
-        "openscenario",
-        "--out",
-        str(out),
-    )
+    chosen = f"--point '{point}'" if point else ""
+    done = run(f"export {results} {HANDLE} {chosen} --to openscenario --out {out}")
     (results / "printed.txt").write_text(done.stdout)
     there = assemble(at_point(load_study(study), point)) if point else system
     return out, comparison_of(
@@ -193,9 +184,7 @@ def for_carla(tmp_path: Path) -> ForCarla:
         "carla", reason="CARLA's client has wheels for Linux and Python 3.10 to 3.12"
     )
     results, _, setting = results_of("rain", tmp_path)
-    run(
-        "export", str(results), *HANDLE, "--to", "carla", "--out", str(tmp_path / "out")
-    )
+    run(f"export {results} {HANDLE} --to carla --out {tmp_path / 'out'}")
     script = SimpleNamespace(**runpy.run_path(str(tmp_path / "out/run_in_carla.py")))
     return script, json.loads((tmp_path / "out/vehicle.json").read_text()), setting
 
@@ -281,20 +270,11 @@ def test_the_script_drives_the_whole_record(for_carla: ForCarla) -> None:
 
 def test_what_carla_has_no_counterpart_of_is_refused(tmp_path: Path) -> None:
     worn, _, _ = results_of("wear", tmp_path)
-    message = (
+    out = tmp_path / "out"
+    refused(
+        f"export {worn} {HANDLE} --to carla --out {out}",
         "treadDepth, brakeTorque",
         "no counterpart in CARLA",
         "--to openscenario",
-    )
-    out = tmp_path / "out"
-    refused(
-        "export",
-        str(worn),
-        *HANDLE,
-        "--to",
-        "carla",
-        "--out",
-        str(out),
-        message=message,
     )
     assert not out.exists()

@@ -8,7 +8,6 @@ import html
 import re
 import shlex
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from itertools import pairwise
@@ -39,6 +38,7 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress
 from safevar_sumo.vehicles import VEHICLES
 from tests.in_process import SLOW, run, searched
+from tests.manual import PROGRAM
 from tests.report.conftest import ASK, page_of
 
 
@@ -355,24 +355,18 @@ def test_every_printed_command_gives_the_answer_of_the_page(
     place = tmp_path / "results"
     shutil.copytree(slippery, place, ignore=shutil.ignore_patterns("answers"))
     page = html.unescape(page_of(place, ask=ASK, jobs=2))
-    printed = list(commands_of(page))
-    assert [words[0] for words in printed] == [
-        "tolerance",
-        "explain",
-        "risk",
-        "rules",
-        *["simulate"] * 3,
-    ][: len(printed)]
-    for words in printed[: len(ASK)]:
-        answer = html.unescape(run(*words, "--format", "html").stdout).strip()
-        assert answer.replace("^2", "²").replace("^3", "³") in page, words
-    assert run(*[word.replace("it.", f"{tmp_path}/it.") for word in printed[-1]]).stdout
+    printed = commands_of(page)
+    asked = f"tolerance explain risk rules {'simulate ' * 3}".split()
+    assert [typed.split()[0] for typed in printed] == asked[: len(printed)]
+    for typed in printed[: len(ASK)]:
+        answer = html.unescape(run(f"{typed} --format html").stdout).strip()
+        assert answer.replace("^2", "²").replace("^3", "³") in page, typed
+    assert run(printed[-1].replace("it.", f"{tmp_path}/it.")).stdout
 
 
-def commands_of(page: str) -> Iterator[list[str]]:
-    """The words of the commands that a page prints, without those that start the program."""
-    for line in re.findall("<code>(python -m .*?)</code>", page):
-        yield shlex.split(line)[3:]
+def commands_of(page: str) -> list[str]:
+    """The commands that a page prints, without the words that start the program."""
+    return re.findall(f"<code>{PROGRAM}(.*?)</code>", page)
 
 
 DAY, RAIN = "crossing, clear", "crossing, hard_rain"

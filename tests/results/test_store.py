@@ -397,15 +397,9 @@ def test_results_in_another_format_are_refused_with_the_release_that_wrote_them(
     manifest["versions"]["safevar_sumo"] = release
     (copied / "manifest.json").write_text(json.dumps(manifest))
     before = contents(copied)
-    for command in (
-        ("tables", str(copied)),
-        ("study", "smoke", "--status", "--out", str(copied)),
-    ):
-        message = (
-            f"in format {number}",
-            f"the release that wrote them, safevar_sumo {release}",
-        )
-        refused(*command, message=message)
+    told = f"the release that wrote them, safevar_sumo {release}"
+    for command in f"tables {copied}", f"study smoke --status --out {copied}":
+        refused(command, f"in format {number}", told)
     assert contents(copied) == before
 
 
@@ -418,15 +412,9 @@ def test_what_is_no_file_in_place_of_a_journal_is_refused_at_once(
     make(journal)
     before = contents(copied)
     study = str(slippery.parent / "slippery.toml")
-    for command in (
-        ("tables", str(copied)),
-        ("study", study, "--out", str(copied), "--quiet"),
-        ("report", str(copied)),
-    ):
-        refused(
-            *command,
-            message=("rs-00.jsonl: is no file", "or no file: the run then begins anew"),
-        )
+    for command in "tables", f"study {study} --quiet --out", "report":
+        told = "or no file: the run then begins anew"
+        refused(f"{command} {copied}", "rs-00.jsonl: is no file", told)
     assert contents(copied) == before
 
 
@@ -478,7 +466,7 @@ def contents(place: Path) -> dict[str, tuple[bytes, int]]:
 
 def status_of(place: Path) -> dict[str, dict[str, Any]]:
     """The rows of the status of the study in a directory, by algorithm."""
-    status = json_of("study", "smoke", "--status", "--out", str(place))
+    status = json_of(f"study smoke --status --out {place}")
     return {row["algorithm"]: row for row in status["tables"]["algorithms"]["rows"]}
 
 
@@ -526,7 +514,7 @@ def test_results_of_a_study_whose_search_was_a_key_are_read_by_their_release(
     tmp_path: Path,
 ) -> None:
     """A key that was without effect is passed over."""
-    run("study", "smoke", "--runs", "1", "--evaluations", "50", "--out", str(tmp_path))
+    run(f"study smoke --runs 1 --evaluations 50 --out {tmp_path}")
     manifest = read_manifest(tmp_path)
     file = tmp_path / "manifest.json"
     file.write_text(

@@ -104,11 +104,11 @@ def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_
     worst = drive_and_score(system, setting)
     assert worst.outcome.tolist() == ["stopped"]
     assert worst.column("impact_excess")[0] == -worst.f_safe[0] > speed - 35 * KMH
-    told = run("simulate", "r152", "--set", "sensorRange=15", "--point", FAST).stdout
+    told = run(f"simulate r152 --set sensorRange=15 --point '{FAST}'").stdout
     assert f"has an impact at {speed / KMH:.3g} km/h where 35 is allowed" in told
     assert (
         "fails in none of the 13 test cases"
-        in run("simulate", "r152", "--set", "sensorRange=15").stdout
+        in run("simulate r152 --set sensorRange=15").stdout
     )
 
 
@@ -118,7 +118,7 @@ def test_a_point_fails_by_the_criterion_of_its_study() -> None:
         ("0.61", "fails in 1 of 1 test cases: type 0"),
         ("0.62", "fails in no test case"),
     ):
-        assert told in run("simulate", "r13h", "--set", f"brakeTorque={share}").stdout
+        assert told in run(f"simulate r13h --set brakeTorque={share}").stdout
 
 
 @SLOW

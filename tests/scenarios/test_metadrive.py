@@ -30,17 +30,14 @@ def page(in_tmp: Path) -> str:
 
 @pytest.mark.usefixtures("page", "worker_processes")
 def test_repeats_are_bit_equal_in_any_order_and_in_a_new_process() -> None:
-    assert (
-        "curve.toml passed all checks"
-        in run("check", "curve.toml", "--vehicles", "4").stdout
-    )
+    assert "curve.toml passed all checks" in run("check curve.toml --vehicles 4").stdout
 
 
 def test_the_page_says_what_the_driver_does(page: str) -> None:
     rows = re.findall(r"^\| `(\S+) = (\S+)`.* \| (\S+) \|$", page, re.M)
     assert rows
     for name, value, degree in rows:
-        answer = json_of("simulate", "curve.toml", "--set", f"{name}={value}")
+        answer = json_of(f"simulate curve.toml --set {name}={value}")
         found = answer["numbers"]["safety_degree"]
         assert found == pytest.approx(float(degree), abs=0.05), name
 

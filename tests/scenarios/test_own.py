@@ -157,13 +157,13 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(
 
 def test_a_list_of_ones_own_scenario_names_it_and_claims_no_check(in_tmp: Path) -> None:
     (in_tmp / "own.py").write_text(MINE)
-    printed = run("list", "own:Mine").stdout
+    printed = run("list own:Mine").stdout
     assert printed.startswith("A study can name own:Mine.\n")
     assert "passed" not in printed
 
 
 def test_the_list_of_scenarios_has_what_their_classes_declare() -> None:
-    answer = json_of("list", "scenarios", "--json")
+    answer = json_of("list scenarios --json")
     assert answer["numbers"] == {"passed": True}
     rows = {row["name"]: row for row in answer["tables"]["scenarios"]["rows"]}
     assert {*rows} == {*SCENARIOS}

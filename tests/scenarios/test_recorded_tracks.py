@@ -125,8 +125,8 @@ def write() -> None:
 @SLOW
 def test_a_study_is_checked_and_its_limits_are_sought(in_tmp: Path) -> None:
     write()
-    assert json_of("check", "walk.toml", "--vehicles", "4")["numbers"]["passed"]
-    limits = json_of("tolerance", "walk.toml", "--quick", "--simulations", "200")
+    assert json_of("check walk.toml --vehicles 4")["numbers"]["passed"]
+    limits = json_of("tolerance walk.toml --quick --simulations 200")
     rows = limits["tables"]["limits"]["rows"]
     assert {"treadDepth", "payload"} <= {row["characteristic"] for row in rows}
 
@@ -134,21 +134,15 @@ def test_a_study_is_checked_and_its_limits_are_sought(in_tmp: Path) -> None:
 @SLOW
 def test_results_and_packs_depend_on_the_bytes_of_the_file(in_tmp: Path) -> None:
     write()
-    run("study", "walk.toml", "--out", "results")
-    run("evidence", "results", "--ask", "rules --samples 20", "--out", "it.zip")
+    run("study walk.toml --out results")
+    run("evidence results --ask 'rules --samples 20' --out it.zip")
     for name in ("walk.csv", "walk.toml"):
         Path(name).unlink()
-    run("verify", "it.zip")  # which has the file, and no code
+    run("verify it.zip")  # which has the file, and no code
     write()
     Path("walk.csv").write_text(PAGE["walk.csv"].replace("45.0", "45.5"))
-    refused("rules", "results", message=("walk.csv has changed since",))
-    refused(
-        "study",
-        "walk.toml",
-        "--out",
-        "results",
-        message=("walk.csv has changed since",),
-    )
+    refused("rules results", "walk.csv has changed since")
+    refused("study walk.toml --out results", "walk.csv has changed since")
 
 
 def test_a_matrix_plays_several_files(in_tmp: Path) -> None:

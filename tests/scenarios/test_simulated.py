@@ -354,8 +354,8 @@ def test_a_process_opens_its_worker_once_and_ends_it(wall: Path, name: str) -> N
     """Also where the code is loaded again, and with a number: 0 without worker processes."""
     (wall.parent / "keeps.py").write_text(KEEPS)
     wall.write_text(STUDY.replace("models:Wall", f"keeps:{name}"))
-    assert json_of("check", "wall.toml")["numbers"]["passed"]
-    run("simulate", "wall.toml")
+    assert json_of("check wall.toml")["numbers"]["passed"]
+    run("simulate wall.toml")
     kept.close_simulator()
     assert Path("log").read_text().split("\n") == [
         f"{name} open 0",
@@ -364,7 +364,7 @@ def test_a_process_opens_its_worker_once_and_ends_it(wall: Path, name: str) -> N
     ]
     wrong = KEEPS.replace("def open_worker(cls, worker)", "def open_worker(cls)")
     (wall.parent / "keeps.py").write_text(wrong)
-    refused("check", "wall.toml", message=("open_worker that does not take (worker)",))
+    refused("check wall.toml", "open_worker that does not take (worker)")
 
 
 @SLOW
@@ -372,7 +372,7 @@ def test_a_process_opens_its_worker_once_and_ends_it(wall: Path, name: str) -> N
 def test_workers_have_numbers_which_those_have_that_replace_them(wall: Path) -> None:
     (wall.parent / "keeps.py").write_text(KEEPS)
     wall.write_text(STUDY.replace("models:Wall", "keeps:Dies"))
-    run("study", "wall.toml", "--out", "results", "--jobs", "2")
+    run("study wall.toml --out results --jobs 2")
     kept.close_simulator()  # of this process
     lines = Path("log").read_text().splitlines()
     assert {line for line in lines if "open" in line} == {"Dies open 0", "Dies open 1"}
@@ -388,7 +388,7 @@ def test_runs_have_one_time_step(wall: Path) -> None:
     with pytest.raises(InputError, match=r"time steps of 0.05 and 0.1 s"):
         simulators.simulate_each(system, np.array([[4.0, 0.5]]))
     wall.write_text(STUDY.replace("models:Wall", "models:Wrong"))
-    refused("check", "wall.toml", message=("time steps of 0.05 and 0.1 s",))
+    refused("check wall.toml", "time steps of 0.05 and 0.1 s")
 
 
 @pytest.mark.parametrize(
@@ -418,7 +418,7 @@ def test_a_speed_that_disagrees_with_the_way_is_a_finding(
 ) -> None:
     wrong_system(wall, f"lambda r: {{**r, **dict({change})}}")
     wall.write_text(STUDY.replace("models:Wall", "models:Wrong"))
-    assert told in run("check", "wall.toml", expect=int(bool(told))).stdout
+    assert told in run("check wall.toml", expect=int(bool(told))).stdout
 
 
 @SLOW
@@ -443,11 +443,11 @@ def test_what_a_study_names_and_a_simulator_never_has_is_a_finding_of_check_alon
     wall.write_text(
         study if "never" in told else study.replace("ttc", 'also = ["drac"]\nttc', 1)
     )
-    printed = run("check", "wall.toml", expect=1).stdout
+    printed = run("check wall.toml", expect=1).stdout
     parts = [line.partition(":")[0] for line in printed.splitlines()[2:6]]
     assert parts == ["where", "found", "expected", "what to do"]
     assert told in printed
-    run("study", "wall.toml", "--out", "results", "--runs", "1")
+    run("study wall.toml --out results --runs 1")
 
 
 def test_versions_belong_to_the_identity_of_results(wall: Path) -> None:
@@ -464,34 +464,13 @@ def test_versions_belong_to_the_identity_of_results(wall: Path) -> None:
 
 @SLOW
 def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
-    run(
-        "simulate",
-        "wall.toml",
-        "--set",
-        "decel=4",
-        "--plot",
-        "a.png",
-        "--animate",
-        "a.html",
-    )
+    run("simulate wall.toml --set decel=4 --plot a.png --animate a.html")
     assert Path("a.png").stat().st_size
     assert "wall" in Path("a.html").read_text()
     wall.write_text(STUDY.replace("models:Wall", "models:Rig"))
-    refused(
-        "simulate", "wall.toml", "--animate", "b.html", message=("needs the position",)
-    )
-    refused(
-        "simulate", "wall.toml", "--trace", "b.csv", message=("states metrics alone",)
-    )
-    refused(
-        "study",
-        "wall.toml",
-        "--engine",
-        "sumo",
-        "--out",
-        "r",
-        message=("no other engine",),
-    )
+    refused("simulate wall.toml --animate b.html", "needs the position")
+    refused("simulate wall.toml --trace b.csv", "states metrics alone")
+    refused("study wall.toml --engine sumo --out r", "no other engine")
 
 
 @SLOW
@@ -499,13 +478,13 @@ def test_a_cause_ends_where_the_formula_does_and_weather_is_not_said(
     wall: Path,
 ) -> None:
     """Failures are explained without reference drivers."""
-    found = json_of("explain", "wall.toml")
+    found = json_of("explain wall.toml")
     assert found["numbers"]["collisions"] is None
     assert not found["tables"]["drivers"]["rows"]
     causes = found["tables"]["causes"]["rows"]
     (share,) = (row["begins_at"] for row in causes if row["causes"] == {"decel": 3})
     assert 8 - 5 * share == pytest.approx(225 / 2 / 32.5, abs=0.1)
-    assert "weather" not in run("tolerance", "wall.toml", "--quick").stdout
+    assert "weather" not in run("tolerance wall.toml --quick").stdout
 
 
 NOISY = """
@@ -535,9 +514,9 @@ def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(
     """The worst run counts, each is in the journal, and without repeats the study is refused."""
     (wall.parent / "noisy.py").write_text(NOISY)
     wall.write_text(STUDY.replace("models:Wall", "noisy:Drifts"))
-    assert "repeats = N" in run("check", "wall.toml", expect=1).stdout
+    assert "repeats = N" in run("check wall.toml", expect=1).stdout
     wall.write_text(STUDY.replace('"models:Wall"', '"noisy:Drifts"\nrepeats = 4'))
-    assert json_of("check", "wall.toml")["numbers"]["passed"]
+    assert json_of("check wall.toml")["numbers"]["passed"]
     found = drive_and_score(
         system_of(wall), np.array([[8.0, 0.0], [3.0, 0.0], [9.0, 0.5]])
     )
@@ -546,7 +525,7 @@ def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(
     assert found.metrics["unsafe_share"].tolist() == [0, 1, 0]
     assert len({*rounds[:, 0]}) == 4
     assert found.outcome.tolist() == ["stopped", "collision", "stopped"]
-    run("study", "wall.toml", "--out", "results")
+    run("study wall.toml --out results")
     assert (
         '"safety_degree_4":[' in next(Path("results/runs").glob("*.jsonl")).read_text()
     )
@@ -617,7 +596,7 @@ def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
         for one in system_of(wall.parent / "own.toml").measuring.scoring.objectives
     ]
     assert names == ["f_safe", "f_diff"]
-    found = json_of("simulate", "wall.toml", "--set", "delay=0.15")
+    found = json_of("simulate wall.toml --set delay=0.15")
     assert (
         "collides at 8.00 m/s in 3 of 20 runs (95 % confidence interval 3 to 38 %)"
         in (found["verdict"])
@@ -625,7 +604,7 @@ def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
     assert found["numbers"]["unsafe_share"] == 0.15
     assert found["numbers"]["safety_degree"] == -8
     for question in ("risk", "rules"):
-        numbers = json_of(question, "wall.toml", "--simulations", "2000")["numbers"]
+        numbers = json_of(f"{question} wall.toml --simulations 2000")["numbers"]
         share = numbers["failures"] / numbers["samples"]
         assert share == pytest.approx(0.5, abs=0.06)
         low, high = numbers["interval"]
@@ -638,7 +617,7 @@ def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
             pool=InlinePool(),
         )
         assert answer.numbers["kept"] is holds
-    run("study", "wall.toml", "--out", "results")
+    run("study wall.toml --out results")
     assert "unsafe_share" in Path("results/solutions.csv").read_text()
 
 
@@ -674,13 +653,13 @@ def test_a_simulator_that_ends_its_process_is_started_again_once(
     (wall.parent / "noisy.py").write_text(NOISY.replace("END", end))
     wall.write_text(STUDY.replace("models:Wall", "noisy:Ends"))
     if often == 1:
-        run("study", "wall.toml", "--out", "results")
+        run("study wall.toml --out results")
         return
     told = (
         "exit code 7",
         "to reproduce it: python -m safevar_sumo simulate wall.toml --set decel=3",
     )
-    refused("study", "wall.toml", "--out", "results", message=told)
+    refused("study wall.toml --out results", *told)
 
 
 FAILS = """
@@ -737,8 +716,8 @@ def test_settings_that_fail_may_be_skipped_and_tried_again(
 ) -> None:
     """They are infeasible and counted; `check` names them; children end with their simulator."""
     with_failures(wall, failure)
-    options = ("study", "wall.toml", "--out", "results", "--jobs", "1")
-    printed = run(*options).stdout
+    options = "study wall.toml --out results --jobs 1"
+    printed = run(options).stdout
     number = int(re.search(r"could not simulate (\d+) ", printed)[1])
     journals = "".join(
         path.read_text() for path in Path("results/runs").glob("*.jsonl")
@@ -746,13 +725,13 @@ def test_settings_that_fail_may_be_skipped_and_tried_again(
     assert journals.count('"simulator-error"') == number > 0
     assert "--set decel=3" in journals or failure == "1 / 0"
     assert children() == 0
-    printed = run("check", "wall.toml", expect=None)
+    printed = run("check wall.toml", expect=None)
     assert {"1 / 0": "division", "os._exit(7)": "code 7"}.get(
         failure, "time limit"
     ) in (printed.stdout + printed.stderr)
     assert children() == 0
     before = Path("count").stat().st_size
-    run(*options, "--retry-failed")
+    run(f"{options} --retry-failed")
     assert Path("count").stat().st_size > before
 
 
@@ -838,18 +817,18 @@ def test_a_simulator_that_takes_its_process_apart_is_named(
     Path("leaks.py").write_text(LEAKS.replace("DAMAGE", damage))
     wall.write_text(STUDY.replace("models:Wall", "leaks:Leaks"))
     message = (told, "leaks:Leaks" if "close" in damage else "leaks.py:5")
-    refused("study", "wall.toml", "--out", "results", "--jobs", "1", message=message)
+    refused("study wall.toml --out results --jobs 1", *message)
 
 
 @SLOW
 def test_more_than_a_tenth_of_failures_is_an_error(wall: Path) -> None:
     with_failures(wall, "1 / 0", limit=5)
     told = ("settings failed, more than 10 %", "division by zero")
-    refused("study", "wall.toml", "--out", "results", message=(*told, "--retry-failed"))
-    printed = run("risk", "wall.toml", "--simulations", "1000", expect=2).stderr
+    refused("study wall.toml --out results", *told, "--retry-failed")
+    printed = run("risk wall.toml --simulations 1000", expect=2).stderr
     assert all(part in printed for part in told)
     with_failures(wall, "1 / 0", failed="stop")
-    refused("study", "wall.toml", "--out", "other", message=("division by zero",))
+    refused("study wall.toml --out other", "division by zero")
     with pytest.raises(InputError, match="failed = 'skip' without a simulator"):
         assemble(sv.load_study("rain", search={"failed": "skip"}))
 
@@ -859,19 +838,19 @@ def test_a_pack_states_the_number_that_followed_from_time(
     wall: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So that `verify` asks the same on another machine; so does the command of each answer."""
-    run("study", "wall.toml", "--out", "results")
+    run("study wall.toml --out results")
     with monkeypatch.context() as patch:
         patch.setattr("safevar_sumo.questions.price.LONGEST", 0.4)
         seconds = "safevar_sumo.questions.evaluator.seconds_of_simulation"
         patch.setattr(seconds, lambda *_: 0.001)  # whatever else this machine does
-        run("evidence", "results", "--out", "pack.zip", "--ask", "risk --samples 4000")
+        run("evidence results --out pack.zip --ask 'risk --samples 4000'")
         first = sv.risk("results")
     assert re.search(r"risk results --simulations \d+$", first.command)
     again = sv.risk("results", simulations=int(first.command.split()[-1]))
     assert again.to_dict() == first.to_dict()
     with ZipFile("pack.zip") as pack:
         assert b" --simulations " in pack.read("1-wall/answers.json")
-    assert json_of("verify", "pack.zip", "--run-code")["numbers"]["passed"]
+    assert json_of("verify pack.zip --run-code")["numbers"]["passed"]
 
 
 READS = """
@@ -916,18 +895,18 @@ def with_data(wall: Path, how: str, value: float) -> None:
 def test_results_of_two_simulators_are_not_mixed(wall: Path, how: str) -> None:
     """Neither by `study`, nor by a question; what the simulator has written itself is no input."""
     with_data(wall, how, 1.0)
-    run("study", "wall.toml", "--out", "results", "--runs", "1")
+    run("study wall.toml --out results --runs 1")
     files = sv.load("results").directory / "manifest.json"
     named = {"opened": "data.txt", "sqlite3": "data.db", "elsewhere": ""}[how]
     assert named in files.read_text()
     assert "own.log" not in files.read_text()
-    run("study", "wall.toml", "--out", "results")
-    run("risk", "results", "--simulations", "50")
+    run("study wall.toml --out results")
+    run("risk results --simulations 50")
     with_data(wall, how, 1.1)
     told = f"{named} has changed since" if named else "the original vehicle had"
-    refused("study", "wall.toml", "--out", "results", message=(told,))
-    refused("risk", "results", "--simulations", "50", message=(told,))
-    run("risk", "results", "--simulations", "50", "--as-it-is-now")
+    refused("study wall.toml --out results", told)
+    refused("risk results --simulations 50", told)
+    run("risk results --simulations 50 --as-it-is-now")
     study = sv.load_study(str(wall))
     keys = set()
     for value in (1.0, 1.1):
@@ -975,17 +954,15 @@ def test_a_study_repeats_three_settings_in_another_process(
     wall: Path, jobs: int
 ) -> None:
     """A hash of a text is the same in all workers, a process's number is not."""
-    options = ("study", "wall.toml", "--out", f"results-{jobs}", "--jobs", f"{jobs}")
+    options = f"study wall.toml --jobs {jobs} --out"
     for value in ("1 + hash('a') % 9973", "1 + os.getpid() % 997"):
         (wall.parent / "reads.py").write_text(READS.replace("READ", value, 1))
         wall.write_text(STUDY.replace("models:Wall", "reads:Reads"))
         if "pid" in value:
-            refused(
-                *options[:3], "other", *options[4:], message=("in another process",)
-            )
+            refused(f"{options} other", "in another process")
         else:
-            run(*options)
-            assert "in a new process" in run("check", "wall.toml", expect=1).stdout
+            run(f"{options} results")
+            assert "in a new process" in run("check wall.toml", expect=1).stdout
 
 
 @SLOW
@@ -999,24 +976,16 @@ def test_what_an_object_keeps_of_another_point_is_found(wall: Path) -> None:
     (wall.parent / "reads.py").write_text(text)
     tests = '\n[[matrix.tests]]\nname = "a"\nover = { gap = [40.0, 60.0] }\n'
     wall.write_text(STUDY.replace("models:Wall", "reads:Reads") + tests)
-    assert "in a new process" in run("check", "wall.toml", expect=1).stdout
-    refused(
-        "study", "wall.toml", "--out", "results", message=("points in another order",)
-    )
+    assert "in a new process" in run("check wall.toml", expect=1).stdout
+    refused("study wall.toml --out results", "points in another order")
 
 
 @SLOW
 def test_a_library_of_the_search_counts_if_the_simulator_uses_it(wall: Path) -> None:
-    run("study", "wall.toml", "--out", "results")
+    run("study wall.toml --out results")
     manifest = Path("results/manifest.json")
     manifest.write_text(manifest.read_text().replace(np.__version__, "1.0"))
-    refused(
-        "study",
-        "wall.toml",
-        "--out",
-        "results",
-        message=("version of numpy was '1.0'",),
-    )
+    refused("study wall.toml --out results", "version of numpy was '1.0'")
     stored, now = ({"versions": {"numpy": one}, "study": {}} for one in ("1.0", "1.1"))
     for libraries, matters in ([], False), (["numpy"], True):
         (change,) = manifest_differences(stored, {**now, "libraries": libraries})
@@ -1029,5 +998,5 @@ def test_simulators_are_closed_with_their_workers(wall: Path) -> None:
     place = str(wall.parent / "closed")  # also at the end of this process
     text = MODELS.replace("CLOSED.append(1)", f"open({place!r}, 'a').write('x')")
     (wall.parent / "models.py").write_text(text)
-    run("study", "wall.toml", "--out", "results")
+    run("study wall.toml --out results")
     assert len(Path("closed").read_text()) >= 2

@@ -79,19 +79,15 @@ def bound(in_tmp: Path) -> Path:
 @pytest.mark.usefixtures("coarse")
 def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     """The region is given in closed form; without constraints a fifth of the domain lies in it."""
-    run("study", "bound.toml", "--quiet", "--out", "out")
+    run("study bound.toml --quiet --out out")
     frame = sv.load("out").evaluations
     assert set(frame["algorithm"]) == set(ALGORITHMS)
     assert len(frame) > 150
     assert all(is_feasible(row) for row in frame[list(SUN.names)].to_dict("records"))
-    below = ("--unsafe", "below=2.5", "--fits", "0")
-    explained = json_of("explain", "out", *below, "--top", "2", "--quick")
+    below = "--unsafe below=2.5 --fits 0"
+    explained = json_of(f"explain out {below} --top 2 --quick")
     tolerance = json_of(
-        "tolerance",
-        "bound.toml",
-        *below,
-        "--characteristics",
-        "tireFric,mass,maxBrakeTorque",
+        f"tolerance bound.toml {below} --characteristics tireFric,mass,maxBrakeTorque"
     )
     boundaries = [cause["boundary"] for cause in explained["tables"]["causes"]["rows"]]
     alone = [
@@ -108,7 +104,7 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
         "rules bound.toml --samples 200",
         "risk bound.toml --samples 200",
     ):
-        words = " ".join(run(*question.split(), "--unsafe", "below=2.5").stdout.split())
+        words = " ".join(run(f"{question} --unsafe below=2.5").stdout.split())
         assert "satisfies the constraints of the study" in words, question
         assert "mass - maxBrakeTorque at least 700 kg" in words, question
 
@@ -139,5 +135,5 @@ def test_an_unfeasible_setting_is_simulated_only_where_that_is_asked_for(
         sv.evaluate("bound.toml", pd.DataFrame({"mass": [2404, 2040]}), jobs=1)
     assert (
         "or any with --beyond"
-        in run("simulate", "bound.toml", "--set", "mass=2040", expect=2).stderr
+        in run("simulate bound.toml --set mass=2040", expect=2).stderr
     )

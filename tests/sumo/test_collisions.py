@@ -149,9 +149,7 @@ def test_options_of_the_web_wizard_give_the_same_answer_and_leave_json_alone(
         f'parameters = {{ network = "{network}" }}\n'
     )
     changes = [f"{name}={value}" for name, value in WEAK_BRAKES.items()]
-    answer = json_of(
-        "simulate", str(study), "--set", changes[0], "--set", changes[1], "--json"
-    )
+    answer = json_of(f"simulate {study} --set {changes[0]} --set {changes[1]} --json")
     shipped = sv.simulate(
         {"extends": "native", "name": "finer", "step_length": 0.05}, WEAK_BRAKES
     )
