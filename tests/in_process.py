@@ -32,17 +32,18 @@ from tests.made_up import MISSING
 from tests.manual import PROGRAM
 
 SLOW = pytest.mark.slow
-LONG = (
-    *(
-        "alks",
-        "autoware_december",
-        "euro_ncap_pedestrian",
-        "fmvss127",
-        "lgsvl",
-        "r152_laden",
-    ),
-    *("sensing", "wear_idm", "wear_realistic", "wear_rss"),
-)
+LONG = [
+    "alks",
+    "autoware_december",
+    "euro_ncap_pedestrian",
+    "fmvss127",
+    "lgsvl",
+    "r152_laden",
+    "sensing",
+    "wear_idm",
+    "wear_realistic",
+    "wear_rss",
+]
 EVERY_STUDY = [
     pytest.param(name, marks=SLOW if name in LONG else ())
     for name in study_names()
@@ -78,6 +79,11 @@ def inline_worker(last_words: Path) -> InlinePool:
     """A worker in this process, which knows as little as a new one."""
     evaluation._assemble_packed.cache_clear()
     return InlinePool()
+
+
+def write(name: str, text: str) -> None:
+    """Write a file in the working directory, as a user does."""
+    Path(name).write_text(text)
 
 
 def searched(
@@ -151,8 +157,13 @@ def json_of(typed: str, *arguments: str, expect: int = 0) -> Any:
     return json.loads(run(typed, *arguments, "--json", expect=expect).stdout)
 
 
+def rows_of(answer: Any, table: str) -> Any:
+    """The rows of a table of an answer's JSON."""
+    return answer["tables"][table]["rows"]
+
+
 def numbers_of(command: str) -> Any:
-    """The numbers of a printed command."""
+    """The numbers of a command, typed or printed."""
     return json_of(command.removeprefix(PROGRAM))["numbers"]
 
 

@@ -20,7 +20,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.results import MANIFEST
 from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, refused
+from tests.in_process import SLOW, refused, write
 
 PIPES = [
     "simulate pipe",
@@ -101,7 +101,7 @@ def test_a_pipe_or_device_is_no_input(command: str, kind: str, in_tmp: Path) -> 
     Path("results").mkdir()
     for path in Path("pipe"), Path("results", MANIFEST):
         os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
-    Path("extends.toml").write_text('extends = "pipe"')
+    write("extends.toml", 'extends = "pipe"')
     refused(command, "no regular file of at most")
 
 

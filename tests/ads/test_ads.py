@@ -49,7 +49,7 @@ SYSTEMS = {
     for name in ADS
     if name not in UNAVAILABLE
 }
-TAKE_OVER = {
+TAKE_OVER = [
     "ad_rss",
     "aeb",
     "autoware_aeb",
@@ -59,7 +59,7 @@ TAKE_OVER = {
     "highway_idm",
     "r157",
     "rss",
-}
+]
 """ADSs that keep the initial speed."""
 FAR = 1e6
 COASTING, FULL, BRAKING = 0.1, 2.0, 10.0

@@ -22,6 +22,7 @@ from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import Nominal, Observation
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
+from tests.in_process import write
 
 SOURCE = '''
 from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
@@ -103,8 +104,10 @@ def small(in_tmp: Path) -> Make:
                     "modelDescription.xml": edited.encode(),
                 }.items():
                     archive.writestr(name, content)
-        Path("small.toml").write_text(
-            f'extends = "native"\nname = "small"\n[ads]\nkind = "fmu"\nmodel = "Small.fmu"\n{table}'
+        write(
+            "small.toml",
+            'extends = "native"\nname = "small"\n[ads]\nkind = "fmu"\n'
+            f'model = "Small.fmu"\n{table}',
         )
         return assemble(load_study("small.toml"))
 
@@ -151,7 +154,9 @@ def test_an_acceleration_drives_as_the_same_law_in_python(small: Make) -> None:
     fmu = small(
         "self.wish = -9.0", table.replace('brake = "pedal"', 'acceleration = "wish"')
     )
-    Path("law.py").write_text("""
+    write(
+        "law.py",
+        """
 import numpy as np
 from safevar_sumo.ads.base import Ads, pedals_for, trim_at
 
@@ -165,10 +170,9 @@ class Law(Ads):
         trim = trim or trim_at(nominal, seen)
         wish = np.where(seen.gap < 15.0, -9.0, 8.0 - seen.speed)
         return pedals_for(nominal, seen.speed, wish, trim), (nominal, trim)
-""")
-    Path("law.toml").write_text(
-        'extends = "native"\nname = "law"\n[ads]\nmodel = "law:Law"'
+""",
     )
+    write("law.toml", 'extends = "native"\nname = "law"\n[ads]\nmodel = "law:Law"')
     law = assemble(load_study("law.toml"))
     members = law.characteristics
     settings = np.random.default_rng(5).uniform(

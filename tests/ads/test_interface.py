@@ -16,13 +16,13 @@ from pythonfmu.builder import FmuBuilder
 from safevar_sumo.ads import Ads, ScalarAds
 from safevar_sumo.ads.base import Trim
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import UserCodeError
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 from safevar_sumo.scenarios.tracks import BODIES
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import assemble
 from tests.ads.test_ads import BRAKING, COASTING, FULL, KNOWN
+from tests.in_process import write
 from tests.made_up import original_of
 
 WISHES = [
@@ -65,10 +65,11 @@ def test_pedals_are_those_of_the_original_vehicles_tables(
 
 
 def test_a_class_may_have_another_method_of_that_name(in_tmp: Path) -> None:
-    (in_tmp / "own.py").write_text(
+    write(
+        "own.py",
         "from safevar_sumo.ads import ScalarAds\n\n\nclass Own(ScalarAds):\n"
         "    def pedals(self, wish):\n        return 0.0, min(-wish, 1.0)\n\n"
-        "    def drive(self, seen):\n        return self.pedals(-0.5)\n"
+        "    def drive(self, seen):\n        return self.pedals(-0.5)\n",
     )
     system = assemble(
         load_study("wear", matrix=None, scenario=STANDING, ads={"model": "own:Own"})
@@ -141,12 +142,13 @@ class Tells(Fmi2Slave):
 
 
 def test_an_fmu_may_be_given_the_same_numbers(in_tmp: Path) -> None:
-    (in_tmp / "tells_sizes.py").write_text(TELLS)
+    write("tells_sizes.py", TELLS)
     FmuBuilder.build_FMU(in_tmp / "tells_sizes.py", dest=in_tmp)
-    (in_tmp / "tells.toml").write_text(
+    write(
+        "tells.toml",
         'extends = "native"\nname = "tells"\n[ads]\nkind = "fmu"\nmodel = "Tells.fmu"\n'
         'inputs = { obstacle_length = "target", nominal_length = "own", step = "step_size" }\n'
-        'outputs = { brake = "pedal" }\n'
+        'outputs = { brake = "pedal" }\n',
     )
     ads = assemble(load_study("tells.toml")).ads
     memory = ads.start(1, KNOWN._replace(length=5.0), 0.1)
@@ -154,21 +156,3 @@ def test_an_fmu_may_be_given_the_same_numbers(in_tmp: Path) -> None:
     seen = Observation(0.0, one, one, one, one, one, 1.0, obstacle_length=4 * one)
     command, _ = ads.drive(seen, memory)
     assert command.brake[0] == pytest.approx(0.04 + 0.005 + 0.1)
-
-
-CONTROLLER = """
-def step(traci, vehicle_id):
-    ahead = traci.vehicle.getLeader(vehicle_id, 200)
-    if ahead:
-        sizes = traci.vehicle.getLength(ahead[0]), traci.vehicle.getLength(vehicle_id)
-        raise ValueError(f"{sizes[0]:.3f} m and {sizes[1]:.3f} m")
-"""
-
-
-def test_a_traci_controller_reads_them_by_its_own_calls(in_tmp: Path) -> None:
-    (in_tmp / "reads.py").write_text(CONTROLLER)
-    system: System = assemble(
-        load_study("native", ads={"kind": "traci", "model": "reads:step"})
-    )
-    with pytest.raises(UserCodeError, match=r"4\.700 m and \d\.\d+ m"):
-        drive_and_score(system, original_of(system))

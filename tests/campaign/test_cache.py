@@ -31,7 +31,7 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import SLOW, InlinePool
+from tests.in_process import SLOW, InlinePool, write
 
 OWN_ADS = """
 from threshold import TTC
@@ -196,11 +196,11 @@ def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_conti
     """What user code reads cannot be known: here a file whose name no study has."""
     monkeypatch.setattr(batches, "PORTION", 16)
     monkeypatch.setattr(batches, "SMALL_PORTION", 16)
-    (in_tmp / "threshold.py").write_text(
-        "from pathlib import Path\nTTC = float(Path('t').read_text())"
+    write(
+        "threshold.py", "from pathlib import Path\nTTC = float(Path('t').read_text())"
     )
-    (in_tmp / "own.py").write_text(OWN_ADS)
-    (in_tmp / "t").write_text("3.0")
+    write("own.py", OWN_ADS)
+    write("t", "3.0")
     study = load_study("smoke", ads={"model": "own:Own"})
     settings = some_settings(study, 64)
 
@@ -241,11 +241,11 @@ def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_conti
     # Nobody continues what is older than a day, or simulated with other modules.
     with pytest.raises(KeyboardInterrupt):
         ask("risk own", after=40)
-    (in_tmp / "own.py").write_text(OWN_ADS + "# changed\n")
+    write("own.py", OWN_ADS + "# changed\n")
     unload_user_modules()
     ask("risk own")
     assert sum(simulated) == 64
-    (in_tmp / "own.py").write_text(OWN_ADS)
+    write("own.py", OWN_ADS)
     monkeypatch.setattr(cache, "DAY", -1.0)
     ask("risk own")
     assert sum(simulated) == 64

@@ -37,7 +37,7 @@ from safevar_sumo.study import ModelTable, Origin, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.campaign.formulas import SUN, evaluated
-from tests.in_process import SLOW
+from tests.in_process import SLOW, write
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 
@@ -105,11 +105,12 @@ def take(task: Task, seconds: float) -> None:
 def test_work_of_which_two_workers_die_is_named_with_its_study_and_user_code(
     pool: Pool, in_tmp: Path
 ) -> None:
-    (in_tmp / "my_ads.py").write_text(
+    write(
+        "my_ads.py",
         "from safevar_sumo.ads import ScalarAds\n"
         "class Mine(ScalarAds):\n"
         "    def drive(self, seen):\n"
-        "        return 0.1, 0.0\n"
+        "        return 0.1, 0.0\n",
     )
     study = load_study("smoke", search={"time_limit": 0.2})
     why = "two workers were lost at the same work, 9: a batch took longer than the time limit"

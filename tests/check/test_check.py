@@ -12,7 +12,7 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.check import check_study, study_to_check, trials
-from tests.in_process import SLOW, json_of, run
+from tests.in_process import SLOW, json_of, rows_of, run, write
 from tests.manual import files_of
 
 SCALAR = """import random
@@ -275,8 +275,8 @@ def test_a_planted_defect_is_found_with_the_input_that_shows_it(
     name: str, in_tmp: Path
 ) -> None:
     defect = DEFECTS[name]
-    (in_tmp / "mine.py").write_text(defect.module)
-    (in_tmp / "mine.toml").write_text(STUDY_OF[defect.kind])
+    write("mine.py", defect.module)
+    write("mine.toml", STUDY_OF[defect.kind])
     (finding,) = check_study(study_to_check("mine.toml"))
     assert finding.check == defect.check, finding
     assert defect.got in str(finding)
@@ -295,11 +295,12 @@ def test_a_planted_defect_is_found_with_the_input_that_shows_it(
 def test_a_driver_who_does_not_get_to_the_encounter_does_not_pass(
     subject: str, drive: str, reason: str, in_tmp: Path
 ) -> None:
-    (in_tmp / "mine.py").write_text(
+    write(
+        "mine.py",
         "from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
-        f"    def drive(self, seen):\n        {drive}\n"
+        f"    def drive(self, seen):\n        {drive}\n",
     )
-    (in_tmp / "mine.toml").write_text(STUDY_OF["ads"])
+    write("mine.toml", STUDY_OF["ads"])
     assert [
         (finding.check, reason in finding.finding)
         for finding in check_study(study_to_check(subject))
@@ -322,13 +323,15 @@ def test_others_who_have_left_in_time_or_never_come_are_the_scenarios_matter(
     """A deer runs from 12 m beside the lane to 50 m ahead, or away; the car, at 40 km/h, is there
     after 4.5 s.
     """
-    (in_tmp / "mine.py").write_text(
+    write(
+        "mine.py",
         "from safevar_sumo.scenarios import Track\n\n\nclass Deer:\n    speed = 40.0\n    duration"
         " = 12.0\n\n    def tracks(self, times):\n        return [Track.of('deer', 'deer', 50.0,"
-        f" -12.0 + {pace} * times, vy={pace}, size=(0.6, 1.5))]\n"
+        f" -12.0 + {pace} * times, vy={pace}, size=(0.6, 1.5))]\n",
     )
-    (in_tmp / "mine.toml").write_text(
-        'extends = "wear"\nname = "mine"\n[scenario]\nmodel = "mine:Deer"\n'
+    write(
+        "mine.toml",
+        'extends = "wear"\nname = "mine"\n[scenario]\nmodel = "mine:Deer"\n',
     )
     findings = check_study(study_to_check("mine.toml"))
     assert [finding.check for finding in findings] == found
@@ -349,10 +352,8 @@ def test_an_original_that_is_unsafe_does_not_pass(criterion: str, in_tmp: Path) 
     wrong = SCALAR.replace("seen.gap < stopping", "seen.gap < -stopping").replace(
         "BODY", "pass"
     )
-    (in_tmp / "mine.py").write_text(
-        SCALAR.replace("BODY", "pass") if criterion else wrong
-    )
-    (in_tmp / "mine.toml").write_text(STUDY_OF["ads"] + criterion)
+    write("mine.py", SCALAR.replace("BODY", "pass") if criterion else wrong)
+    write("mine.toml", STUDY_OF["ads"] + criterion)
     (finding,) = check_study(study_to_check("mine.toml"))
     assert finding.check == "original", finding
     assert ("below 99 m" if criterion else "itself collides at ") in finding.finding
@@ -375,27 +376,28 @@ def test_a_driving_system_that_does_not_end_is_a_finding_in_time(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trials, "LONGEST", 0.5)
-    Path("mine.py").write_text(
+    write(
+        "mine.py",
         "from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
-        "    def drive(self, seen):\n        while True:\n            pass\n"
+        "    def drive(self, seen):\n        while True:\n            pass\n",
     )
     output = run("check mine:Mine", expect=1).stdout
     assert "took longer than the time limit of 0.5 s" in " ".join(output.split())
 
 
 def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) -> None:
-    (in_tmp / "mine.py").write_text(DEFECTS["out of range"].module)
-    (in_tmp / "mine.toml").write_text(STUDY_OF["ads"])
+    write("mine.py", DEFECTS["out of range"].module)
+    write("mine.toml", STUDY_OF["ads"])
     answer = json.loads(run("check mine.toml --json", expect=1).stdout)
     assert answer["numbers"]["passed"] is False
-    (finding,) = answer["tables"]["findings"]["rows"]
+    (finding,) = rows_of(answer, "findings")
     assert {"finding", "where", "input", "expected"} <= set(finding)
     text = run("check mine:Mine --format csv", expect=1).stdout
     assert "ads.model = 'mine:Mine' returned brake = 100.0 from drive" in text
     assert "mine.py:11" in text
-    (in_tmp / "mine.py").write_text(SCALAR.replace("BODY", "self.far = seen.gap"))
+    write("mine.py", SCALAR.replace("BODY", "self.far = seen.gap"))
     passed = json_of("check mine.toml")
-    assert (passed["numbers"]["passed"], passed["tables"]["findings"]["rows"]) == (
+    assert (passed["numbers"]["passed"], rows_of(passed, "findings")) == (
         True,
         [],
     )
@@ -415,9 +417,9 @@ def test_it_says_how_many_vehicles_it_has_simulated_and_what_it_has_not_tried(
 ) -> None:
     """As many as the time allows, unless their number is given."""
     monkeypatch.setattr(trials, "LONGEST", longest)
-    (in_tmp / "mine.py").write_text(SCALAR.replace("BODY", "pass"))
+    write("mine.py", SCALAR.replace("BODY", "pass"))
     test = '[[matrix.tests]]\nname = "it"\nover = { turns_after = [0.5, 0.6, 0.7, 0.8, 0.9] }\n'
-    (in_tmp / "mine.toml").write_text(STUDY_OF["ads"] + test)
+    write("mine.toml", STUDY_OF["ads"] + test)
     answer = json_of(f"check mine.toml {options}")
     assert answer["numbers"] == {"passed": True, "vehicles": vehicles, "points": 3}
     assert (

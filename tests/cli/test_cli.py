@@ -28,7 +28,7 @@ from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import SLOW, json_of, refused, run
+from tests.in_process import SLOW, json_of, refused, rows_of, run, write
 
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 
@@ -149,7 +149,7 @@ def test_a_change_is_a_value_or_a_share(change: str, value: float) -> None:
 def test_a_matrix_says_of_how_many_test_cases_a_degree_is_the_least() -> None:
     """Every number stands once, and the test case of the least degree is named."""
     lead, _, _ = simulate("wear").stdout.partition("\n┏")
-    points = json.loads(simulate("wear", "--json").stdout)["tables"]["points"]["rows"]
+    points = rows_of(json.loads(simulate("wear", "--json").stdout), "points")
     worst = min(points, key=lambda row: row["safety_degree"])
     least = f"{worst['safety_degree']:.2f} m in the worst of {len(points)} test cases"
     assert f"{least} ({worst['point']}). The original vehicle fails in none" in lead
@@ -212,7 +212,7 @@ def test_an_output_that_fails_leaves_the_old_file_and_no_new_one(
             "with space for it",
         )
         assert list(in_tmp.iterdir()) == []
-        Path(name).write_text("old")
+        write(name, "old")
         refused(f"simulate sun {flag} {name}", flag, name)
         assert Path(name).read_text() == "old"
         Path(name).unlink()
@@ -275,14 +275,13 @@ def test_what_user_code_prints_leaves_the_json_alone(
     in_tmp: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Also what other processes and compiled code print."""
-    Path("loud.py").write_text(
+    write(
+        "loud.py",
         "import os\nfrom safevar_sumo.ads import ScalarAds\n\nprint('loaded')\n\n\nclass"
         " Loud(ScalarAds):\n    def drive(self, seen):\n        print('drives')\n       "
-        " os.write(1, b'writes')\n        return 0.3, 0.0\n"
+        " os.write(1, b'writes')\n        return 0.3, 0.0\n",
     )
-    Path("loud.toml").write_text(
-        'extends = "smoke"\nname = "loud"\n[ads]\nmodel = "loud:Loud"\n'
-    )
+    write("loud.toml", 'extends = "smoke"\nname = "loud"\n[ads]\nmodel = "loud:Loud"\n')
     for question in "simulate loud.toml", "risk loud.toml --samples 4 --jobs 1":
         assert json_of(question)["question"] in question
         out, err = capfd.readouterr()
@@ -327,9 +326,7 @@ def test_a_key_that_the_study_of_a_simulation_has_not_is_refused_before_it_drive
 
 
 def test_a_metric_of_the_study_is_a_key_of_its_simulations(in_tmp: Path) -> None:
-    Path("mine.toml").write_text(
-        'extends = "smoke"\nname = "mine"\n[metrics]\nalso = ["drac"]\n'
-    )
+    write("mine.toml", 'extends = "smoke"\nname = "mine"\n[metrics]\nalso = ["drac"]\n')
     assert (
         "failed: drac = "
         in run("simulate mine.toml --fail-if 'drac > 0'", expect=3).stderr

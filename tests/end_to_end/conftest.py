@@ -18,7 +18,7 @@ import psutil
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from tests.in_process import run, searched
+from tests.in_process import run, searched, write
 
 STUDY = """
 extends = "smoke"
@@ -138,7 +138,7 @@ def _nothing_left_running() -> Iterator[None]:
 @pytest.fixture
 def small(in_tmp: Path) -> None:
     """Write the file of the small study to an empty working directory."""
-    Path("small.toml").write_text(STUDY)
+    write("small.toml", STUDY)
 
 
 @pytest.fixture(scope="session")

@@ -20,7 +20,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.results import FILES, load_runs, read_manifest
 from safevar_sumo.shipped import NETWORKS
 from tests.end_to_end.conftest import solutions, study, written
-from tests.in_process import SLOW, json_of, run
+from tests.in_process import SLOW, numbers_of, run, write
 
 pytestmark = pytest.mark.usefixtures("small")
 
@@ -29,24 +29,11 @@ pytestmark = pytest.mark.usefixtures("small")
 def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> None:
     run(f"simulate {study} --trace trace.csv")
     frame = pd.read_csv("trace.csv")
-    assert list(frame.columns) == [
-        "time [s]",
-        "position [m]",
-        "speed [m/s]",
-        "acceleration [m/s^2]",
-        "gap [m]",
-        "ttc [s]",
-        "throttle [-]",
-        "brake [-]",
-        "gear [-]",
-        "lateral [m]",
-        "lateral speed [m/s]",
-        "seen speed [m/s]",
-        "seen gap [m]",
-        "seen closing speed [m/s]",
-        "seen lateral [m]",
-        "seen lateral speed [m/s]",
-    ]
+    assert ", ".join(frame.columns) == (
+        "time [s], position [m], speed [m/s], acceleration [m/s^2], gap [m], ttc [s], "
+        "throttle [-], brake [-], gear [-], lateral [m], lateral speed [m/s], seen speed [m/s], "
+        "seen gap [m], seen closing speed [m/s], seen lateral [m], seen lateral speed [m/s]"
+    )
     assert frame.loc[frame["speed [m/s]"] < 1e-3, "ttc [s]"].isna().all(), (
         "a standing vehicle closes nothing"
     )
@@ -60,9 +47,7 @@ def test_trace_has_every_quantity_with_its_unit(study: str, in_tmp: Path) -> Non
 
 @SLOW
 def test_a_title_is_no_markup(in_tmp: Path) -> None:
-    Path("mine.toml").write_text(
-        'extends = "smoke"\nname = "mine"\ntitle = "[red]x[/blue] {$"\n'
-    )
+    write("mine.toml", 'extends = "smoke"\nname = "mine"\ntitle = "[red]x[/blue] {$"\n')
     assert "[red]x[/blue]" in run("simulate mine.toml --details").stdout
     run("study mine.toml --evaluations 10 --runs 1 --algorithms rs --quiet")
 
@@ -124,7 +109,7 @@ def test_the_end_of_a_study_counts_what_was_simulated_and_quiet_prints_only_what
     simulated = len(load_runs(whole).evaluations)
     again = f"study small.toml --out {whole} --quiet"
     assert run(again).stdout == ""
-    assert json_of(again)["numbers"]["evaluations"] == simulated
+    assert numbers_of(again)["evaluations"] == simulated
     assert "NSGA-II" in run(f"{again} --table algorithms").stdout
 
 
@@ -154,9 +139,9 @@ runs = 1
 
 @pytest.fixture
 def mine(in_tmp: Path) -> None:
-    Path("my_ads.py").write_text(ADS)
-    Path("my_map.py").write_text("GAP = 9.0\n")
-    Path("mine.toml").write_text(STUDY)
+    write("my_ads.py", ADS)
+    write("my_map.py", "GAP = 9.0\n")
+    write("mine.toml", STUDY)
     shutil.copytree(NETWORKS / "pedestrian_crossing", "my_net")
 
 
@@ -247,7 +232,7 @@ def test_a_search_says_how_fast_an_original_collides(in_tmp: Path) -> None:
     weather = (
         'name = "fog"\nroad_friction = 1.0\nvisibility = 1.0\nrecognition_delay = 1.5'
     )
-    Path("late.toml").write_text(f'extends = "smoke"\n[weather]\n{weather}\n')
+    write("late.toml", f'extends = "smoke"\n[weather]\n{weather}\n')
     searched = run("study late.toml --runs 1 --evaluations 10 --json")
     speed = sv.simulate("late.toml").collision_speed
     assert speed > 1

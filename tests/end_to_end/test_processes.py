@@ -30,7 +30,7 @@ from tests.end_to_end.conftest import (
     workers_of,
     written,
 )
-from tests.in_process import SLOW, refused, run
+from tests.in_process import SLOW, refused, run, write
 from tests.scenarios.test_simulated import MODELS, STUDY
 
 Process = subprocess.Popen[str]
@@ -166,13 +166,15 @@ def test_a_temporary_folder_is_removed_once_its_process_was_killed(
 
 @SLOW
 def test_a_worker_that_hangs_does_not_outlive_a_killed_study() -> None:
-    Path("my_ads.py").write_text(
+    write(
+        "my_ads.py",
         "import time\nfrom pathlib import Path\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass"
         " Dozing(ScalarAds):\n    def drive(self, seen):\n        Path('dozing').touch()\n       "
-        " time.sleep(1000)\n"
+        " time.sleep(1000)\n",
     )
-    Path("dozing.toml").write_text(
-        'extends = "small.toml"\nname = "dozing"\n[ads]\nmodel = "my_ads:Dozing"\n'
+    write(
+        "dozing.toml",
+        'extends = "small.toml"\nname = "dozing"\n[ads]\nmodel = "my_ads:Dozing"\n',
     )
     process = started("study dozing.toml --out out")
     until(Path("dozing").exists, process)
@@ -194,14 +196,16 @@ def test_a_worker_that_hangs_does_not_outlive_a_killed_study() -> None:
 def test_user_code_that_its_workers_die_of_is_an_error_with_its_line(
     line: str, why: str
 ) -> None:
-    Path("my_ads.py").write_text(
+    write(
+        "my_ads.py",
         "import ctypes\nimport os\nimport time\nfrom safevar_sumo.ads import ScalarAds\n\n\nclass"
         " Deadly(ScalarAds):\n    def drive(self, seen):\n        if os.path.exists('now'):\n     "
-        f"       {line}\n        return 0.5, 0.0\n"
+        f"       {line}\n        return 0.5, 0.0\n",
     )
-    Path("deadly.toml").write_text(
+    write(
+        "deadly.toml",
         'extends = "small.toml"\nname = "deadly"\n[ads]\nmodel ='
-        ' "my_ads:Deadly"\n[search]\ntime_limit = 5.0\n'
+        ' "my_ads:Deadly"\n[search]\ntime_limit = 5.0\n',
     )
     process = started("study deadly.toml --out out --jobs 1", batch=1)
     until_it_writes(process)
@@ -324,9 +328,9 @@ def test_questions_on_a_cluster_have_the_bytes_of_one_process(
     scheduler: tuple[Process, str], start: Start
 ) -> None:
     """A worker that dies is replaced, with its number; one with another file ends the command."""
-    Path("models.py").write_text(MODELS)
-    Path("counted.py").write_text(COUNTED)
-    Path("wall.toml").write_text(STUDY.replace("models:Wall", "counted:Counted"))
+    write("models.py", MODELS)
+    write("counted.py", COUNTED)
+    write("wall.toml", STUDY.replace("models:Wall", "counted:Counted"))
     _, address = scheduler
     workers = [worker(start, address, "--no-nanny") for _ in range(2)]
     logs = [Path(f"worker-{number}.log") for number in (1, 2)]
@@ -364,8 +368,8 @@ def test_a_worker_with_another_file_ends_a_question(
     scheduler: tuple[Process, str], start: Start
 ) -> None:
     _, address = scheduler
-    Path("models.py").write_text(MODELS)
-    Path("wall.toml").write_text(STUDY)
+    write("models.py", MODELS)
+    write("wall.toml", STUDY)
     until(
         lambda: "Registered to" in Path("worker-1.log").read_text(),
         worker(start, address, "--no-nanny"),

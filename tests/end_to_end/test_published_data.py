@@ -14,7 +14,7 @@ from safevar_sumo.reference.rows import package_filter
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import SLOW, json_of, refused, run
+from tests.in_process import SLOW, json_of, refused, rows_of, run
 
 COLUMNS = {
     "safety_degree": "SaftyDegree",
@@ -145,7 +145,7 @@ def test_an_unfinished_campaign_is_answered_as_far_as_it_went(
         output["tables"]["remarks"]
     )
     assert "1 of 2 runs of rs" in run("rules part --samples 64 --jobs 1").stderr
-    records = output["tables"]["rq2"]["rows"]
+    records = rows_of(output, "rq2")
     assert next(one for one in records if one["metric"] == "igd")["n2"] == 1
     assert "budget" not in output["tables"]
     assert {*json_of("tables part --table budget")["tables"]} == {

@@ -11,13 +11,9 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import OPTIONAL_METRICS
-from safevar_sumo.questions.catalogue import list_models
 from safevar_sumo.records import FloatArray, SimulationRuns
-from safevar_sumo.scenarios.ahead import Along, CarToCar
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import assemble
-from tests.made_up import original_of
 from tests.scenarios.ideal import met_at_once
 
 WEAR = assemble(load_study("wear", matrix=None, weather="clear"))
@@ -71,47 +67,3 @@ def test_towards_who_crosses_only_the_way_along_the_path_counts(test: Any) -> No
     expected = along_the_path(runs)
     assert np.isfinite(expected).sum() > 200
     assert measured(runs) == pytest.approx(expected, nan_ok=True)
-
-
-def test_in_the_published_scenario_too() -> None:
-    system = assemble(load_study("sun"))
-    runs = drive_worst(system, original_of(system))
-    assert measured(runs) == pytest.approx(along_the_path(runs))
-
-
-def test_a_pedestrian_who_walks_fast_is_not_approached_faster() -> None:
-    """2.84 m/s^2 stops in time, and gap over speed is never below 0.577 s; TET and TIT keep the
-    paper's TTC.
-    """
-    values = {
-        "test": "CPNA",
-        "speed": 12.26,
-        "impact_location": 4.88,
-        "target_speed": 11.99,
-    }
-    scenario: Any = WEAR.points[0].scenario.at(values)
-    runs = met_at_once(WEAR, scenario, WEAR.ads, 1)
-    assert measured(runs)[:, 0] == pytest.approx([0.577, 2.84], abs=3e-3)
-    assert runs.time_to_collision.min() == pytest.approx(0.489, abs=5e-4)
-
-
-@pytest.mark.parametrize(
-    "scenario", [CarToCar(impact_location=20), CarToCar(test="CCRb"), Along()], ids=repr
-)
-def test_behind_a_leader_both_times_to_collision_are_one_to_the_bit(
-    scenario: Any,
-) -> None:
-    runs = met_at_once(WEAR, scenario, WEAR.ads, 1)
-    ttc = runs.time_to_collision
-    assert measured(runs)[:, 0].tolist() == [
-        ttc.min(),
-        np.nanmax(runs.encounter.closing_speed / (2 * ttc)),
-    ]
-
-
-def test_the_table_of_metrics_says_that_there_are_two_times_to_collision() -> None:
-    title = list_models("metrics").tables.records["metrics"].title
-    assert (
-        "TET and TIT use TTC = L_s / v_L; ttc_min and drac use TTC_p = gap / (v - u)"
-        in title
-    )

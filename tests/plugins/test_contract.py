@@ -21,7 +21,7 @@ from safevar_sumo.plugins.process import defer_interrupts, this_process
 from safevar_sumo.records import differences
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import run
+from tests.in_process import run, write
 from tests.made_up import original_of
 from tests.plugins.conftest import ADS, SCALAR, Mine
 
@@ -37,7 +37,7 @@ def throttle(study: Path) -> float:
 def test_beside_the_study_comes_before_the_working_directory(
     mine: Mine, folder: Path
 ) -> None:
-    Path("mine.py").write_text(CONSTANT.format(0.1))
+    write("mine.py", CONSTANT.format(0.1))
     mine(CONSTANT.format(0.9))
     assert throttle(folder / "mine.toml") == 0.9
     (folder / "mine.py").unlink()
@@ -142,13 +142,6 @@ def handled_by_default(name: str) -> Iterator[None]:
         assert signal.getsignal(number) is signal.default_int_handler
     finally:
         signal.signal(number, handler)
-
-
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_ctrl_c_passes(name: str, mine: Mine) -> None:
-    ctrl_c = mine(SCALAR + PRESSED.format(name))
-    with handled_by_default(name), pytest.raises(KeyboardInterrupt):
-        drive_and_score(ctrl_c, original_of(ctrl_c))
 
 
 def test_what_user_code_does_on_ctrl_c_stays(mine: Mine) -> None:

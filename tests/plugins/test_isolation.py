@@ -20,7 +20,7 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Vehicle
-from tests.in_process import SLOW, json_of, refused, run, searched
+from tests.in_process import SLOW, json_of, numbers_of, refused, run, searched, write
 from tests.manual import files_of
 from tests.plugins.conftest import Mine
 from tests.scenarios.holding import Pedals
@@ -74,14 +74,8 @@ def six(in_tmp: Path) -> None:
     for name, text in files_of(
         *(f"docs/tutorials/own_{page}.md" for page in ("ads", "vehicle", "metric"))
     ).items():
-        Path(name).write_text(text)
-    Path("six.toml").write_text(SIX)
-
-
-def test_members_of_user_code_are_simulated_and_scored(six: None) -> None:
-    output = json_of("simulate six.toml --set grip=5")["numbers"]
-    assert output["jerk"] > 0
-    assert output["mean_change"] == pytest.approx(3 / 8 / 3)
+        write(name, text)
+    write("six.toml", SIX)
 
 
 @SLOW
@@ -120,10 +114,11 @@ class Late(ScalarAds):
 def test_a_state_that_shows_late_is_an_error_at_the_end(
     command: str, in_tmp: Path
 ) -> None:
-    Path("late.py").write_text(LATE)
-    Path("late.toml").write_text(
+    write("late.py", LATE)
+    write(
+        "late.toml",
         'extends = "smoke"\nname = "late"\n[ads]\nmodel = "late:Late"\n'
-        '[search]\nalgorithms = ["rs"]\nruns = 1\nevaluations = 1500\n'
+        '[search]\nalgorithms = ["rs"]\nruns = 1\nevaluations = 1500\n',
     )
     refused(command, "when a worker simulated its first batch again", "late:Late")
     assert not [*Path().rglob("*.jsonl")], "nothing is continued"
@@ -213,15 +208,15 @@ def test_a_vehicle_that_diverges_before_its_end_is_an_error_in_every_batch(
 def test_a_module_beside_the_study_may_have_the_name_of_one_that_is_loaded(
     in_tmp: Path,
 ) -> None:
-    Path("random.py").write_text(
+    write(
+        "random.py",
         "import random\n"
         "from safevar_sumo.ads.aeb import Aeb\n"
         "class Mine(Aeb, frozen=True, kw_only=True):\n"
-        "    braking_share: float = random.choice([0.3])\n"
+        "    braking_share: float = random.choice([0.3])\n",
     )
-    Path("mine.toml").write_text(
-        'extends = "wear"\nname = "mine"\n[ads]\nmodel = "random:Mine"\nparameters = {}\n'
+    write(
+        "mine.toml",
+        'extends = "wear"\nname = "mine"\n[ads]\nmodel = "random:Mine"\nparameters = {}\n',
     )
-    assert json_of("simulate mine.toml")["numbers"]["f_safe"] == pytest.approx(
-        1.16, abs=0.01
-    )
+    assert numbers_of("simulate mine.toml")["f_safe"] == pytest.approx(1.16, abs=0.01)

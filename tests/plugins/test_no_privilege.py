@@ -29,7 +29,7 @@ from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import VEHICLES
-from tests.in_process import SLOW, searched
+from tests.in_process import SLOW, searched, write
 from tests.made_up import drawn
 from tests.manual import ROOT
 
@@ -127,7 +127,7 @@ def test_what_a_search_leaves_out_is_what_a_class_declares_a_shipped_one_as_a_us
     in_tmp: Path,
 ) -> None:
     """The original is the class's default; in a matrix the class may be that of a test."""
-    (in_tmp / "deer.py").write_text(DEER)
+    write("deer.py", DEER)
     for model in ("crossing", copied(SCENARIOS["crossing"], in_tmp), "deer:Deer"):
         domain = ("km/h", 40, *((20, 60) if model == "deer:Deer" else (10, 80)))
         over = {"speed": {}, "visibility": {"lower": 0.5}}
@@ -211,9 +211,7 @@ def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(
 ) -> None:
     """Random numbers go with an algorithm's name, so the copy has it, too."""
     module, _, class_ = copied(ALGORITHMS[name], in_tmp).partition(":")
-    (in_tmp / "named.py").write_text(
-        f"from {module} import {class_}\n\n{name} = {class_}\n"
-    )
+    write("named.py", f"from {module} import {class_}\n\n{name} = {class_}\n")
     assert_same_solutions(short("smoke", name), short("smoke", f"named:{name}"), in_tmp)
 
 
@@ -243,7 +241,7 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
         "own_f_diff = Measure(name='own_f_diff', title='largest', unit='-', of='settings',"
         " function=largest)"
     )
-    (in_tmp / "named.py").write_text("\n".join(lines))
+    write("named.py", "\n".join(lines))
     own = [f"named:{name}" for name in shipped]
     objectives = ["named:tit", "f_safe", "named:own_f_diff"]
     system = assemble(

@@ -25,7 +25,7 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import InlinePool, searched
+from tests.in_process import InlinePool, searched, write
 from tests.made_up import made_up_evaluations
 
 
@@ -165,7 +165,7 @@ def diagonal_band(settings: FloatArray) -> BoolArray:
 @pytest.fixture
 def ahead(request: pytest.FixtureRequest, in_tmp: Path) -> Study:
     """The study that the test's module has as `AHEAD`."""
-    (in_tmp / "ahead.toml").write_text(request.module.AHEAD)
+    write("ahead.toml", request.module.AHEAD)
     return load_study("ahead.toml")
 
 

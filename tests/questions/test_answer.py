@@ -35,7 +35,7 @@ from safevar_sumo.questions.render import MAX_LINES, MAX_ROWS
 from safevar_sumo.questions.sentence import Verdict, answer as said, note
 from safevar_sumo.questions.words import change_texts
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import refused
+from tests.in_process import refused, rows_of
 from tests.manual import files_of
 
 COLUMNS = {
@@ -204,7 +204,7 @@ def test_a_long_table_has_a_column_for_each_value_and_its_intervals() -> None:
         "up to 2",
         "-",
     ]
-    assert len(answer.to_dict()["tables"]["lengths"]["rows"]) == 4
+    assert len(rows_of(answer.to_dict(), "lengths")) == 4
 
 
 def test_html_and_latex_are_escaped_and_csv_reads_back() -> None:
@@ -375,7 +375,7 @@ def test_the_question_that_the_manual_adds_from_outside(
         CliRunner().invoke(commands, [*command, "--format", "json"]).stdout
     )
     assert answer["question"] == name
-    rows = answer["tables"]["ends"]["rows"]
+    rows = rows_of(answer, "ends")
     assert len(rows) == 2 * len(load_study("smoke").vehicle.characteristics)
     assert answer["numbers"]["unsafe_ends"] == sum(
         row["safety_degree"] < 2.2 for row in rows

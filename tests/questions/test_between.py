@@ -22,7 +22,7 @@ from safevar_sumo.questions.tolerance.oracle import Exhausted, Oracle, product_o
 from safevar_sumo.study import Constraint, Study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, InlinePool, json_of
+from tests.in_process import SLOW, InlinePool, json_of, write
 from tests.questions.conftest import Plant, made_up_study, model_of
 
 AHEAD = """
@@ -145,9 +145,7 @@ def test_a_scope_names_a_range_only_where_it_was_driven(
     text = f'[[matrix.tests]]\nname = "A"\nparameters = {{ test = "CPNA" }}\nover = {{ {over} }}\n'
     if "target" in over:
         text = text.replace("CPNA", "CPFA")
-    Path("own.toml").write_text(
-        f'extends = "wear"\nname = "own"\ntitle = "Own"\n{text}'
-    )
+    write("own.toml", f'extends = "wear"\nname = "own"\ntitle = "Own"\n{text}')
     assert said in scope_of(load_study("own.toml"), between=between)
 
 
@@ -184,7 +182,7 @@ def test_a_set_in_which_the_original_is_unsafe_is_named_with_its_test(
 ) -> None:
     text = Path("ahead.toml").read_text()
     spread = '[spread]\n"vehicle.parameters.tyre_friction" = [1.079, 0.2]\n'
-    Path("slippery.toml").write_text(f"{text}{spread}".replace('"ahead"', '"slippery"'))
+    write("slippery.toml", f"{text}{spread}".replace('"ahead"', '"slippery"'))
     study = load_study("slippery.toml")
     answer = tolerance.compute(
         study,

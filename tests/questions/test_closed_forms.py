@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
-from tests.in_process import InlinePool
+from tests.in_process import InlinePool, write
 from tests.scenarios.test_simulated import STUDY
 
 CARS = """
@@ -51,7 +51,7 @@ def car(coarse: None, in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """Its study, with few simulations of every search."""
     monkeypatch.setattr("safevar_sumo.questions.cases.LEAST_SIMULATIONS", 90)
     monkeypatch.setattr("safevar_sumo.questions.cases.USUAL_BUDGET", 90)
-    Path("cars.py").write_text(CARS)
+    write("cars.py", CARS)
     return STUDY.replace("models:Wall", "cars:Car")
 
 
@@ -73,7 +73,7 @@ def test_cars_may_drive_at_the_speeds_of_the_formula(car: str) -> None:
     for end, error in (9, ERROR), (1, LATENESS):
         precision = f"precision = {{ value = {error}, source = 'test' }}"
         study = study.replace(f"upper = {end} }}", f"upper = {end}, {precision} }}")
-    Path("car.toml").write_text(study)
+    write("car.toml", study)
     worn = {"decel": 5.0, "delay": 0.25}
     cars = {"new": {}, "worn": worn, "old": {"decel": 3.5, "delay": 0.875}}
     rows = sv.permit("car.toml", cars=cars, **OPTIONS).tables["cars"].set_index("car")
@@ -99,7 +99,7 @@ def test_cars_may_drive_at_the_speeds_of_the_formula(car: str) -> None:
 
 
 def test_all_cars_within_limits_drive_as_fast_as_the_worst_of_them(car: str) -> None:
-    Path("car.toml").write_text(car.replace("[vehicle.", SPEED))
+    write("car.toml", car.replace("[vehicle.", SPEED))
     answer = sv.permit("car.toml", limits=["decel >= 5", "delay <= 0.25"], **OPTIONS)
     (row,) = answer.tables["cars"].to_dict("records")
     assert (row["up_to"], row["repair_first"]) == (permitted(5.0, 0.25), None)
@@ -114,8 +114,8 @@ def test_two_versions_are_counted_as_the_formula_says(
 ) -> None:
     """One brakes with 8 m/s^2, the other with 6.5: the same changes of each are compared."""
     study = car.replace("[vehicle.", "parameters.gap = 40.0\n[vehicle.")
-    Path("hard.toml").write_text(study)
-    Path("soft.toml").write_text(study.replace("original = 8", "original = 6.5"))
+    write("hard.toml", study)
+    write("soft.toml", study.replace("original = 8", "original = 6.5"))
     names = ["hard.toml", "soft.toml"][:: 1 if is_worse else -1]
     answer = sv.compare(
         *names, samples=64, limits=[f"decel >= {least}"], pool=InlinePool()

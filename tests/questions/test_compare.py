@@ -18,10 +18,17 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.compare.coverage import missing_in_words, missing_parts
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.research_questions.statistics import compare_samples
-from safevar_sumo.questions.sentence import Sentence
-from safevar_sumo.questions.tables import cell_text
 from safevar_sumo.questions.tolerance import asked
-from tests.in_process import SLOW, InlinePool, json_of, refused, run, searched
+from tests.in_process import (
+    SLOW,
+    InlinePool,
+    json_of,
+    refused,
+    rows_of,
+    run,
+    searched,
+    write,
+)
 
 ONE_TEST = {
     "title": "one test",
@@ -153,7 +160,7 @@ def test_a_version_whose_failing_tests_were_deleted_is_not_released(
         "name": "version",
         "matrix": {"tests": [table]},
     }
-    Path("version.toml").write_text(tomli_w.dumps(version))
+    write("version.toml", tomli_w.dumps(version))
     answer = json_of("compare autoware_july version.toml --samples 8", expect=4)
     assert answer["numbers"]["decision"] == "decide"
     assert "version lacks the test case (CCRs, speed 40, clear)" in answer["verdict"]
@@ -233,7 +240,7 @@ def test_none_of_four_worse_versions_is_released(
 @SLOW
 def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
     answer = json_of("compare smoke smoke --samples 100")
-    numbers, limits = answer["numbers"], answer["tables"]["limits"]["rows"]
+    numbers, limits = answer["numbers"], rows_of(answer, "limits")
     assert (numbers["only_a_unsafe"], numbers["only_b_unsafe"]) == (0, 0)
     assert (numbers["p"], numbers["a12"], numbers["settings"]) == (1.0, 0.5, 100)
     assert [one["a_low"] for one in limits] == [one["b_low"] for one in limits]
@@ -315,13 +322,3 @@ def test_a_report_of_two_results_compares_them(
         "--ask: compare cannot be asked about 1",
     )
     refused(f"report {dry} {dry} --out it.html", "twice")
-
-
-@SLOW
-def test_what_a_person_has_to_decide_passes_no_gate_and_counts_have_no_exponent(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    decided = "DECIDE", [Sentence("answer", "DECIDE: B is both.")]
-    monkeypatch.setattr("safevar_sumo.questions.compare._decide", lambda *_: decided)
-    run("compare smoke smoke --samples 8 --jobs 1", expect=4)
-    assert cell_text(1259.0, ".3g") == "1,259"

@@ -11,7 +11,7 @@ from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import region_of
-from tests.in_process import SLOW, InlinePool, json_of, numbers_of, refused
+from tests.in_process import SLOW, InlinePool, json_of, numbers_of, refused, rows_of
 from tests.questions.conftest import made_up_model, made_up_study
 
 
@@ -57,9 +57,9 @@ def test_an_axis_of_the_matrix_is_set_where_tests_have_it() -> None:
     at_test = "simulate wear --point 'CPFA, speed 40, wet'"
     assert numbers_of(f"{at_test} --set speed=40") == numbers_of(at_test)
     both = json_of("simulate wear --set speed=33 --set impact_location=40")
-    assert [row["point"] for row in both["tables"]["points"]["rows"]] == ["CPNA, wet"]
+    assert [row["point"] for row in rows_of(both, "points")] == ["CPNA, wet"]
     refused("simulate wear --set speed=70", "speed = 70.0", "[10, 60] km/h")
-    within = json_of("simulate fmvss127 --set speed=65")["tables"]["points"]["rows"]
+    within = rows_of(json_of("simulate fmvss127 --set speed=65"), "points")
     tests = {row["point"].partition(",")[0] for row in within}
     assert {"stopped lead vehicle", "slower lead vehicle"} < tests
     assert "adult crosses from the right" not in tests, "its range ends at 60 km/h"

@@ -40,7 +40,7 @@ from safevar_sumo.results import handles_of, solutions_frame
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.conftest import FITS
-from tests.in_process import InlinePool, json_of, numbers_of
+from tests.in_process import InlinePool, json_of, numbers_of, rows_of
 from tests.questions.conftest import (
     ORIGINAL,
     Plant,
@@ -64,7 +64,7 @@ RESOLUTION = 1 / 16_384
 def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> None:
     answer = json.loads(explained.render("json"))
     output = [str(handle) for handle in handles_of(case.solutions)]
-    for row in answer["tables"]["solutions"]["rows"]:
+    for row in rows_of(answer, "solutions"):
         solution = case.solutions.iloc[output.index(row["solution"])]
         assert (row["outcome"], row["safety_degree"]) == (
             solution["outcome"],
@@ -72,7 +72,7 @@ def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> N
         )
         causes = [
             one
-            for one in answer["tables"]["causes"]["rows"]
+            for one in rows_of(answer, "causes")
             if one["solution"] == row["solution"]
         ]
         assert causes
@@ -190,7 +190,7 @@ def test_the_fewest_changes_collide_as_they_are_printed_and_no_fewer_of_them_do(
             for name, value in values.items()
             if name != left_out
         ]
-        assert json_of(f"simulate {slippery}", *rest)["numbers"]["outcome"] == "stopped"
+        assert numbers_of(f"simulate {slippery}", *rest)["outcome"] == "stopped"
 
 
 def test_the_verdict_tells_a_colleague_limits_robustness_and_who_avoids_it(
@@ -338,13 +338,6 @@ def test_a_boundary_of_a_single_change_is_unsafe_when_typed_with_the_others() ->
 
     alone = printed_of(2, region, 9.0, 8.55)["single_boundary"]
     assert region(np.array([[alone["a"], 8.55], [9.0, alone["b"]]])).all()
-
-
-def test_a_boundary_just_below_a_change_is_found_as_accurately() -> None:
-    evaluator = made_up_evaluator(1, lambda settings: settings[:, 0] > 8.996)
-    assert limits(evaluator, 9.0).boundary["a"] == pytest.approx(
-        8.996, abs=4 * RESOLUTION
-    )
 
 
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:

@@ -22,7 +22,7 @@ from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.questions.tolerance.oracle import Oracle
 from safevar_sumo.results.identity import identity_digest, manifest_of
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, json_of, refused, run, searched
+from tests.in_process import SLOW, json_of, refused, rows_of, run, searched
 
 STUDY = """
 extends = "rain"
@@ -106,18 +106,14 @@ def test_simulate_and_the_summary_of_a_search_compare_with_the_original_in_the_s
     ]
     answer = json_of("simulate results", *values)
     degrees = next(
-        one
-        for one in answer["tables"]["results"]["rows"]
-        if one["result"] == "safety_degree"
+        one for one in rows_of(answer, "results") if one["result"] == "safety_degree"
     )
     assert (degrees["original"], degrees["simulated"]) == (
         row["original_safety_degree"],
         row["safety_degree"],
     )
     assert "A search would leave this encounter out: the" in answer["verdict"]
-    rows = json_of("study tiny.toml --status --out results")["tables"]["algorithms"][
-        "rows"
-    ]
+    rows = rows_of(json_of("study tiny.toml --status --out results"), "algorithms")
     safe = drawn[drawn["original_safety_degree"] >= limit]
     expected = [
         ((safe["outcome"] == "collision") & (safe["algorithm"] == name)).sum()
@@ -262,10 +258,10 @@ def test_two_studies_are_compared_in_the_encounters_that_both_search(
     assert re.search(LEFT_OUT.format(r"[\d,]+"), answer["verdict"])
     assert answer["numbers"]["margin"] == 0.1, "as in tolerance"
     assert answer["numbers"]["only_a_unsafe"] == answer["numbers"]["only_b_unsafe"] == 0
-    frame = answer["tables"]["settings"]["rows"]
+    frame = rows_of(answer, "settings")
     assert all(10 <= one["distance"] <= 18 for one in frame)
     assert "distance" not in {
-        one["characteristic"] for one in answer["tables"]["limits"]["rows"]
+        one["characteristic"] for one in rows_of(answer, "limits")
     }
 
 

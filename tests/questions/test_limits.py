@@ -257,19 +257,6 @@ def test_children_lie_between_beside_and_around_their_parents() -> None:
     assert np.isin(values, (0.0, 10.0)).mean() == pytest.approx(0.6 / 7, abs=0.01)
 
 
-def test_children_come_nearer_to_what_is_unsafe_than_random_cases() -> None:
-    """A corner of 4 % of each of six domains: a random case hits it with 2^-6 0.52^6."""
-
-    def judge(cases: FloatArray) -> FloatArray:
-        return np.abs(cases[:, :6] - 8).sum(axis=1) - 1.2
-
-    for seed in range(5):
-        met = search_cases(
-            judge, space_of(6), nothing(6), SearchPlan(5000), default_rng(seed)
-        )
-        assert len(met.unsafe), seed
-
-
 def test_no_box_without_failures_is_larger_than_the_cut() -> None:
     """Of all that move one limit in for each failure."""
     failures = default_rng(1).uniform(0, 10, (7, 2))

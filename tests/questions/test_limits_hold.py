@@ -24,7 +24,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import InlinePool
+from tests.in_process import InlinePool, rows_of, write
 from tests.made_up import HARDEST_BRAKING
 
 ROUNDS = 12
@@ -67,13 +67,6 @@ CLAIMS: dict[str, tuple[str, dict[str, Any], dict[str, Any], int, str]] = {
         },
         600,
         "hardest > 6.8",
-    ),
-    "rain": (
-        "rain",
-        {},
-        {"limits": ("tireFric >= 3",), "fits": 3},
-        1500,
-        "at 3 or more",
     ),
     "SUMO's vehicle, gaps between bumpers": (
         "native",
@@ -163,7 +156,7 @@ def test_another_optimiser_finds_nothing_unsafe_within_joint_limits(
     name, changes, options, simulations, said = CLAIMS[claim]
     if claim != "several parameter sets":  # which few simulations do not reach
         request.getfixturevalue("few_simulations")
-    (in_tmp / "hardest_braking.py").write_text(HARDEST_BRAKING)
+    write("hardest_braking.py", HARDEST_BRAKING)
     unsafe = options.get("unsafe", Unsafe())
     study = study_by(load_study(name, **changes), unsafe)
     evaluator = Evaluator(study, InlinePool(), verified=0)
@@ -177,7 +170,7 @@ def test_another_optimiser_finds_nothing_unsafe_within_joint_limits(
         np.where(members.of_vehicle, members.original, ends)
         for ends in (members.lower, members.upper)
     )
-    for row in answer.to_dict()["tables"]["limits"]["rows"]:
+    for row in rows_of(answer.to_dict(), "limits"):
         column = members.names.index(row["characteristic"])
         item = members.members[column]
         demand = row["sentence"].partition(". ")[0]

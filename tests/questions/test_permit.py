@@ -33,7 +33,7 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, json_of, numbers_of, refused, run
+from tests.in_process import SLOW, json_of, numbers_of, refused, rows_of, run, write
 from tests.questions.conftest import model_of
 
 SHORT = """
@@ -61,8 +61,8 @@ slow;;1,6;0,55;525;0,4;0,4
 
 @pytest.fixture
 def short(in_tmp: Path) -> Study:
-    Path("short.toml").write_text(SHORT)
-    Path("fleet.csv").write_text(FLEET)
+    write("short.toml", SHORT)
+    write("fleet.csv", FLEET)
     return load_study("short.toml")
 
 
@@ -134,7 +134,7 @@ def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(
     short: Study,
 ) -> None:
     row = json_of("permit short.toml --cars fleet.csv --ignore note --fits 0")
-    cars = row["tables"]["cars"]["rows"]
+    cars = rows_of(row, "cars")
     numbers = row["numbers"]
     assert cars[0]["car"] == "slow"
     assert (numbers["cars"], numbers["stop"], numbers["not_driven_above"]) == (3, 1, 45)
@@ -204,7 +204,7 @@ def test_the_rough_answer_lets_no_car_drive_and_says_so_in_each_form(
         (0.1, "collision")
     }
     assert "rough" in answer.only("cars").render("text")
-    Path("rough.csv").write_text(answer.render("csv"))
+    write("rough.csv", answer.render("csv"))
     assert [*pd.read_csv("rough.csv")["rough"]] == ["yes", "yes"]
     told = permit(short, cars="rough.csv", others="new", quick=True).verdict
     assert "the list is a rough answer" in told
@@ -354,7 +354,7 @@ def reached(
 def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(
     in_tmp: Path,
 ) -> None:
-    Path("three.toml").write_text(MATRIX)
+    write("three.toml", MATRIX)
     study = load_study("three.toml")
     span = span_of(study, None)
     assert (span.low, span.high, span.unit) == (10, 30, "km/h")
@@ -407,7 +407,7 @@ def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
 def test_where_a_test_lists_speeds_the_answer_is_one_of_them(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    Path("listed.toml").write_text(LISTED)
+    write("listed.toml", LISTED)
     monkeypatch.setattr(
         EncounterRange,
         "robustness",

@@ -33,7 +33,16 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import EVERY_STUDY, SLOW, InlinePool, json_of, numbers_of, refused
+from tests.in_process import (
+    EVERY_STUDY,
+    SLOW,
+    InlinePool,
+    json_of,
+    numbers_of,
+    refused,
+    rows_of,
+    write,
+)
 from tests.made_up import drawn
 
 STEP = 0.05
@@ -122,7 +131,7 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     original = evaluator.characteristics.original
 
     # The tips at phase 0, where the distance ends to brake just one step later.
-    speeds = np.linspace(40, 50, 4001)
+    speeds = np.linspace(43, 47, 1601)
     settings = np.tile(original, (len(speeds), 1))
     settings[:, evaluator.characteristics.names.index("speed")] = speeds
     left = model.robustness(settings, "speeds")
@@ -148,7 +157,7 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
 @SLOW
 def test_a_car_may_not_drive_where_it_fails_at_another_phase() -> None:
     typed = "permit autoware_july --set brakeTorque=0.93 --others new --margin 0.3"
-    (row,) = json_of(typed)["tables"]["cars"]["rows"]
+    (row,) = rows_of(json_of(typed), "cars")
     assert row["phase"] > 0
 
     # The failure of the worst brake torque that this may be is none at phase 0.
@@ -194,7 +203,8 @@ def test_tracks_that_ignore_the_phases_of_others_are_refused() -> None:
 def test_an_answer_says_that_a_driving_system_counts_steps(
     question: Callable[..., Answer], options: dict[str, Any], in_tmp: Path
 ) -> None:
-    Path("slow_ads.py").write_text(
+    write(
+        "slow_ads.py",
         "from safevar_sumo.ads import ScalarAds\n"
         "class Slow(ScalarAds):\n"
         "    def __init__(self, near=25.0):\n"
@@ -203,7 +213,7 @@ def test_an_answer_says_that_a_driving_system_counts_steps(
         "        if self.calls % 4 == 0 and seen.gap < self.near:\n"
         "            self.brake = 1.0\n"
         "        self.calls += 1\n"
-        "        return 0.0, self.brake\n"
+        "        return 0.0, self.brake\n",
     )
     near = {
         "lower": 10.0,

@@ -12,7 +12,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.questions import model_spread
 from safevar_sumo.report.page import report
-from tests.in_process import SLOW, InlinePool, run
+from tests.in_process import SLOW, InlinePool, rows_of, run
 
 
 @SLOW
@@ -27,7 +27,7 @@ def test_a_rough_tolerance_calls_no_limit_kept() -> None:
         None,
         1,
     ]
-    assert {row["kept"] for row in answer["tables"]["limits"]["rows"]} == {None}
+    assert {row["kept"] for row in rows_of(answer, "limits")} == {None}
     assert "confirms no limit" in done.stderr
 
 

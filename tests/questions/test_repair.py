@@ -40,7 +40,7 @@ from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, InlinePool, run
+from tests.in_process import SLOW, InlinePool, rows_of, run
 
 SPEED, MARGIN, GAP_TODAY = 20.0, 0.3, 12.0
 """Speed [m/s] of the planted system; its gap of today lets even a new sled collide, so that the
@@ -172,7 +172,7 @@ def test_repair_and_price_of_a_planted_system_equal_the_closed_form(
     planted: Path,
 ) -> None:
     found = sv.repair(planted, change=["gap", "colour"], jobs=2)
-    (repair,) = found.to_dict()["tables"]["repairs"]["rows"]
+    (repair,) = rows_of(found.to_dict(), "repairs")
     needed = max(
         gap_for(5), gap_for(5 * 0.9) - MARGIN
     )  # another fit than the study's own needs not to collide
@@ -206,7 +206,7 @@ def test_a_promise_over_encounters_counts_those_that_a_new_vehicle_survives(
         )
     )
     found = sv.repair(planted, change=["gap"], fits=0, pool=InlinePool())
-    (repair,) = found.to_dict()["tables"]["repairs"]["rows"]
+    (repair,) = rows_of(found.to_dict(), "repairs")
     fastest = 2 * 8 * (GAP_TODAY - MARGIN)  # squared, with grip 8
     assert repair["parameters"]["gap"] == pytest.approx(
         MARGIN + fastest / (2 * 5), rel=0.02
@@ -225,7 +225,7 @@ def test_always_braking_has_its_price_for_any_number_of_workers(planted: Path) -
         for pool in (InlinePool(), InlinePool(2))
     ]
     assert answers[0] == answers[1]
-    (repair,) = answers[0]["tables"]["repairs"]["rows"]
+    (repair,) = rows_of(answers[0], "repairs")
     assert repair["needless_braking"] == repair["benign_scenes"] >= 6
     assert repair["needless_braking_today"] == 0
 
@@ -312,11 +312,11 @@ def test_cases_leave_what_vehicles_leave_unless_nobody_saves_them(name: str) -> 
             parameters=parameters_of(evaluator.study, ()),
             budget=100,
         )
-        vehicles = problem.promise.draw(20, default_rng(1))
+        vehicles = problem.promise.draw(6, default_rng(1))
         cases = product_of(vehicles, problem.encounters)
         left = problem.robustness_with(problem.today, cases, "")
         expected = unsafe.robustness(evaluator.evaluate(vehicles, ""))
-        assert left.reshape(20, -1).min(axis=1) == pytest.approx(expected)
+        assert left.reshape(6, -1).min(axis=1) == pytest.approx(expected)
         is_saved = problem.repairable(cases)
         assert is_saved.all() == (name == "rain")
         counted = np.where(is_saved, left, np.inf)

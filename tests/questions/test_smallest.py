@@ -9,7 +9,6 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given, strategies as st
 
 import safevar_sumo as sv
@@ -26,7 +25,7 @@ from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, InlinePool, json_of
+from tests.in_process import SLOW, InlinePool, json_of, rows_of
 from tests.questions.conftest import (
     ORIGINAL,
     Plant,
@@ -226,24 +225,11 @@ def test_combinations_that_contain_a_cause_and_cures_are_counted() -> None:
     assert "prevents the failure in 9 of the 26 simulated combinations" in verdict
 
 
-@pytest.mark.parametrize(
-    ("name", "budget", "sizes"), [("native", 165, (2, 13)), ("wear", 50, (4, 0, 1))]
-)
-def test_few_settings_find_the_causes_of_shipped_studies(
-    name: str, budget: int, sizes: tuple[int, ...]
-) -> None:
-    evaluator = Evaluator(load_study(name), InlinePool(), verified=0)
-    found = enumerate_causes(evaluator, COLLISION, budget)
-    counts = [len(cause.changes) for cause in found.causes]
-    assert tuple(counts.count(size) for size in range(1, len(sizes) + 1)) == sizes
-    assert evaluator.simulated <= budget
-
-
 @SLOW
 def test_the_answer_leads_with_the_smallest_changes() -> None:
     """Of rain: one pair, one of three, two of four (the enumeration of another implementation)."""
     answer = json_of("explain rain --fits 2 --jobs 1")
-    rows = answer["tables"]["causes"]["rows"]
+    rows = rows_of(answer, "causes")
     assert sorted(row["size"] for row in rows if row["size"] < 5) == [2, 3, 4, 4]
     (pair,) = (row for row in rows if row["size"] == 2)
     assert pair["causes"] == {"dampRateZeroT_CE": 1.0, "tireFric": 1.0}
@@ -257,7 +243,7 @@ def test_the_answer_leads_with_the_smallest_changes() -> None:
     counted = "1 of the 264 combinations of two changes causes a collision"
     assert counted in answer["verdict"]
     assert "All causes" not in answer["verdict"]
-    first, *_, last = answer["tables"]["staircase"]["rows"]
+    first, *_, last = rows_of(answer, "staircase")
     assert (first["share"], first["fewest"], last["fewest"]) == (1.0, 2, None)
 
     # The vehicles of `risk` with both parameter sets.

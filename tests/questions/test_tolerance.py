@@ -29,6 +29,7 @@ from safevar_sumo.questions.words import bound_in_words
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles import region_of
+from tests.in_process import rows_of
 from tests.made_up import case_of
 from tests.questions.conftest import (
     Plant,
@@ -352,7 +353,7 @@ def test_a_refusal_says_which_limits_would_hold() -> None:
         unsafe="collision",
         limits=("a <= 9", "b <= 8"),
     )
-    first, second = answer.to_dict()["tables"]["nearest"]["rows"]
+    first, second = rows_of(answer.to_dict(), "nearest")
     assert [first["nearest"], second["nearest"]] == [
         pytest.approx(6.95, abs=0.06),
         pytest.approx(5.95, abs=0.06),

@@ -7,6 +7,7 @@ import math
 import pytest
 
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.questions.tables import cell_text
 from safevar_sumo.questions.words import (
     MAX_POINTS_NAMED,
     count_in_words,
@@ -37,6 +38,7 @@ def test_a_count_is_all_or_none_only_if_it_is_exactly_that() -> None:
 def test_a_share_has_the_digits_that_decide() -> None:
     shares = (0.00043, 0.0994, 0.0995, 0.37)
     assert [*map(percentage, shares)] == ["0.043", "9.9", "10", "37"]
+    assert cell_text(1259.0, ".3g") == "1,259", "no exponent"
     values = (None, math.nan, -0.004, 1.006)
     assert [*map(two_decimals, values)] == ["-", "-", "0.00", "1.01"]
 

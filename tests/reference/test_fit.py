@@ -25,7 +25,7 @@ from safevar_sumo.reference.rows import COLUMNS, ReferenceData
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, InlinePool
+from tests.in_process import SLOW, InlinePool, rows_of, write
 from tests.made_up import made_up_evaluations
 
 GAP = "ads.parameters.brake_gap"
@@ -48,15 +48,17 @@ def test_a_search_brings_a_planted_parameter_nearer_to_the_truth(
     data: ReferenceData, in_tmp: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """From a gap of 8 m towards the 6.9 m that the rows were made with."""
-    Path("mine.toml").write_text(
-        'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n'
+    write(
+        "mine.toml",
+        'extends = "sun"\nname = "mine"\n[ads.parameters]\nbrake_gap = 8.0\n',
     )
-    Path("plan.toml").write_text(
+    write(
+        "plan.toml",
         "population = 4\nhold_out = 4\ntolerance = 0.045\n[[parameters]]\n"
         f'key = "{GAP}"\nlower = 6\nupper = 12\nunit = "m"\nmeaning = "gap"\n'
         '[studies."mine.toml"]\nfiles = ["rows.csv"]\noriginal = 1.0\nrank = 5.0\ncollisions ='
         " 10.0\n"
-        "weights = { safety_degree = 1.0 }\n"
+        "weights = { safety_degree = 1.0 }\n",
     )
     names = load_study("sun").vehicle.characteristics
     columns = {
@@ -207,14 +209,6 @@ def test_the_sets_are_simulated_one_by_one() -> None:
     )
 
 
-def test_another_vehicle_or_driver_has_no_spread() -> None:
-    other = load_study(
-        load_study("sun", spread={GAP: [OWN, 5.0]}), ads={"model": "full_braking"}
-    )
-    assert not other.spread
-    assert not other.model_error
-
-
 @SLOW
 @pytest.mark.usefixtures("few_simulations")
 def test_the_ends_over_fits_are_those_of_each_fitted_study() -> None:
@@ -237,7 +231,7 @@ def test_the_ends_over_fits_are_those_of_each_fitted_study() -> None:
     of_each = np.array([low_end(with_values(study, {gap: value})) for value in gaps])
     assert len({*of_each}) > 1, "the fits differ"
     answer = tolerance(study, **asked)
-    (row,) = answer.to_dict()["tables"]["limits"]["rows"]
+    (row,) = rows_of(answer.to_dict(), "limits")
     assert 0 <= row["alone_low"] - np.nanmax(of_each) <= 0.03, (
         "the strictest fit decides, rounded to the safe side"
     )

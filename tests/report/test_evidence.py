@@ -29,7 +29,7 @@ from safevar_sumo.report.evidence import _files_of_user
 from safevar_sumo.report.pack import DESCRIPTION, _check_entries, digests_of, read_pack
 from safevar_sumo.results import load_runs
 from safevar_sumo.shipped import NETWORKS
-from tests.in_process import SLOW, json_of, refused, run, searched
+from tests.in_process import SLOW, json_of, refused, rows_of, run, searched, write
 from tests.manual import PROGRAM, files_of
 from tests.questions.test_repair import planted as planted
 
@@ -155,7 +155,7 @@ def digit_of(pattern: str) -> Callable[[str], str]:
 def not_same(typed: str) -> list[dict[str, str]]:
     """The claims that `verify` does not find the same; it must end with exit code 1."""
     result = json_of(f"verify {typed}", expect=1)
-    numbers, claims = result["numbers"], result["tables"]["claims"]["rows"]
+    numbers, claims = result["numbers"], rows_of(result, "claims")
     counts = [
         numbers[verdict] for verdict in ("same", "differs", "cannot", "unchecked")
     ]
@@ -167,7 +167,7 @@ def not_same(typed: str) -> list[dict[str, str]]:
 def verified(typed: str) -> list[str]:
     """The claims that `verify` finds the same, all of them that it checks."""
     result = json_of(f"verify {typed}")
-    claims = result["tables"]["claims"]["rows"]
+    claims = rows_of(result, "claims")
     assert result["numbers"]["passed"]
     assert {claim["verdict"] for claim in claims} <= {"same", "unchecked"}
     return [claim["claim"] for claim in claims if claim["verdict"] == "same"]
@@ -228,7 +228,7 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The example of CONTRIBUTING."""
-    Path("my_questions.py").write_text(files_of("CONTRIBUTING.md")["my_questions.py"])
+    write("my_questions.py", files_of("CONTRIBUTING.md")["my_questions.py"])
     monkeypatch.syspath_prepend(str(in_tmp))
     run(f"report {slippery} --ask 'my_questions:ends --unsafe below=0.5' --out it.html")
     page = Path("it.html").read_text()
@@ -259,10 +259,8 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
 def test_a_pack_holds_a_list_of_cars_without_their_names(
     slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    Path("of_cars.py").write_text(OF_CARS)
-    Path("fleet.csv").write_text(
-        "plate;mass;driver\nM-XY 1;2100,5;Ada L.\nM-XY 2;2200;Bob\n"
-    )
+    write("of_cars.py", OF_CARS)
+    write("fleet.csv", "plate;mass;driver\nM-XY 1;2100,5;Ada L.\nM-XY 2;2200;Bob\n")
     monkeypatch.syspath_prepend(str(in_tmp))
     ask = "of_cars:named --cars fleet.csv --ignore driver"
     run(f"evidence {slippery} --ask '{ask}' --out it.zip")
@@ -436,7 +434,7 @@ def test_links_bombs_and_other_files_are_refused(in_tmp: Path) -> None:
     with zipfile.ZipFile("link.zip", "w") as archive:
         archive.writestr(link, "/etc/passwd")
     refused("verify link.zip", "'link' is a symbolic link")
-    Path("text.zip").write_text("no archive")
+    write("text.zip", "no archive")
     refused("verify text.zip", "is no zip archive")
     with zipfile.ZipFile("bomb.zip", "w") as archive:
         archive.writestr("zeros", "")
@@ -490,7 +488,7 @@ def test_a_file_outside_the_folder_of_the_study_is_refused(
     Path("files").mkdir()
     Path("files/it.fmu").write_bytes(b"")
     Path("own").mkdir()
-    Path("own/it.toml").write_text('extends = "smoke"')
+    write("own/it.toml", 'extends = "smoke"')
     study = load_study("own/it.toml", **named)
     with pytest.raises(InputError, match=r"files/.*: lies outside the study's folders"):
         _files_of_user(study, {}, [])
@@ -571,8 +569,8 @@ def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
     study = study.replace("at_least = 5", "at_least = 7.9").replace(
         "step_length = 0.005", "step_length = 0.02"
     )
-    Path("planted.toml").write_text(
-        re.sub(r"(always|colour) = \{ .*\n", "", study)
+    write(
+        "planted.toml", re.sub(r"(always|colour) = \{ .*\n", "", study)
     )  # which it keeps already
     run("study planted.toml --out results --quiet --jobs 1")
     run("evidence results --out it.zip --ask 'repair --quick'")

@@ -26,7 +26,7 @@ from safevar_sumo.questions.research_questions.fronts import (
 from safevar_sumo.questions.research_questions.statistics import can_be_significant
 from safevar_sumo.questions.subject import load
 from tests.campaign.formulas import carried_out
-from tests.in_process import SLOW
+from tests.in_process import SLOW, rows_of
 from tests.research_questions.cases import made_up, row
 
 FIVE_WORST = """
@@ -111,7 +111,7 @@ def test_the_table_has_the_median_and_quartiles_of_the_hypervolume_of_all_so_far
     front = moocore.filter_dominated(case.solutions[OBJECTIVES].to_numpy(float))
     low = front.min(axis=0)
     width = front.max(axis=0) - low
-    rows = answer.to_dict()["tables"]["convergence"]["rows"]
+    rows = rows_of(answer.to_dict(), "convergence")
     for name, number in product(("nsga2", "FiveWorst"), (4, -1)):
         found = [one for one in rows if one["algorithm"] == name][number]
         count = found["evaluations"]
@@ -185,7 +185,7 @@ def test_what_was_not_tested_is_neither_significant_nor_not() -> None:
         ("rq2-runs", 2),
         ("a12", 2),
     ):
-        table = answer.to_dict()["tables"][name]["rows"]
+        table = rows_of(answer.to_dict(), name)
         values = [one["significant"] for one in table]
         assert [value is None for value in values] == [
             one["effect_size"] is None for one in table

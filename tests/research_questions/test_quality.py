@@ -33,7 +33,6 @@ from safevar_sumo.questions.research_questions.fronts import (
     reference_front,
 )
 from safevar_sumo.questions.research_questions.statistics import (
-    EXACT_TEST,
     compare_samples,
     correct_by_holm,
     effect_interval,
@@ -113,16 +112,6 @@ def test_effect_size_is_the_share_of_pairs_won_and_half_of_those_tied(
     )
     assert 0 <= there.p_value <= 1
     assert back.p_value == pytest.approx(there.p_value)
-
-
-def test_exact_p_of_separated_samples_is_two_orders_of_all() -> None:
-    result = compare_samples(np.arange(8), 100 + np.arange(8))
-    assert result.p_value == pytest.approx(2 / math.comb(16, 8))
-    assert (result.effect_size, result.magnitude, result.method) == (
-        0,
-        "large",
-        EXACT_TEST,
-    )
 
 
 def test_an_empty_sample_is_undefined_not_zero_and_nan_is_refused() -> None:

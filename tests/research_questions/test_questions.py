@@ -22,8 +22,6 @@ from safevar_sumo.questions.research_questions.answer import answer_questions
 from safevar_sumo.questions.research_questions.changes import (
     count_collisions,
     critical_solutions,
-    rq31,
-    rq32,
     rq33,
     rq33_safety,
 )
@@ -410,40 +408,6 @@ def test_critical_solutions_are_strictly_below_the_original() -> None:
     assert critical_solutions(case)["safety_degree"].tolist() == [1.999, -1]
     with pytest.raises(UnanswerableError, match="safety degree"):
         critical_solutions(made_up(row(), original={}))
-
-
-def test_rq31_counts_runs_without_any() -> None:
-    case = made_up(
-        row(values=HEAVY),
-        row(values=GRIPLESS),
-        row(values=BOTH),
-        finished=[("nsga2", 0), ("nsga2", 1)],
-    )
-    assert rq31(case)[["run", "j", "count"]].to_numpy().tolist() == [
-        [0, "1", 2],
-        [0, "2", 1],
-        [0, "3", 0],
-        [1, "1", 0],
-        [1, "2", 0],
-        [1, "3", 0],
-    ]
-
-
-def test_rq32_shares_and_ranks() -> None:
-    frame = rq32(
-        made_up(
-            row(values=HEAVY), row(values=GRIPLESS), row(values=BOTH), row(values=HEAVY)
-        )
-    )
-    percents = {
-        (one["characteristic"], one["j"]): one["percent"]
-        for one in frame.to_dict("records")
-    }
-    assert [percents["mass", j] for j in ("1", "2", "3", "any")] == pytest.approx(
-        [200 / 3, 100, np.nan, 75], nan_ok=True
-    )
-    assert percents["lag", "any"] == 0
-    assert frame[frame["j"] == "any"]["rank"].tolist() == [1, 2, 3]
 
 
 def test_rq33_tells_increases_from_decreases() -> None:

@@ -216,17 +216,6 @@ def test_other_solutions_and_lines_in_another_order_are_not_believed(
     assert holds_the_first(0, read_journal(path, HEAD))
 
 
-def test_a_checksum_is_that_of_all_lines_up_to_there_without_their_checksums(
-    tmp_path: Path,
-) -> None:
-    write(tmp_path / "a.jsonl")
-    head, *lines = (tmp_path / "a.jsonl").read_bytes().splitlines()
-    for line in lines:
-        content, _, checksum = line.rpartition(b',"crc32":')
-        head += content + b"}"
-        assert checksum == b"%d}" % zlib.crc32(head)
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [

@@ -71,7 +71,7 @@ def test_a_target_arrives_in_time_with_any_speed_profile(
 WORN = assemble(load_study("wear", matrix=None))
 
 
-TURNS = {"north": (0.0, 1.0), "west": (-1.0, 0.0), "north-west": (-0.6, 0.8)}
+TURNS = {"north": (0.0, 1.0), "north-west": (-0.6, 0.8)}
 """Direction of a rotated road that led east before."""
 
 

@@ -12,14 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Outcome
 from safevar_sumo.scenarios import WEATHERS, Along, CarToCar, Crossing, Point
 from safevar_sumo.scenarios.tracks import BODIES
 from safevar_sumo.sumo import drive
 from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.matrix import simulate_all_points
-from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import SLOW
 from tests.made_up import original_of
 from tests.scenarios.holding import CARLA, Hold, Pedals, at_contact, driven
@@ -276,34 +274,3 @@ def test_a_cyclist_behind_parked_cars_is_seen_past_the_corner_whatever_his_direc
         driven(scenario, Pedals(coast))
         assert np.isinf(gaps).tolist() == hidden[: len(gaps)].tolist()
         assert 0.5 < before[np.argmin(hidden)] < 3.0
-
-
-BRAKE = {
-    "euro_ncap_pedestrian": "maxBrakeTorque",
-    "euro_ncap_car_to_car": "maxBrakeTorque",
-    "wear": "brakeTorque",
-}
-
-
-def original_and_half_its_brakes(study: str, system: System) -> np.ndarray:
-    half = system.characteristics.original.copy()
-    half[system.characteristics.names.index(BRAKE[study])] /= 2
-    return np.stack([system.characteristics.original, half])
-
-
-@SLOW
-@pytest.mark.parametrize("study", BRAKE)
-def test_the_originals_avoid_every_shipped_point_and_with_half_their_brakes_some_fail(
-    study: str,
-) -> None:
-    system = assemble(load_study(study))
-    collided = np.stack(
-        [
-            one.evaluations.collided
-            for one in simulate_all_points(
-                system, original_and_half_its_brakes(study, system)
-            )
-        ]
-    )
-    assert not collided[:, 0].any()
-    assert collided[:, 1].any()

@@ -13,11 +13,10 @@ import pytest
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.reaction import ANY_BRAKING
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
 from safevar_sumo.sumo.matrix import drive_worst, simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, verify_everywhere
+from tests.in_process import SLOW, verify_everywhere, write
 from tests.made_up import original_of
 from tests.scenarios.holding import Hold, at_contact, driven
 from tests.scenarios.ideal import STEP, Mass, agreement, ideal, met_at_once, point_mass
@@ -227,7 +226,7 @@ def test_whoever_drives_the_actors_are_where_sumo_has_them(
     """The test's speed is held until the driving system acts, be it an AEB, one that drives itself
     or a script.
     """
-    (in_tmp / "script.py").write_text(SCRIPT)
+    write("script.py", SCRIPT)
     scenario = {"model": model, "parameters": BODY | parameters}
     driver = {"model": ads, "parameters": {}, "kind": "traci" if ":" in ads else ""}
     system = assemble(load_study("wear", matrix=None, scenario=scenario, ads=driver))
@@ -237,17 +236,3 @@ def test_whoever_drives_the_actors_are_where_sumo_has_them(
     assert (run.trace.speed[0] == system.points[0].scenario.test_speed).all()
     assert (np.abs(run.test_speed_error) < 0.1).all()
     assert (np.abs(np.diff(run.trace.speed, axis=0)) > 0.01).any(axis=0).any()
-
-
-def test_a_leader_brakes_down_to_a_stop() -> None:
-    """R157's following: the leader's way to a stop is v^2 / (2 b), and the run lasts until he
-    stands.
-    """
-    one = CarToCar(
-        test="CCRb", speed=72.0, headway=2.0, target_deceleration=8.0, final_speed=0.0
-    )
-    run = driven(one, Hold(), system=WEAR)
-    assert at_contact(run, run.trace.time) == pytest.approx(
-        (40.0 + 60.0 + 20.0**2 / 16.0) / 20.0
-    )
-    assert one.duration >= 3.0 + 20.0 / 8.0

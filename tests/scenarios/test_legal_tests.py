@@ -53,29 +53,14 @@ def test_what_a_braking_leader_leaves_is_that_of_the_closed_form(
 
 
 def test_a_person_on_the_road_may_stand() -> None:
-    times = np.arange(0.0, 6.0, 0.5)[:, np.newaxis]
-    for speed, way in ((0.0, 0.0), (5.0, 5 * KMH * 5.5 - 1.0)):
-        (person,) = Along(speed=50.0, target_speed=speed).tracks(times)
-        covered = float(np.broadcast_to(person.x, times.shape)[-1, 0]) - float(
-            person.x[0, 0]
-        )
-        assert covered == pytest.approx(way, abs=0.02)
+    (person,) = Along(speed=50.0, target_speed=0.0).tracks(np.array([[0.0], [5.5]]))
+    assert np.ptp(person.x) == 0
 
 
 def test_r152_allows_the_impact_of_the_higher_row() -> None:
     points = assemble(load_study("r152")).points
     found = {point.scenario.speed: point.allowed_impact_speed / KMH for point in points}
     assert found == pytest.approx({**ALLOWED, 56: 35, 60: 35})
-
-
-@pytest.mark.parametrize("name", ["r152", "r152_laden", "fmvss127"])
-def test_the_new_car_passes_the_test_of_the_study(name: str) -> None:
-    system = assemble(load_study(name))
-    assert not drive_and_score(system, original_of(system)).collided[0]
-    mass = system.nominal.mass
-    assert mass - assemble(load_study("wear")).nominal.mass == (
-        450 if name == "r152_laden" else 0
-    )
 
 
 FAST = "impact at 35 km/h, speed 60, clear"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from mypy import api
 
-from tests.in_process import SLOW, json_of, run
+from tests.in_process import SLOW, json_of, run, write
 from tests.manual import ROOT, files_of
 
 PAGE = "docs/simulators.md"
@@ -23,8 +23,8 @@ if os.environ.get("SAFEVAR_METADRIVE") != "required":
 @pytest.fixture
 def page(in_tmp: Path) -> str:
     """The text below the class of the page, whose files are in the working directory."""
-    Path("curve.toml").write_text(files_of(PAGE)["curve.toml"])
-    Path("my_metadrive.py").write_text((ROOT / "docs" / "my_metadrive.py").read_text())
+    write("curve.toml", files_of(PAGE)["curve.toml"])
+    write("my_metadrive.py", (ROOT / "docs" / "my_metadrive.py").read_text())
     return (ROOT / PAGE).read_text().partition("<!-- learned driver -->")[2]
 
 
@@ -49,7 +49,7 @@ def test_the_calls_of_the_page_fit_the_client_of_carla(in_tmp: Path) -> None:
         Path(carla.__file__).parent
     )  # which does not say that it has types
     source = (ROOT / "docs" / "my_carla.py").read_text()
-    Path("my_carla.py").write_text(source.replace(".load_world(", ".load_wurld("))
+    write("my_carla.py", source.replace(".load_world(", ".load_wurld("))
     printed = api.run(["--strict", "--config-file=", "my_carla.py"])[0]
     faults = re.findall("^my_carla.*error: (.*?);", printed, re.M)
     assert faults == ['"Client" has no attribute "load_wurld"']

@@ -5,17 +5,15 @@ refused.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.scenarios import SCENARIOS
-from safevar_sumo.study import Study
 from safevar_sumo.sumo import reason_against_scenes
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, json_of, run, verify_everywhere
+from tests.in_process import json_of, rows_of, run, write
 from tests.made_up import drawn
 
 MINE = """
@@ -46,59 +44,6 @@ class Mine(Struct, frozen=True, kw_only=True):
         scooter = Track.of("scooter", "scooter", x, y, v, 1.0 * moves, size=(1.8, 0.6))
         return [scooter, Track.of("van", "van", self.gap + 20.0, -3.2, size=(5.5, 2.0))]
 """
-SEARCH = {
-    "scooter": {"unit": "km/h", "original": 15, "lower": 8, "upper": 25},
-    "gap": {"unit": "m", "original": 50, "lower": 35, "upper": 55},
-}
-
-
-def mine(folder: Path, search: dict[str, Any], **tables: Any) -> Study:
-    folder.joinpath("own.py").write_text(MINE)
-    scenario = {"model": "own:Mine", "over": search}
-    return load_study(
-        "wear", matrix=None, scenario=scenario, encounters="ranges", **tables
-    )
-
-
-@SLOW
-def test_parameters_that_a_users_class_declares_are_searched(in_tmp: Path) -> None:
-    """Each encounter is that of a study with these parameters, and the original vehicle meets the
-    same.
-    """
-    system = assemble(mine(in_tmp, SEARCH))
-    settings = drawn(system, 6, 4)
-    found = drive_and_score(system, settings)
-    of_vehicle = system.characteristics.of_vehicle
-    assert system.characteristics.scenario.names == ("scooter", "gap")
-    for row, setting in enumerate(settings):
-        parameters = system.characteristics.scenario.named(setting[~of_vehicle])
-        alone = assemble(
-            load_study(
-                "wear",
-                matrix=None,
-                scenario={"model": "own:Mine", "parameters": parameters},
-            )
-        )
-        both = drive_and_score(
-            alone, np.stack([setting[of_vehicle], alone.characteristics.original])
-        )
-        assert both.outcome[0] == found.outcome[row]
-        assert both.f_safe.tolist() == [
-            found.f_safe[row],
-            found.metrics["original_safety_degree"][row],
-        ]
-    verify_everywhere(system, settings)
-
-
-def test_a_matrix_runs_over_them(in_tmp: Path) -> None:
-    (in_tmp / "own.py").write_text(MINE)
-    test = {"name": "scooter", "over": {"gap": [40, 50], "scooter": [10.0]}}
-    study = load_study("wear", matrix={"tests": [test]}, scenario={"model": "own:Mine"})
-    names = [point.name for point in assemble(study).points]
-    assert names == [
-        "scooter, gap 40, scooter 10.0, wet",
-        "scooter, gap 50, scooter 10.0, wet",
-    ]
 
 
 TRAFFIC = """
@@ -129,7 +74,7 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(
         f" LeadVehicleStopped().{name}(*arguments)\n"
         for name in ("begin", "observe", "encounter")
     )
-    (in_tmp / "own.py").write_text(TRAFFIC + methods)
+    write("own.py", TRAFFIC + methods)
     search = {"distance": {"unit": "m", "original": 50, "lower": 30, "upper": 60}}
     system = assemble(
         load_study(
@@ -156,7 +101,7 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(
 
 
 def test_a_list_of_ones_own_scenario_names_it_and_claims_no_check(in_tmp: Path) -> None:
-    (in_tmp / "own.py").write_text(MINE)
+    write("own.py", MINE)
     printed = run("list own:Mine").stdout
     assert printed.startswith("A study can name own:Mine.\n")
     assert "passed" not in printed
@@ -165,6 +110,6 @@ def test_a_list_of_ones_own_scenario_names_it_and_claims_no_check(in_tmp: Path) 
 def test_the_list_of_scenarios_has_what_their_classes_declare() -> None:
     answer = json_of("list scenarios --json")
     assert answer["numbers"] == {"passed": True}
-    rows = {row["name"]: row for row in answer["tables"]["scenarios"]["rows"]}
+    rows = {row["name"]: row for row in rows_of(answer, "scenarios")}
     assert {*rows} == {*SCENARIOS}
     assert "target_deceleration 0.5 to 10 m/s^2" in str(rows["car_to_car"])

@@ -12,15 +12,11 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from safevar_sumo.ads import Aeb
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.scenarios import Track, TrackScenario, travelled
 from safevar_sumo.sumo.bodies import Body, distance_between, find_overlaps
-from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.moving import Moving
-from safevar_sumo.sumo.system import assemble
-from tests.made_up import original_of
 from tests.scenarios.holding import Hold, driven
 
 LENGTH, WIDTH = 4.9016, 2.1284
@@ -114,48 +110,6 @@ def test_a_driver_watches_his_corridor_up_to_the_bodys_side(
             Cast(lambda times, y=beside: Track.of("body", kind, 60.0, y)), Aeb()
         )
         assert (run.trace.brake[run.trace.active] == 1).any() == brakes
-
-
-def test_what_stands_before_another_body_hides_it_until_it_leaves() -> None:
-    """A leader at 60 m moves aside and shows a standing car at 110 m."""
-    run = held(moving("leader", 60.0, 0.0, 0.01, 1.75), standing(110.0))
-    gap = run.trace.gap[:, 0]
-    shown = int(np.argmax(np.abs(np.diff(gap)) > 10)) + 1
-    lateral = 1.75 * run.trace.time[shown]
-    assert gap[shown] == pytest.approx(
-        110.0 - 4.023 / 2 - SPEED * run.trace.time[shown]
-    )
-    assert lateral - 0.9 < WIDTH / 2 + 2.2, (
-        "only after the leader has gone far enough to the side"
-    )
-    assert run.outcome[0] == Outcome.COLLISION
-
-
-def test_a_braking_leader_is_avoided_only_once_he_has_stopped_braking() -> None:
-    """From 80 km/h, 2 m/s^2: a vehicle as fast as its leader is not safe while the leader still
-    brakes.
-    """
-    speed = 80 / 3.6
-    wear = load_study("wear", matrix=None)
-    scenario = {
-        "model": "car_to_car",
-        "parameters": {"test": "CCRb", "speed": 80.0, "target_deceleration": 2.0},
-    }
-    system = assemble(load_study(wear, scenario=scenario))
-    assert system.points[0].scenario.duration >= 3 + (speed - 2 / 3.6) / 2
-    run = drive_worst(system, original_of(system))
-    end = run.trace.last_active[0]
-    assert run.outcome[0] == Outcome.PASSED
-    assert run.trace.speed[end, 0] > 2 / 3.6 - 1e-9 >= run.trace.speed[end + 1, 0], (
-        "it ends when it is slower for good"
-    )
-    gap = run.trace.gap[run.trace.active]
-    assert gap.min() == pytest.approx(1.63, abs=0.005), (
-        "4.95 m at 12 m/s, where the leader still brakes"
-    )
-    assert gap[run.trace.speed[run.trace.active] >= 12].min() == pytest.approx(
-        4.95, abs=0.02
-    )
 
 
 def body_of(*quantities: Any) -> Body:

@@ -17,7 +17,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.vehicles import region_of
-from tests.in_process import SLOW, json_of, run
+from tests.in_process import SLOW, json_of, rows_of, run, write
 from tests.search.test_algorithms import SUN
 
 BOUND = """
@@ -71,7 +71,7 @@ def settings_in(answer: Any) -> Iterator[dict[str, float]]:
 
 @pytest.fixture
 def bound(in_tmp: Path) -> Path:
-    Path("bound.toml").write_text(BOUND)
+    write("bound.toml", BOUND)
     return in_tmp
 
 
@@ -89,10 +89,10 @@ def test_every_setting_that_a_command_reports_is_feasible(bound: Path) -> None:
     tolerance = json_of(
         f"tolerance bound.toml {below} --characteristics tireFric,mass,maxBrakeTorque"
     )
-    boundaries = [cause["boundary"] for cause in explained["tables"]["causes"]["rows"]]
+    boundaries = [cause["boundary"] for cause in rows_of(explained, "causes")]
     alone = [
         {row["characteristic"]: row[end]}
-        for row in tolerance["tables"]["limits"]["rows"]
+        for row in rows_of(tolerance, "limits")
         for end in ("alone_low", "alone_high")
     ]
     assert boundaries

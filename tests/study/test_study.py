@@ -30,6 +30,7 @@ from safevar_sumo.study import (
 )
 from safevar_sumo.study.file_schema import schema_text
 from safevar_sumo.sumo.system import assemble
+from tests.in_process import write
 
 VALIDATOR = jsonschema.Draft7Validator(json.loads(STUDY_SCHEMA.read_text()))
 
@@ -76,14 +77,12 @@ def test_another_system_inherits_neither_title_nor_published_values(
 
 def test_an_axis_of_all_tests_that_no_test_takes_is_named(in_tmp: Path) -> None:
     shared = "[scenario.over]\nspeed = { at = [20, 35], upper = 45 }\n"
-    Path("mine.toml").write_text(f'extends = "wear"\n{shared}')
+    write("mine.toml", f'extends = "wear"\n{shared}')
     _, remarks = with_remarks("mine.toml")
     assert remarks == [
         "scenario.over.speed has no effect: each test has an axis of this name"
     ]
-    Path("mine.toml").write_text(
-        f'extends = "wear"\n{shared}[[matrix.tests]]\nname = "one"\n'
-    )
+    write("mine.toml", f'extends = "wear"\n{shared}[[matrix.tests]]\nname = "one"\n')
     _, remarks = with_remarks("mine.toml")
     assert not [text for text in remarks if "no effect" in text]
 
@@ -91,11 +90,11 @@ def test_an_axis_of_all_tests_that_no_test_takes_is_named(in_tmp: Path) -> None:
 def test_a_study_without_a_title_is_called_as_itself_and_never_as_the_study_that_it_extends(
     in_tmp: Path,
 ) -> None:
-    Path("mine.toml").write_text('extends = "sun"\n[ads]\nmodel = "krauss"\n')
-    Path("metric.toml").write_text('extends = "mine.toml"\nname = "own"\n')
-    Path("rash.toml").write_text('extends = "metric.toml"\n')
-    Path("headed.toml").write_text('extends = "metric.toml"\ntitle = "A heading"\n')
-    Path("heir.toml").write_text('extends = "headed.toml"\n')
+    write("mine.toml", 'extends = "sun"\n[ads]\nmodel = "krauss"\n')
+    write("metric.toml", 'extends = "mine.toml"\nname = "own"\n')
+    write("rash.toml", 'extends = "metric.toml"\n')
+    write("headed.toml", 'extends = "metric.toml"\ntitle = "A heading"\n')
+    write("heir.toml", 'extends = "headed.toml"\n')
     titles = [
         read_study(f"{name}.toml").title
         for name in ("mine", "metric", "rash", "headed", "heir")
@@ -191,21 +190,6 @@ def test_what_was_not_measured_changes_no_result_and_is_not_inherited(
     assert all(one.source for one in read_study("wear").unmeasured.values())  # type: ignore[union-attr]
 
 
-def test_a_study_drops_the_matrix_of_the_study_that_it_extends() -> None:
-    scenario = {"model": "crossing", "parameters": {"test": "CPNA", "speed": 30}}
-    study = read_study(
-        {
-            "extends": "wear",
-            "name": "mine",
-            "scenario": scenario,
-            "matrix": {"tests": []},
-        }
-    )
-    assert study.matrix is None
-    assert [point.scenario.test for point in assemble(study).points] == ["CPNA"]
-    assert read_study(tables_of(study)).matrix is None
-
-
 CRASH = {
     "name": "crash",
     "model": "car_to_car",
@@ -242,7 +226,7 @@ def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
     scenario: dict[str, str], in_tmp: Path
 ) -> None:
     ((key, value),) = scenario.items()
-    Path("mine.toml").write_text(f'extends = "wear"\n[scenario]\n{key} = "{value}"\n')
+    write("mine.toml", f'extends = "wear"\n[scenario]\n{key} = "{value}"\n')
     study, remarks = with_remarks("mine.toml")
     assert study.matrix is None
     text = "mine.toml: has a different scenario than 'wear', so not its [matrix]"
@@ -255,15 +239,6 @@ def test_a_study_of_another_scenario_does_not_inherit_a_matrix_and_says_so(
         "wear", scenario={"model": "crossing", "parameters": {"speed": 30}}
     )
     assert (same.matrix, remarks) == (read_study("wear").matrix, [])
-
-
-def test_a_study_of_another_scenario_says_which_parameters_it_does_not_inherit() -> (
-    None
-):
-    scenario = {"model": "car_to_car", "parameters": {"vut_length": 4.7, "speed": 30}}
-    _, (remark,) = with_remarks("sun", scenario=scenario)
-    lost = "distance of [scenario], recognition_delay of [scenario], road_friction of [scenario]"
-    assert remark.endswith(f"{lost}, walking_speed of [scenario]")
 
 
 def test_a_value_counts_in_tests_and_a_range_of_the_same_parameter_in_its_place() -> (
@@ -298,6 +273,7 @@ def test_the_worn_car_has_one_size_in_all_tests_of_un_r157(encounters: str) -> N
 def test_a_study_of_another_driving_system_says_all_that_it_does_not_inherit() -> None:
     study, remarks = with_remarks("wear", ads={"model": "krauss"})
     assert study.spread == {}
+    assert not read_study("sun", ads={"model": "full_braking"}).model_error
     assert len(remarks) == 1
     assert remarks[0].endswith("has a different ADS than 'wear', so not its [spread]")
     assert with_remarks("wear_rss")[1] == [], (

@@ -18,7 +18,7 @@ from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.perception import Perception
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.without_effect import without_effect
-from tests.in_process import SLOW
+from tests.in_process import EVERY_STUDY, SLOW
 from tests.made_up import drawn, original_of
 
 
@@ -44,19 +44,17 @@ def test_a_result_depends_neither_on_the_batch_nor_on_its_size(
         ]
 
 
-def test_the_original_vehicle_does_not_collide(
-    any_system: System, request: pytest.FixtureRequest
-) -> None:
-    original = drive_and_score(any_system, original_of(any_system))
-    if (
-        request.node.callspec.id == "autoware_december"
-    ):  # what docs/autoware.md is about
+@pytest.mark.parametrize("name", EVERY_STUDY)
+def test_the_original_vehicle_does_not_collide(name: str) -> None:
+    """At any point of a matrix. The collisions of one study are what docs/autoware.md is about."""
+    system = assemble(load_study(name))
+    original = drive_and_score(system, original_of(system))
+    if name == "autoware_december":
         assert original.outcome[0] == Outcome.COLLISION
         return
     assert original.outcome[0] in (Outcome.STOPPED, Outcome.PASSED)
-    assert (
-        original.f_safe[0] > 0 or any_system.points[0].scenario.brakes_fully
-    )  # where nobody is met
+    # A full braking meets nobody.
+    assert original.f_safe[0] > 0 or system.points[0].scenario.brakes_fully
     assert original.f_diff[0] == original.f_num_diff[0] == 0
 
 

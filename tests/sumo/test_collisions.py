@@ -17,7 +17,7 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.network_check import network_remarks
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, json_of
+from tests.in_process import SLOW, json_of, rows_of
 
 CHECKED = {"collision.mingap-factor": "0", "collision.check-junctions": "true"}
 OPTIONS = {
@@ -121,21 +121,6 @@ def test_no_option_of_a_users_file_decides_what_a_collision_is(
 
 
 @SLOW
-def test_a_crossing_car_is_hit_in_the_middle_of_a_users_road(tmp_path: Path) -> None:
-    network = own_network(tmp_path / "road", "along")
-    set_options(network, OPTIONS["junctions unchecked"])
-    parameters = {"network": str(network), "test": "CCCscp", "speed": 50}
-    scenario = {"model": "crossing", "parameters": parameters}
-    system = assemble(sv.load_study("sun", scenario=scenario, ads={"model": "aeb"}))
-    weak = {"maxBrakeTorque": 400.0, "tireFric": 0.3}
-    setting = system.characteristics.setting(weak, beyond=True)[np.newaxis]
-    ((_, evaluations, runs),) = simulate_all_points(system, setting)
-    assert evaluations.outcome[0] == "collision"
-    # The car crosses at right angles: what closes is the vehicle's own speed.
-    assert evaluations.f_safe[0] == -runs.collision_speed[0] < -10
-
-
-@SLOW
 def test_options_of_the_web_wizard_give_the_same_answer_and_leave_json_alone(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,7 +139,7 @@ def test_options_of_the_web_wizard_give_the_same_answer_and_leave_json_alone(
         {"extends": "native", "name": "finer", "step_length": 0.05}, WEAK_BRAKES
     )
     assert answer["numbers"]["safety_degree"] == shipped.metrics["safety_degree"] < 0
-    assert answer["tables"]["results"]["rows"][0]["original"] == "stopped"
+    assert rows_of(answer, "results")[0]["original"] == "stopped"
     assert capfd.readouterr().out == ""  # of SUMO itself
     assert {*network.iterdir()} == files
     remarks = str(answer["tables"]["remarks"])

@@ -5,6 +5,7 @@ original, and what is refused.
 from __future__ import annotations
 
 import shutil
+import tomllib
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -204,35 +205,35 @@ def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
     assert_the_same_in_sumo(system, settings)
 
 
+PLANTED = """
+name = "planted"
+title = "A standing car"
+weather = "clear"
+step_length = 0.02
+encounters = "ranges"
+[scenario]
+model = "car_to_car"
+parameters.headway = 2.0
+over.speed = { original = 50, lower = 50, upper = 70 }
+over.road_friction = { original = 1, lower = 0.5, upper = 1 }
+[vehicle]
+model = "planted:Block"
+characteristics.brakes = { unit = "-", original = 1, lower = 0.2, upper = 1 }
+[ads]
+model = "planted:AtGap"
+[metrics]
+ttc_threshold = 1.5
+[search]
+algorithms = ["nsga2", "rs", "safe_fuzzer"]
+population = 30
+evaluations = 150
+runs = 1
+seed = 1
+"""
+
+
 def planted(**changes: Any) -> Study:
-    tables = {
-        "name": "planted",
-        "title": "A standing car",
-        "weather": "clear",
-        "step_length": 0.02,
-        "scenario": {
-            "model": "car_to_car",
-            "parameters": {"headway": 2.0},
-            "over": {"speed": domain(50, 70), "road_friction": domain(0.5, 1, 1)},
-        },
-        "encounters": "ranges",
-        "vehicle": {
-            "model": "planted:Block",
-            "characteristics": {
-                "brakes": {"unit": "-", "original": 1, "lower": 0.2, "upper": 1}
-            },
-        },
-        "ads": {"model": "planted:AtGap"},
-        "metrics": {"ttc_threshold": 1.5},
-        "search": {
-            "algorithms": ["nsga2", "rs", "safe_fuzzer"],
-            "population": 30,
-            "evaluations": 150,
-            "runs": 1,
-            "seed": 1,
-        },
-        **changes,
-    }
+    tables = {**tomllib.loads(PLANTED), **changes}
     tables["scenario"]["margin"] = MARGIN
     return load_study(tables)
 
@@ -285,27 +286,6 @@ def test_a_setting_whose_original_collides_too_is_never_a_solution(
     assert (results.solutions["original_safety_degree"] >= MARGIN).all()
     assert set(results.solutions["algorithm"]) == {"nsga2", "rs", "safe_fuzzer"}
     assert (results.solutions["outcome"] == "collision").any()
-
-
-@SLOW
-@pytest.mark.parametrize("name", ["sun", "wear"])
-def test_all_solutions_of_the_shipped_studies_have_a_safe_original(
-    name: str, tmp_path: Path
-) -> None:
-    """`searched` also verifies all solutions in SUMO."""
-    study = load_study(
-        name,
-        encounters="ranges",
-        search={
-            "runs": 1,
-            "evaluations": 150,
-            "algorithms": ["nsga2", "rs", "pymoo:NSGA3", "pymoo:DE"],
-        },
-    )
-    solutions = load_runs(searched(study, tmp_path / "out")).solutions
-    limit = assemble(study).measuring.scoring.safe_original
-    assert (solutions["original_safety_degree"] >= limit).all()
-    assert (solutions["outcome"] == "collision").any()
 
 
 @SLOW

@@ -123,23 +123,6 @@ def test_unbraked_a_vehicle_holds_the_tests_speed_in_one_gear_and_hits_with_its_
     assert runs.contact.place == pytest.approx(np.full(len(settings), 50.0), abs=2.0)
 
 
-def test_a_vehicle_that_cannot_hold_the_speed_makes_the_test_invalid_unless_it_brakes_before() -> (
-    None
-):
-    """The slope requires 2404 kg g sin(atan 0.2) 0.355 m / (1.35 * 4) = 304 N m; the engine has 0.5
-    * 500 N m.
-    """
-    steep = CarToCar(test="CCRs", speed=50.0, grade=20.0)
-    runs = run(steep, system=WEAK)
-    assert runs.outcome[0] == Outcome.INVALID_TEST
-    assert runs.test_speed_error[0] * 3.6 < -0.5
-    assert np.isnan(runs.collision_speed[0])
-    assert (
-        run(steep, Pedals(lambda seen: (0, 0.5)), system=WEAK).outcome[0]
-        == Outcome.STOPPED
-    )
-
-
 @pytest.mark.parametrize(
     ("error", "invalid"), [(-0.51, True), (-0.49, False), (0.99, False), (1.01, True)]
 )

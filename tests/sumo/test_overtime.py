@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from msgspec.structs import replace as replace_in
 
@@ -41,16 +40,6 @@ def test_a_run_that_goes_on_ends_as_one_that_had_the_time(creeping: System) -> N
     assert not [
         *differences(found.results, drive_and_score(patient, population).results)
     ]
-
-
-def test_the_other_runs_of_a_batch_do_not_change(creeping: System) -> None:
-    population = drawn(creeping, 60, 3)
-    ends = drive_all(creeping, population).trace.last_active * 0.05
-    went_on = ends > float(np.max(creeping.points[0].scenario.duration))
-    assert 0 < went_on.sum() < len(population)
-    alone = drive_and_score(creeping, population[~went_on]).results
-    together = drive_and_score(creeping, population).take(~went_on).results
-    assert not [*differences(alone, together)]
 
 
 @pytest.mark.parametrize("in_sumo", [False, True])

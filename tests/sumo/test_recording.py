@@ -30,7 +30,7 @@ from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import SLOW, json_of, run, verify_everywhere
+from tests.in_process import SLOW, json_of, run, verify_everywhere, write
 from tests.made_up import drawn, original_of
 from tests.scenarios.holding import Pedals
 
@@ -172,7 +172,7 @@ def test_who_reacts_against_the_claim_is_at_another_place_in_sumo(
     reacting: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(reacting)
-    Path("claims.py").write_text(CLAIM)
+    write("claims.py", CLAIM)
     scenario = {"model": "claims:Claims", "parameters": {"network": "reacting"}}
     system = assemble(load_study("native", scenario=scenario))
     with pytest.raises(
@@ -256,9 +256,10 @@ def test_the_reason_counts_the_points_and_names_one() -> None:
     ],
 )
 def test_a_traci_controller_sees_nobody(step: str, expected: str, in_tmp: Path) -> None:
-    Path("controller.py").write_text(f"def step(traci, vehicle_id):\n    {step}\n")
-    Path("mine.toml").write_text(
-        'extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "controller:step"\n'
+    write("controller.py", f"def step(traci, vehicle_id):\n    {step}\n")
+    write(
+        "mine.toml",
+        'extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "controller:step"\n',
     )
     said = why_no_verdict(assemble(load_study("mine.toml")))
     assert expected in said
@@ -268,32 +269,28 @@ def test_a_traci_controller_sees_nobody(step: str, expected: str, in_tmp: Path) 
 @pytest.fixture
 def still(in_tmp: Path) -> str:
     """A study file whose driving system does nothing."""
-    Path("still.py").write_text(
+    write(
+        "still.py",
         "from safevar_sumo.ads import ScalarAds\n\n\nclass Still(ScalarAds):\n    def drive(self,"
-        " seen):\n        return 0.0, 0.0\n"
+        " seen):\n        return 0.0, 0.0\n",
     )
-    Path("still.toml").write_text(
-        'extends = "smoke"\nname = "still"\n[ads]\nmodel = "still:Still"\nparameters = {}\n'
+    write(
+        "still.toml",
+        'extends = "smoke"\nname = "still"\n[ads]\nmodel = "still:Still"\nparameters = {}\n',
     )
     return "still.toml"
 
 
-def begins_with_the_reason(command: str) -> None:
-    assert run(command).stdout.startswith(STANDS)
-    answer = json_of(command)
-    assert answer.get("numbers", answer)["driven"] is False
-
-
-@SLOW
-def test_an_answer_begins_with_the_reason(still: str) -> None:
-    begins_with_the_reason(f"rules {still} --samples 32 --unsafe collision")
-    begins_with_the_reason(f"simulate {still}")
-
-
 @SLOW
 def test_every_command_begins_with_the_reason(still: str) -> None:
-    for command in f"explain {still}", f"simulate {still} --set mass=2600":
-        begins_with_the_reason(command)
+    for command in (
+        f"rules {still} --samples 32 --unsafe collision",
+        f"explain {still}",
+        f"simulate {still} --set mass=2600",
+    ):
+        assert run(command).stdout.startswith(STANDS)
+        answer = json_of(command)
+        assert answer.get("numbers", answer)["driven"] is False
     assert run(
         f"study {still} --runs 1 --evaluations 20 --out results"
     ).stdout.startswith(STANDS)

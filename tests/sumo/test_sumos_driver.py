@@ -253,23 +253,6 @@ def test_krauss_brakes_softer_with_a_longer_tau_and_stops_where_sumos_krauss_doe
     assert np.all(np.diff(bare_hardest) < 0)
 
 
-def test_in_native_tau_softens_braking_and_a_lag_makes_collisions_harder() -> None:
-    runs = assemble(load_study("native"))
-    by_tau = [
-        braking(drive_worst(runs, changed(runs, tau=tau)))
-        for tau in (0.5, 1.0, 1.5, 2.0)
-    ]
-    assert np.all(np.diff([one.max() for one in by_tau]) < -0.5)
-    assert np.all(np.diff([one.mean() for one in by_tau]) < -0.3)
-    lags = np.concatenate(
-        [
-            changed(runs, actuatorLag=lag, sensorRange=20, reactionTime=0.5)
-            for lag in (0.1, 0.2, 0.4, 0.6)
-        ]
-    )
-    assert np.all(np.diff(drive_worst(runs, lags).collision_speed) > 0.3)
-
-
 def test_tau_drives_idm_and_a_line_says_where_it_or_decel_has_no_effect() -> None:
     def remarks(model: str, **parameters: float) -> list[str]:
         study = load_study("native", ads={"model": model, "parameters": parameters})

@@ -5,7 +5,6 @@ out its commands.
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from types import ModuleType
 
 import msgspec
@@ -18,7 +17,7 @@ from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traci_commands import CommandedSpeed
-from tests.in_process import SLOW
+from tests.in_process import SLOW, write
 from tests.made_up import original_of
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
@@ -83,7 +82,7 @@ def step(traci, vehicle_id):
 
 
 def system(name: str, script: str = SCRIPT, **tables: object) -> System:
-    Path("my_controller.py").write_text(script)
+    write("my_controller.py", script)
     return assemble(
         msgspec.structs.replace(
             load_study("native", **tables),
@@ -98,7 +97,7 @@ def changed(of: System, **values: float) -> np.ndarray:
 
 @SLOW
 def test_a_module_that_imports_traci_reads_the_simulation() -> None:
-    Path("helper.py").write_text(HELPER)
+    write("helper.py", HELPER)
     runs = system("step", USES_HELPER)
     assert drive_worst(runs, changed(runs)).trace.speed.max() == pytest.approx(
         5, abs=0.7

@@ -24,7 +24,7 @@ from safevar_sumo.vehicles import LEVEL, VEHICLES, _accelerations, slope_of
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, WHEEL_MASS, WHEELS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.sensors import DelayedSignal
-from tests.in_process import SLOW
+from tests.in_process import SLOW, write
 from tests.made_up import original_of, seen
 from tests.vehicles.runs import (
     STEP,
@@ -420,9 +420,10 @@ def test_a_thousand_times_too_much_is_another_unit(model: str) -> None:
 
 
 def test_an_own_vehicle_may_say_that_everything_is_plausible(in_tmp: Path) -> None:
-    Path("own.py").write_text(
+    write(
+        "own.py",
         "from safevar_sumo.vehicles.sensing import WornVehicle\n\nclass Own(WornVehicle,"
-        " frozen=True, kw_only=True):\n    PLAUSIBLE = {}\n"
+        " frozen=True, kw_only=True):\n    PLAUSIBLE = {}\n",
     )
     vehicle = {"model": "own:Own", "parameters": {"kerb_mass": 300}}
     characteristics = msgspec.to_builtins(load_study("wear").vehicle.characteristics)

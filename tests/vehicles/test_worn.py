@@ -212,22 +212,6 @@ def test_the_handbooks_wet_rows_have_its_order() -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("speed", "tread", "low", "high"),
-    [
-        (80, 1.6, 1.3, 1.5),
-        (80, 3, 1.12, 1.28),
-        (120, 1.6, 1.8, 3.0),
-        (30, 1.6, 1.0, 1.25),
-    ],
-)
-def test_a_millimetre_of_water_costs_worn_tyres_what_tests_measured(
-    speed: float, tread: float, low: float, high: float
-) -> None:
-    worn, new = stopping_distances(speed, 1.0, CAR.tyre_friction, tread, 8.0)
-    assert low <= worn / new <= high
-
-
 @pytest.mark.parametrize("speed", [30.0, 80.0, 120.0])
 def test_a_wet_stop_is_the_integral_of_speed_over_friction(speed: float) -> None:
     """The integral of v / (mu g) dv has a closed form."""
