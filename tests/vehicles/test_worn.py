@@ -205,11 +205,7 @@ def test_the_handbooks_wet_rows_have_its_order() -> None:
     assert rank >= 0.95
     assert error <= 0.08
     assert f"mean error {error:.3f}, rank correlation {rank:.3f}" in PAGE
-    shallow = [row["water_mm"] == "0.2" and row["speed_kmh"] == "50" for row in wet]
-    assert (
-        f"up to {(here - published)[shallow].max():.2f} too high at 50 km/h in 0.2 mm"
-        in PAGE
-    )
+    assert f"the computed grip is up to {(here - published).max():.2f} too high" in PAGE
 
 
 @pytest.mark.parametrize("speed", [30.0, 80.0, 120.0])
