@@ -134,5 +134,17 @@ class Nominal(NamedTuple):
     width: float = 0.0
 
     @property
+    def speeds(self) -> FloatArray:
+        return self.tables().speeds
+
+    @property
+    def full_throttle(self) -> FloatArray:
+        return self.tables().full_throttle
+
+    @property
+    def coasting(self) -> FloatArray:
+        return self.tables().coasting
+
+    @property
     def braking(self) -> float:
         return self.tables().braking
