@@ -16,7 +16,7 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.box import Box, prove
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.tolerance import boxes
+from safevar_sumo.questions.tolerance import asked, boxes
 from safevar_sumo.questions.tolerance.asked import (
     asked_of,
     effort_of,
@@ -109,6 +109,16 @@ def test_a_search_that_gives_up_says_that_it_found_no_box(
         "A: no joint limits were found.",
         "B: no joint limits were found.",
     ]
+
+
+@pytest.mark.parametrize(
+    ("limit", "said"), [(3, "3 random corner cases"), (4, "All corner cases")]
+)
+def test_an_answer_says_which_corners_were_simulated(
+    limit: int, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(asked, "USUAL", asked.USUAL._replace(corners=limit))
+    assert f"{said} were simulated" in answer_of(2, nowhere).tested
 
 
 def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:

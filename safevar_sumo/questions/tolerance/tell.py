@@ -113,8 +113,12 @@ def _tested(facts: Told) -> Iterator[Sentence]:
         number=facts.attacked,
         keeps=keeps,
     )
-    if facts.task.effort.corners:
+    limit = facts.task.effort.corners
+    corners = 2 ** np.count_nonzero(facts.box.lower < facts.box.upper)
+    if corners <= limit:
         yield words.CORNERS
+    elif limit:
+        yield words.SOME_CORNERS(number=limit)
     proof = facts.limits.proof
     if proof is not None:
         yield words.PROOF(

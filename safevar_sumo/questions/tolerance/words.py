@@ -136,6 +136,10 @@ EMPTY_SEARCH = evidence(
     "{number:,} simulations searched for a counterexample (an unsafe vehicle within the limits),"
     " but none met an encounter that counts (in which the original vehicle is safe)."
 )
+SOME_CORNERS = evidence(
+    "{number:,} random corner cases were simulated (vehicles with every characteristic at an end of"
+    " its allowed range)."
+)
 CORNERS = evidence(
     "All corner cases were simulated (vehicles with every characteristic at an end of its allowed"
     " range)."
