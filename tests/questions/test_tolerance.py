@@ -111,14 +111,11 @@ def test_a_search_that_gives_up_says_that_it_found_no_box(
     ]
 
 
-@pytest.mark.parametrize(
-    ("limit", "said"), [(3, "3 random corner cases"), (4, "All corner cases")]
-)
-def test_an_answer_says_which_corners_were_simulated(
-    limit: int, said: str, monkeypatch: pytest.MonkeyPatch
+def test_an_answer_says_that_not_all_corners_were_simulated(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(asked, "USUAL", asked.USUAL._replace(corners=limit))
-    assert f"{said} were simulated" in answer_of(2, nowhere).tested
+    monkeypatch.setattr(asked, "USUAL", asked.USUAL._replace(corners=3))
+    assert "3 random corner cases were simulated" in answer_of(2, nowhere).tested
 
 
 def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
