@@ -335,8 +335,9 @@ class Question:
         stated = study.unsafe
         cites = []
         if stated.source:
-            rule = stated.criterion or None
-            cites.append(CRITERION_OF_STUDY(criterion=rule, source=stated.source))
+            cites.append(
+                CRITERION_OF_STUDY(criterion=stated.criterion, source=stated.source)
+            )
         if stated.not_simulated:
             cites.append(NOT_SIMULATED(parts=stated.not_simulated))
         criterion = None

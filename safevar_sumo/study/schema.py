@@ -160,6 +160,10 @@ class UnsafeTable(Table, frozen=True, kw_only=True):
     source: str = ""
     not_simulated: str = ""
 
+    def __post_init__(self) -> None:
+        if self.source and not self.criterion:
+            raise mistake(f"source = {self.source!r}", "a criterion beside its source")
+
 
 class RepairTable(Table, frozen=True, kw_only=True):
     """The table [repair] says what a repair of the driving system may change, and what a repair has
