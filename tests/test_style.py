@@ -62,14 +62,14 @@ def public_names_in(source: str) -> Iterator[str]:
         yield from (name for name in names if not name.startswith("_"))
 
 
-@pytest.mark.parametrize(("name", "size"), sizes().items())
-def test_the_sizes_are_within_their_limits(name: str, size: int) -> None:
-    assert size <= LIMITS["size"][name]
-
-
-@pytest.mark.parametrize(("name", "figure"), reading().items())
-def test_the_package_is_no_denser_than_its_limits(name: str, figure: float) -> None:
-    assert figure <= LIMITS["reading"][name]
+@pytest.mark.parametrize(
+    ("table", "measured"), [("size", sizes()), ("reading", reading())]
+)
+def test_sizes_and_density_are_within_their_limits(
+    table: str, measured: dict[str, float]
+) -> None:
+    for name, figure in measured.items():
+        assert figure <= LIMITS[table][name], name
 
 
 def test_a_public_name_is_defined_once() -> None:

@@ -333,10 +333,11 @@ def evaluations_in(content: bytes | None) -> Evaluations | None:
     try:
         with np.load(BytesIO(zlib.decompress(content)), allow_pickle=False) as file:
             arrays = dict(file)
-        metrics = {}
-        for name, values in arrays.items():
-            if name.startswith(METRIC):
-                metrics[name.removeprefix(METRIC)] = values
+        metrics = {
+            name.removeprefix(METRIC): values
+            for name, values in arrays.items()
+            if name.startswith(METRIC)
+        }
         columns = {name: arrays[name] for name in COLUMNS}
         return Evaluations(**columns, metrics=metrics, worst_points=arrays.get(POINTS))
     except (ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error):

@@ -435,10 +435,11 @@ def _unpack(
         If it is damaged.
     """
     prefix = f"{described.folder}/"
-    own_files = {}
-    for name, content in files.items():
-        if name.startswith(prefix):
-            own_files[name.removeprefix(prefix)] = content
+    own_files = {
+        name.removeprefix(prefix): content
+        for name, content in files.items()
+        if name.startswith(prefix)
+    }
     code = [name for name in own_files if name.startswith(f"{CODE}/")]
     lists = [name for name in own_files if name.startswith(f"{LISTS}/")]
 

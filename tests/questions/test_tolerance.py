@@ -201,9 +201,10 @@ def test_sets_that_break_or_cut_limits_are_told() -> None:
     """Of four sets one breaks the specified limit, and one makes another limit narrower."""
     study = made_up_study(2)
     regions = [pair, lambda rows: rows[:, 0] > 8, lambda rows: rows[:, 1] > 7, nowhere]
+    plants = [Plant(study, region) for region in regions]
     fits = [
-        Model(number, Evaluator(study, Plant(study, region)), Unsafe())
-        for number, region in enumerate(regions)
+        Model(number, Evaluator(study, plant), Unsafe())
+        for number, plant in enumerate(plants)
     ]
     limits = {"a": Limit(at_most=9.0)}
     own, two, all_sets = (
@@ -220,6 +221,8 @@ def test_sets_that_break_or_cut_limits_are_told() -> None:
     assert all_sets.sides[1, 1] <= 2
     assert all_sets.alone.upper.tolist() == pytest.approx([8, 7], abs=0.1)
     assert all_sets.proofs == 2, "the smaller box is proved anew"
+    corner = 5 + all_sets.sides[1]
+    assert corner.tobytes() in plants[0].seen, "its corners are driven anew"
 
 
 def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> None:

@@ -277,7 +277,7 @@ def _with_settled(
     fit: int,
 ) -> FoundLimits:
     """Limits with the box within another one that passes searches with a parameter set and, where
-    it became smaller, random vehicles.
+    it became smaller, its corners and random vehicles with the study's own set.
     """
     boxes = limits.boxes
     former = limits.sides
@@ -295,7 +295,11 @@ def _with_settled(
         sides = _within_alone(task, limits, settled.sides)
         unsafe = task.nothing
         is_same = former is not None and np.array_equal(former, sides)
-        if not is_same and task.effort.share < 1:
+        # The searches drove the corners of another box, or none.
+        has_corners = fit == 0 and np.array_equal(settled.sides, sides)
+        if task.effort.corners and not is_same and not has_corners:
+            unsafe = _corner_search(task)(boxes.cases_in(sides), unsafe).unsafe
+        if not (is_same or len(unsafe)) and task.effort.share < 1:
             number = limits.proofs + 1
             proof, unsafe = _prove(task, boxes.cases_in(sides), number)
             limits = limits._replace(proof=proof, proofs=number)
