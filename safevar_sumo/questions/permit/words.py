@@ -88,6 +88,5 @@ TESTED = evidence(
     " an unsafe encounter."
 )
 TESTED_QUICK = evidence(
-    "In each test, {number} values {values} were simulated. The program did not search for an"
-    " unsafe encounter between them."
+    "In each test, {number} values {values} were simulated. Nothing else was simulated."
 )
