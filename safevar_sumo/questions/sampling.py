@@ -28,7 +28,7 @@ class Stream(IntEnum):
     REPAIRED_BOUND = 7  # vehicles within the required range, for the bound of a repair
     # Falsification of a limit in place of a specified one that does not hold.
     NEAREST_LIMIT = 8
-    # Falsification of limits in the scope of a wider study, and up to a value.
+    # Falsification of limits in the ranges of a study.
     WIDER_SCOPE = 9
     EXTENSION = 10  # falsification of joint limits of which one is extended
     SPECIFIED_BETWEEN = 11  # specified limits between the tests of a matrix

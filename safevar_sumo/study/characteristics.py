@@ -68,9 +68,9 @@ Domains = Mapping[str, Domain]
 
 
 class Precision(Table, frozen=True, kw_only=True):
-    """A precision states how exactly a characteristic is measured. Two measurements of one vehicle
-    may differ by `value`, in the characteristic's unit. `source` says where this value comes from,
-    or that it is an assumption.
+    """A precision states how exactly a characteristic is measured. The true value of a vehicle may
+    be greater or less than the measured one by `value`, in the characteristic's unit. `source` says
+    where this value comes from, or that it is an assumption.
     """
 
     value: PositiveNumber

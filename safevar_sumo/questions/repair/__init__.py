@@ -3,8 +3,8 @@ wear, and what does it cost?
 
 The first counterexamples are corners and Sobol points of the range in the listed encounters,
 without those that no driving system keeps safe. The smallest changes that survive them (`smallest`)
-are searched for counterexamples and validated (`validation`); what breaks a change is a new
-counterexample (`survivors`). Today's driving system is the change of no parameter.
+are searched for counterexamples and proved with sampled vehicles (`survivors`); what breaks a
+change is a new counterexample. Today's driving system is the change of no parameter.
 """
 
 from __future__ import annotations
