@@ -215,7 +215,7 @@ class Evaluations:
 
 
 def differences(
-    outputs: ResultColumns, references: ResultColumns
+    outputs: ResultColumns, references: ResultColumns, tolerance: float = 0.0
 ) -> Iterator[tuple[int, str]]:
     """Yield, for each result that differs, the first row where it does, and both values in
     words.
@@ -224,7 +224,9 @@ def differences(
         reference = references[name]
         is_same = values == reference
         if values.dtype.kind == "f":
-            is_same |= np.isnan(values) & np.isnan(reference)
+            is_same |= np.isclose(
+                values, reference, rtol=0, atol=tolerance, equal_nan=True
+            )
         if not is_same.all():
             row = int(np.argmin(is_same))
             yield row, f"{name} is {reference[row]} instead of {values[row]}"
