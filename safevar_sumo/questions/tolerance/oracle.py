@@ -1,5 +1,14 @@
-"""What cases leave to the limit: the worlds in which vehicles drive, one for each test and each
-parameter set of the vehicle model, and their simulations.
+"""The oracle simulates cases, and returns the robustness of each case. The robustness is the
+distance of a simulated vehicle to the limit of the criterion: below 0 the case is unsafe.
+
+A case is a row of 1 + n + k numbers, in this order:
+
+- vehicle: n values, in the order of the vehicle's characteristics and in their units;
+- world: one number, whose floor is an index into `Oracle.worlds`. A world is a test (or all tests
+  without moving axes together) with one parameter set of the vehicle model;
+- places: k numbers from 0 to 1. The first place is the phase (the moment between two decisions of
+  the driving system at which the encounter begins). Each further place is the share of the range of
+  one axis of encounters. A world with fewer axes than another one ignores the last places.
 """
 
 from __future__ import annotations
@@ -26,13 +35,20 @@ STAGE = "limits"
 
 
 class Exhausted(InputError):
-    """Fewer simulations may follow than are asked for."""
+    """The question asks for more simulations than it still may do."""
 
 
 class CaseWorld(NamedTuple):
-    """Encounters with one parameter set: a model in which the axes of encounters are parameters,
-    the phase last if they have one; and the test of the matrix with the values of its axes, if it
-    moves.
+    """A world holds encounters that are simulated with one parameter set of the vehicle model.
+
+    Attributes
+    ----------
+    model
+        The parameter set. Its settings are a vehicle and then the values of the axes of encounters.
+        If encounters have a phase, the phase is the last value.
+    test
+        The test of the matrix, with the listed values of its axes, if axes of the test move; None
+        for the world of all other encounters.
     """
 
     model: Model
@@ -40,12 +56,14 @@ class CaseWorld(NamedTuple):
 
     @property
     def has_phase(self) -> bool:
-        """Whether an encounter has a phase."""
+        """Whether encounters of this world have a phase."""
         return PHASE in self.model.characteristics.scenario.names
 
     @property
     def places(self) -> int:
-        """The number of places of a case: the phase, then each other axis."""
+        """The number k of places that this world uses: 1 for the phase (also in a world without
+        phases, which ignores this place), and 1 for each other axis.
+        """
         return 1 + len(self.model.characteristics.scenario) - self.has_phase
 
     def settings(
@@ -53,9 +71,19 @@ class CaseWorld(NamedTuple):
         vehicles: FloatArray,
         places: FloatArray,
     ) -> FloatArray:
-        """Vehicles, shape (M, n), at places, shape (M, k), as they are printed."""
+        """The settings of M cases, with encounters rounded to the digits that answers print.
+
+        Parameters
+        ----------
+        vehicles
+            Values of the vehicles, shape (M, n).
+        places
+            The phase and then the share of the range of each axis, from 0 to 1, shape (M, k). The
+            array may have further columns, which only other worlds use.
+        """
         members = self.model.characteristics
         axes = members.scenario
+        # A case has the phase before the axes, but a setting has the phase last.
         shares = places[:, 1 : self.places]
         if self.has_phase:
             shares = np.hstack([shares, places[:, :1]])
@@ -63,8 +91,10 @@ class CaseWorld(NamedTuple):
         return members.with_printed_encounters(np.hstack([vehicles, encounters]))
 
     def listed(self) -> FloatArray:
-        """The places of its listed encounters, shape (E, k), at phase 0; of ranges, those at which
-        the original vehicle leaves least.
+        """The places of the E listed encounters of this world, at phase 0, shape (E, k).
+
+        If the study has ranges of encounters in place of lists, the encounters are the original one
+        and those in which the original vehicle is least safe.
         """
         axes = self.model.characteristics.scenario
         if self.test is None:
@@ -84,18 +114,20 @@ class CaseWorld(NamedTuple):
 
 
 class Oracle:
-    """What cases leave to the limit.
+    """An oracle simulates cases, and returns the robustness of each case.
 
     Attributes
     ----------
     worlds
-        Those of the study's own parameter set, then of each other one.
+        The worlds of the study's own parameter set, followed by the worlds of each other set.
     fits
-        The number of the parameter set of each world.
+        The number of the parameter set of each world; worlds of the same set are adjacent.
     places
-        The number of places of a case.
+        The number k of places of a case, which is the largest number that a world uses.
     own
         The model with the study's own parameter set.
+    vehicle
+        The n characteristics of the vehicle.
     phases
         The progress of the question.
     """
@@ -132,17 +164,26 @@ class Oracle:
 
     @property
     def available(self) -> float:
-        """The number of cases that may follow; infinite without a limit."""
+        """The number of cases that may still be simulated; infinite if the user sets no limit."""
         evaluator = self.own.evaluator
-        # The remark on phases, at last, drives the original vehicle twice.
+        # The answer's remark on phases drives the original vehicle twice, after all cases.
         remark = 2 * len(evaluator.system.points)
         return (evaluator.account.left - remark) // self._simulations
 
     def __call__(self, cases: FloatArray, failed: float = np.inf) -> FloatArray:
-        """What each of M cases leaves, shape (M,): below 0 it is unsafe, infinite where it does not
-        count, and `failed` where it could not be simulated.
+        """The robustness of each of M cases, shape (M,): below 0 the case is unsafe, and from 0 on
+        it is safe.
+
+        The robustness is infinite if the case does not count: its setting violates a constraint of
+        the study, or the original vehicle is unsafe in its encounter, too. The robustness is
+        `failed` if the case could not be simulated.
+
+        Raises
+        ------
+        Exhausted
+            If the simulations that are still allowed may not suffice.
         """
-        # Simulations of the original vehicle may follow.
+        # Each unsafe case may need one more simulation: of the original vehicle in its encounter.
         if (1 + self._tries_originals) * len(cases) > self.available:
             raise Exhausted(
                 "simulations",
@@ -155,6 +196,7 @@ class Oracle:
             model = world.model
             runs = model.evaluate(settings, STAGE)
             of_world = model.robustness_by(runs)
+            # NaN marks cases that could not be simulated, until `failed` replaces it at the end.
             of_world[~(runs.valid | runs.infeasible)] = np.nan
             of_world[~model.evaluator.region.feasible(settings)] = np.inf
             unsafe = np.flatnonzero(of_world < 0)
@@ -167,7 +209,9 @@ class Oracle:
         self,
         cases: FloatArray,
     ) -> Iterator[tuple[int, IntArray, FloatArray]]:
-        """The numbers of the worlds of cases, each with their rows and their settings there."""
+        """For each world in which some of M cases drive: the number of the world, the rows of these
+        cases, and the settings of these cases in this world.
+        """
         n = len(self.vehicle)
         numbers = np.floor(cases[:, n]).astype(int)
         for number in np.unique(numbers).tolist():
@@ -183,11 +227,14 @@ class Oracle:
         world: CaseWorld,
         cases: FloatArray,
     ) -> BoolArray:
-        """Which cases of a world are encounters that count: in which the original is safe, too."""
+        """Which of M cases of one world count, shape (M,): those in whose encounter the original
+        vehicle is safe. Otherwise a failure says nothing about changes of the vehicle.
+        """
         new_car = world.model.new_car
         if new_car is None or not len(cases):
             return np.ones(len(cases), dtype=bool)
         n = len(self.vehicle)
+        # World and places identify an encounter: the original drives in each one only once.
         keys = [case.tobytes() for case in cases[:, n:]]
         rows = {key: row for row, key in enumerate(keys) if key not in self._counts}
         if rows:
@@ -209,7 +256,9 @@ class Oracle:
         draw: Callable[[int], FloatArray],
         number: int,
     ) -> FloatArray:
-        """So many drawn vehicles that satisfy the study's constraints."""
+        """`number` vehicles that satisfy the study's constraints, shape (number, n). The function
+        `draw` returns as many random vehicles as it is asked for.
+        """
         n = len(self.vehicle)
         encounter = self._region.characteristics.original[n:]
 
@@ -219,7 +268,9 @@ class Oracle:
         return self._region.draw_feasible(draw_settings, number)[:, :n]
 
     def setting(self, case: FloatArray) -> tuple[Model, FloatArray]:
-        """The model of a case, and its setting there."""
+        """The model in which a case, shape (n + 1 + k,), is simulated, and the setting of the case
+        in this model.
+        """
         n = len(self.vehicle)
         world = self.worlds[int(case[n])]
         rows = case[np.newaxis]
@@ -234,18 +285,21 @@ class Oracle:
         *,
         phases: bool = True,
     ) -> Space:
-        """The cases of vehicles between two ends with a parameter set, at all phases or phase 0."""
+        """All cases with a parameter set: vehicles from `lower` to `upper`, each of shape (n,), in
+        all worlds of this set, and at all places. Without `phases` the phase is always 0.
+        """
         numbers = np.flatnonzero(np.equal(self.fits, fit))
         begin = np.zeros(1 + self.places)
         begin[0] = numbers[0]
         end = np.ones(1 + self.places)
+        # The floor of the largest number is still the last world of the set.
         end[0] = np.nextafter(numbers[-1] + 1, 0)
         end[1] = phases
         return Space(np.append(lower, begin), np.append(upper, end), len(lower))
 
     def listed(self) -> FloatArray:
-        """The listed encounters with the study's own parameter set: worlds and places, shape (E,
-        1 + k).
+        """The E listed encounters of all worlds of the study's own parameter set: the number of the
+        world and the places, shape (E, 1 + k).
         """
         tables = []
         for number in np.flatnonzero(np.equal(self.fits, 0)).tolist():
@@ -257,7 +311,9 @@ class Oracle:
         return np.vstack(tables)
 
     def hardest(self, number: float) -> FloatArray:
-        """So many of the listed encounters: those in which the original vehicle leaves least."""
+        """The `number` listed encounters in which the original vehicle has the least robustness,
+        shape (number, 1 + k); all listed encounters if there are fewer.
+        """
         encounters = self.listed()
         if number >= len(encounters):
             return encounters
@@ -266,7 +322,9 @@ class Oracle:
 
 
 def product_of(vehicles: FloatArray, encounters: FloatArray) -> FloatArray:
-    """Each vehicle in each encounter."""
+    """The cases of each of M vehicles, shape (M, n), in each of E encounters (world and places),
+    shape (E, 1 + k). The result has shape (M * E, n + 1 + k); the cases of a vehicle are adjacent.
+    """
     repeated = np.repeat(
         vehicles,
         len(encounters),
@@ -281,7 +339,9 @@ def worlds_of(
     *,
     between: bool,
 ) -> list[CaseWorld]:
-    """The worlds of a parameter set: each test that moves, and all other points together."""
+    """The worlds of a parameter set. With `between`, each test with moving axes has a world, whose
+    encounters lie between the test's listed values, too. All other test cases share one world.
+    """
     moving = moving_tests(model, new_car) if between else []
     worlds = [CaseWorld(alone.in_phases or alone, test) for test, alone in moving]
     names = {test.name for test, _ in moving}
@@ -296,8 +356,10 @@ def worlds_of(
 
 
 def moving_tests(model: Model, new_car: Unsafe) -> list[tuple[MatrixTest, Model]]:
-    """The tests of a model's matrix with axes that move, each with the model in this test alone,
-    whose axes are ranges; an encounter counts unless the original is unsafe by `new_car` in it.
+    """The tests of a model's matrix that have moving axes, each with a model of this test alone.
+
+    In this model the moving axes are ranges, from the least to the greatest listed value. An
+    encounter counts unless the original vehicle is unsafe in it by the criterion `new_car`.
     """
     study = model.evaluator.study
     tests = []
@@ -311,7 +373,7 @@ def moving_tests(model: Model, new_car: Unsafe) -> list[tuple[MatrixTest, Model]
             evaluator = model.evaluator.for_study(
                 in_ranges(study, [(listed, domains)]), verified=0
             )
-            # The original is simulated only where a vehicle fails.
+            # Because of `new_car`, the original drives only where a vehicle has failed.
             moving = Model(model.fit, evaluator, model.unsafe, new_car=new_car)
             tests.append((listed, moving))
     return tests
