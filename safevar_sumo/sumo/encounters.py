@@ -1,8 +1,9 @@
-"""Encounters: those of a test that each setting has, in ranges of parameters of scenario and
-weather, and the worst of those that it meets.
+"""Encounters in ranges of parameters of scenario and weather: each setting has its own values of
+these parameters, meets the tests whose ranges hold these values, and has the result of the worst
+test that it meets.
 
-A scenario whose parameters are arrays of N values stands for N scenarios. Its scene is a recorded
-one, in which each vehicle starts elsewhere and meets a target that moves otherwise
+A scenario whose parameters are arrays of N values stands for N scenarios. One recorded scene gives
+the N scenes: each vehicle starts at another place, and meets a target that moves in another way
 (`Scenario.layout`).
 """
 
@@ -47,9 +48,14 @@ if TYPE_CHECKING:
 
 
 def check_domains(study: Study, points: Points) -> None:
-    """Refuse a range of a parameter that a test's scenario does not have or in which its weathers
-    differ, a range that is wider than the scenario's, and ranges in which an encounter is
-    impossible.
+    """Refuse ranges in which not every encounter can be simulated.
+
+    Raises
+    ------
+    InputError
+        If a test's scenario does not have a parameter with a range; if a range has another unit
+        than the scenario's range, or is wider; if the weathers of the matrix set different values
+        of a parameter with a range; or if an encounter at a corner of the ranges is impossible.
     """
     for point in points:
         legal = searchable_in(point.scenario)
@@ -105,8 +111,10 @@ def _check_corners(study: Study, point: Point, ranges: Domains) -> None:
 
 
 def encounter(point: Point, values: Quantities) -> Point:
-    """A point at other values of its own parameters, numbers, or arrays for N vehicles; its
-    scenario is the same object if only weather and phase vary.
+    """The point with other values of those parameters that it has. A value is a number, or an array
+    of shape (N,) for N vehicles.
+
+    If the values are of weather and phase alone, the new point has the same scenario object.
     """
     values = point.own(values)
     phase = point.phase
@@ -122,12 +130,14 @@ def encounter(point: Point, values: Quantities) -> Point:
 
 
 def original_encounter(point: Point, ranges: Domains) -> Point:
-    """A point at the original values of its own ranges, or of all."""
+    """The point with the original value of each parameter that has a range. The ranges are those of
+    the point's test; `ranges` (those of the study) if the point states none.
+    """
     return encounter(point, _originals(_ranges_of(point, ranges)))
 
 
 def _ranges_of(point: Point, ranges: Domains) -> Domains:
-    """A point's own ranges, or all."""
+    """The ranges of the point's test; `ranges` (those of the study) if the point states none."""
     if point.ranges is None:
         return ranges
     return point.ranges
@@ -140,7 +150,9 @@ def _originals(ranges: Domains) -> dict[str, Quantity]:
 def scenes_of_encounters(
     recording: Recording, scenario: WorldScenario, n: int
 ) -> Recording:
-    """The scenes of N vehicles whose scenario has arrays as parameters, from a recorded scene."""
+    """The scenes of N vehicles, made from one recorded scene. Parameters of the scenario are arrays
+    of shape (N,).
+    """
     step = recording.step_length
     samples = 1 + int(np.max(np.round(np.asarray(scenario.duration) / step)))
     layout = scenario.layout(recording, step, samples)
@@ -151,10 +163,14 @@ def scenes_of_encounters(
     if layout.pedestrian:
         track = recording.tracks[layout.pedestrian]
         frame = Frame.of(recording.lane(recording.first_lanes[VUT]))
+        # The index of the recorded sample at which the pedestrian is nearest to the middle of the
+        # lane. Positions are NaN in samples in which the pedestrian is not on the road.
         at_lane = np.nanargmin(np.abs(frame.left(track.motion[:, :2])))
+        # `along` takes an array of positions: x and y of this sample alone have shape (1, 2).
         place = frame.point(frame.along(track.motion[[at_lane], :2]), layout.left)
         sign = np.where(layout.backwards, -1.0, 1.0)
         _, _, dir_x, dir_y, _ = track.motion[0]
+        # The empty array gives the other columns (x, y, direction, speed) the shape (samples, n).
         columns = np.broadcast_arrays(
             np.empty((samples, n)), *place, sign * dir_x, sign * dir_y, layout.speed
         )[1:]
@@ -171,7 +187,7 @@ def scenes_of_encounters(
 
 
 def _extended(track: Film, samples: int) -> Film:
-    """The track of an actor who stands, for at least this number of samples."""
+    """The track with at least this number of samples: the actor then stays as in the last one."""
     shortage = max(samples - len(track.motion), 0)
     return track._replace(
         motion=np.pad(track.motion, ((0, shortage), (0, 0)), mode="edge")
@@ -179,12 +195,13 @@ def _extended(track: Film, samples: int) -> Film:
 
 
 def where_met(system: System, setting: FloatArray) -> System:
-    """The system at the points whose encounters a setting, shape (n,), meets.
+    """The system with only those points that a setting, shape (n,), meets. A point that belongs to
+    no test always stays.
 
     Raises
     ------
     InputError
-        If there is none.
+        If the setting meets no point.
     """
     settings = setting[None]
     points = tuple(
@@ -202,12 +219,15 @@ def where_met(system: System, setting: FloatArray) -> System:
 
 
 def met_at(point: Point, system: System, settings: FloatArray) -> BoolArray:
-    """Which of N settings have an encounter of a point, shape (N,); beyond the ranges of the study
-    those that have one at their ends.
+    """Which of N settings meet a point, shape (N,): the setting's encounter is in the ranges of the
+    point, and satisfies the point's constraints.
+
+    A value beyond the range of the study counts as the end of this range.
     """
     members = system.characteristics.scenario
     if not len(members):
         return np.ones(len(settings), bool)
+    # `split` returns the vehicles and then the encounters, shape (N, n - k).
     encounters = np.clip(system.split(settings)[1], members.lower, members.upper)
     return np.broadcast_to(point.meets(members.columns(encounters)), len(settings))
 
@@ -215,7 +235,9 @@ def met_at(point: Point, system: System, settings: FloatArray) -> BoolArray:
 def in_place_of_unmet(
     point: Point, system: System, settings: FloatArray, is_met: BoolArray
 ) -> FloatArray:
-    """Settings, of which those that have no encounter of a point stand in its original one."""
+    """The settings, shape (N, n). Settings that do not meet the point (`is_met`, shape (N,), is
+    false) get the point's original encounter, so that all settings can be simulated together.
+    """
     members = system.characteristics
     originals = _originals(point.ranges or {})
     original = np.array([originals.get(item.name, item.original) for item in members])
@@ -223,15 +245,18 @@ def in_place_of_unmet(
 
 
 def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
-    """The number of each setting's worst point; `at_points` are the evaluations of the settings at
-    all points.
+    """The index of each setting's worst point in `system.points`, shape (N,). `at_points` has the
+    evaluations of the N settings at each point, in the order of the points.
 
-    It is the point with the least safety degree, or for a setting that collides nowhere the one
-    that is worst by the measure of the study's matrix; of equal points, the first by name. A
-    collision in a valid test always counts. Without a collision, a point with an invalid test
-    counts as the worst, because such a test leaves open whether the setting is safe.
+    - By the aggregate "worst" of the matrix, the point with the least safety degree is the worst.
+    - By another aggregate, such as "drac >", the worst value of this metric decides for a setting
+      that collides at no point. For a setting that collides, the least safety degree decides. The
+      metric `impact_excess` is an exception: this metric decides for every setting.
+    - Of a setting without a collision, a point with an invalid test is the worst, because such a
+      test leaves open whether the setting is safe.
+    - Of equal points, the first by name is the worst.
     """
-    # In the order of names, so that ties do not depend on the order of the file.
+    # With points sorted by name, ties do not depend on the order of tests in the study's file.
     order = np.argsort([point.name for point in system.points])
     evaluations = Evaluations.concatenate([at_points[k] for k in order])
     shape = (len(order), -1)
@@ -242,13 +267,13 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
     values = safety_degrees
 
     if system.aggregate != WORST:
-        # Such as "drac >".
+        # The aggregate is a metric and a direction, such as "drac >".
         name, direction = system.aggregate.split()
         measures = evaluations.column(name).reshape(shape)
         if direction == ">":
             measures = -measures
         measures = np.where(np.isnan(measures), np.inf, measures)
-        # An impact may be allowed: then the measure says how bad a collision is.
+        # A test may allow impacts: then only the excess says how bad a collision is.
         values = np.where(
             ~has_collided | (name == IMPACT_EXCESS.name), measures, safety_degrees
         )
