@@ -1,5 +1,5 @@
-"""How a reference driver answers a danger: it releases the accelerator, reacts, brakes, and does
-not accelerate again while the cause of the danger blocks its way.
+"""How a reference driver answers a danger. The driver releases the accelerator, brakes after the
+reaction time, and does not accelerate again while the cause of the danger blocks the way.
 """
 
 from __future__ import annotations
@@ -44,38 +44,47 @@ CRUISE_GAIN = 1.0
 LEAST_DIVISOR = 1e-9
 """Lower bound of an acceleration [m/s^2] or of a ramp's width [m] that is a divisor."""
 StartThrottle = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
-"""Throttle in the run's first steps, one value per step [-]: the start of another driver."""
+"""Throttle in the run's first steps, one value per step [-], with which the run starts as it does
+with another driver.
+"""
 
 
 class Reaction(NamedTuple):
-    """What a reference driver remembers of N vehicles; arrays have shape (N,).
+    """The memory of a reference driver that drives N vehicles; arrays have shape (N,).
 
     Attributes
     ----------
-    nominal, step
-        The original vehicle, and the time between two calls of `drive` [s].
+    nominal
+        The original vehicle.
+    step
+        Time between two calls of `drive` [s].
     cruise
-        Speed to hold [m/s], and the trim and the brake pedal at the first call [-]; None before
-        that call.
+        Speed to hold [m/s], trim [-], and position of the brake pedal [-], all taken at the first
+        call; None before the first call.
     speed
         Speed at the last call [m/s].
     is_endangered
         Whether there was a danger at the last call.
     aware_time
-        Time since the driver first saw a danger whose cause is still ahead [s]; negative without
-        such a cause.
-    felt_deceleration, intended_deceleration
-        The vehicle's deceleration without the driver's braking, and the one that the driver aims
-        at [m/s^2].
+        Time since the danger began that made the driver aware of its cause [s]. The time is
+        negative if the driver is aware of no cause.
+    felt_deceleration
+        Deceleration that the vehicle has without the driver's braking [m/s^2].
+    intended_deceleration
+        Deceleration that the driver wants to reach at the end of the step [m/s^2].
     leader
         Number of the obstacle at the last call.
-    leader_speed, leader_deceleration, leader_has_braked
-        Of an obstacle in the way: its speed at the last call [m/s], its mean deceleration since
-        the call before [m/s^2], and whether it has braked there; 0 and false for nobody.
+    leader_speed
+        Speed of the leader (an obstacle in the way) at the last call [m/s]; 0 without a leader.
+    leader_deceleration
+        Mean deceleration of the leader between the last two calls [m/s^2]; 0 without a leader.
+    leader_has_braked
+        Whether the leader has braked while it was in the way; false without a leader.
     is_undercut
-        Whether a leader was too near before it braked, by a driver that has such a distance.
+        Whether the gap was smaller than the driver's least gap before the leader braked. Only one
+        of the drivers has a least gap; for the others the value is false.
     nearness
-        What is above 0 in a danger, at the last call, in a unit of the driver's own.
+        `Danger.nearness` at the last call, but at least -`LARGEST_GAP`.
     """
 
     nominal: Nominal
@@ -102,33 +111,38 @@ class Reaction(NamedTuple):
 
     @property
     def leader_brakes(self) -> BoolArray:
-        """Whether a leader has braked since the last call."""
+        """Whether the leader braked between the last two calls."""
         return self.leader_deceleration > ANY_BRAKING + DECELERATION_ROUNDING
 
 
 Reacted = tuple[Command, Reaction]
-"""What a driver does at a step, and what it remembers for the next one."""
+"""The driver's command in a step, and the driver's memory for the next step."""
 
 
 class Danger(NamedTuple):
-    """What a reference driver sees as a danger, and how it brakes for it; arrays have shape (N,).
+    """The danger that a reference driver sees now, and how the driver brakes; arrays have shape
+    (N,).
 
     Attributes
     ----------
     is_present
         Whether there is a danger now.
-    deceleration, jerk
-        Deceleration after the reaction time [m/s^2], and how fast it rises [m/s^3].
+    deceleration
+        Deceleration that the driver reaches after the reaction time [m/s^2].
     reaction_time
-        Time from the first sight of the danger to braking [s].
+        Time from the beginning of the danger to braking [s].
+    jerk
+        Rise of the deceleration per second, once the driver brakes [m/s^3].
     released
-        Deceleration with the accelerator released, until the reaction time is over [m/s^2]; a
-        vehicle that coasts with less is braked.
+        Deceleration while the accelerator is released, until the reaction time is over [m/s^2]. If
+        the vehicle decelerates less by itself, the driver brakes a little.
     nearness
-        What rises above 0 when a danger begins, in any unit: a driver looks all the time, so that
-        the danger began within the last step, where this was 0.
+        A measure of the danger, in any unit: above 0 in a danger, and below 0 before it. Calls are
+        a step apart, but the danger begins between two calls: at the moment at which `nearness`,
+        interpolated linearly between the two calls, crosses 0. By default the nearness is infinite,
+        and a new danger has lasted a whole step.
     longest
-        Upper limit of the time for which a danger that is new has lasted [s].
+        Upper limit of the time for which a new danger has already lasted [s].
     """
 
     is_present: BoolArray
@@ -141,11 +155,11 @@ class Danger(NamedTuple):
 
 
 class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):
-    """Base of the drivers: a driver feels how the vehicle coasts, and brakes by what its
-    deceleration lacks.
+    """Base of the reference drivers. The driver feels the deceleration that the vehicle has by
+    itself, and brakes for the difference to the deceleration that the driver wants.
 
-    The original vehicle's table of coasting would mislead the driver: the calibration drive that
-    made it was in other gears.
+    The driver does not take the coasting deceleration from the original vehicle's table
+    (`Nominal`), because the calibration drive that made this table was in other gears.
     """
 
     cruise_speed: PositiveParameter | None = None
@@ -174,7 +188,9 @@ class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):
     def watch_leader(
         self, observation: Observation, memory: Reaction, is_in_way: BoolArray
     ) -> Reaction:
-        """The memory with the leader as it is now; `is_in_way` says where the obstacle is one."""
+        """The memory with the leader's present speed and deceleration. The obstacle of a vehicle is
+        its leader where `is_in_way`, shape (N,), is true.
+        """
         speed = np.where(is_in_way, observation.obstacle_speed, 0.0)
         is_same = observation.obstacle == memory.leader
         is_led = is_in_way & is_same & (memory.leader_speed > 0)
@@ -196,8 +212,9 @@ class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):
 
         The driver releases the accelerator when it sees a danger, and brakes when the reaction time
         is over. A danger lasts as long as its cause blocks the way and approaches or brakes. After
-        it the driver is aware of the cause as long as that blocks the way: it does not press the
-        accelerator, and to a further danger from the same cause it reacts without a reaction time.
+        the danger the driver stays aware of the cause, as long as the cause blocks the way. An
+        aware driver does not press the accelerator. The same cause may become a danger again: then
+        the driver brakes at once if the reaction time has passed since the first danger began.
 
         Parameters
         ----------
@@ -212,16 +229,22 @@ class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):
         )
         speed_to_hold, trim, brake_at_start = cruise
 
-        # Is there a danger? A known one is there while its cause approaches or brakes.
+        # Is there a danger? A danger that the driver knows lasts while its cause blocks the way
+        # and approaches or brakes.
         is_same = observation.obstacle == memory.leader
         is_known = (memory.aware_time >= 0) & (is_same | memory.is_endangered)
         blocks = is_ahead(observation) & blocks_the_way(observation, self.corridor)
         approaches = (observation.closing_speed >= 0) | memory.leader_brakes
         is_endangered = danger.is_present | (is_known & blocks & approaches)
 
-        # Since when is the driver aware of it? It forgets a cause that no longer blocks the way.
+        # For how long is the driver aware of the cause of a danger? The driver forgets a cause that
+        # no longer blocks the way.
         is_aware = is_endangered | (is_known & is_same & blocks)
-        # The time for which a new danger has lasted [s]: that since `nearness` was 0 in this step.
+        # The time for which a new danger has lasted [s]. Let a < 0 be the nearness at the last call
+        # and b > 0 the nearness now. A straight line from a to b crosses 0 after the share
+        # -a / (b - a) of the step, so the danger has lasted for the share b / (b - a) =
+        # 1 / (1 - a / b). For a new obstacle, whose nearness was not seen before, a = 0: the danger
+        # has lasted the whole step.
         old_nearness = np.where(is_same, memory.nearness, 0.0)
         lower_limit = np.full_like(observation.gap, -LARGEST_GAP)
         nearness = np.maximum(danger.nearness, lower_limit)
@@ -233,7 +256,8 @@ class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):
         known_time = np.where(is_known, memory.aware_time + memory.step, new_time)
         aware_time = np.where(is_aware, known_time, -1.0)
 
-        # Without a danger it holds its speed; aware of a cause it only ever becomes slower.
+        # Without a danger the driver holds the cruise speed. A driver that is aware of a cause does
+        # not accelerate.
         if (step_index := round(observation.time / memory.step)) < len(start):
             calm = Command(
                 np.full_like(observation.speed, start[step_index]),
@@ -246,7 +270,8 @@ class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):
             )
             calm = self.pedals(acceleration, observation.speed, memory.nominal, trim)
 
-        # In a danger it brakes by what the vehicle's own deceleration lacks.
+        # In a danger the brake adds what the vehicle's own deceleration (felt) lacks to the wanted
+        # one (mean).
         mean, felt, intended = _decelerations(
             observation, memory, danger, is_endangered, aware_time
         )
@@ -273,26 +298,30 @@ def _decelerations(
     is_endangered: BoolArray,
     aware_time: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Decelerations of vehicles in a danger, shape (N,) [m/s^2]: the mean one to reach in the next
-    step, the one that is felt without braking, and the one at the step's end.
+    """Three decelerations of vehicles in a danger [m/s^2], each of shape (N,): the mean
+    deceleration that the driver wants in the coming step; the deceleration that the vehicle has
+    without the driver's braking; and the deceleration that the driver wants at the end of the step.
     """
     step = memory.step
 
-    # How the vehicle decelerates by itself: as before it braked, or as it does now.
+    # The deceleration that the vehicle has by itself. While the driver brakes, this deceleration
+    # cannot be felt: the driver takes the value from before braking.
     was_braking = memory.aware_time + step - danger.reaction_time > TIME_ROUNDING
     braked = np.maximum(memory.intended_deceleration - memory.felt_deceleration, 0.0)
     felt_now = np.maximum(-memory.acceleration(observation) - braked, 0.0)
     felt = np.where(was_braking, memory.felt_deceleration, felt_now)
 
-    # In the step in which it sees the danger it feels how the vehicle coasts, and does not brake.
+    # In the step in which the driver sees the danger, the driver does not brake, in order to feel
+    # how the vehicle coasts.
     released = np.where(is_endangered & (memory.aware_time >= 0), danger.released, 0.0)
 
-    # It brakes for the part of the step that is after the reaction time.
+    # The driver brakes only in the part of the coming step that is after the reaction time.
     braking_time = np.minimum(aware_time + step - danger.reaction_time, step)
     is_braking = is_endangered & (braking_time > TIME_ROUNDING)
     share = np.where(is_braking, braking_time / step, 0.0)
 
-    # The deceleration rises within that part, which has its mean.
+    # In that part the deceleration rises linearly, so its mean is begin + rise / 2. In the rest of
+    # the step the vehicle decelerates with the accelerator released.
     begin = np.maximum(memory.intended_deceleration, felt)
     rise = danger.jerk * np.where(is_braking, braking_time, step)
     risen = share * np.minimum(begin + rise / 2, danger.deceleration)
