@@ -1,4 +1,4 @@
-"""Measures of stops and impacts, by which the law judges a vehicle: UN R13-H, UN R152."""
+"""Measures of stops and impacts. The law judges a vehicle by them: UN R13-H, UN R152."""
 
 from __future__ import annotations
 
@@ -15,26 +15,32 @@ from safevar_sumo.records import (
 from safevar_sumo.study import MetricsTable
 
 PEDAL_ROUNDING = 1e-6
-"""Change of the brake pedal that is a rounding error of its delay [-]."""
+"""Changes of the pedal's position up to this one are rounding errors of the brake's delay [-]."""
 
 
 # Vehicles that do not brake divide by 0.
 @np.errstate(all="ignore")
 def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Distance from the first brake force to standstill [m]; shape (N,), NaN for a vehicle that
-    does not brake or stop.
+    """Distance from the first brake force to standstill [m], shape (N,); NaN for a vehicle that
+    does not brake or does not stop.
 
-    A sample's pedal acts in the step before it. A dead time of the brake may end inside that step.
+    Samples are a step apart. `pedal[t]` is the position of the brake pedal that acted in the step
+    from sample t - 1 to sample t. If the brake's dead time ends inside this step, `pedal[t]` is the
+    mean over the step, and brake force acts only in the last part of the step.
     """
     trace = runs.trace
     pedal = np.broadcast_to(trace.pedal, trace.speed.shape)
     vehicles = np.arange(trace.speed.shape[1])
     is_pressed = pedal > pedal[0] + PEDAL_ROUNDING
+    # The first step with brake force ends at this sample.
     end = np.argmax(is_pressed, axis=0)
+    # The samples at the begin of this step, at its end, and a step later.
     samples = np.clip([end - 1, end, end + 1], 0, len(pedal) - 1)
 
-    # The share of this step with brake force is 1 unless the pedal has a part of the first command
-    # there and all of it a step later. The loss of speed says more where tyres limit the force.
+    # The share of this step in which brake force acts. The share is 1, unless the pedal has only a
+    # part of the first command in this step, and the whole command in the next step: then it is
+    # part / full. Where tyres limit the force, the ratio of the losses of speed is larger than
+    # part / full, and says more.
     first_command = trace.brake[
         np.argmax(trace.brake > pedal[0] + PEDAL_ROUNDING, axis=0), vehicles
     ]
@@ -67,15 +73,17 @@ STOPPING_DISTANCE = Measure(
 
 
 def _of_stops(runs: SimulationRuns, values: FloatArray) -> FloatArray:
-    """Values of vehicles that have stopped, shape (N,), NaN for others."""
+    """The values of vehicles, shape (N,), with NaN for a vehicle that has not stopped or has
+    collided.
+    """
     return mask_collisions(
         runs, np.where(runs.trace.speed[-1] <= STANDSTILL, values, np.nan)
     )
 
 
 def stop_from_pedal(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Distance from the first command to brake to standstill [m]; shape (N,), NaN for a vehicle
-    that does not brake or stop.
+    """Distance from the first command to brake to standstill [m], shape (N,); NaN for a vehicle
+    that does not brake or does not stop.
     """
     trace = runs.trace
     is_commanded = trace.brake > 0
@@ -96,7 +104,7 @@ STOP_FROM_PEDAL = Measure(
 
 
 MFDD_SHARES = 0.8, 0.1
-"""Shares of the first speed between which the mean fully developed deceleration counts."""
+"""The mean fully developed deceleration is taken between these two shares of the first speed."""
 
 
 # Vehicles that do not stop divide by 0.
@@ -104,16 +112,19 @@ MFDD_SHARES = 0.8, 0.1
 def mean_fully_developed_deceleration(
     runs: SimulationRuns, thresholds: MetricsTable
 ) -> FloatArray:
-    """Mean fully developed deceleration of UN R13-H, (v_b^2 - v_e^2) / (2 (s_e - s_b)) [m/s^2],
-    with the places s_b and s_e where the speed is 80 and 10 % of the first one; shape (N,), NaN for
-    a vehicle that does not stop.
+    """Mean fully developed deceleration of UN R13-H [m/s^2], shape (N,); NaN for a vehicle that
+    does not stop.
 
-    With a constant deceleration in a step, squares of speeds are linear over the way.
+    The deceleration is (v_b^2 - v_e^2) / (2 (s_e - s_b)). The speed is v_b, 80 % of the first
+    speed, at the place s_b, and v_e, 10 % of the first speed, at the place s_e. Both places are
+    interpolated in the square of the speed, which is linear over the way while the deceleration is
+    constant.
     """
     trace = runs.trace
     squares = trace.speed * trace.speed
     end_squares = np.square(MFDD_SHARES)[:, None] * squares[0]
     columns = zip(end_squares.T, squares.T, trace.position.T, strict=True)
+    # `np.interp` needs ascending values, but the speed falls: hence the minus signs.
     places = np.array(
         [np.interp(-levels, -square, way) for levels, square, way in columns]
     )
@@ -132,8 +143,8 @@ MFDD = Measure(
 
 
 def impact_speed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Relative speed at contact along the vehicle's lane [m/s], at least `LEAST_CLOSING_SPEED`;
-    shape (N,), NaN without a collision.
+    """Relative speed at contact along the vehicle's lane [m/s], shape (N,), at least
+    `LEAST_CLOSING_SPEED`; NaN for a vehicle that does not collide.
     """
     return np.maximum(runs.relative_speed, LEAST_CLOSING_SPEED)
 
@@ -149,8 +160,9 @@ IMPACT_SPEED = Measure(
 
 
 def impact_excess(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Relative speed at contact above the one that the test case allows [m/s]; without a contact
-    minus the least clearance [m]. Shape (N,), NaN where there was no encounter.
+    """How bad an encounter is, shape (N,): after a contact the relative speed minus the speed that
+    the test case allows [m/s]; without a contact the least clearance with a minus sign [m]; NaN if
+    nobody was met.
     """
     excess = impact_speed(runs, thresholds) - runs.allowed_impact_speed
     clearance = safety_degree(runs, thresholds) - runs.middles_apart
