@@ -1,5 +1,5 @@
-"""Boxes of settings: a promise, limits; settings in them, and the proof that hardly any of them is
-unsafe.
+"""A box holds all settings between a lower and an upper end of each value, such as the limits of a
+vehicle. This module draws settings from a box, and bounds the share of its unsafe settings.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ MAX_CORNERS = 4096
 
 @dataclass(frozen=True)
 class Box:
-    """Settings from `lower` to `upper`, shape (n,), that satisfy the constraints; where both ends
-    are equal, a characteristic does not vary.
+    """All settings from `lower` to `upper`, each of shape (n,), that satisfy the constraints of the
+    `region`. A value with equal ends does not vary.
     """
 
     region: FeasibleRegion
@@ -31,11 +31,13 @@ class Box:
     upper: FloatArray
 
     def end(self, side: int, column: int) -> float:
-        """An end of a column: 0, the lower one, or 1, the upper one."""
+        """The lower end of a column (side 0), or its upper end (side 1)."""
         return float((self.lower, self.upper)[side][column])
 
     def in_encounters_of(self, region: FeasibleRegion) -> Box:
-        """The box of its vehicles, in all encounters of another region of the same vehicle."""
+        """The box with the same vehicles, and with all encounters of another region. The region is
+        of the same vehicle, but its settings may have other values of encounters.
+        """
         members = region.characteristics
         count = len(members.vehicle)
         return Box(
@@ -45,25 +47,37 @@ class Box:
         )
 
     def at(self, points: FloatArray) -> FloatArray:
-        """The settings at points of the unit cube, shape (M, n)."""
+        """The settings at M points of the unit cube, shape (M, n): 0 is `lower`, 1 is `upper`."""
         return self.lower + points * (self.upper - self.lower)
 
     def holds(self, settings: FloatArray) -> BoolArray:
-        """Which settings are in the box, shape (M,)."""
+        """Which of M settings, shape (M, n), are in the box; shape (M,)."""
         is_within = ((settings >= self.lower) & (settings <= self.upper)).all(axis=1)
         return is_within & self.region.feasible(settings)
 
     def draw(self, number: int, rng: Generator) -> FloatArray:
-        """Settings drawn uniformly, shape (number, n); fewer if hardly any is feasible."""
+        """Settings of the box, drawn uniformly, shape (number, n). The settings are fewer if hardly
+        any setting satisfies the constraints.
+        """
         return self.region.draw_feasible(
             lambda count: self.at(rng.random((count, len(self.lower)))), number
         )
 
 
 class Proof(NamedTuple):
-    """`failures` of `samples` settings drawn after the box was chosen, and those that could not be
-    simulated; at most the share `at_most` of all is unsafe or cannot be simulated, with
-    `CONFIDENCE`.
+    """The result of a test with settings that were drawn after the box was chosen.
+
+    Attributes
+    ----------
+    samples
+        Number of settings that count.
+    failures
+        Number of these settings that are unsafe.
+    at_most
+        Upper bound, with `CONFIDENCE`, of the share of all settings of the box that are unsafe or
+        cannot be simulated.
+    not_simulated
+        Number of the settings that could not be simulated, and are not among the failures.
     """
 
     samples: int
@@ -73,14 +87,14 @@ class Proof(NamedTuple):
 
 
 def proof_size(attempt: int, share: float) -> int:
-    """The number of settings of which none may be unsafe in a test, so that at most this share of
-    all is.
+    """The number of settings that the test number `attempt` (1, 2, ...) needs. If all of them are
+    safe, at most `share` of the box is unsafe.
     """
     return math.ceil(math.log(_error_of(attempt)) / math.log1p(-share))
 
 
 def _error_of(attempt: int) -> float:
-    """The probability with which a test may be wrong."""
+    """The probability with which the test number `attempt` (1, 2, ...) may be wrong."""
     return float((1 - CONFIDENCE) * 0.5**attempt)
 
 
@@ -90,33 +104,50 @@ def prove(
     share: float,
     attempt: int,
 ) -> Proof:
-    """Test with settings drawn anew that at most `share` of all are unsafe. The judge says what
-    each of M settings leaves to the limit in E encounters, shape (M, E): NaN where it could not be
-    simulated, infinite where it does not count.
+    """Test whether at most `share` of the settings of a box are unsafe.
+
+    Parameters
+    ----------
+    draw
+        Returns new settings of the box, as many as it is asked for.
+    judge
+        Returns the robustness of M settings in E encounters, shape (M, E): below 0 the setting is
+        unsafe; NaN if it could not be simulated; infinite if it does not count in this encounter.
+    share
+        The upper bound that the test needs.
+    attempt
+        The number of the test: 1 for the first box, 2 for the box that is tested next, and so on.
 
     Notes
     -----
     The settings are drawn independently and uniformly, by a random generator that no search uses.
-    Test k, k = 1, 2, ..., may be wrong with probability alpha_k = alpha / 2^k, alpha = 1 -
-    `CONFIDENCE`: its bound is Clopper and Pearson's at confidence 1 - alpha_k. Box k depends on
-    earlier samples alone, so given box k the bound fails with probability at most alpha_k. So the
-    probability that any bound is wrong, and with it the bound of the box that passes, is at most
-    sum alpha_k <= alpha. Later tests draw more settings, so that the bound stays `share` if all of
-    them are safe. If all settings of the first test are safe, its bound is the one-sided one at
-    `CONFIDENCE`: it is smaller than `share`, and a box between both passes as safe by no later
-    test, whose bound is `share`.
+
+    Several boxes may be tested in turn, until one of them passes. Let alpha be 1 - `CONFIDENCE`.
+    Test k (k = 1, 2, ...) tests box k, and computes the upper bound of Clopper and Pearson at the
+    confidence 1 - alpha_k, with alpha_k = alpha / 2^k. Box k depends only on the samples of earlier
+    tests. So, whatever box k is, the bound of test k is wrong with a probability of at most
+    alpha_k. The probability that the bound of any test is wrong is then at most the sum of all
+    alpha_k, which is at most alpha. This also covers the bound of the box that passes.
+
+    A later test has a smaller alpha_k, and therefore draws more settings: the bound is `share`
+    again if all settings are safe.
+
+    If all settings of the first test are safe, its bound is computed at the confidence
+    `CONFIDENCE`, and not at 1 - alpha_1. This bound is smaller than `share`. A later test never
+    claims this smaller bound: a box whose unsafe share lies between the smaller bound and `share`
+    passes no later test wrongly, because a later test claims only `share`.
     """
-    # It takes longer to load than a simulation.
+    # scipy takes longer to load than a simulation takes: only a test loads it.
     import scipy
 
-    # Samples enough for the bound, if all are safe.
+    # If all of these settings are safe, the bound is at most `share`.
     error = _error_of(attempt)
     settings = draw(proof_size(attempt, share))
     robustness = judge(settings)
     is_unsafe = (robustness < 0).any(axis=1)
     has_failed = np.isnan(robustness).any(axis=1)
 
-    # An upper bound on the share, where a failed simulation counts as unsafe.
+    # For the upper bound, a setting that could not be simulated counts as unsafe.
     samples = int(np.count_nonzero((robustness < np.inf).any(axis=1) | has_failed))
     failures = int(np.count_nonzero(is_unsafe))
     not_simulated = int(np.count_nonzero(has_failed & ~is_unsafe))
