@@ -1,5 +1,5 @@
-"""The unsafe shares of a sample over the parameter sets of the vehicle model, each with the same
-vehicles: the first ones that `risk`, `rules` and `explain` sample.
+"""The share of unsafe vehicles with each parameter set of the vehicle model. Every set simulates
+the same vehicles: the first `VEHICLES` of those that `risk`, `rules` and `explain` sample.
 """
 
 from __future__ import annotations
@@ -29,11 +29,13 @@ from safevar_sumo.records import (
 from safevar_sumo.study import Study
 
 STAGE = "check other parameter sets"
-"""Phase of progress."""
+"""Phase of progress in which the vehicles are simulated with each set."""
 BY_SET, INTERVALS = "by_set", "by_set_intervals"
-"""The numbers of an answer that have the shares, and their intervals."""
+"""Keys of the numbers of an answer: the share with each set, and the interval of each share."""
 VEHICLES = 400
-"""Number of vehicles that are simulated with each set."""
+"""Largest number of vehicles that are simulated with each set: of all vehicles, and in addition of
+the vehicles that are in further groups.
+"""
 ONE_SET = Sentence(
     "condition",
     "This share was computed with parameter set 0 of the vehicle model (the calibration that the"
@@ -54,12 +56,12 @@ SAME_SHARE = Sentence(
 def simulate_sample(
     evaluator: Evaluator, model: VariationModel, number: int, stage: str
 ) -> Evaluations:
-    """Evaluations of vehicles that vary as a study states.
+    """Evaluations of `number` vehicles that are sampled from a model of variation.
 
     Raises
     ------
     SimulationError
-        If none of them could be simulated.
+        If no vehicle could be simulated.
     """
     vehicles = model.draw(number, np.random.default_rng(evaluator.seed))
     evaluations = evaluator.evaluate(vehicles, stage)
@@ -73,24 +75,29 @@ def simulate_sample(
 def planned_over_sets(
     study: Study, stage: str, settings: int, fits: int | None = None
 ) -> NamedValues:
-    """The phases of progress of a sample, each with its number of settings: `stage`, in which all
-    are simulated with the study's own set, and that of its first vehicles with each of the first
-    `fits` sets, by default with all.
+    """The number of settings of each of the two phases of progress.
+
+    In the phase `stage`, all `settings` are simulated with the study's own set. In the phase
+    `STAGE`, the first `VEHICLES` settings are simulated with each of the first `fits` sets (by
+    default all). The study's own set is the first one. Without other sets, `STAGE` has no settings.
     """
     number = len(other_sets(study, fits))
     return {stage: settings, STAGE: (number + bool(number)) * min(settings, VEHICLES)}
 
 
 class SharesOverSets(NamedTuple):
-    """The unsafe shares of G groups of vehicles with each parameter set, that of the study first.
+    """The shares of unsafe vehicles in G groups of vehicles, with each of S parameter sets.
 
     Attributes
     ----------
+    study
+        The study of the vehicles.
     shares
-        Shape (sets, G); NaN for a group of which no vehicle could be simulated. No row where the
-        number of simulations is bounded, or a single set is asked about.
+        Share of unsafe vehicles by set and group, shape (S, G). The study's own set has the first
+        row. The share is NaN if no vehicle of the group could be simulated. S is 0 if the user
+        limits the number of simulations, or if the study's own set is the only one.
     intervals
-        Their 95 % intervals, shape (sets, G, 2).
+        Lower and upper end of the 95 % confidence interval of each share, shape (S, G, 2).
     """
 
     study: Study
@@ -106,12 +113,22 @@ class SharesOverSets(NamedTuple):
         groups: Sequence[BoolArray] = (),
         fits: int | None = None,
     ) -> Self:
-        """Simulate the first `VEHICLES` of M settings, shape (M, n), which are the first group, and
-        for further groups, shape (M,) each, as many of their settings, with the first `fits` sets,
-        by default with all.
+        """Simulate some of M settings with each set, and compute the shares of all groups.
+
+        Parameters
+        ----------
+        settings
+            The sampled vehicles, shape (M, n). The first `VEHICLES` of them are the first group.
+        groups
+            Further groups: for each group, which settings belong to it, shape (M,). In addition to
+            the first group, the first `VEHICLES` settings that are in any further group are
+            simulated.
+        fits
+            Number of sets that are simulated, with the study's own; by default all.
         """
         is_first = np.arange(len(settings)) < VEHICLES
         in_groups = np.any([np.zeros_like(is_first), *groups], axis=0)
+        # The cumulative sum numbers the settings in further groups: the first ones are chosen.
         is_chosen = is_first | (in_groups & (np.cumsum(in_groups) <= VEHICLES))
         members = np.array([is_first, *groups])[:, is_chosen]
         rows = []
@@ -127,8 +144,8 @@ class SharesOverSets(NamedTuple):
         return cls(evaluator.study, table[..., 0], table[..., 1:])
 
     def numbers(self, share: float) -> JsonObject:
-        """The shares of all vehicles and their intervals, by the number of the set; `share` alone
-        where a single set was asked about.
+        """The shares and intervals of the first group (all vehicles), in the order of the sets. If
+        no set was simulated here, the list of shares has `share` alone.
         """
         shares = self.shares[:, 0].tolist() or [share]
         return {BY_SET: shares, INTERVALS: self.intervals[:, 0].tolist()}
@@ -136,8 +153,11 @@ class SharesOverSets(NamedTuple):
     def ends(
         self, group: int, facts: Sequence[float]
     ) -> tuple[float, float, float, float]:
-        """The least and the greatest share of a group, and the ends of their intervals; `facts` are
-        the share and interval of more of its vehicles with the study's own set.
+        """The least share of a group, its greatest share, the lowest end of all intervals, and the
+        highest end of all intervals.
+
+        `facts` are a share and the two ends of its interval, from a larger sample of the group with
+        the study's own set. They count beside the shares of all sets.
         """
         rows = np.column_stack([self.shares[:, group], self.intervals[:, group]])
         share, low, high = np.vstack([facts, rows]).T
@@ -146,8 +166,8 @@ class SharesOverSets(NamedTuple):
         return smallest, greatest, lowest, highest
 
     def sentences(self) -> Iterator[Sentence]:
-        """The least and the greatest share of all vehicles; that the study's own set was the only
-        one if there are others.
+        """A sentence with the least and the greatest share of all vehicles. If the study has other
+        sets, but none was simulated, the sentence says so.
         """
         if not self.study.spread:
             return
@@ -167,7 +187,9 @@ class SharesOverSets(NamedTuple):
         )
 
     def _in_words(self, number: np.intp) -> str:
-        """The share of all vehicles with a set, and its number if no other interval overlaps."""
+        """The share of all vehicles with a set, in percent with its interval. The text names the
+        set if its interval overlaps with the interval of no other set.
+        """
         intervals = np.delete(self.intervals[:, 0], number, axis=0)
         low, high = self.intervals[number, 0]
         is_apart = ((intervals[:, 1] < low) | (intervals[:, 0] > high)).all()
