@@ -39,49 +39,57 @@ from safevar_sumo.scenarios.tracks import (
 from safevar_sumo.study import searched
 
 PARKED_GAP = 1.0
-"""Gap between vehicle and parked cars, between the nearer car's front and the target's path, and
-between the two cars [m].
+"""Three gaps with the same value [m]: between the side of the vehicle and the parked cars; between
+the target's path and the front of the parked car that is nearer to it; between both parked cars.
 """
 PARKED_LENGTHS, PARKED_WIDTH = {"parked_small": 4.25, "parked_large": 4.5}, 1.8
-"""Sizes of the parked cars, the nearer one first [m]: the middle of the protocol's ranges, 4.1 to
-4.4 and 4.3 to 4.7 m.
+"""Lengths of the two parked cars, and their width [m]. The small car is nearer to the target. The
+lengths are the middles of the protocol's ranges: 4.1 to 4.4 m and 4.3 to 4.7 m.
 """
 ROW_LENGTH = 1000.0
-"""Length of the row of parked cars that nobody looks past [m]: of the two that stand there, the
-rest of the row hides, too.
+"""Length of a body that stands for a row of parked cars [m]. The body only hides what is behind it:
+the vehicle can hit the two parked cars, but not see past the row.
 """
 TIME_TO_IMPACT = 6.0
-"""Time from the start to the impact, unless the target needs longer [s]."""
+"""Time from the start of the run to the impact, unless the target needs a longer time [s]."""
 ROUNDING_STEP = 0.5
 """A time to impact above `TIME_TO_IMPACT` is rounded up to a multiple of this step [s]."""
 STOP_DISTANCE = 5.0
-"""Distance past the middle of the lane at which a pedestrian stops [m]."""
+"""Distance between the middle of the lane and the place at which a pedestrian stops after crossing
+[m].
+"""
 SHORT_OF_PATH = (0.3, 0.6, 1.0, 1.5, 2.0)
-"""Distances from the vehicle's path at which a benign pedestrian stops [m]."""
+"""Distances before the vehicle's path at which the pedestrian of a benign scene stops [m]."""
 LEADS = (1.5, 2.0)
-"""Times by which a benign pedestrian is at the place of the impact before the vehicle [s]: the path
-is clear half a second later.
+"""Times by which the pedestrian of a benign scene reaches the place of the impact before the
+vehicle [s]. The pedestrian has left the vehicle's path half a second after reaching this place.
 """
 PRE_CRASH = {
     TESTS[test].target: TESTS[test].pre_crash
     for test in ("CPFA", "CPNCO", "CBNA", "CCCscp", "CMCscp")
 }
-"""Pre-crash types by target."""
+"""NHTSA's pre-crash type of each kind of target."""
 
 
 class _Start(NamedTuple):
-    """How a test starts.
+    """How the target starts, and where it meets the vehicle if nobody brakes. Quantities are
+    numbers, or arrays of shape (N,) for N encounters.
 
     Attributes
     ----------
     side
-        1 for a target that moves to the left, -1 to the right.
-    direction, extent
-        The direction of motion, and the size of the target's body along the lane and across it [m].
+        1 for a target that starts at the right of the lane and moves to the left; -1 for a target
+        that starts at the left and moves to the right.
+    direction
+        The direction in which the target moves.
+    extent
+        Size of the target's body along the lane and across it [m].
     impact_left
         Distance of the impact to the left of the lane's middle [m].
-    distance_to_impact, time_to_impact
-        Distance and time from the target's start to the impact [m, s].
+    distance_to_impact
+        Distance that the target covers from its start to the impact [m].
+    time_to_impact
+        Time from the start of the run to the impact [s].
     profile
         The target's speed over time.
     """
@@ -96,7 +104,7 @@ class _Start(NamedTuple):
 
     @classmethod
     def of(cls, test: Crossing) -> _Start:
-        """The start of a test.
+        """Compute how the target of a test starts.
 
         Raises
         ------
@@ -117,6 +125,8 @@ class _Start(NamedTuple):
                     "acceleration_distance: the target starts at its speed",
                     "lateral_start too",
                 )
+            # The target moves at its speed from the start: with a smaller share of the way, the run
+            # begins later.
             time = float(test.time_to_impact or TIME_TO_IMPACT) * test.start_share
             distance = speed * time
             profile = TargetProfile(begin=0.0, speed=speed, run_up=0.0)
@@ -236,7 +246,9 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True):
 
     @property
     def stop(self) -> float:
-        """Position at which a pedestrian stops, past the middle of the lane [m]."""
+        """Distance from the middle of the lane to the place at which a pedestrian stops [m]. The
+        distance is negative if the pedestrian stops before the middle.
+        """
         if self.short is None:
             return STOP_DISTANCE
         return (
@@ -249,7 +261,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True):
         return PRE_CRASH[self.parameter("target")]
 
     def obstacle(self) -> str:
-        """The target, and where it comes from."""
+        """Words for the target and the side from which the target comes."""
         target = f"a {self.parameter('target')}".replace("a adult", "an adult")
         pronoun = "who" if self.is_on_foot else "that"
         if self.parameter("hidden"):
@@ -267,19 +279,25 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True):
         return _Start.of(self).time_to_impact + self.time_after
 
     def check(self) -> None:
-        """Refuse a target that cannot be at the impact in time."""
+        """Refuse a target that cannot reach the place of the impact in time."""
         _Start.of(self)
 
     def tracks(self, times: FloatArray) -> list[Track]:
-        """The target, which moves past the place of the impact, and the parked cars, if any."""
+        """The tracks of the target and of the parked cars, if there are any, at `times`. The target
+        moves on after the place of the impact.
+        """
         start = _Start.of(self)
         target = self.parameter("target")
         way = start.profile.travelled(times)
+        # The distance from the start at which the target stops: only a pedestrian stops.
         end = np.inf
         if self.is_on_foot:
             end = start.distance_to_impact + self.stop - start.side * start.impact_left
+        # The distance of the target past the place of the impact; below 0 before the impact.
         path = np.minimum(way, end) - start.distance_to_impact
         speed = np.where(way < end, start.profile.speed_at(times), 0.0)
+        # The place of the target's middle at the impact: the nearest side of its body is then at
+        # the vehicle's front.
         impact = self.start_speed * start.time_to_impact + start.extent.length / 2
         x = impact + start.direction.along * path
         y = start.impact_left + start.direction.left * path
@@ -291,8 +309,8 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True):
         return [crossing, *self._parked_cars(impact)]
 
     def benign(self) -> NamedScenarios:
-        """A pedestrian stops short of the vehicle's path or leaves it in time; a car is in the next
-        lane.
+        """Scenes in which nobody needs to brake: a pedestrian stops before the vehicle's path, a
+        pedestrian leaves this path in time, or a car stands in the next lane.
         """
         row = f"{self.test}, {self.speed:g} km/h"
         if (
@@ -311,7 +329,9 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True):
         yield from next_lane(self, HEADWAYS[::4])
 
     def _parked_cars(self, impact: Quantity) -> list[Track]:
-        """The parked cars beside the lane, and the row that hides the target."""
+        """The tracks of both parked cars beside the lane, and of the row that hides the target.
+        `impact` is the place of the impact along the lane [m].
+        """
         front = impact - PARKED_GAP
         y = -self.vut_width / 2 - PARKED_GAP - PARKED_WIDTH / 2
         cars = [
