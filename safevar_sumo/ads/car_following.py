@@ -23,26 +23,31 @@ from safevar_sumo.ads.base import (
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 from safevar_sumo.study import Table
 
-# Defaults of MSCFModel_ACC: the gain of the speed error [1/s]; for each other mode the gains of
-# speed [1/s] and gap [1/s^2]; and thresholds.
+# Defaults of SUMO's class MSCFModel_ACC. The mode that holds a speed has one gain, of the speed
+# error [1/s]. Each other mode has two gains: of the relative speed [1/s], and of the error of the
+# gap [1/s^2].
 SPEED_GAIN = -0.4
 CLOSING_GAINS = 0.8, 0.04
 KEEPING_GAINS = 0.07, 0.23
 AVOIDING_GAINS = 0.23, 0.8
-FOLLOWING_GAP = 100.0  # m, largest gap at which it follows
-GAP_TOLERANCE, SPEED_TOLERANCE = 0.2, 0.1  # m, m/s: errors below which it keeps the gap
+FOLLOWING_GAP = 100.0  # m, largest gap at which the vehicle follows a leader
+# m, m/s: below both errors the mode that keeps the gap applies.
+GAP_TOLERANCE, SPEED_TOLERANCE = 0.2, 0.1
 LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
-# m/s^2, assumption: at v_safe alone Krauss would creep to its gap, and never stop.
+# m/s^2, an assumption: a vehicle that drives at v_safe approaches the standing gap ever more
+# slowly, and never stops. With this deceleration the vehicle stops.
 LAST_DECELERATION = 0.5
 
 
 _Following = tuple[Nominal, Trim | None]
-"""What a driver remembers: the vehicle, and the pedals that held its speed at the start."""
+"""A driver's memory: the original vehicle, and the trim of the pedals that held the speed at the
+start (None before the first call).
+"""
 
 
 class CarFollowing(Ads, Table, frozen=True, kw_only=True):
-    """Base of models that compute an acceleration from gap and speeds; obstacles beside the way are
-    ignored.
+    """Base of the models that compute an acceleration from the gap, the vehicle's speed and the
+    leader's speed. The models ignore obstacles beside the vehicle's way.
     """
 
     cruise_speed: PositiveParameter = 13.89
@@ -71,8 +76,8 @@ class CarFollowing(Ads, Table, frozen=True, kw_only=True):
     def acceleration_at(
         self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray
     ) -> FloatArray:
-        """Commanded acceleration [m/s^2] at a gap from bumper to bumper [m] and speeds [m/s], shape
-        (N,).
+        """The acceleration that the model commands [m/s^2], shape (N,). The gap is measured between
+        bumpers [m]; both speeds are in m/s. `gap` is `LARGEST_GAP` if nobody is in the way.
         """
 
 
@@ -93,8 +98,8 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
     def acceleration_at(
         self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray
     ) -> FloatArray:
-        """The control law of the mode that applies; near standstill it keeps 2 m more than the
-        headway (Xiao et al. 2017).
+        """The acceleration by the control law of the mode that applies [m/s^2], shape (N,). Near
+        standstill the desired gap is 2 m larger than by the headway (Xiao et al. 2017).
         """
         excess_speed = speed - self.cruise_speed
         relative_speed = leader_speed - speed
@@ -144,7 +149,7 @@ class Idm(CarFollowing, frozen=True, kw_only=True):
     def acceleration_at(
         self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray
     ) -> FloatArray:
-        """dv/dt [m/s^2]."""
+        """The acceleration dv/dt of the formula above [m/s^2], shape (N,)."""
         speed_ratio = speed / self.cruise_speed
         closing_term = (
             speed
@@ -192,11 +197,11 @@ class Krauss(Ads, Table, frozen=True, kw_only=True):
     def drive(
         self, observation: Observation, memory: tuple[Nominal, float]
     ) -> tuple[Command, tuple[Nominal, float]]:
-        """Aim at v_safe = -b t + sqrt((b t)^2 + 2 b gap), with the planned deceleration b and the
-        reaction time t.
+        """Aim at the speed v_safe = -b t + sqrt((b t)^2 + 2 b gap), but at most at the cruise
+        speed. b is the planned deceleration [m/s^2], and t is the reaction time [s].
 
-        From v_safe the vehicle comes to rest behind a standing obstacle, towards the end at
-        `LAST_DECELERATION`.
+        A vehicle at v_safe can still stop behind a standing obstacle. For the last metres the
+        driver aims at a higher speed, from which the vehicle stops at `LAST_DECELERATION`.
         """
         nominal, step = memory
         deceleration = self.braking_share * nominal.decel
