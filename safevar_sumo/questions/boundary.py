@@ -1,8 +1,9 @@
-"""The boundary between what is safe and what is unsafe on straight lines of settings, and how far
-each value of a vehicle may go alone, all others as in the original.
+"""The boundary between safe and unsafe settings on straight lines, and the limits alone: how far
+one value of a vehicle may change while all other values are as in the original vehicle.
 
-Nothing here knows of studies: a star is a space of vehicles that differ from its center in one
-value.
+This module knows nothing of studies. A case is a vehicle (n values), the number of a world, and k
+places; see `safevar_sumo.questions.cases`. A star is the space of all cases whose vehicle differs
+from the star's center (the original vehicle) in one value.
 """
 
 from __future__ import annotations
@@ -16,18 +17,27 @@ from safevar_sumo.questions.cases import CaseJudge, CaseSearch, Space
 from safevar_sumo.records import BoolArray, FloatArray
 
 PARTS = (8, 8, 8, 8)
-"""Number of equal parts into which each round divides what is left of a line."""
+"""Each round divides a piece of a line into this number of equal parts. The next round divides one
+of these parts.
+"""
 MOST_SEARCHES = 20
-"""Largest number of searches that move limits alone; values that the last one moves stay as in the
-original.
+"""Largest number of searches that move limits alone. If the last search still finds an unsafe case,
+the value of this case gets no room: its limit is the value of the original.
 """
 Side = tuple[int, int]
-"""0, below the original, or 1, above it; and the column of a value."""
+"""A side of the original: 0 (below it) or 1 (above it), and the column of the vehicle's value."""
 
 
 class Boundaries(NamedTuple):
-    """The last safe and the first unsafe share of each of K lines, shape (K,), with the settings
-    there, shape (K, n).
+    """The boundary on each of K lines.
+
+    Attributes
+    ----------
+    safe_shares, unsafe_shares
+        The last safe and the first unsafe share of the way from the start of the line to its end,
+        from 0 to 1, shape (K,).
+    safe, unsafe
+        The settings at these shares, shape (K, n).
     """
 
     safe_shares: FloatArray
@@ -43,27 +53,37 @@ def find_boundaries(
     parts: Sequence[int] = PARTS,
     lowest: FloatArray | float = 0.0,
 ) -> Boundaries:
-    """The first unsafe place on each of K lines from `starts` to `ends`, shape (K, n), from the
-    share `lowest` on, shape (K,).
+    """Find the first unsafe setting on each of K lines.
 
-    The start of a line counts as safe and its end as unsafe, without being tested. `are_unsafe`
-    tests settings of all lines together, shape (M, n): which of them are unsafe, shape (M,). The
-    error is at most one part of the last round.
+    The search counts the setting at the share `lowest` as safe, and the end of the line as unsafe;
+    it tests neither. The error of a boundary is at most one part of the last round.
+
+    Parameters
+    ----------
+    starts, ends
+        The ends of the lines, shape (K, n).
+    are_unsafe
+        Says which of M settings of all lines, shape (M, n), are unsafe; shape (M,).
+    parts
+        The number of parts in each round.
+    lowest
+        Share of each line at which the search begins, shape (K,) or a number.
     """
     lines = np.arange(len(starts))
     low = np.broadcast_to(np.asarray(lowest, dtype=float), lines.shape)
     high = np.ones(len(lines))
     for number in parts:
-        # The bounds between equal parts of what is left of each line.
+        # Divide the piece from `low` to `high` of each line: shares of the bounds between the
+        # parts, shape (K, number + 1).
         width = (high - low)[:, np.newaxis]
         shares = low[:, np.newaxis] + width * np.arange(number + 1) / number
-        # Without a rounding error.
+        # The last bound gets its exact value, without a rounding error.
         shares[:, -1] = high
         bounds = on_lines(starts, ends, shares[:, 1:-1])
         is_unsafe = np.ones((len(lines), number), dtype=bool)
         tested = are_unsafe(bounds.reshape(-1, starts.shape[1]))
         is_unsafe[:, :-1] = tested.reshape(len(lines), number - 1)
-        # Of these parts the one below the first unsafe bound is left.
+        # The next round divides the part below the first unsafe bound.
         first_unsafe = np.argmax(is_unsafe, axis=1)
         low = shares[lines, first_unsafe]
         high = shares[lines, first_unsafe + 1]
@@ -73,8 +93,8 @@ def find_boundaries(
 
 
 def on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) -> FloatArray:
-    """Settings at P `shares`, shape (K, P), of K lines from `starts` to `ends`, shape (K, n); shape
-    (K, P, n).
+    """The settings at P shares of the way on each of K lines, shape (K, P, n). The lines lead from
+    `starts` to `ends`, shape (K, n); `shares` has shape (K, P).
     """
     factors = shares[..., np.newaxis]
     start = starts[:, np.newaxis]
@@ -83,8 +103,14 @@ def on_lines(starts: FloatArray, ends: FloatArray, shares: FloatArray) -> FloatA
 
 
 class Alone(NamedTuple):
-    """The last safe values below and above the original, each of shape (n,); and by side a case
-    just beyond.
+    """The limits of each value alone.
+
+    Attributes
+    ----------
+    lower, upper
+        The last safe value below and above the original, shape (n,).
+    breaches
+        For a side, an unsafe case just beyond the limit.
     """
 
     lower: FloatArray
@@ -100,12 +126,27 @@ def scan_alone(
     values: int,
     parts: Sequence[int],
 ) -> Alone:
-    """Limits of a star within known ones, by some values between its center and each of these, in
-    some encounters; `parts` as of `find_boundaries`.
+    """Find limits alone by a scan: evenly spaced values of each line are simulated.
+
+    Parameters
+    ----------
+    judge
+        Returns the robustness of cases; below 0 a case is unsafe.
+    star
+        The cases whose vehicle differs from the original in one value.
+    limits
+        Known limits: the new limits are not wider.
+    encounters
+        The E encounters (world and places) in which the scan drives, shape (E, 1 + k).
+    values
+        Number of values that the scan tests between the original and each known limit.
+    parts
+        The parts into which `find_boundaries` divides the way between the last safe and the first
+        unsafe value.
     """
     center = _center_of(star)
 
-    # Each line leads from the original to an end, in one encounter.
+    # Each line leads from the original to a known limit, in one encounter.
     ends = np.stack([limits.lower, limits.upper], axis=1)
     columns, sides = np.nonzero(ends != center[:, np.newaxis])
     number = len(encounters)
@@ -115,7 +156,8 @@ def scan_alone(
     rows = np.arange(len(stops))
     stops[rows, columns.repeat(number)] = ends[columns, sides].repeat(number)
 
-    # The first unsafe value of each line; the value before it is safe.
+    # Find the first unsafe value of each line. A line is left out if neither its end nor a value
+    # before the end fails.
     lines = find_boundaries(
         starts,
         stops,
@@ -123,6 +165,8 @@ def scan_alone(
         [values],
     )
     fails = np.flatnonzero((judge(stops) < 0) | (lines.unsafe_shares < 1))
+    # The first unsafe value is step `passed` + 1 of the scan. The line is now shorter, and ends
+    # there: step `passed` was safe, at the share passed / (passed + 1) of the shorter line.
     passed = np.rint(lines.safe_shares[fails] * values)
     lowest = passed / (passed + 1)
     return limits_before(
@@ -143,7 +187,12 @@ def limits_before(
     parts: Sequence[int],
     lowest: FloatArray | float = 0.0,
 ) -> Alone:
-    """Limits before K unsafe cases of a star, each safe up to the share `lowest` of its change."""
+    """The limits alone, moved so that K unsafe cases lie beyond them.
+
+    Each of the unsafe cases, shape (K, n + 1 + k), has one change from the original. The change is
+    reduced, in the same encounter, until the case is safe. The share `lowest` of the change, shape
+    (K,), counts as safe.
+    """
     center = _center_of(star)
     starts = unsafe.copy()
     starts[:, : star.size] = center
@@ -174,7 +223,7 @@ def search_alone(
     search: CaseSearch,
     parts: Sequence[int],
 ) -> Alone:
-    """Limits of a star in which a search finds nothing, within known ones."""
+    """Move the known limits of a star inwards, until a search finds no unsafe case within them."""
     start = star.lower[np.newaxis][:0]
     unsafe = start
     for _ in range(MOST_SEARCHES):
@@ -190,7 +239,7 @@ def search_alone(
             parts,
         )
 
-    # No room is left on the sides where unsafe cases are.
+    # After the last search, a side with an unsafe case gets no room: its limit is the original.
     center = _center_of(star)
     vehicles = unsafe[:, : star.size]
     return limits._replace(
