@@ -1,7 +1,10 @@
-"""The largest box of vehicles without a case that is unsafe: proposed from what is known to fail,
-searched for counterexamples, and proposed anew.
+"""The search for the largest box of vehicles that holds no unsafe case. A box is proposed from the
+known failures, and searched for counterexamples. Counterexamples become known failures, and the
+next box is proposed.
 
-Nothing here knows of studies.
+This module knows nothing of studies. A case is a vehicle (n values), the number of a world, and k
+places; see `safevar_sumo.questions.cases`. The sides of a box, shape (2, n), are the distances from
+the original vehicle to the box's lower ends (row 0) and to its upper ends (row 1).
 """
 
 from __future__ import annotations
@@ -20,48 +23,48 @@ from safevar_sumo.questions.cases import CaseJudge, CaseSearch, Space
 from safevar_sumo.records import BoolArray, FloatArray
 
 DEVIATIONS = tuple(0.35 * 0.6**number for number in range(6))
-"""Standard deviations of the steps by which a random search changes a box, one after another, as
-shares of the domain.
+"""Rounds of a random search for a larger box: in each round, the standard deviation of the steps by
+which the sides change, as a share of the domain.
 """
 PROPOSALS = 4096
-"""Number of boxes that each of these rounds proposes."""
+"""Number of boxes that each round of the random search proposes."""
 WHOLE = 0.05
-"""Share of the sides that become as long as they may be instead: sides that no failure needs end a
-little short in steps.
+"""Share of the sides that a proposal makes as long as they may be. Random steps alone would leave a
+side a little too short, even if no failure bounds this side.
 """
 LEAST_GAIN = 0.01
 """Least gain in the logarithm of the volume for which a box is simulated."""
 LEAST_MOVE = 1 / 50
-"""Unit of the distance by which limits keep off failures, as a share of the domain."""
+"""Unit of the distance of a limit from the failure beyond it, as a share of the domain."""
 MOST_CUTS = 100
-"""Largest number of boxes of which something is cut off in turn."""
+"""Largest number of boxes that are searched in turn, each cut from the box before."""
 MOST_BRANCHES = 200
-"""Number of boxes after which a branch and bound only follows the best cut."""
+"""Number of boxes after which the branch and bound follows only the best cut of each box."""
 ROUNDING = 1e-9
-"""Rounding errors of a value, as a share of the domain."""
+"""Largest rounding error of a value, as a share of the domain."""
 
 
 class BoxEffort(NamedTuple):
-    """How much a box is searched.
+    """How much is done to find a large box.
 
     Attributes
     ----------
     parts
-        Into how many parts the way to something unsafe is divided, again and again.
+        Parts into which each round divides the way to an unsafe case; see `find_boundaries`.
     explored
-        Boxes that a random search seeks before failures are only cut off.
+        Most boxes that a random search proposes. Later boxes are only cut from these.
     batch
-        Cases that it simulates at once.
+        Number of cases that the random search simulates at once.
     growths
-        How often a box that passed grows.
+        How often the search tries to enlarge a box that passed.
     learnt
-        Failures of a box whose causes are sought.
+        Largest number of failures of a box from which unneeded changes are removed.
     places
-        Places of a box, at most, at which a failure is expected.
+        Largest number of places of former failures at which a new box is tested first.
     retreat
-        How much farther limits keep off failures after each box that failed, in `LEAST_MOVE`.
+        Growth of the distance between limits and failures after each failed box, in `LEAST_MOVE`.
     farthest
-        How far they keep off at most, as a share of the change that failed.
+        Largest such distance, as a share of the change that failed.
     """
 
     parts: Sequence[int] = (8, 8, 8)
@@ -75,17 +78,22 @@ class BoxEffort(NamedTuple):
 
 
 class Boxes(NamedTuple):
-    """Boxes around an original vehicle, each given by its sides: how far it reaches below and above
-    the original, shape (2, n).
+    """Everything that all boxes around an original vehicle share. A box is given by its sides,
+    shape (2, n): the distances from the original to its lower ends (row 0) and upper ends (row 1).
 
     Attributes
     ----------
+    judge
+        Returns the robustness of cases; below 0 a case is unsafe.
     space
-        All cases: the domains of the vehicle's values, the worlds, and the places.
+        The space of all cases: the domains of the vehicle's values, all worlds, and all places.
     longest
-        The longest that each side may be; sides that are not free are just as long.
+        The greatest length of each side, shape (2, n). A side that is not free always has this
+        length.
+    is_free
+        Which sides the search may shorten, shape (2, n).
     printed
-        Makes sides such as they are printed, no longer than before.
+        Rounds sides to the digits that answers print. The rounded sides are not longer.
     """
 
     judge: CaseJudge
@@ -98,25 +106,25 @@ class Boxes(NamedTuple):
 
     @property
     def width(self) -> FloatArray:
-        """The widths of the domains; 0 where there is only one value."""
+        """The width of the domain of each value, shape (n,); 0 for a value that does not vary."""
         space = self.space
         return (space.upper - space.lower)[: space.size]
 
     @property
     def fixed(self) -> FloatArray:
-        """The sides of the smallest box: without those that are free."""
+        """The sides of the smallest box, shape (2, n): free sides are 0."""
         return np.where(self.is_free, 0.0, self.longest)
 
     def ends(self, sides: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The lowest and the highest values of a box."""
+        """The lowest and the highest values of the vehicles in a box, each of shape (n,)."""
         return self.original - sides[0], self.original + sides[1]
 
     def cases_in(self, sides: FloatArray) -> Space:
-        """The cases of a box."""
+        """The space of all cases of a box: its vehicles in all worlds, at all places."""
         return self.space.of_vehicles(*self.ends(sides))
 
     def log_volume(self, sides: FloatArray) -> FloatArray:
-        """The logarithm of the volume of boxes, shape (..., 2, n), as a share of the domain's."""
+        """The logarithm of the volume of boxes, shape (..., 2, n), relative to the domain's."""
         is_open = self.width > 0
         lengths = sides.sum(axis=-2)
         shares = np.ones_like(lengths)
@@ -125,7 +133,7 @@ class Boxes(NamedTuple):
         return np.asarray(logarithms.sum(axis=-1))
 
     def extents(self, cases: FloatArray) -> FloatArray:
-        """The sides that a box needs to hold each of K cases, shape (K, 2, n)."""
+        """The least sides with which a box holds a case, for each of K cases, shape (K, 2, n)."""
         changes = cases[:, : self.space.size] - self.original
         of_sides = np.stack([-changes, changes], axis=1)
         return np.maximum(of_sides - ROUNDING * self.width, 0.0)
@@ -135,7 +143,10 @@ class Boxes(NamedTuple):
         cases: FloatArray,
         sides: FloatArray,
     ) -> FloatArray:
-        """Where cases lie in a box: their changes as shares of its sides."""
+        """The positions of K cases in a box, shape (K, n + 1 + k). Each value of the vehicle
+        becomes its change from the original, as a share of the box's side (below 0 for a lower
+        value). World and places stay. `cases_at` is the inverse function.
+        """
         n = self.space.size
         changes = cases[:, :n] - self.original
         side = np.where(changes > 0, sides[1], sides[0])
@@ -148,7 +159,9 @@ class Boxes(NamedTuple):
         places: FloatArray,
         sides: FloatArray,
     ) -> FloatArray:
-        """The cases at C places of B boxes, shape (B, C, n + 1 + k)."""
+        """The cases at C positions, shape (C, n + 1 + k), in each of B boxes, shape (B, 2, n). The
+        result has shape (B, C, n + 1 + k). `shares` is the inverse function.
+        """
         n = self.space.size
         shares = places[:, :n]
         encounters = places[:, n:]
@@ -159,8 +172,17 @@ class Boxes(NamedTuple):
 
 
 class Failures(NamedTuple):
-    """What is known to fail: unsafe cases with as few changes as possible, the places of boxes
-    where such cases were, and the number of these boxes.
+    """The known failures.
+
+    Attributes
+    ----------
+    cases
+        Unsafe cases with as few changes of the vehicle as possible, shape (K, n + 1 + k).
+    places
+        Positions in boxes at which unsafe cases were, shape (C, n + 1 + k); see `Boxes.shares`. The
+        next box is tested at the same positions.
+    boxes
+        Number of the boxes in which unsafe cases were.
     """
 
     cases: FloatArray
@@ -172,7 +194,7 @@ class Failures(NamedTuple):
         boxes: Boxes,
         sides: FloatArray,
     ) -> FloatArray:
-        """The cases at the places of a box where failures were."""
+        """The cases of a box at the positions of former failures, shape (C, n + 1 + k)."""
         (cases,) = boxes.cases_at(self.places, sides[np.newaxis])
         return np.asarray(cases)
 
@@ -181,21 +203,29 @@ class Failures(NamedTuple):
         boxes: Boxes,
         sides: FloatArray,
     ) -> FloatArray:
-        """The cases that a box holds."""
+        """The known unsafe cases that a box holds."""
         is_inside = (boxes.extents(self.cases) <= sides).all(axis=(1, 2))
         return np.asarray(self.cases[is_inside])
 
 
 class Attack(NamedTuple):
-    """The number of cases that searched limits, and the least that these leave."""
+    """A search for counterexamples: the number of its cases, and their least robustness."""
 
     simulated: int = 0
     least: float = math.inf
 
 
 class Settled(NamedTuple):
-    """The sides of a box in which no search finds anything, None without one; what is known to
-    fail then; and the searches.
+    """The result of a search for a box.
+
+    Attributes
+    ----------
+    sides
+        The sides of a box in which no search found an unsafe case; None if there is no such box.
+    failures
+        The known failures after the search.
+    attack
+        How the box was searched.
     """
 
     sides: FloatArray | None
@@ -210,8 +240,10 @@ def find_largest_box(
     thorough: CaseSearch,
     rng: Generator,
 ) -> Settled:
-    """The largest box in which a thorough search finds nothing; a quick one teaches where failures
-    are.
+    """The largest box in which a thorough search finds no unsafe case.
+
+    A quick search finds the failures of the first boxes, so that the thorough search, which costs
+    more, begins with a box that is nearly safe.
     """
     effort = boxes.effort
     sides = boxes.longest
@@ -245,8 +277,8 @@ def _grow(
     search: CaseSearch,
     rng: Generator,
 ) -> Settled:
-    """The best box so far, or a larger one from its sides that passes, without what is known to
-    fail then.
+    """A box that is larger than the best box so far, if one passes the search. Otherwise the best
+    box so far, reduced so that it holds none of the failures that became known.
     """
     wider = widen(boxes, best.failures, sides, rng)
     grown = settle(boxes, best.failures, wider, [search])
@@ -264,7 +296,7 @@ def settle(
     sides: FloatArray,
     searches: Sequence[CaseSearch],
 ) -> Settled:
-    """A box within another one in which no search finds anything."""
+    """A box, cut from the box with the given sides, in which no search finds an unsafe case."""
     for number in range(MOST_CUTS):
         if len(failures.inside(boxes, boxes.fixed)):
             break
@@ -292,18 +324,22 @@ def cut(
     failures: Failures,
     clearance: float,
 ) -> FloatArray:
-    """The largest sides within some sides that hold none of the known cases that a free side can
-    cut off, by branch and bound. Limits keep off each failure by a `clearance`, in moves.
+    """The sides of the largest box, within the given sides, that holds no known failure. Failures
+    that no free side can cut off are ignored.
 
-    Each failure is cut off by one side. The largest box that waits comes first, so that the first
-    one without failures is the largest; after `MOST_BRANCHES` only the best cut is followed.
+    One side is enough to cut off a failure: the side ends before the failure, with a distance of
+    `clearance` times `LEAST_MOVE`. The choice of the sides is a branch and bound. The queue returns
+    the largest box first. So the first box without failures is the largest one. After
+    `MOST_BRANCHES` boxes only the best cut of each box is followed.
     """
     extents = boxes.extents(failures.cases)
     farthest = boxes.effort.farthest * extents
     distance = np.minimum(clearance * LEAST_MOVE * boxes.width, farthest)
-    # A cut excludes its own failure also after rounding, so that this ends.
+    # With the rounding error, a cut always excludes its own failure. Without it, the same failure
+    # might be cut off again and again.
     ends = np.maximum(extents - distance - ROUNDING * boxes.width, 0.0)
     is_choice = boxes.is_free & (extents > 0)
+    # No box holds a failure with infinite extents: it is ignored.
     extents[~is_choice.any(axis=(1, 2))] = np.inf
     numbers = count()
     queue = [(0.0, next(numbers), sides)]
@@ -313,7 +349,7 @@ def cut(
         if not is_inside.any():
             return sides
 
-        # The failure whose best cut costs most is cut off first.
+        # Cut off the failure whose best cut costs most volume.
         rows = np.flatnonzero(is_inside)
         lengths = np.maximum(sides.sum(axis=0), ROUNDING)
         shares = (lengths - sides + ends[rows]) / lengths
@@ -335,7 +371,7 @@ def learn(
     unsafe: FloatArray,
     sides: FloatArray,
 ) -> Failures:
-    """What is known with the unsafe cases of a box: as few of their changes as possible."""
+    """The known failures, and new unsafe cases of a box with as few small changes as possible."""
     step = math.ceil(len(unsafe) / boxes.effort.learnt)
     causes = reduce_changes(boxes.judge, boxes.original, unsafe[::step])
     starts = causes.copy()
@@ -343,7 +379,8 @@ def learn(
     parts = boxes.effort.parts
     lines = find_boundaries(starts, causes, lambda cases: boxes.judge(cases) < 0, parts)
 
-    # A place for each combination of changes in each world: that of the worst case.
+    # Keep one position for each combination of directions of change and world. Cases come worst
+    # first, so the first row of a combination is its worst case.
     n = boxes.space.size
     directions = np.sign(causes[:, :n] - boxes.original)
     kinds = np.column_stack([directions, np.floor(causes[:, n])])
@@ -358,7 +395,7 @@ def reduce_changes(
     original: FloatArray,
     unsafe: FloatArray,
 ) -> FloatArray:
-    """Unsafe cases with as few changes as possible, undone in turn."""
+    """The unsafe cases. Each change is undone in turn, if the case stays unsafe without it."""
     causes = unsafe.copy()
     for column, value in enumerate(original):
         candidates = causes.copy()
@@ -374,8 +411,9 @@ def shrink(
     failures: Failures,
     sides: FloatArray,
 ) -> FloatArray:
-    """A box whose free sides are the largest share of those of another one with which it is safe
-    at known places.
+    """A box with the free sides of another box, all multiplied by the same share. The share is the
+    largest one found with which the box holds no known failure, and is safe at the positions of
+    former failures.
     """
 
     def at_share(shares: FloatArray) -> FloatArray:
@@ -400,7 +438,9 @@ def widen(
     sides: FloatArray,
     rng: Generator,
 ) -> FloatArray:
-    """A box that is safe at known places, as large as a random search makes it."""
+    """A larger box, found by a random search, that holds no known failure and is safe at the
+    positions of former failures.
+    """
     number = max(boxes.effort.batch // max(len(failures.places), 1), 1)
     for deviation in DEVIATIONS:
         proposals = _propose(boxes, sides, deviation, rng)
@@ -418,7 +458,9 @@ def _propose(
     deviation: float,
     rng: Generator,
 ) -> FloatArray:
-    """Boxes of which a random share of the sides is moved by random steps, larger than a box."""
+    """Up to `PROPOSALS` boxes, shape (B, 2, n), that are larger than the box with the given sides.
+    In each box, a random share of the sides moves by random steps.
+    """
     shape = (PROPOSALS, *sides.shape)
     is_moved = rng.random(shape) < rng.random((PROPOSALS, 1, 1))
     steps = rng.normal(0.0, deviation, shape) * is_moved * boxes.width
@@ -434,7 +476,7 @@ def _are_safe(
     failures: Failures,
     candidates: FloatArray,
 ) -> BoolArray:
-    """Which of B boxes are safe at known places, shape (B,)."""
+    """Which of B boxes are safe at the positions of former failures, shape (B,)."""
     cases = boxes.cases_at(failures.places, candidates)
     robustness = boxes.judge(cases.reshape(-1, cases.shape[2]))
     is_safe = robustness.reshape(cases.shape[:2]) >= 0
@@ -447,6 +489,7 @@ def _are_empty(
     candidates: FloatArray,
 ) -> Iterator[bool]:
     """Whether each of B boxes holds no known failure."""
+    # Only failures within the hull of all boxes can be in one of the boxes.
     extents = boxes.extents(failures.cases)
     hull = candidates.max(axis=0, initial=0.0)
     extents = extents[(extents <= hull).all(axis=(1, 2))]
