@@ -371,7 +371,7 @@ def learn(
     unsafe: FloatArray,
     sides: FloatArray,
 ) -> Failures:
-    """The known failures, and new unsafe cases of a box with as few small changes as possible."""
+    """The known failures with new unsafe cases of a box, reduced to few and small changes."""
     step = math.ceil(len(unsafe) / boxes.effort.learnt)
     causes = reduce_changes(boxes.judge, boxes.original, unsafe[::step])
     starts = causes.copy()
