@@ -1,5 +1,9 @@
-"""The limits that a question asks for: of each characteristic alone, and of all at the same time,
-in one parameter set of the vehicle model after another.
+"""The search for limits: limits of each characteristic alone, and joint limits (limits that hold at
+the same time). One parameter set of the vehicle model is searched after another.
+
+A case is a vehicle (n values), the number of a world, and k places; see
+`safevar_sumo.questions.tolerance.oracle`. A box is given by its sides; see
+`safevar_sumo.questions.tolerance.boxes`.
 """
 
 from __future__ import annotations
@@ -36,14 +40,14 @@ from safevar_sumo.questions.tolerance.oracle import Exhausted, product_of
 from safevar_sumo.records import FloatArray
 
 MOST_PROOFS = 20
-"""Largest number of boxes that random vehicles meet."""
+"""Largest number of boxes that are tested with randomly drawn vehicles."""
 NEAR = 0.05
-"""How much farther a limit that would hold keeps off failures after each value that failed."""
+"""`BoxEffort.retreat` of the search for the nearest values with which the specified limits hold."""
 QUICK = 2
-"""Generations of a search that only teaches where failures are."""
+"""Number of generations of a search that only shows where failures are."""
 OWN_SET_STAGE = "limits with the study's own parameter set"
 OTHER_SETS_STAGE = "limits in each further parameter set"
-"""Phases of progress; the second has a round for each set."""
+"""Phases of progress; the second phase has a round for each set."""
 
 
 class FoundLimits(NamedTuple):
@@ -51,18 +55,25 @@ class FoundLimits(NamedTuple):
 
     Attributes
     ----------
-    broken
-        By the number of each parameter set in which the specified limits are unsafe, a case.
+    alone
+        The limits of each characteristic alone.
+    boxes
+        What all boxes share. Specified limits are sides that are not free.
     failures
-        What failed while the joint limits were sought.
+        The failures that became known during the search for joint limits.
+    broken
+        For the number of each parameter set in which the specified limits are unsafe: an unsafe
+        case within these limits.
     sides
-        The box of the joint limits; None if there are none.
+        The sides of the box of the joint limits; None if there are no joint limits.
     attacks
-        By the number of each parameter set, how the joint limits were searched.
-    proof, proofs
-        The upper bound of their unsafe share, and how often it was sought.
+        For the number of each parameter set: how the joint limits were searched.
+    proof
+        The upper bound of the unsafe share within the joint limits.
+    proofs
+        Number of boxes for which such a bound was computed.
     breaches
-        By side, an unsafe case just beyond a joint limit.
+        For a side: an unsafe case just beyond the joint limit of this side.
     """
 
     alone: Alone
@@ -77,13 +88,15 @@ class FoundLimits(NamedTuple):
 
     @property
     def specified(self) -> FloatArray:
-        """The box of the specified limits."""
+        """The sides of the box with the specified limits, in which nothing else varies."""
         return self.boxes.fixed
 
 
 def find_limits(task: Asked, wider: FoundLimits | None = None) -> FoundLimits:
-    """The limits in all parameter sets, within wider ones: those of the study's own, which the
-    others in turn cut, so that more sets never widen them.
+    """Find the limits in all parameter sets, within `wider` limits if these are given.
+
+    First the limits with the study's own set are found. Then each other set may only make the
+    limits narrower. Therefore a further set never makes them wider.
     """
     phases = task.oracle.phases
     with phases.stage(OWN_SET_STAGE):
@@ -94,7 +107,8 @@ def find_limits(task: Asked, wider: FoundLimits | None = None) -> FoundLimits:
             try:
                 limits = _with_set(task, limits, fit)
             except Exhausted:
-                # Nothing is claimed of a set that was not searched to the end.
+                # The simulations did not suffice for this set: the answer then claims no joint
+                # limits at all.
                 nothing = task.nothing
                 limits = limits._replace(
                     sides=None, failures=Failures(nothing, nothing)
@@ -106,14 +120,14 @@ def find_limits(task: Asked, wider: FoundLimits | None = None) -> FoundLimits:
 
 
 def no_limits(task: Asked) -> FoundLimits:
-    """No limits, around an unsafe original."""
+    """The limits around an unsafe original vehicle: no characteristic may change."""
     alone = Alone(task.original, task.original)
     failures = Failures(task.nothing, task.nothing)
     return FoundLimits(alone, task.boxes(task.domain), failures)
 
 
 def _with_own_set(task: Asked, wider: FoundLimits | None) -> FoundLimits:
-    """The limits with the study's own parameter set."""
+    """The limits with the study's own parameter set, within `wider` limits if these are given."""
     alone = Alone(task.lower, task.upper) if wider is None else wider.alone
     suffices = task.effort.cases >= LEAST_CASES
     try:
@@ -125,6 +139,7 @@ def _with_own_set(task: Asked, wider: FoundLimits | None) -> FoundLimits:
         sides = wider.specified if wider.sides is None else wider.sides
         longest = np.minimum(longest, sides)
     boxes = task.boxes(longest)
+    # Vehicles to avoid are known failures: a failure needs an encounter, and any one will do.
     encounter = task.star.lower[np.newaxis, boxes.space.size :]
     avoided = product_of(task.avoided, encounter)
     limits = FoundLimits(alone, boxes, Failures(avoided, task.nothing))
@@ -140,8 +155,8 @@ def _with_own_set(task: Asked, wider: FoundLimits | None) -> FoundLimits:
 
 
 def alone_with_own_set(task: Asked, limits: Alone) -> Alone:
-    """The limits of each characteristic alone, within known ones; they end before what cannot be
-    simulated, too.
+    """The limits of each characteristic alone, within known limits. A limit ends before values that
+    cannot be simulated, too.
     """
     oracle = task.oracle
     effort = task.effort
@@ -149,6 +164,7 @@ def alone_with_own_set(task: Asked, limits: Alone) -> Alone:
     parts = effort.box.parts
     hardest = oracle.hardest(effort.encounters)
     limits = scan_alone(
+        # For the scan, a case that cannot be simulated is unsafe.
         partial(oracle, failed=-np.inf),
         star,
         limits,
@@ -171,7 +187,7 @@ def alone_with_own_set(task: Asked, limits: Alone) -> Alone:
             parts,
         )
 
-    # Cases that could not be simulated show nothing.
+    # A case that could not be simulated is no example of an unsafe vehicle.
     cases = [*limits.breaches.values()]
     rows = np.array(cases).reshape(-1, task.nothing.shape[1])
     breaches = compress(limits.breaches.items(), oracle(rows) < 0)
@@ -183,8 +199,9 @@ def _with_broken(
     limits: FoundLimits,
     fit: int,
 ) -> FoundLimits:
-    """Limits with a case in which the specified ones are unsafe in a parameter set, all others as
-    in the original.
+    """Search the specified limits for an unsafe case with a parameter set, while all other
+    characteristics are as in the original. If there is one, the returned limits have it in
+    `broken`.
     """
     if not limits.specified.any() or fit in limits.broken:
         return limits
@@ -197,10 +214,11 @@ def _with_broken(
 
 
 def _with_largest_box(task: Asked, limits: FoundLimits) -> FoundLimits:
-    """Limits with the largest box that passes all searches and random vehicles.
+    """Limits with the largest box that passes all searches and the test with random vehicles.
 
-    The random search knows phase 0 alone, because a place with its phase says little of the next
-    box, whose worst phase is another.
+    The search that proposes boxes drives at phase 0 alone. It tests each new box at the positions
+    of former failures. A position with another phase would say little about the next box, because
+    the worst phase changes from box to box.
     """
     effort = task.effort
     boxes = limits.boxes
@@ -239,7 +257,7 @@ def _with_set(
     limits: FoundLimits,
     fit: int,
 ) -> FoundLimits:
-    """Limits that hold in a further parameter set, too."""
+    """The limits, made narrower so that they hold in a further parameter set, too."""
     effort = task.effort
     search = task.search(
         Stream.LIMITS_ALONE,
@@ -276,8 +294,11 @@ def _with_settled(
     searches: list[CaseSearch],
     fit: int,
 ) -> FoundLimits:
-    """Limits with the box within another one that passes searches with a parameter set and, where
-    it became smaller, its corners and random vehicles with the study's own set.
+    """Limits with a part of a box that passes the searches with a parameter set.
+
+    If this part is smaller than the box of the former limits, it must also pass the test of its
+    corners and the test with random vehicles, both with the study's own set. The limits have no
+    joint limits if no box passes.
     """
     boxes = limits.boxes
     former = limits.sides
@@ -295,7 +316,8 @@ def _with_settled(
         sides = _within_alone(task, limits, settled.sides)
         unsafe = task.nothing
         is_same = former is not None and np.array_equal(former, sides)
-        # The searches drove the corners of another box, or none.
+        # With the study's own set, the searches included the corners of this box. Otherwise the
+        # corners are still to be driven.
         has_corners = fit == 0 and np.array_equal(settled.sides, sides)
         if task.effort.corners and not is_same and not has_corners:
             unsafe = _corner_search(task)(boxes.cases_in(sides), unsafe).unsafe
@@ -308,7 +330,7 @@ def _with_settled(
             settled = settled._replace(failures=failures)
             continue
         if boxes.is_free.any() and not sides[boxes.is_free].any():
-            # It leaves no characteristic room.
+            # The box leaves no room to any characteristic that may vary.
             break
         attacks = {**limits.attacks, fit: settled.attack}
         return limits._replace(sides=sides, attacks=attacks)
@@ -316,7 +338,9 @@ def _with_settled(
 
 
 def _alone_before(task: Asked, limits: FoundLimits) -> Alone:
-    """The limits alone, before what the search for joint limits met with a single change."""
+    """The limits alone, moved so that known failures with a single change lie beyond them. The
+    search for joint limits found these failures.
+    """
     alone = limits.alone
     cases = limits.failures.cases
     vehicles = cases[:, : len(task.original)]
@@ -338,7 +362,7 @@ def _within_alone(
     limits: FoundLimits,
     sides: FloatArray,
 ) -> FloatArray:
-    """The sides of joint limits, none longer than what is safe alone."""
+    """The sides of joint limits, shortened so that no side is longer than the limit alone."""
     boxes = limits.boxes
     alone = limits.alone
     shorter = np.minimum(sides, task.sides(alone.lower, alone.upper))
@@ -346,7 +370,9 @@ def _within_alone(
 
 
 def _corner_search(task: Asked) -> CaseSearch:
-    """A search of the corners of a box, each in all listed encounters."""
+    """A search that simulates the corners of a box, each in all listed encounters. If the box has
+    more than `Effort.corners` corners, the search draws so many of them.
+    """
     listed = task.oracle.listed()
     limit = task.effort.corners
     rng = Stream.FIRST_CORNERS.generator(task.seed)
@@ -354,6 +380,7 @@ def _corner_search(task: Asked) -> CaseSearch:
     def search(space: Space, start: FloatArray) -> Counterexamples:
         lower = space.lower[: space.size]
         upper = space.upper[: space.size]
+        # Bit i of a corner's number says whether value i that varies is at its upper end.
         columns = np.flatnonzero(lower < upper)
         number = 2 ** len(columns)
         corners = np.arange(min(number, limit))
@@ -365,6 +392,7 @@ def _corner_search(task: Asked) -> CaseSearch:
         cases = product_of(vehicles, listed)
         results = Counterexamples(start[:0], np.zeros(0))
         results = results.after(cases, task.oracle(cases))
+        # Corners do not count as cases of the search for counterexamples.
         return results._replace(simulated=0)
 
     return search
@@ -375,8 +403,8 @@ def _prove(
     space: Space,
     number: int,
 ) -> tuple[Proof, FloatArray]:
-    """The upper bound of the unsafe share of a box's vehicles in the listed encounters, and its
-    unsafe cases.
+    """Test a box with randomly drawn vehicles in the listed encounters. Returns the upper bound of
+    the share of unsafe vehicles, and the unsafe cases of the test. `number` counts the tests.
     """
     oracle = task.oracle
     listed = oracle.listed()
@@ -408,7 +436,9 @@ def _breaches(
     limits: FoundLimits,
     sides: FloatArray,
 ) -> dict[Side, FloatArray]:
-    """For each joint limit an unsafe case just beyond it, all other values within theirs."""
+    """For each joint limit, an unsafe case in which one value is just beyond its limit, and all
+    other values are within their limits. A limit has no case if none is found.
+    """
     boxes = limits.boxes
     failures = limits.failures
     search = task.search(Stream.EXTENSION, 0, QUICK * task.effort.generation)
@@ -421,7 +451,7 @@ def _breaches(
         wider[side, column] = min(sides[side, column] + move, longest)
         cases = failures.inside(boxes, wider)
         if not len(cases):
-            # A slice of the wider box: this value at its end.
+            # Search the outermost slice of the wider box, in which this value is at its new end.
             space = boxes.cases_in(wider)
             ends = np.stack([space.lower, space.upper])
             ends[:, column] = ends[side, column]
@@ -433,8 +463,9 @@ def _breaches(
 
 
 def nearest_limits(task: Asked, limits: FoundLimits) -> FloatArray:
-    """The furthest values of each specified limit with which all hold, the others as specified,
-    shape (2, n); NaN where there is none.
+    """For each specified limit, the value nearest to it with which all specified limits hold, shape
+    (2, n). Only this limit moves; the other limits stay as specified. The value is NaN if nothing
+    is specified, or if no such value was found.
     """
     nearest = np.full_like(task.specification, np.nan)
     failures = Failures(task.nothing, task.nothing)
