@@ -1,4 +1,9 @@
-"""The greatest speeds of cars in all parameter sets, and the repair that raises a speed most."""
+"""The greatest speed up to which each car is safe in all parameter sets of the vehicle model, and
+the repair that raises this speed most.
+
+"Speed" and "value" mean the parameter over which `permit` drives, which may be another quantity. A
+car is measured: each measured value stands for all values between its errors of measurement.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +25,22 @@ from safevar_sumo.vehicles import CharacteristicSet
 REPAIR_STAGE = "cars with one part as new"
 ENDS_STAGE = "cars with assumed values at ends of their domains"
 USUAL_PLACES = 100
-"""Usual number of encounters of a vehicle at a speed, those of all tests at all their phases."""
+"""Usual number of encounters of a vehicle at one speed: all tests at all phases together."""
 MOST_LIMITING = 3
-"""Number of failures of a car that each repair of it meets first."""
+"""Largest number of failures of a car that are simulated first with each of its repairs."""
 
 
 class Reached(NamedTuple):
-    """How far a car is safe in a parameter set: the greatest value, None if it is not safe at the
-    least; and the failure that limits it, if one was found.
+    """How far a car is safe in one parameter set.
+
+    Attributes
+    ----------
+    fit
+        The number of the parameter set.
+    up_to
+        The greatest value up to which the car is safe; None if it fails already at the least value.
+    failure
+        The failure that limits the car; None if none was found.
     """
 
     fit: int
@@ -36,20 +49,18 @@ class Reached(NamedTuple):
 
     @property
     def order(self) -> float:
-        """What decides which of two values is greater: None, of a car that is not safe at all, is
-        the least.
-        """
+        """`up_to` as a number that can be compared: minus infinity stands for None."""
         return -np.inf if self.up_to is None else self.up_to
 
 
 class Permit(NamedTuple):
-    """What is known of a car: how far it is safe in each parameter set."""
+    """How far a car is safe in each parameter set in which it was driven."""
 
     reached: list[Reached]
 
     @property
     def least(self) -> Reached:
-        """The parameter set that limits it most."""
+        """The result with the parameter set that limits the car most."""
         return min(self.reached, key=lambda reached: reached.order)
 
     @property
@@ -58,14 +69,14 @@ class Permit(NamedTuple):
 
     @property
     def failures(self) -> list[LimitingFailure]:
-        """The failure that limits it in each parameter set in which one was found."""
+        """The failures that limit the car, one for each parameter set in which one was found."""
         return [
             reached.failure for reached in self.reached if reached.failure is not None
         ]
 
     @property
     def limiting(self) -> list[LimitingFailure]:
-        """Those at the least values."""
+        """The `MOST_LIMITING` failures at the least values, over all parameter sets."""
         ordered = sorted(self.failures, key=lambda failure: failure.value)
         return ordered[:MOST_LIMITING]
 
@@ -75,12 +86,23 @@ class Permit(NamedTuple):
 
 
 Repaired = tuple[int, Permit] | None
-"""The column of the characteristic that raises a car's value most, and the car as it is then."""
+"""The column of the characteristic whose repair raises a car's speed most, and how far the repaired
+car is safe; None if no single repair raises the speed.
+"""
 
 
 class WorstEnd(NamedTuple):
-    """The assumed value of a car that lowers its speed most at an end of its domain: the name of
-    the characteristic, the end as text, and the value at which the car is unsafe then.
+    """The assumed (not measured) value of a car that lowers the car's speed most, if this value is
+    at an end of its domain.
+
+    Attributes
+    ----------
+    name
+        The name of the characteristic.
+    text
+        The end of the domain, as text.
+    value
+        The speed at which the car is unsafe then.
     """
 
     name: str
@@ -89,18 +111,23 @@ class WorstEnd(NamedTuple):
 
 
 class PermitSearch:
-    """The search for the greatest values of a parameter up to which cars are safe.
+    """The search for the greatest value of a parameter, such as the speed, up to which each car is
+    safe.
 
     Attributes
     ----------
-    values, span
-        The values of the grid, and the parameter.
+    span
+        The parameter and its range.
+    values
+        The grid of values at which all cars are driven, in ascending order.
     listed
-        The values of tests that cannot move it: nothing is known between them.
+        The values of tests that are only driven at listed values. Nothing is known between these
+        values, so `up_to` is one of them.
     attacked
-        Number of simulations that searched for counterexamples so far.
+        Number of simulations so far that searched for counterexamples.
     least
-        Usual number of settings of these searches of all cars: with fewer, no speed is claimed.
+        Usual number of settings of the searches for counterexamples, of all cars together. With
+        fewer settings the question claims no speed.
     """
 
     def __init__(
@@ -123,7 +150,8 @@ class PermitSearch:
     def phases(self, cars: Sequence[Cars], *, with_repairs: bool) -> NamedValues:
         """The phases of progress, each with its usual number of settings."""
         members = self._models.members
-        # Tests are simulated alone, so that settings at all points of a matrix are fewer.
+        # Each simulation drives one test, but a setting counts a simulation of every test case:
+        # hence the numbers are divided by the number of test cases.
         points = len(members[0].evaluator.system.points)
         vehicles = sum(car.together for car in cars)
         places = len(self.values) * USUAL_PLACES
@@ -143,15 +171,24 @@ class PermitSearch:
     def reach(
         self, cars: Sequence[Cars], floors: Sequence[float | None], stage: str = ""
     ) -> list[Permit]:
-        """How far each of the cars is safe, whichever others are asked for with it.
+        """Search how far each car is safe in each parameter set. The result of a car does not
+        depend on the other cars of the call.
 
-        A car of which only the least value counts, where it is above a floor, is driven no further
-        in a parameter set than in those before, and in no further set once it is not.
+        Parameters
+        ----------
+        cars
+            The cars.
+        floors
+            For each car None, or a floor. With a floor, only the least value over all sets is of
+            interest, and only if it is above the floor. Then a car is driven up to the least value
+            of the sets before, and in no further set once this value is not above the floor.
+        stage
+            The phase of progress; by default the phase of each parameter set.
         """
         permits = [Permit([]) for _ in cars]
         top = float(self.values[-1])
         for model in self._models_in_order:
-            # The cars that are still of interest, and how far.
+            # The cars that are still of interest, and the greatest value that is of interest.
             waiting = list[int]()
             caps = list[float]()
             for car, (permit, floor) in enumerate(zip(permits, floors, strict=True)):
@@ -178,7 +215,7 @@ class PermitSearch:
             self.attacked += search.attacked
             for number, car in enumerate(waiting):
                 up_to = search.up_to(number)
-                # The last listed value, if any.
+                # Between listed values nothing is known: the last safe listed value counts.
                 values = self.listed[self.listed <= (up_to or -np.inf)]
                 up_to = max(values.tolist(), default=up_to)
                 reached = Reached(model.fit, up_to, search.failures[number])
@@ -192,15 +229,18 @@ class PermitSearch:
         is_measured: BoolArray,
         permit: Permit,
     ) -> WorstEnd | None:
-        """The worst end of a car; None where nothing is assumed, the car may not drive as it is, or
-        no end lowers its speed on the grid.
+        """The assumed value that lowers the car's speed most at an end of its domain.
+
+        The result is None if all values are measured, if the car is safe at no speed, or if no end
+        lowers the speed on the grid.
         """
         if permit.up_to is None or is_measured.all():
             return None
 
-        # Each assumed value at either end, all others as they are worst. Any failure shows that
-        # the car may drive no faster, so the grid up to its own speed is enough, with the set that
-        # limits it.
+        # Each vehicle has one assumed value at one end of its domain, and all other values as in
+        # the failure that limits the car. Only speeds up to the car's own can be lowered: the grid
+        # up to this speed is enough. Only the parameter set that limits the car is driven, because
+        # a failure in one set is enough.
         limiting = permit.least.failure
         worst = car.lower if limiting is None else limiting.setting[: len(vehicle)]
         is_assumed = np.eye(len(vehicle), dtype=bool)[~is_measured]
@@ -233,21 +273,22 @@ class PermitSearch:
         original: FloatArray,
         permits: Sequence[Permit],
     ) -> list[Repaired]:
-        """For each of K cars the characteristic among its `worn` ones, shape (K, n), that, as in
-        the original, raises its value most, with the car as it is then; None where no single one
-        does.
+        """For each of K cars, find the repair that raises its speed most. A repair sets one of the
+        `worn` characteristics, shape (K, n), to its value in the `original`, shape (n,).
 
-        A repaired car first meets the encounters that limit the car, or another repair: what it
-        could reach at most decides which repair is driven next, and whether another one is at all.
+        A repair has an upper bound of the speed that it can reach. The bound becomes lower when the
+        repaired car fails in an encounter that limits the car, or that limits another repair of the
+        car. The repair with the largest bound is driven next. No repair is driven whose bound is
+        not above the best speed so far.
         """
-        # First the parameter sets that limit most cars.
+        # The parameter sets that limit most cars are driven first, because they lower values most.
         limiting = Counter(permit.least.fit for permit in permits)
         self._models_in_order.sort(key=lambda model: -limiting[model.fit])
         top = float(self.values[-1])
         bounds = list[dict[int, float]]()
         failures = list[list[LimitingFailure]]()
         best = list[Repaired]([None] * len(cars))
-        # With the best repair so far.
+        # The speed of each car with its best repair so far; at first, the speed without a repair.
         orders = [permit.order for permit in permits]
         for row, permit in enumerate(permits):
             columns = np.flatnonzero(worn[row] & (permit.order < top)).tolist()
@@ -262,7 +303,8 @@ class PermitSearch:
                     cars,
                     original,
                 )
-                # The most promising repair of each car, unless a better one is known.
+                # Choose the repair with the largest bound for each car, and drop all repairs that
+                # cannot be better than the best one so far.
                 chosen = dict[int, int]()
                 for row, of_car in enumerate(bounds):
                     promising = {
@@ -294,8 +336,11 @@ class PermitSearch:
         cars: Sequence[Cars],
         original: FloatArray,
     ) -> None:
-        """Lower what each repair could reach at most, by the failures of other cars that it does
-        not avoid.
+        """Lower the upper bounds of repairs. Each repaired car drives in the encounters of
+        `failures`, in which its car or another repair of its car failed. A repaired car that fails,
+        too, can reach only the next lower value of the grid.
+
+        `bounds` has, for each car, the upper bound by the column of the repair; it is changed.
         """
         repairs = dict[int, list[tuple[int, int, LimitingFailure, FloatArray]]]()
         for row, of_car in enumerate(bounds):
@@ -317,7 +362,7 @@ class PermitSearch:
 
 
 def cars_of(vehicle: CharacteristicSet, fleet: Fleet) -> list[Cars]:
-    """The cars of a list, with all values that their measured ones may really have."""
+    """The cars of a list. A measured value becomes the range of values that it may really have."""
     ends = np.array(
         [
             [item.measured(value) for item, value in zip(vehicle, setting, strict=True)]
