@@ -1,9 +1,13 @@
-"""The search for the greatest value of a parameter, such as the speed, up to which each of several
-cars is safe with one parameter set.
+"""The search, with one parameter set, for the greatest value of a parameter (such as the speed) up
+to which each of several cars is safe.
 
-First all cars meet the encounters of a grid. Then the encounters up to what was found for each of
-them are searched for counterexamples. Nothing is assumed to be monotone: one failure at 33 km/h
-means "up to 32".
+First, all cars drive in the encounters of a grid of values. Then a search for counterexamples
+covers all encounters of each car up to the value that the grid gave. The search does not assume
+that a car is safer at lower values: one failure at 33 km/h means "up to 32".
+
+A case is a row of n + 1 + 1 + k numbers: a vehicle (n values), the number of a test, the value of
+the parameter in its unit, and k shares of the ranges of other axes, from 0 to 1. The last k + 1
+numbers are a place.
 """
 
 from __future__ import annotations
@@ -27,29 +31,32 @@ from safevar_sumo.questions.sampling import Stream, sobol_points
 from safevar_sumo.records import FloatArray, IntArray
 
 BLOCK = 8
-"""Number of values of the grid that cars meet before those that failed are left out; more for few
-cars.
+"""Least number of values of the grid in a block. After each block, cars that failed are left out. A
+block has more values if there are few cars.
 """
 EFFICIENT = 512
-"""Number of cars times values that fill a batch: a smaller one costs hardly less."""
+"""Number of vehicles times values that fill a batch. A smaller batch costs hardly less."""
 GENERATION = 512
 MORE = 1
-"""Number of cases of a generation of the search for counterexamples, and the generations that
-follow the first with an unsafe case.
+"""Number of cases in a generation of the search for counterexamples, and number of generations that
+follow the first generation with an unsafe case.
 """
 SPREAD = 128
-"""Number of cars that stand for all within limits, beside those at their corners."""
+"""Number of vehicles at Sobol points that stand for all vehicles within limits; as many vehicles at
+corners are added.
+"""
 
 
 class Cars(NamedTuple):
-    """A car, with all values that its measured ones may really have, or all cars within limits.
+    """All vehicles between two ends. They are one car, whose values are known only up to errors of
+    measurement, or all cars within limits.
 
     Attributes
     ----------
     lower, upper
-        The least and greatest values of the vehicle's characteristics, shape (n,).
+        The least and the greatest value of each characteristic of the vehicle, shape (n,).
     vehicles
-        The cars that meet the encounters of the grid, shape (V, n).
+        The vehicles that drive in the encounters of the grid, shape (V, n).
     """
 
     lower: FloatArray
@@ -58,13 +65,13 @@ class Cars(NamedTuple):
 
     @classmethod
     def one(cls, values: FloatArray) -> Cars:
-        """A car with these values of its characteristics."""
+        """A car whose characteristics have exactly these values, shape (n,)."""
         return cls(values, values, values[np.newaxis])
 
     @classmethod
     def measured(cls, lower: FloatArray, upper: FloatArray) -> Cars:
-        """A car whose values are between these: those at all ends drive the grid, or of many at
-        some.
+        """A car whose values are between `lower` and `upper`. Vehicles at its corners (each value
+        at an end) drive in the grid: all corners, or up to `SPREAD` of them if there are more.
         """
         corners = np.round(sobol_points(SPREAD, len(lower), seed=0))
         return cls(
@@ -73,13 +80,15 @@ class Cars(NamedTuple):
 
     @classmethod
     def within(cls, lower: FloatArray, upper: FloatArray, seed: int) -> Cars:
-        """All cars within limits: those at Sobol points and at as many corners drive the grid."""
+        """All cars within limits. Vehicles at Sobol points, and as many at corners, drive in the
+        grid.
+        """
         points = sobol_points(SPREAD, len(lower), seed)
         points = np.concatenate([np.round(points), points])
         return cls(lower, upper, np.unique(lower + points * (upper - lower), axis=0))
 
     def with_value_of(self, column: int, model: FloatArray) -> Cars:
-        """A car with one of its values as in a model, such as the original."""
+        """The same car, with the value of one column as in the `model` vehicle, shape (n,)."""
         fields = [values.copy() for values in self]
         for values in fields:
             values[..., column] = model[column]
@@ -88,12 +97,12 @@ class Cars(NamedTuple):
 
     @property
     def together(self) -> int:
-        """How many of the vehicles meet an encounter of the grid."""
+        """The number of vehicles that drive in each encounter of the grid."""
         return min(len(self.vehicles), MOST_VEHICLES)
 
     def at(self, place: FloatArray) -> FloatArray:
-        """The vehicles that meet an encounter of the grid; of many, others at each, and half of
-        them at corners.
+        """The vehicles that drive in one encounter of the grid, shape (`together`, n). If there are
+        more vehicles, other ones are drawn for each encounter, and half of them are at corners.
         """
         if len(self.vehicles) == self.together:
             return self.vehicles
@@ -108,15 +117,25 @@ class Cars(NamedTuple):
 
     @property
     def number(self) -> int:
-        """A number by which random numbers of these cars are drawn: it does not depend on others
-        that are asked for with them.
+        """A seed of random numbers for these cars. The seed depends on the ends alone, and not on
+        other cars of the same question.
         """
         return zlib.crc32(np.concatenate([self.lower, self.upper]).tobytes())
 
 
 class LimitingFailure(NamedTuple):
-    """The unsafe encounter at the least value of the parameter that was found: the value, the test,
-    the setting, shape (n,), and what it leaves to the limit.
+    """The unsafe encounter at the least value of the parameter at which a car was found to fail.
+
+    Attributes
+    ----------
+    value
+        The value of the parameter.
+    encounters
+        The encounters of the test in which the car failed.
+    setting
+        The vehicle and its encounter, shape (n + number of encounter values,).
+    robustness
+        The distance to the criterion's limit, which is below 0.
     """
 
     value: float
@@ -126,17 +145,15 @@ class LimitingFailure(NamedTuple):
 
 
 class SpeedSearch:
-    """The search with one parameter set.
+    """The search with one parameter set. Each car has a cap: the greatest value that is of
+    interest, above which the car is not driven.
 
     Attributes
     ----------
     failures
-        The limiting failure of each of the cars; None where none was found.
+        The limiting failure of each car; None for a car without a known failure.
     attacked
         Number of simulations of the search for counterexamples.
-
-    A car is driven no further than up to its cap, the greatest value that is of interest. A case is
-    a vehicle, the number of a test, and a place in its encounters.
     """
 
     def __init__(
@@ -149,7 +166,7 @@ class SpeedSearch:
     ) -> None:
         self.failures: list[LimitingFailure | None] = [None] * len(cars)
         self.attacked = 0
-        # The tests that go on up to some value are the first ones.
+        # Sorted by their least values, the tests that exist up to a value have the first numbers.
         self._ranges = sorted(ranges, key=lambda encounters: encounters.low)
         self._cars = cars
         self._values = values
@@ -161,8 +178,8 @@ class SpeedSearch:
         self._judged: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in cars]
 
     def up_to(self, car: int) -> float | None:
-        """The greatest value of the grid below the limiting failure of a car, at most its cap; None
-        if it fails at the least.
+        """The greatest value of the grid below the limiting failure of a car, and not above its
+        cap. The result is None if the car fails at the least value.
         """
         failure = self.failures[car]
         is_safe = self._values <= self._caps[car]
@@ -174,8 +191,8 @@ class SpeedSearch:
         )
 
     def drive_grid(self) -> None:
-        """Have all cars meet the encounters of the grid, from low values to high ones, each up to
-        the first block in which it fails.
+        """Simulate all cars in the encounters of the grid, from low values to high values. A car
+        ends with the first block of values in which it fails.
         """
         values = self._values
         while len(values):
@@ -196,8 +213,11 @@ class SpeedSearch:
                     self._note(car, of_car, robustness)
 
     def _places(self, block: FloatArray) -> FloatArray:
-        """The numbers of tests, and their places at the values of a block, shape (P, 2 + k). The
-        least value of a test, which may be its only one, is driven with the next value of the grid.
+        """The encounters of all tests at the values of a block: the number of the test, the value,
+        and k shares of other axes, shape (P, 2 + k).
+
+        The least value of a test may not be a value of the grid, and may be the only value of the
+        test. Therefore the least value is driven in the block of the next value of the grid.
         """
         rows = [np.zeros((0, 2 + self._axes))]
         for number, encounters in enumerate(self._ranges):
@@ -210,19 +230,22 @@ class SpeedSearch:
                 ].tolist()
             for value in values:
                 places = encounters.places(value)
+                # A test with fewer axes than another one ignores the last shares.
                 padding = 1 + self._axes - places.shape[1]
                 rows.append(np.pad(places, ((0, 0), (1, padding))))
                 rows[-1][:, 0] = number
         return np.concatenate(rows)
 
     def _cases(self, car: int, places: FloatArray) -> FloatArray:
-        """The vehicles of a car at places, some of them at each."""
+        """The cases of a car in P encounters, shape (P, 2 + k): in each, `together` vehicles of the
+        car. The result has shape (P * together, n + 2 + k).
+        """
         cars = self._cars[car]
         vehicles = np.concatenate([cars.at(place) for place in places])
         return np.hstack([vehicles, np.repeat(places, cars.together, axis=0)])
 
     def _judge(self, cases: FloatArray) -> FloatArray:
-        """What each of M cases leaves to the limit, shape (M,)."""
+        """The robustness of each of M cases, shape (M,): below 0 the case is unsafe."""
         robustness = np.zeros(len(cases))
         for encounters, rows, settings in self._in_tests(cases):
             robustness[rows] = encounters.robustness(settings, self._stage)
@@ -231,7 +254,9 @@ class SpeedSearch:
     def _in_tests(
         self, cases: FloatArray
     ) -> Iterator[tuple[EncounterRange, IntArray, FloatArray]]:
-        """The tests that cases meet, each with their rows and their settings there."""
+        """For each test in which some of M cases drive: the encounters of the test, the rows of
+        these cases, and the settings of these cases.
+        """
         numbers = np.floor(cases[:, self._size]).astype(int)
         for number in np.unique(numbers).tolist():
             rows = np.flatnonzero(numbers == number)
@@ -240,8 +265,9 @@ class SpeedSearch:
             yield encounters, rows, encounters.settings(vehicles, places[:, 1:])
 
     def _note(self, car: int, cases: FloatArray, robustness: FloatArray) -> bool:
-        """Keep what a car met, and its failure at the least value, of several the worst; whether it
-        fails.
+        """Store the cases of a car with their robustness, and update its limiting failure: the
+        failure at the least value, and of several failures there the worst. Returns whether a case
+        is unsafe.
         """
         self._judged[car].append((cases, robustness))
         unsafe = np.flatnonzero(robustness < 0)
@@ -259,14 +285,15 @@ class SpeedSearch:
         return len(unsafe) > 0
 
     def attack(self, budget: int) -> None:
-        """Search encounters of each car up to its value, with a budget for each, until nothing is
-        found. What is found is a value of the grid, at which all tests were driven.
+        """Search for counterexamples to the value of each car. A counterexample lowers the value to
+        a value of the grid, and the search begins anew with the whole `budget` of cases, until it
+        finds no unsafe case.
         """
         attempt = 0
         waiting = self._open(range(len(self._cars)))
         while waiting:
             attempt += 1
-            # All cars side by side, each from what it met.
+            # Search all cars side by side. The search of a car begins with its worst cases so far.
             searches = [self._search(car, budget, attempt) for car in waiting]
             results = search_side_by_side(self._judge, searches)
             self.attacked += sum(result.simulated for result in results)
@@ -277,7 +304,9 @@ class SpeedSearch:
             )
 
     def _open(self, cars: Iterable[int]) -> list[int]:
-        """The cars that are safe at some value, and of which more than one case is not met yet."""
+        """Those of the cars for which a search can find something new: a car is safe at some value,
+        and its encounters have axes, or it stands for several vehicles.
+        """
         return [
             car
             for car in cars
@@ -286,10 +315,13 @@ class SpeedSearch:
         ]
 
     def _search(self, car: int, budget: int, attempt: int) -> Generations:
-        """The search for counterexamples to the value of a car."""
+        """The search for counterexamples to the value of a car. `attempt` counts the searches of
+        the car, and is a part of the seed.
+        """
         up_to = self.up_to(car)
         cars = self._cars[car]
         assert up_to is not None
+        # Only tests that exist at the car's value or below are searched.
         number = sum(encounters.low <= up_to for encounters in self._ranges)
         ends = np.array([np.zeros(2 + self._axes), np.ones(2 + self._axes)])
         ends[:, 0] = 0, np.nextafter(number, 0)
@@ -298,7 +330,7 @@ class SpeedSearch:
             np.append(cars.lower, ends[0]), np.append(cars.upper, ends[1]), self._size
         )
 
-        # The worst cases so far, up to this value.
+        # The search begins with the worst cases so far that are in the searched space.
         cases, robustness = map(np.concatenate, zip(*self._judged[car], strict=True))
         is_inside = (cases >= space.lower) & (cases <= space.upper)
         robustness = np.where(is_inside.all(axis=1), robustness, np.inf)
