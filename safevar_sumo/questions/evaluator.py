@@ -1,5 +1,5 @@
-"""Evaluates settings for all questions about a study, and draws settings that cover the study's
-domain.
+"""The evaluator simulates settings for all questions about a study. A setting has the values of a
+vehicle, and of its encounter if the study searches encounters (in ranges, or at all phases).
 """
 
 from __future__ import annotations
@@ -58,23 +58,23 @@ CRITERION_SETTINGS = 1024
 setting collides, else a safety degree.
 """
 FIRST_SETTINGS = 64
-"""Number of them that are tried first: one collision decides."""
+"""Number of these settings that are simulated first: one collision among them decides already."""
 ENCOUNTERS = 16
-"""Number of encounters in which a vehicle is tried, where encounters are ranges."""
+"""Largest number of critical encounters in which vehicles drive, if encounters are ranges."""
 CANDIDATES = 512
-"""Number of encounters over its domain from which they are chosen."""
+"""Number of encounters over the domain from which the critical encounters are chosen."""
 
 
 class Evaluator:
-    """Evaluates settings of one study without the filter, and draws settings that cover the study's
-    domain.
+    """Evaluates settings of one study (without the filter of the study's search), and draws
+    settings that cover the study's domain.
 
     Attributes
     ----------
     simulated
-        Number of settings simulated so far; of equal settings in one call only one is simulated.
+        Number of settings simulated so far. Equal settings in one call are simulated only once.
     account
-        What the question may simulate and has simulated, with evaluators of other studies, too.
+        The simulations of the question, also of evaluators of other studies for this question.
 
     Examples
     --------
@@ -115,7 +115,7 @@ class Evaluator:
 
     @cached_property
     def in_phases(self) -> Evaluator | None:
-        """An evaluator of settings that end with the phase of their encounter; None without."""
+        """An evaluator whose settings have the phase as last value; None if there is no phase."""
         study = in_phases(self.study, self.system)
         if study == self.study:
             return None
@@ -126,9 +126,9 @@ class Evaluator:
     ) -> Evaluations:
         """Evaluate M settings, shape (M, n). Progress is shown for `stage`.
 
-        Settings that violate a constraint of the study are not simulated and get the outcome
-        `infeasible`, unless `ignore_constraints` is true. So do settings in whose encounter the
-        original vehicle is not safe, where encounters are ranges.
+        Settings that violate a constraint of the study are not simulated, and get the outcome
+        `infeasible`, unless `ignore_constraints` is true. If encounters are ranges, settings in
+        whose encounter the original vehicle is not safe get this outcome, too.
         """
         if ignore_constraints:
             return self._simulate_shown(settings, stage, self._verified)
@@ -137,12 +137,11 @@ class Evaluator:
     def evaluate_selection(
         self, rows: FloatArray, selection: Selection, stage: str, verified: int = 0
     ) -> Evaluations:
-        """Evaluate M settings as `selection` says: at some points, and with values of P parameters
-        of the ADS.
+        """Evaluate M settings as `selection` says: only at some points, or with values of P
+        parameters of the ADS. A row has a setting and these P values, shape (M, n + P).
 
-        The values stand beside the settings, shape (M, n + P). Of a part of the points, encounters
-        in which the original vehicle is not safe count, too. Settings that violate a constraint are
-        not simulated.
+        Settings that violate a constraint are not simulated. With a part of the points, encounters
+        in which the original vehicle is not safe count, too.
         """
         n = len(self.characteristics)
         is_feasible = self.region.feasible(rows[:, :n])
@@ -157,15 +156,15 @@ class Evaluator:
             return not_simulated
         simulated = self._simulate_shown(rows[is_feasible], stage, verified, selection)
         evaluations = Evaluations.concatenate([simulated, not_simulated])
-        # In the order of the settings.
+        # Restore the order of the settings.
         return evaluations.take(np.argsort(np.argsort(~is_feasible, kind="stable")))
 
     def begin(
         self, settings: NamedValues, minimum: int = 1, *, of_list: bool = False
     ) -> None:
-        """Begin a question of these phases, each with the number of settings that it is expected to
-        simulate; below the `minimum` there is no answer. One about a list of vehicles says how
-        long it takes where a simulation is short, too.
+        """Begin a question. `settings` has the expected number of settings of each phase of
+        progress. With fewer than `minimum` settings there is no answer. A question `of_list` (of
+        vehicles) prints how long it takes even if a simulation is short.
         """
         expected = sum(settings.values())
         account = self.account
@@ -191,7 +190,7 @@ class Evaluator:
 
     @property
     def left(self) -> int | None:
-        """The number of settings that may follow; None without a limit."""
+        """The number of settings that may still be simulated; None without a limit."""
         account = self.account
         if account.limit is None:
             return None
@@ -200,8 +199,8 @@ class Evaluator:
     def limit(
         self, simulations: int | None, questions: int, *, quick: bool = False
     ) -> None:
-        """Let the question do so many simulations, with those that check a simulator's class; it is
-        one of so many that share the time. A quick one searches less.
+        """Limit the number of simulations of the question, which includes the check of a
+        simulator's class. `questions` questions share the time. A quick question searches less.
         """
         seconds = sum(np.max(point.scenario.duration) for point in self.system.points)
         self.account.effort = 1.0
@@ -216,12 +215,12 @@ class Evaluator:
         self._pool.checked = 0
 
     def scaled(self, number: float) -> int:
-        """A usual number of simulations, or of rounds, by how much is searched."""
+        """A usual number of simulations or rounds, times the effort of the question."""
         return int(number * self.account.effort)
 
     def at_most(self, number: int, part: int = 1) -> int:
-        """A usual number of settings, by how much is searched; where few simulations are allowed,
-        at most this part of those that may follow. It is at least 1.
+        """A usual number of settings, times the effort of the question, but at least 1. If the
+        number of simulations is limited, at most 1 / `part` of the settings that may follow.
         """
         number = self.scaled(number)
         if self.left is not None:
@@ -239,7 +238,7 @@ class Evaluator:
         verified: int,
         selection: Selection = EVERYTHING,
     ) -> Evaluations:
-        """Evaluate settings while progress is shown."""
+        """Evaluate settings, show progress, and count simulations in the account."""
         if not len(settings):
             return Evaluations.none(len(self.characteristics), METRICS)
         total = len(np.unique(settings, axis=0))
@@ -269,8 +268,8 @@ class Evaluator:
         compile_vehicle(self.study, self._pool, self.phases.say)
 
     def _without_unsafe_originals(self, evaluations: Evaluations) -> Evaluations:
-        """Evaluations whose results are undefined where the original vehicle is not safe in the
-        same encounter.
+        """The evaluations, with undefined results (outcome `infeasible`, metrics NaN) of settings
+        in whose encounter the original vehicle is not safe.
         """
         scoring = self.system.measuring.scoring
         if scoring.safe_original is None:
@@ -291,8 +290,8 @@ class Evaluator:
     def evaluate_over_encounters(
         self, settings: FloatArray, unsafe: Unsafe, stage: str
     ) -> Evaluations:
-        """Evaluate M settings, shape (M, n); where encounters are ranges, in that of its
-        critical encounters and the original one which is worst by the criterion.
+        """Evaluate M settings, shape (M, n). If encounters are ranges, each vehicle drives in the
+        original encounter and all critical ones: the worst by the criterion is its evaluation.
         """
         if not len(self.characteristics.scenario):
             return self.evaluate(settings, stage)
@@ -308,17 +307,17 @@ class Evaluator:
 
     @cached_property
     def critical_encounters(self) -> FloatArray:
-        """The original vehicle in those `ENCOUNTERS` of many encounters in which it is least safe,
-        shape (k, n); none where encounters are listed.
+        """Settings of the original vehicle in the `ENCOUNTERS` encounters in which it is least
+        safe, shape (k, n). They are chosen among many; there are none if encounters are listed.
         """
         valid = self._originals.take(self._originals.valid)
-        # NaN is last.
+        # `argsort` puts NaN last.
         least_safe_first = np.argsort(valid.f_safe, kind="stable")
         return valid.settings[least_safe_first[:ENCOUNTERS]]
 
     @cached_property
     def share_left_out(self) -> float:
-        """The share of unsafe originals in encounters over the domain; 0 where these are listed."""
+        """Share of encounters over the domain with an unsafe original; 0 if they are listed."""
         is_possible = self.region.feasible(self._originals.settings)
         if not is_possible.any():
             return 0.0
@@ -326,16 +325,16 @@ class Evaluator:
 
     @cached_property
     def _originals(self) -> Evaluations:
-        """Evaluations of originals in encounters over the domain; none where these are listed."""
+        """Evaluations of the original in encounters over the domain; none if they are listed."""
         if not len(self.characteristics.scenario):
             return Evaluations.none(len(self.characteristics), METRICS)
-        # Of few simulations an eighth chooses encounters, and the others are of vehicles there.
+        # An eighth of few simulations chooses encounters: the others are for vehicles in them.
         settings = sobol_settings(self.characteristics, self.at_most(CANDIDATES, 8))
         originals = self.characteristics.with_original_vehicle(settings)
         return self.evaluate(originals, "encounters of the original")
 
     def feasible_settings(self, number: int) -> FloatArray:
-        """`number` settings that cover the feasible part of the domain evenly."""
+        """`number` settings, shape (number, n), that cover the feasible domain evenly."""
         total = 0
 
         def draw_next(count: int) -> FloatArray:
@@ -374,8 +373,8 @@ class Evaluator:
         return evaluations
 
     def refuse_other_original(self, case: Case) -> None:
-        """Refuse results whose simulator drives the original vehicle otherwise now; one that is not
-        deterministic, and results of a single point, tell nothing.
+        """Refuse results if the simulator drives the original vehicle in another way now. Without
+        deterministic runs at all points this cannot be compared, and nothing is refused.
         """
         study = case.study
         if not case.has_runs or study.scenario.repeats > 1 or study.origin.point:
@@ -390,8 +389,8 @@ class Evaluator:
 
     @cached_property
     def no_verdict(self) -> str:
-        """Why simulations tell nothing about the ADS, in a sentence with which every answer begins;
-        "" if they do.
+        """The reason why simulations tell nothing about the ADS, as the first sentence of every
+        answer; "" if simulations tell something.
         """
         return ask_why_no_verdict(self.study, self._pool, begin=self._compile)
 
@@ -401,10 +400,10 @@ class Evaluator:
         source: Subject,
         original: Evaluations | None = None,
     ) -> Unsafe:
-        """The criterion that is stated, or else the default for the solutions of results, or for
-        settings over the whole domain of a study.
+        """The stated criterion. Without one, the criterion of results with solutions; else the
+        default, by settings over the whole domain of the study.
 
-        Raises what `checked` and `Unsafe.default_among` raise.
+        Raises the errors of `checked` and `Unsafe.default_among`.
         """
         if stated is None and not isinstance(source, Study) and len(source.solutions):
             stated = source.unsafe
@@ -414,15 +413,15 @@ class Evaluator:
         original = original or self.evaluate_original()
         stage = "settings over the whole domain"
         settings = self.feasible_settings(CRITERION_SETTINGS)
-        # The most of a few simulations is the question's, not the criterion's.
+        # Most of few simulations should serve the question, and not the choice of a criterion.
         evaluations = self.evaluate(settings[: self.at_most(FIRST_SETTINGS, 8)], stage)
         if not evaluations.collided.any() and self.left is None:
             evaluations = self.evaluate(settings, stage)
         return Unsafe.default_among(evaluations, original)
 
     def use(self, unsafe: Unsafe) -> None:
-        """Ask by a criterion: settings without the value that it bounds are counted. Raises what
-        `checked` raises.
+        """Use a criterion in the question. If it bounds a metric, the account counts the settings
+        without a value of this metric. Raises the errors of `checked`.
         """
         self.checked(unsafe)
         if unsafe.bound:
@@ -430,15 +429,15 @@ class Evaluator:
             self.check_measured(unsafe.bound.measure)
 
     def checked(self, unsafe: Unsafe) -> Unsafe:
-        """A criterion between the bodies of the study; raises an InputError if nobody is on the
-        road, from whom it is a distance.
+        """The criterion, with the safety degree at which bodies of the study touch. Raises an
+        InputError if the criterion is a distance to others, but nobody else is on the road.
         """
         if unsafe.measure == F_SAFE.name:
             self.check_measured()
         return self.system.with_contact(unsafe)
 
     def check_measured(self, measure: str = F_SAFE.name) -> None:
-        """Refuse what is measured in an encounter, as a distance, where nobody else is on the
+        """Refuse a metric that needs an encounter, such as a distance, if nobody else is on the
         road.
         """
         if not self.system.meets_nobody:
@@ -452,7 +451,7 @@ class Evaluator:
 
     def with_step(self, step: float) -> Evaluator:
         """An evaluator of the same study with another time step [s]."""
-        # The interval may be no multiple of this step.
+        # The study's sampling interval may be no multiple of the new step.
         return self.for_study(
             replace_in(
                 self.study,
@@ -462,12 +461,12 @@ class Evaluator:
         )
 
     def end(self) -> None:
-        """Have user code simulate again what it began with: an error if it does not repeat it."""
+        """Repeat the first simulations of user code: other results than before are an error."""
         repeat_first_batches(self.study, self._pool)
 
     def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
-        """An evaluator of another study, on the same pool; `verified` settings are simulated in
-        SUMO, too.
+        """An evaluator of another study, on the same pool and account. In addition, `verified`
+        settings are simulated in SUMO.
         """
         if verified is None:
             verified = self._verified
@@ -482,8 +481,8 @@ def open_evaluator(
     progress: Progress = show_no_progress,
     cluster: str | None = None,
 ) -> Iterator[Evaluator]:
-    """An evaluator that simulates on `pool`; without a pool, on `jobs` new worker processes, by
-    default one for each core, or on the workers of a cluster at an address.
+    """An evaluator that simulates on `pool`. Without a pool it starts `jobs` worker processes (by
+    default one for each core), or uses the workers of the cluster at the address `cluster`.
 
     Raises
     ------
@@ -493,7 +492,7 @@ def open_evaluator(
     if pool is not None:
         yield Evaluator(study, pool, progress)
         return
-    # An error comes before workers start.
+    # An error of the study is raised before workers start.
     assemble(study)
     with open_pool(jobs, cluster) as new_pool:
         yield Evaluator(study, new_pool, progress)
