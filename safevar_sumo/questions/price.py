@@ -1,5 +1,5 @@
-"""What a question costs where a simulation takes long: how many simulations it takes, how long that
-is, and how many it may do.
+"""The price of a question whose simulations take long: the number of simulations, their duration,
+and the number that the question may do. An account counts the simulations.
 """
 
 from __future__ import annotations
@@ -29,50 +29,59 @@ from safevar_sumo.terminal import print_text
 from safevar_sumo.vehicles import CharacteristicSet
 
 LONGEST = 900.0
-"""Time up to which a question does by default all that it is made for [s]."""
+"""A question that takes at most this time does all its simulations by default [s]. Otherwise the
+question does only as many simulations as fit into this time.
+"""
 MEASURED = 2
-"""Settings that are simulated to know how long one takes."""
+"""Number of simulations by which the duration of a simulation is measured."""
 BATCH = 512
-"""Vehicles that are simulated side by side to know how long one of a list takes."""
+"""Number of vehicles in the batch that measures how long a vehicle of a list takes."""
 LEAST_SETTINGS = 3
-"""Fewest settings with which a question that samples answers."""
+"""Fewest settings with which a question that samples settings gives an answer."""
 QUICK = 1 / 40, 1 / 8
-"""How much a quick answer searches, as a share of what is usual: at least so much that the box of
-joint limits, which is usually sought up to 40 times, is sought once; and at most.
+"""Least and largest effort of a quick answer. (The effort is the amount of search, as a share of
+the usual amount.) Usually a question proposes up to 40 boxes of joint limits: the least effort
+suffices for one box.
 """
 QUICK_SECONDS = 25.0
-"""This share times the seconds that a vehicle drives at all points: where it drives longer, each
-simulation costs more, and fewer are done.
+"""The effort of a quick answer is this number divided by the seconds that a vehicle drives at all
+points, within `QUICK`. The longer a vehicle drives, the more a simulation costs, and the fewer
+simulations are done.
 """
 MOST_EFFORT = 8.0
-"""Largest such share where more simulations are allowed than are usual."""
+"""Largest effort if the user allows more simulations than are usual."""
 DIGITS = 2
-"""Digits of a number of simulations that is derived from a time."""
+"""Number of digits to which a number of simulations is rounded that is derived from a time."""
 
 
 @dataclass
 class Account:
-    """The simulations of a question, also of its evaluators of other studies.
+    """Counts and limits the simulations of a question, also of its evaluators of other studies.
 
     Attributes
     ----------
     phases
-        Their progress.
+        The progress of the question.
     allowance
-        The largest number that the user allows; None if he says nothing.
+        The largest number of simulations that the user allows; None if the user states no number.
     questions
-        Number of questions of a page, which share the time.
+        Number of questions that share the time, such as all questions of a page.
     is_question
-        Whether a question asks, which says first what it costs.
+        Whether the simulations are those of a question, which prints its price before it begins.
     limit
-        The largest number of simulations; None if there is none.
-    spent, minimum
-        Simulations so far; the least number for an answer.
+        The largest number of simulations that the question may do; None without a limit.
+    spent
+        Number of simulations so far.
+    minimum
+        The least number of simulations for an answer.
     effort
-        How much is searched, as a share of what is usual.
-    measure, undefined, judged
-        The metric of the question's criterion, if it has one; the numbers of settings without a
-        collision that have no such value, and of all.
+        The amount of search, as a share of the usual amount.
+    measure
+        The metric that the question's criterion bounds; "" without such a metric.
+    undefined
+        Number of settings without a collision for which this metric is undefined.
+    judged
+        Number of all settings that were judged by this metric.
     """
 
     phases: Phases
@@ -89,26 +98,26 @@ class Account:
 
     @property
     def left(self) -> float:
-        """Simulations that may follow."""
+        """The number of simulations that may still be done; infinite without a limit."""
         if self.limit is None:
             return float("inf")
         return self.limit - self.spent
 
     @property
     def undefined_in_words(self) -> str:
-        """How often the metric was undefined, in a sentence; empty if it never was."""
+        """A sentence that says how often the metric was undefined; "" if it never was."""
         if not self.undefined:
             return ""
         of_all = f"{self.undefined:,} of {self.judged:,} simulated settings, which count as safe"
         return f"Remark: {self.measure} is undefined, without a collision, in {of_all}."
 
     def spend(self, simulations: int) -> None:
-        """Count simulations that begin.
+        """Count `simulations` that are about to begin.
 
         Raises
         ------
         InputError
-            If they are more than may follow.
+            If the question may not do so many further simulations.
         """
         self.spent += simulations
         bound = self.allowance if self.limit is None else self.limit
@@ -120,7 +129,7 @@ class Account:
             )
 
     def require(self, minimum: int) -> None:
-        """Refuse fewer simulations than the least number for an answer."""
+        """Set the least number of simulations for an answer. Refuse an allowance below it."""
         self.minimum = minimum
         self._refuse_few(self.allowance)
 
@@ -134,12 +143,24 @@ class Account:
             )
 
     def open(self, expected: float, seconds: float | None, checked: int = 0) -> None:
-        """Allow what the user allows, or all if that does not take too long; `expected` simulations
-        are planned, one of which takes so many seconds, None for an unknown time that is short. The
-        check of a simulator's class took `checked` simulations: whatever it took, its part of those
-        that are allowed counts, so that the answer does not depend on what was checked before.
+        """Set the limit and the effort of the question, and print its price.
+
+        The limit is the number that the user allows. If the user states no number, there is no
+        limit, unless all simulations would take too long.
+
+        Parameters
+        ----------
+        expected
+            Number of simulations that the question is expected to need.
+        seconds
+            Duration of a simulation [s]; None if simulations are short, and were not measured.
+        checked
+            Number of simulations that the check of a simulator's class really did. The account does
+            not count this number, but a fixed part of the limit. Otherwise the answer would depend
+            on whether an earlier command had already done the check.
         """
-        # A number that is stated holds for all: the check, and what is repeated at the end.
+        # The number that a user states also covers two other parts: the check at the beginning, and
+        # the first simulations, which are repeated at the end.
         parts = 0
         allowance = self.allowance
         if allowance is not None and seconds is not None:
@@ -147,7 +168,8 @@ class Account:
         self.limit = allowance
         if allowance is not None and allowance >= expected + parts:
             self.limit = None
-            # Half of what is more than usual: some searches take longer than they are expected to.
+            # The effort is only half of the ratio of allowed to usual simulations, because some
+            # searches need more simulations than they are expected to need.
             effort = allowance / (2 * (expected + parts))
             self.effort = min(max(self.effort, effort), MOST_EFFORT)
         if seconds is None:
@@ -171,16 +193,18 @@ class Account:
 
 
 def round_down(number: float) -> int:
-    """A number of simulations with `DIGITS` digits, at least 1."""
+    """A number of simulations, rounded down to `DIGITS` significant digits, but at least 1."""
     simulations = max(int(number), 1)
     unit = 10 ** max(len(str(simulations)) - DIGITS, 0)
     return int(simulations // unit * unit)
 
 
 def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | None:
-    """How long a simulation takes, by all workers together [s], from the original vehicle, which is
-    simulated `MEASURED` times, and must do what it did when an interrupted command began; None
-    where it takes milliseconds, as in SUMO.
+    """The mean duration of a simulation if all workers simulate at the same time [s]. The result is
+    None if a simulation takes milliseconds, as in SUMO.
+
+    The original vehicle is simulated `MEASURED` times. Results that an interrupted command has
+    stored are forgotten if the original vehicle drives in another way now.
     """
     if not system.mover.takes_long:
         return None
@@ -194,8 +218,8 @@ def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | N
 def print_price_of_list(
     study: Study, system: System, pool: Pool, simulations: float
 ) -> None:
-    """Print how long a list of vehicles takes, which share batches: by the time of one at a point.
-    This number bounds nothing, and what is timed does not count.
+    """Print how long a list of vehicles takes. The duration is measured with a batch of vehicles at
+    one point. It limits nothing, and the account does not count the measured simulations.
     """
     task = Task(study=study, selection=Selection(points=(len(system.points) // 2,)))
     batch = np.repeat(system.characteristics.original_settings, BATCH, axis=0)
@@ -205,9 +229,9 @@ def print_price_of_list(
 
 
 def _timed(task: Task, settings: FloatArray, pool: Pool) -> tuple[Evaluations, float]:
-    """What settings do, and how long a worker takes for them [s]."""
+    """The evaluations of settings, and the time that one worker takes for all of them [s]."""
     jobs = [(task, settings)]
-    # A worker starts, and so does its simulator.
+    # The first simulations start a worker and its simulator: their time does not count.
     carry_out(evaluate_settings, jobs, pool)
     start = time.perf_counter()
     (evaluations,) = carry_out(evaluate_settings, jobs, pool)
@@ -215,7 +239,7 @@ def _timed(task: Task, settings: FloatArray, pool: Pool) -> tuple[Evaluations, f
 
 
 def _price(simulations: float, seconds: float) -> str:
-    """A number of simulations, and how long they take if one takes so many seconds."""
+    """Words for a number of simulations and for their duration. One takes `seconds`."""
     return f"about {simulations:,.0f} simulations, about {_duration(simulations * seconds)}"
 
 
