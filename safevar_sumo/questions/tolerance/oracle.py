@@ -1,5 +1,6 @@
 """The oracle simulates cases, and returns the robustness of each case. The robustness is the
-distance of a simulated vehicle to the limit of the criterion: below 0 the case is unsafe.
+distance of a simulated vehicle to the limit of the criterion, in the criterion's unit: below 0 the
+case is unsafe.
 
 A case is a row of 1 + n + k numbers, in this order:
 
@@ -164,7 +165,11 @@ class Oracle:
 
     @property
     def available(self) -> float:
-        """The number of cases that may still be simulated; infinite if the user sets no limit."""
+        """The number of cases that may still be simulated; NaN if the question has no limit.
+
+        Python computes infinity // n as NaN. No comparison with NaN is true, so no number of cases
+        is too large then.
+        """
         evaluator = self.own.evaluator
         # The answer's remark on phases drives the original vehicle twice, after all cases.
         remark = 2 * len(evaluator.system.points)
