@@ -34,12 +34,12 @@ def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatAr
     is_pressed = pedal > pedal[0] + PEDAL_ROUNDING
     # The first step with brake force ends at this sample.
     end = np.argmax(is_pressed, axis=0)
-    # The samples at the begin of this step, at its end, and a step later.
+    # The samples at the beginning of this step, at its end, and a step later.
     samples = np.clip([end - 1, end, end + 1], 0, len(pedal) - 1)
 
     # The share of this step in which brake force acts. The share is 1, unless the pedal has only a
-    # part of the first command in this step, and the whole command in the next step: then it is
-    # part / full. Where tyres limit the force, the ratio of the losses of speed is larger than
+    # part of the first command in this step, and the whole command in the next step: then the share
+    # is part / full. Where tyres limit the force, the ratio of the losses of speed is larger than
     # part / full, and says more.
     first_command = trace.brake[
         np.argmax(trace.brake > pedal[0] + PEDAL_ROUNDING, axis=0), vehicles
