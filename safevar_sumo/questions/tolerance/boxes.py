@@ -335,8 +335,8 @@ def cut(
     extents = boxes.extents(failures.cases)
     farthest = boxes.effort.farthest * extents
     distance = np.minimum(clearance * LEAST_MOVE * boxes.width, farthest)
-    # With the rounding error, a cut always excludes its own failure. Without it, the same failure
-    # might be cut off again and again.
+    # A side also ends before the failure by the rounding error. Otherwise the box might still hold
+    # the failure, and the same cut would be repeated for ever.
     ends = np.maximum(extents - distance - ROUNDING * boxes.width, 0.0)
     is_choice = boxes.is_free & (extents > 0)
     # No box holds a failure with infinite extents: it is ignored.
