@@ -270,8 +270,8 @@ class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):
             )
             calm = self.pedals(acceleration, observation.speed, memory.nominal, trim)
 
-        # In a danger the brake adds what the vehicle's own deceleration (felt) lacks to the wanted
-        # one (mean).
+        # In a danger the driver brakes for the difference between the wanted deceleration (`mean`)
+        # and the deceleration that the vehicle has by itself (`felt`).
         mean, felt, intended = _decelerations(
             observation, memory, danger, is_endangered, aware_time
         )
