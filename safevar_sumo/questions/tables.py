@@ -1,5 +1,5 @@
-"""The tables of answers: frames with units and meanings, and how readers see these tables as text,
-HTML and LaTeX.
+"""The tables of answers: data frames with the unit and the meaning of each column. Readers see a
+table as text on the terminal, as HTML or as LaTeX.
 """
 
 from __future__ import annotations
@@ -22,14 +22,16 @@ from safevar_sumo.terminal import WholeTable
 
 LOW = "_low"
 HIGH = "_high"
-"""Ends of the names of two columns that hold the ends of the interval of a third column."""
+"""Suffixes of column names. The columns `x_low` and `x_high` hold the ends of the interval of the
+column `x`.
+"""
 LONG_TEXT = 60
-"""Longer texts stand below a table on the terminal, unless a column of `LEAST_TEXT` has room
-[characters].
+"""Number of characters above which a text is long. On the terminal, long texts stand below their
+table, unless a column of `LEAST_TEXT` characters fits beside the other columns.
 """
 LEAST_TEXT = 36
 MAX_LEAD_ROWS, MAX_LEAD_COLUMNS = 12, 6
-"""Size of the table of one screen."""
+"""Largest number of rows and of columns in the table that one screen shows."""
 LATEX_PREAMBLE = (
     r"% In the preamble: \usepackage[T1]{fontenc} \usepackage{textcomp}"
     r" \usepackage{booktabs} \usepackage{graphicx}"
@@ -44,7 +46,7 @@ LATEX_CODES = str.maketrans(
         "#": r"\#",
         "%": r"\%",
         "_": r"\_",
-        # LaTeX reads these as arguments of the line before.
+        # At the beginning of a row, LaTeX reads [ or * as an argument of \\ in the row before.
         "[": "{[}",
         "]": "{]}",
         "*": "{*}",
@@ -56,9 +58,9 @@ LATEX_CODES = str.maketrans(
 
 
 class Column(NamedTuple):
-    """A column of a table: its unit, its meaning, how its numbers are written for readers, whether
-    readers see it or JSON and CSV alone have it, its heading, by default its name, and whether one
-    screen leaves it to the details.
+    """A column of a table. `number_format` is the format in which readers see its numbers.
+    `is_shown` is False for a column that only JSON and CSV have. `head` is the heading, by default
+    the column's name. `is_detail` is True for a column that the table of one screen leaves out.
     """
 
     unit: str = ""
@@ -70,15 +72,17 @@ class Column(NamedTuple):
 
 
 Columns = dict[str, Column | str]
-"""Columns by name; a text is the meaning of one without a unit."""
+"""Columns by name. A text stands for a column without a unit: the text is its meaning."""
 Rows = Sequence[tuple[Any, ...]]
 """The rows of a table."""
 
 
 class Wide(NamedTuple):
-    """How readers see a long table: one for each column of `values`, or pair of columns that hold
-    the ends of an interval, in which a row stands for each combination of `labels` and a column for
-    each value of `by`, which stands in its `head`.
+    """How readers see a long table: as wide tables, one table for each name in `values`.
+
+    Each combination of the values of the columns `labels` is a row of a wide table. Each value of
+    the column `by` is a column, whose heading is the template `head` with this value. The cells are
+    the values of the column x, or of x_low and x_high, for the name x in `values`.
     """
 
     labels: Sequence[str]
@@ -95,14 +99,16 @@ class AnswerTable:
     ----------
     frame
         The rows.
+    wide
+        How readers see the table; None if readers see the rows as they are.
     words
-        What readers see in place of the texts that are its keys.
+        A text for readers by the text that stands in the cell.
     lead_rows
-        The places of the rows that one screen shows, the most important first; by default all.
+        Positions of the rows that one screen shows, the most important row first; () for all rows.
     shown_whole
-        The number of rows up to which one screen shows all of them.
+        If the table has at most this number of rows, one screen shows all of them.
     bars
-        A bar for each row.
+        A bar for each row, or no bars.
     """
 
     frame: pd.DataFrame
@@ -115,12 +121,12 @@ class AnswerTable:
     bars: Sequence[Bar] = ()
 
     def with_rows(self, frame: pd.DataFrame) -> AnswerTable:
-        """The table with other rows."""
+        """The same table, but with the rows of `frame`."""
         return replace(self, frame=frame)
 
 
 class Frames(dict[str, pd.DataFrame]):
-    """The frames of tables by name; `records` has the tables themselves."""
+    """The data frames of an answer's tables by name; `records` holds the `AnswerTable` objects."""
 
     def __init__(self, records: Mapping[str, AnswerTable]) -> None:
         super().__init__({name: table.frame for name, table in records.items()})
@@ -133,10 +139,8 @@ def tabulate(
     rows: pd.DataFrame | Iterable[Sequence[Any] | dict[str, Any]],
     **layout: Any,
 ) -> AnswerTable:
-    """A table of an answer, whose `layout` are further attributes of `AnswerTable`.
-
-    A column `x` whose interval stands in `x_low` and `x_high` is declared once; `columns` may name
-    the ends, too.
+    """A table of an answer with exactly the columns of `columns`, in this order. `layout` holds
+    further attributes of `AnswerTable`.
     """
     named = {}
     for name, column in columns.items():
@@ -145,14 +149,16 @@ def tabulate(
 
 
 def with_interval(name: str, column: Column) -> dict[str, Column]:
-    """A column and the two that hold the ends of its interval."""
+    """The column `name`, and two columns for the lower and upper end of its interval."""
     low = column._replace(meaning=f"lower end of {name}")
     high = column._replace(meaning=f"upper end of {name}")
     return {name: column, f"{name}{LOW}": low, f"{name}{HIGH}": high}
 
 
 def columns_from(table: Mapping[str, Any]) -> dict[str, Column]:
-    """Columns as a file has them, in order."""
+    """The columns that a TOML table declares. The value of a name is the column's meaning, or a
+    table of attributes of `Column`; there, `interval = true` adds columns for an interval.
+    """
     columns = dict[str, Column]()
     for name, facts in table.items():
         described = {"meaning": facts} if isinstance(facts, str) else dict(facts)
@@ -163,13 +169,13 @@ def columns_from(table: Mapping[str, Any]) -> dict[str, Column]:
 
 
 def shipped_columns(command: str) -> dict[str, dict[str, Column]]:
-    """The columns of a command's tables, by table."""
+    """The columns of a shipped command's tables, by the name of the table."""
     tables = shipped_table("questions/columns.toml")[command]
     return {name: columns_from(table) for name, table in tables.items()}
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON has it, null where undefined."""
+    """A value that JSON can hold; None if the value is undefined or infinite."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -182,8 +188,7 @@ def plain(value: Any) -> Any:
 
 
 def cell_text(value: Any, number_format: str = ".4g") -> str:
-    """A value for readers; `-` where undefined."""
-    # By the kind of value.
+    """A value as a text for readers; `-` if the value is undefined or infinite."""
     value = plain(value)
     if value is None:
         return "-"
@@ -210,13 +215,13 @@ def cell_text(value: Any, number_format: str = ".4g") -> str:
 
 
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
-"""How cells begin that a spreadsheet calculates."""
+"""A spreadsheet reads a cell that begins with one of these characters as a formula."""
 SIGNED = re.compile(rf"{NUMBER_PATTERN}|[+-]inf")
 
 
 def csv_cell(value: Any) -> Any:
-    """A value as CSV has it: a list as words, and an apostrophe before a text that a spreadsheet
-    would calculate.
+    """A value for a CSV file. A list becomes words with blanks between them. A text that a
+    spreadsheet would calculate as a formula gets an apostrophe in front.
     """
     if isinstance(value, list):
         value = " ".join(map(str, value))
@@ -228,8 +233,8 @@ def csv_cell(value: Any) -> Any:
 
 
 def reader_tables(name: str, table: AnswerTable) -> Iterator[tuple[str, AnswerTable]]:
-    """The tables that readers see in place of a table, by name: itself, or those that `Wide`
-    describes.
+    """Yield the name and the table of each table that readers see in place of `table`: the table
+    itself, or the wide tables that `table.wide` describes.
     """
     frame = table.frame
     columns = table.columns
@@ -238,7 +243,7 @@ def reader_tables(name: str, table: AnswerTable) -> Iterator[tuple[str, AnswerTa
         yield name, table
         return
 
-    # A table for each value, with a column for each head.
+    # Make a table for each name in `values`, with one or two columns for each value of `by`.
     heads = frame[wide.by].unique()
     for value in wide.values:
         ends = ("",) if value in frame else (LOW, HIGH)
@@ -249,14 +254,14 @@ def reader_tables(name: str, table: AnswerTable) -> Iterator[tuple[str, AnswerTa
             text = table.words.get(str(head), wide.head.format(head))
             reader_heads[f"{text}{end}"] = column._replace(unit="")
 
-        # A row for each combination of labels.
+        # Make a row for each combination of the labels' values; a missing cell is NaN.
         rows = []
         for labels, group in frame.groupby(list(wide.labels), sort=False):
             by_head = group.set_index(wide.by)[value_columns].reindex(heads)
             rows.append((*labels, *by_head.to_numpy().ravel()))
         heading = table.title
         if len(wide.values) > 1:
-            # A pair of columns differs in the first word: lowest and highest value.
+            # The meanings of a pair of columns differ in the first word: the heading names both.
             meanings = [columns[name].meaning.partition(" ") for name in value_columns]
             beginnings, _, endings = zip(*meanings, strict=True)
             heading += f": {' and '.join(beginnings)} {endings[0]}"
@@ -267,8 +272,8 @@ def reader_tables(name: str, table: AnswerTable) -> Iterator[tuple[str, AnswerTa
 
 
 class _ReaderColumn(NamedTuple):
-    """A column as a reader sees it: columns of the frame, its heading with the unit, its meaning,
-    and texts.
+    """A column as a reader sees it. `names` are the columns of the frame that it shows: a value,
+    the ends of an interval, or both. `head` is the heading with the unit; `texts` are the cells.
     """
 
     names: list[str]
@@ -279,13 +284,13 @@ class _ReaderColumn(NamedTuple):
 
     @property
     def is_long(self) -> bool:
-        """Whether its texts are too long for a narrow table."""
+        """Whether a text of the column is too long for a narrow table."""
         return max(map(len, self.texts), default=0) > LONG_TEXT
 
 
 def reader_columns(table: AnswerTable) -> Iterator[_ReaderColumn]:
-    """The columns of a table for readers: an interval stands behind its value unless that is exact,
-    or alone.
+    """Yield the columns of a table as readers see them: a value and its interval in one column,
+    such as `3 (2 to 4)`. The text is the value alone if the interval has no width.
     """
     frame = table.frame
     for name in map(str, frame):
@@ -313,7 +318,9 @@ def reader_columns(table: AnswerTable) -> Iterator[_ReaderColumn]:
 
 
 def _texts_of(table: AnswerTable, name: str, ends: list[str]) -> list[str]:
-    """The cells of a column for readers, with the interval between its ends if there is one."""
+    """The cells of the column `name` as texts for readers. If the frame has the columns `ends`, the
+    texts have the interval between them.
+    """
     frame = table.frame
     number_format = table.columns[name].number_format
     texts = []
@@ -333,8 +340,9 @@ def _texts_of(table: AnswerTable, name: str, ends: list[str]) -> list[str]:
 
 
 def lead_table(table: AnswerTable, max_rows: int) -> AnswerTable:
-    """The rows and columns of a table that one screen shows: at most so many of the most important
-    rows, and no column that says the same in each of them, or nothing.
+    """The part of a table that one screen shows: at most `max_rows` of the most important rows, and
+    at most `MAX_LEAD_COLUMNS` columns. A column is left out if all its cells are equal, undefined
+    or 0. The first column stays in a table of several rows, because it names the rows.
     """
     rows = table.lead_rows or range(len(table.frame))
     lead = table.frame.iloc[list(rows)[:max_rows]]
@@ -352,7 +360,7 @@ def lead_table(table: AnswerTable, max_rows: int) -> AnswerTable:
 
 
 def _interval_text(low: Any, high: Any, number_format: str) -> str:
-    """An interval, of which an end may be missing, for readers."""
+    """An interval as a text for readers. An end may be undefined: `from 2`, `up to 4`, or `-`."""
     texts = cell_text(low, number_format), cell_text(high, number_format)
     if low == high:
         return texts[0]
@@ -361,10 +369,10 @@ def _interval_text(low: Any, high: Any, number_format: str) -> str:
 
 
 def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str]:
-    """The table; columns that do not fit stand in further tables, in which the first columns of
-    text are repeated, and long texts in lines of their own.
+    """Yield a table for a terminal of `width` characters as tables and lines. If the columns do not
+    fit beside each other, several tables share the columns. Each of these tables begins with the
+    columns of text that name the rows. Long texts stand below the tables, a line for each row.
     """
-    # Long texts stand below a table.
     all_columns = list(reader_columns(table))
     columns = list[_ReaderColumn]()
     long_columns = list[_ReaderColumn]()
@@ -384,7 +392,8 @@ def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str
         columns = all_columns
         long_columns = []
 
-    # Blocks that fit into the width, each with the labels.
+    # Each block fits into the width, and begins with the labels: the columns of text before the
+    # first column of numbers.
     labels = list(takewhile(lambda column: not column.is_number, columns))
     if 1 + sum(map(_least_width, labels)) > width:
         labels = labels[:1]
@@ -395,7 +404,6 @@ def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str
             blocks.append(list(labels))
         blocks[-1].append(column)
 
-    # Bars, blocks, and long texts.
     bars = [bar.blocks for bar in table.bars]
     if bars and columns:
         yield WholeTable(
@@ -413,16 +421,16 @@ def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str
 
 
 def _least_width(column: _ReaderColumn) -> int:
-    """The width of a column whose words are whole, with a line beside it [characters]."""
+    """The least width of a column that breaks no word, with a line beside it [characters]."""
     words = " ".join([column.head, *column.texts]).split()
     return 1 + max(map(len, words), default=0)
 
 
 def html_table(table: AnswerTable) -> str:
-    """A table with a caption, in which a screen reader finds the headings; texts have the class
-    `label`.
+    """A table as HTML with a caption; "" without rows or columns. The cells of columns of text have
+    the CSS class `label`.
     """
-    # Heads and cells, with the head that a phone shows beside each cell.
+    # Each cell states its heading in `data-head`: on a phone the heading stands beside the cell.
     heads = ""
     rows = [""] * len(table.frame)
     for column in reader_columns(table):
@@ -432,7 +440,6 @@ def html_table(table: AnswerTable) -> str:
         for row, text in enumerate(column.texts):
             rows[row] += f'<td{css} data-head="{head}">{escape(text)}</td>'
 
-    # Bars in a column of their own.
     if not heads or not rows:
         return ""
     title = escape(table.title)
@@ -453,8 +460,7 @@ def html_table(table: AnswerTable) -> str:
 
 
 def latex_table(label: str, table: AnswerTable) -> str:
-    """A booktabs table that fits into the line."""
-    # Cells and columns by kind.
+    """A table as LaTeX with the package booktabs, shrunk if it is wider than a line."""
     readable = pd.DataFrame()
     alignment = ""
     for column in reader_columns(table):
