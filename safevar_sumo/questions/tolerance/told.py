@@ -1,4 +1,6 @@
-"""What was found about limits, and what is told about it: which templates, and what fills them."""
+"""The sentences of an answer about limits. `Told` derives facts from the limits that were found;
+functions choose the templates of sentences, and fill them with these facts.
+"""
 
 from __future__ import annotations
 
@@ -38,15 +40,13 @@ from safevar_sumo.study import Study, unit_text
 from safevar_sumo.vehicles import Characteristic
 
 MOST_LIMITS = 3
-"""Number of joint limits up to which a sentence names all."""
+"""Largest number of joint limits that a sentence names."""
 DECIMALS = 3
-"""Decimals of limits beyond those that are printed: further ones are rounding errors."""
+"""Decimals of a joint limit beyond its printed decimals: further decimals are rounding errors."""
 
 
 class InRanges(NamedTuple):
-    """The searches for counterexamples in the ranges of a study, by the number of the parameter
-    set.
-    """
+    """The searches (by the number of the parameter set) for counterexamples in a study's ranges."""
 
     task: Asked
     unsafe: Unsafe
@@ -55,16 +55,21 @@ class InRanges(NamedTuple):
 
 @dataclass(frozen=True)
 class Told:
-    """What was found, and how it is told.
+    """The limits that were found, and the facts that sentences and tables state about them.
 
     Attributes
     ----------
     columns
-        The columns of the characteristics that vary.
+        The columns of the characteristics whose limits the user asks for.
+    original
+        The evaluations of the original vehicle.
     has_scan
         Whether enough values were simulated to state limits alone.
+    at_tests
+        Whether limits cover only the listed test cases.
     up_to, tests_left_out
-        Where the study was cut, and the names of the tests above.
+        The value above which encounters were left out, such as a speed; None without such a value.
+        The names of the tests that were left out completely.
     """
 
     task: Asked
@@ -80,7 +85,7 @@ class Told:
 
     @property
     def study(self) -> Study:
-        """The study."""
+        """The study of the first model."""
         return self.own.evaluator.study
 
     @property
@@ -90,7 +95,7 @@ class Told:
 
     @cached_property
     def scope(self) -> str:
-        """What the limits cover."""
+        """The tests and encounters that the limits cover, in words."""
         return scope_of(self.study, between=not self.at_tests)
 
     @property
@@ -105,7 +110,9 @@ class Told:
 
     @cached_property
     def box(self) -> Box | None:
-        """The joint limits; none of few simulations if they leave a characteristic no room."""
+        """The joint limits; None if no box was found. A box in which a characteristic cannot change
+        does not count if only few simulations were done.
+        """
         sides = self.limits.sides
         if sides is None or (self.without_room and not self.has_scan):
             return None
@@ -122,7 +129,7 @@ class Told:
         return [self.members[column].short_name for column in closed.tolist()]
 
     def box_of(self, sides: FloatArray) -> Box:
-        """A box of vehicles as it is printed."""
+        """The box of vehicles with these sides; its ends are rounded, except specified limits."""
         vehicle = self.task.oracle.vehicle
         boxes = self.limits.boxes
         ends = np.stack(boxes.ends(sides))
@@ -135,7 +142,10 @@ class Told:
         return Box(self.own.evaluator.region, lower, upper)
 
     def failure(self, case: FloatArray, box: Box | None = None) -> Failure | None:
-        """How a case fails, with the values that are printed; those within a box stay there."""
+        """How a case fails, with values that are rounded for readers. With a `box`, the rounded
+        values stay in the box. The result is None if no rounded values fail, or if there are too
+        few simulations left to test them.
+        """
         if self.task.oracle.available < len(FURTHER_DIGITS):
             return None
         model, setting = self.task.oracle.setting(case)
@@ -145,7 +155,9 @@ class Told:
 
     @cached_property
     def failures(self) -> Mapping[int, Failure]:
-        """How the vehicle fails just beyond a limit, by column: beyond the joint one, or alone."""
+        """How the vehicle fails just beyond a limit, by column. The limit is the joint limit, or
+        the limit alone if there are no joint limits.
+        """
         breaches = self.limits.breaches
         if self.box is None:
             breaches = self.limits.alone.breaches
@@ -159,12 +171,14 @@ class Told:
         return failures
 
     def _change(self, breach: tuple[Side, FloatArray]) -> float:
-        """How far a case beyond a side is from the original."""
+        """How much a case beyond a side changes the side's characteristic, in its unit."""
         (_, column), case = breach
         return abs(float(case[column] - self.task.original[column]))
 
     def alone(self, column: int) -> tuple[float, float] | tuple[None, None]:
-        """What is safe alone, rounded inwards; nothing where it was not scanned."""
+        """The limits of a characteristic alone, rounded inwards; None if they were not searched, or
+        if the original vehicle is unsafe.
+        """
         if not (self.is_safe and self.has_scan):
             return None, None
         low = self._feasible(column, self.limits.alone.lower[column])
@@ -172,7 +186,7 @@ class Told:
         return self.members[column].rounded_inwards((low, high))
 
     def _feasible(self, column: int, end: float) -> float:
-        """The last value on the way to a limit alone that satisfies the study's constraints."""
+        """The last value from the original to `end` that satisfies the study's constraints."""
         region = self.own.evaluator.region
         start = region.characteristics.original_settings
         setting = start.copy()
@@ -183,12 +197,12 @@ class Told:
         return float(line.safe[0, column])
 
     def specified(self, column: int) -> tuple[float | None, float | None]:
-        """The specified limit."""
+        """The lower and upper specified limit of a characteristic; None without such a limit."""
         low, high = self.task.specification[:, column].tolist()
         return finite_or_none(low), finite_or_none(high)
 
     def outside(self, column: int) -> float:
-        """How far a specified limit is beyond what is safe alone; 0 if it is not."""
+        """How far a characteristic's specified limit is beyond its limit alone; 0 if it is not."""
         alone = self.limits.alone
         ends = float(alone.lower[column]), float(alone.upper[column])
         low, high = self.members[column].rounded_inwards(ends)
@@ -197,20 +211,23 @@ class Told:
 
     @cached_property
     def stated(self) -> list[int]:
-        """The columns of the specified limits."""
+        """The columns of the characteristics with specified limits."""
         is_stated = ~np.isnan(self.task.specification).all(axis=0)
         return list(np.flatnonzero(is_stated).tolist())
 
     @cached_property
     def broken(self) -> list[int]:
-        """The columns of the specified limits that are not kept."""
+        """The columns whose specified limits do not hold. If the specified limits together are
+        unsafe, or the original vehicle is unsafe, these are all columns with specified limits.
+        """
         if self.limits.broken or not self.is_safe:
             return self.stated
         return [column for column in self.stated if self._is_broken(column)]
 
     def _is_broken(self, column: int) -> bool:
-        """Whether a specified limit is beyond what is safe alone. A rough search has wide gaps
-        between what is safe and what is not: there an unsafe vehicle must be within the limit.
+        """Whether a specified limit is beyond the limit alone. A rough search leaves a wide gap
+        between the last safe value and the first unsafe one: then the limit is broken only if an
+        unsafe vehicle is within it.
         """
         if not self.is_rough:
             return self.outside(column) > 0
@@ -225,25 +242,25 @@ class Told:
 
     @property
     def attacked(self) -> int:
-        """The number of simulations that searched the joint limits."""
+        """The number of simulations that searched for an unsafe vehicle within the joint limits."""
         return sum(attack.simulated for attack in self.limits.attacks.values())
 
     @property
     def least(self) -> float | None:
-        """The worst that the search found in any parameter set; None without an encounter."""
+        """The worst value that the search of the joint limits found; None without a finite one."""
         return worst_of(self.unsafe, self.limits.attacks)
 
     @property
     def kept(self) -> bool | None:
-        """Whether the specified limits hold, and the original is safe; None if it is not known."""
+        """Whether the specified limits hold; None if only a rough search found no failure."""
         if self.broken or not self.is_safe:
             return False
         return None if self.is_rough else True
 
 
 def value_in(unsafe: Unsafe, fit: int, robustness: float) -> float:
-    """The value of which some robustness is left in a parameter set: a clearance [m], or a metric;
-    a distance to keep is demanded with the study's own alone.
+    """The clearance [m] or the value of a metric that belongs to a robustness in the parameter set
+    number `fit`. Only set 0, the study's own, demands a clearance to keep.
     """
     criterion = unsafe if fit == 0 else replace(unsafe, keep=0.0)
     return criterion.value(robustness)
@@ -252,7 +269,7 @@ def value_in(unsafe: Unsafe, fit: int, robustness: float) -> float:
 def worst_of(
     unsafe: Unsafe, attacks: Mapping[int, Attack | Counterexamples]
 ) -> float | None:
-    """The worst value that searches in some parameter sets found; None without an encounter."""
+    """The worst value that searches found, by parameter set; None without a finite value."""
     pairs = attacks.items()
     values = [value_in(unsafe, fit, attack.least) for fit, attack in pairs]
     finite = [value for value in values if np.isfinite(value)]
@@ -260,7 +277,7 @@ def worst_of(
 
 
 def refusal_in_words(facts: Told) -> str:
-    """Why no limit can be kept."""
+    """The reason for which no limit can be stated: the original vehicle's failure."""
     breach = facts.unsafe.breach_in_words(facts.original)
     return words.ORIGINAL_UNSAFE.format(breach=breach)
 
@@ -295,8 +312,8 @@ def verdict_sentences(
 
 
 def _broken(facts: Told) -> Iterator[Sentence]:
-    """That specified limits do not hold: each that is not safe alone, else all together; and in
-    which parameter sets they fail.
+    """Say that specified limits do not hold. A sentence for each limit that is not safe alone, or
+    else a sentence about all limits together. Then: in which parameter sets they fail.
     """
     yield words.DO_NOT_RELEASE
     outside = [column for column in facts.broken if facts.outside(column) > 0]
@@ -313,7 +330,7 @@ def _broken(facts: Told) -> Iterator[Sentence]:
 
 
 def _together(facts: Told) -> Sentence:
-    """That all specified limits together do not hold."""
+    """Say that all specified limits together do not hold."""
     values = list[str]()
     for column in facts.broken:
         item = facts.members[column]
@@ -327,8 +344,8 @@ def _together(facts: Told) -> Sentence:
 
 
 def _outside(facts: Told, column: int) -> Sentence:
-    """That a specified limit is not safe alone. At the specified value itself the vehicle may be
-    safe; then what fails beyond the limit is said.
+    """Say that a specified limit is not safe alone. The sentence describes a failure at the
+    specified value or, if the vehicle is safe there, at a larger change.
     """
     item = facts.members[column]
     value, event = _failure_outside(facts, column)
@@ -342,7 +359,7 @@ def _outside(facts: Told, column: int) -> Sentence:
 
 
 def _failure_outside(facts: Told, column: int) -> tuple[float, str]:
-    """The value with which the vehicle fails at or beyond a specified limit, and how it does."""
+    """The value of a failure at a specified limit or beyond it, and the failure in words."""
     low, high = facts.specified(column)
     for side, end in enumerate((low, high)):
         unsafe = facts.limits.alone.breaches.get((side, column))
@@ -361,7 +378,7 @@ def _failure_outside(facts: Told, column: int) -> tuple[float, str]:
 
 
 def _nearest(facts: Told, nearest: Rows) -> Iterator[Sentence]:
-    """Which values would hold in place of the specified limits."""
+    """Say which values would be safe in place of the specified limits."""
     names = {item.name: item.short_name for item in facts.members}
     limits = [
         f"{names[str(name)]} {value:.10g}{unit_text(unit)}"
@@ -375,7 +392,7 @@ def _nearest(facts: Told, nearest: Rows) -> Iterator[Sentence]:
 
 
 def _joint(facts: Told, box: Box) -> Iterator[Sentence]:
-    """The joint limits, and what was found within them."""
+    """State the joint limits, and the result of the search within them."""
     if not facts.stated:
         yield from _limits(facts, box)
     elif facts.limits.broken:
@@ -394,7 +411,7 @@ def _joint(facts: Told, box: Box) -> Iterator[Sentence]:
     yield _tested(facts.unsafe, holding)
     yield from _undecidable(facts, box)
     for model in facts.task.exclusions:
-        # Its words name the test and the parameter set.
+        # The failure's words name the test and the parameter set.
         described = describe(model, {"": model.characteristics.original})
         event = words.SOME_UNSAFE
         if described:
@@ -408,7 +425,7 @@ def _joint(facts: Told, box: Box) -> Iterator[Sentence]:
 
 
 def _limits(facts: Told, box: Box) -> Iterator[Sentence]:
-    """The joint limits of the characteristics that have some room; in the table if many have."""
+    """State the joint limits or, if they are many, their number: the table has the limits."""
     texts = [
         limit_in_words(facts, box, column)
         for column in facts.columns
@@ -424,7 +441,7 @@ def _limits(facts: Told, box: Box) -> Iterator[Sentence]:
 
 
 def limit_in_words(facts: Told, box: Box, column: int) -> str:
-    """A joint limit, such as `payload at 500 kg or less`; empty if all the domain is safe."""
+    """A joint limit, such as `payload at 500 kg or less`; "" if the whole domain is safe."""
     item = facts.members[column]
     low = float(box.lower[column])
     high = float(box.upper[column])
@@ -434,7 +451,7 @@ def limit_in_words(facts: Told, box: Box, column: int) -> str:
 
 
 def _no_box(facts: Told) -> Iterator[Sentence]:
-    """That no joint limits were found."""
+    """Say that no joint limits were found, and why."""
     if facts.stated and not facts.is_rough:
         yield words.SPECIFIED_ALONE
     boxes = facts.limits.failures.boxes
@@ -451,8 +468,8 @@ def _no_box(facts: Told) -> Iterator[Sentence]:
 
 
 def _tested(unsafe: Unsafe, fits: int) -> Sentence:
-    """What every vehicle within limits did that hold in some parameter sets: with others than the
-    study's own, no distance is demanded.
+    """Say what every tested vehicle within the limits did. `fits` is the number of parameter sets
+    in which the limits hold. Only the study's own set demands a clearance to keep.
     """
     if not unsafe.keep:
         return words.SAFE(unsafe=unsafe.description)
@@ -462,7 +479,7 @@ def _tested(unsafe: Unsafe, fits: int) -> Sentence:
 
 
 def _undecidable(facts: Told, box: Box) -> Iterator[Sentence]:
-    """Which limits a workshop cannot decide."""
+    """Say which limits a workshop cannot check, because it measures less exactly than needed."""
     ends = zip(facts.members, box.lower.tolist(), box.upper.tolist(), strict=True)
     vague = [item for item, low, high in ends if not item.is_decidable(low, high)]
     if vague:
@@ -470,9 +487,7 @@ def _undecidable(facts: Told, box: Box) -> Iterator[Sentence]:
 
 
 def _alone(facts: Told) -> Iterator[Sentence]:
-    """Which characteristics can make the vehicle unsafe on their own, of those that were asked
-    about.
-    """
+    """Say which characteristics can make the vehicle unsafe alone, of those in `facts.columns`."""
     limited = {column for _, column in facts.limits.alone.breaches}
     names = [
         facts.members[column].short_name
