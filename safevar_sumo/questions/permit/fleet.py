@@ -1,5 +1,6 @@
-"""The list of cars of `permit`: a file, a frame, a mapping or typed values become vehicle settings;
-whatever cannot be read without doubt is refused before anything is simulated.
+"""Reads the list of cars that `permit` is asked about: a CSV file, a data frame, a mapping or typed
+values become vehicle settings. A value that might be read in two ways is refused before anything is
+simulated.
 """
 
 from __future__ import annotations
@@ -27,48 +28,53 @@ from safevar_sumo.study import Study
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet, region_of
 
 CAR = "car"
-"""Natural header of the column that names the cars, which the answer has, too."""
+"""Usual header of the column that names the cars, also in the answer."""
 ROUGH = "rough"
 YES = "yes"
-"""The column of an answer that says whether it is rough, and its text then."""
+"""The answer's column that says whether the answer is rough, and the text of a rough answer."""
 NEW = "new"
-"""Value of `--others`: a characteristic without a value is as in the original vehicle."""
+"""Value of `--others`: a characteristic without a value has the original vehicle's value."""
 TYPED = "--set"
 THIS_CAR = "This car"
-"""The option of typed values, and the name of the car that has them."""
+"""The option with which a user types the values of one car, and the name of this car."""
 SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma"}
-"""Separators of columns: the first one that the header has outside of quotation marks is meant."""
+"""Separators of columns, in order of preference: a file's separator is the first of these that its
+header has outside of quotation marks.
+"""
 SEPARATOR_LINE = re.compile(r"sep=(.)\r?\n", re.IGNORECASE)
-"""First line of a file by which Excel knows the separator."""
+"""A first line that states the separator, as Excel writes it."""
 NUMBERS = {
     ".": re.compile(NUMBER_PATTERN, re.ASCII),
     ",": re.compile(NUMBER_PATTERN.replace(r"\.", ","), re.ASCII),
     ";": re.compile(rf"(?![+-]?[1-9]\d{{0,2}}\.\d{{3}}$){NUMBER_PATTERN}", re.ASCII),
 }
-"""Numbers by their decimal mark; between semicolons 1.250 means 1250 as often as 1.25."""
+"""The form of a number by the file's decimal mark. The key ";" is for a file with semicolons
+between its columns and without decimal commas. In such a file 1.250 is refused, because it may mean
+1250 or 1.25.
+"""
 MARKS = {
     ".": "a decimal point (a decimal comma is read only with semicolons between the columns)",
     ",": "a decimal comma, as others of the file",
     ";": "a decimal comma, or with a point that cannot be one of thousands",
 }
-"""These marks in words."""
+"""The decimal marks of `NUMBERS` in words."""
 
 
 class Fleet(NamedTuple):
-    """The cars of a list, in its order.
+    """The K cars of a list, in the order of the list.
 
     Attributes
     ----------
     names
         Names of the cars.
     settings
-        Values of all characteristics of the vehicle, in the study's order, shape (K, n).
+        Values of the n characteristics of the vehicle, in the study's order, shape (K, n).
     measured
-        Which of them the list states, shape (K, n).
+        Which of these values the list states, shape (K, n).
     table
         The list as it was given: all columns, as text.
     is_rough
-        Whether the list is a rough answer.
+        Whether the list is the file of a rough answer.
     """
 
     names: list[str]
@@ -79,8 +85,8 @@ class Fleet(NamedTuple):
 
 
 class _Cells(NamedTuple):
-    """A list as text: the place of its header and of each row in errors, and the separator of its
-    columns, empty if it is no file.
+    """The cells of a list as text. `place` and `places` say in errors where the header and each row
+    are. `separator` is the separator of a file's columns; "" without a file.
     """
 
     place: str
@@ -107,24 +113,25 @@ def read_fleet(
     vehicle
         The characteristics of the study's vehicle.
     cars
-        A CSV file, a frame, or a mapping from a car's name to its values by characteristic; None
-        for the car that `values` describe. The first column of file and frame names the car.
+        A CSV file, a data frame, or a mapping from a car's name to its values by characteristic;
+        None for the car that `values` describe. The first column of a file or frame names the car.
     values
-        Texts NAME=VALUE of one car.
+        Texts NAME=VALUE with the values of one car.
     others
-        "new" for the original's value where a characteristic has no value in the list and under
-        `[unmeasured]`; None to refuse such a list.
+        "new": a characteristic without a value in the list and under `[unmeasured]` of the study
+        has the original's value. None: a list with such a characteristic is refused.
     ignore
         Columns that are not read.
     answer_columns
-        Columns of the answer. A list that has all of them, beside the name of the car, is one that
-        `--out` wrote, and is read without them; no other list has one of these names.
+        Columns of the answer. A list with all these columns, beside the name of the car, was
+        written by `--out`: then these columns are not read. Any other list with one of these
+        columns is refused.
 
     Raises
     ------
     InputError
-        If the list cannot be read, or has unknown columns, values that are no numbers, outside of
-        their domains or missing, cars that are twice or without a name, or cars that violate a
+        If the list cannot be read; if a column is unknown; if a value is missing, no number or
+        outside of its domain; if a car has no name, the name of another car, or violates a
         constraint.
     """
     if others not in (None, NEW):
@@ -141,7 +148,9 @@ def read_fleet(
         cells = _cells_of_file(Path(check_text("cars", cars)))
     if not cells.rows:
         raise InputError(cells.place, "no car", "at least one car")
-    # An answer beside the list that it is about, which may have had semicolons and decimal commas.
+    # A file that `--out` wrote has commas between its columns. The columns of the user's list,
+    # which
+    # the file repeats, may still have decimal commas: hence the separator is ",;".
     written = {*answer_columns} - {CAR}
     is_answer = bool(written) and written <= {text.strip() for text in cells.header}
     if is_answer:
@@ -149,7 +158,6 @@ def read_fleet(
         ignore = [*ignore, *written]
         answer_columns = ()
 
-    # The columns, the names in the first one, and the values.
     naming, columns = _columns(cells, study, vehicle, ignore, answer_columns)
     names = _names(cells, naming)
     settings, measured = _values(cells, columns, vehicle)
@@ -164,8 +172,8 @@ def read_fleet(
 
 
 def list_without_names(path: Path, ignore: Collection[str]) -> bytes:
-    """A file as `read_fleet` reads it, with other names of its cars, and with empty cells in its
-    columns that are ignored.
+    """The list of cars of a file without private data: the cars are called `car 1`, `car 2` and so
+    on, and the cells of ignored columns are empty. `read_fleet` reads the same values in it.
     """
     cells = _cells_of_file(path)
     is_read = [text.strip() not in ignore for text in cells.header]
@@ -181,8 +189,7 @@ def list_without_names(path: Path, ignore: Collection[str]) -> bytes:
 
 
 def _cells_of_file(path: Path) -> _Cells:
-    """The cells of a CSV file, as Excel and others write it; `places` are numbers of lines."""
-    # A text in UTF-8.
+    """The cells of a CSV file. The places are the file's name with the number of a line."""
     try:
         content = read_file(path)
         text = content.decode("utf-8-sig")
@@ -198,7 +205,7 @@ def _cells_of_file(path: Path) -> _Cells:
             'UTF-8; in Excel: save as "CSV UTF-8"',
         ) from None
 
-    # The separator, by Excel's first line or by the header.
+    # The separator is stated by Excel's first line, or else guessed from the header.
     stated = SEPARATOR_LINE.match(text)
     lines = io.StringIO(text[stated.end() :] if stated else text, newline="")
     skipped = 1 if stated else 0
@@ -214,7 +221,7 @@ def _cells_of_file(path: Path) -> _Cells:
             f"a header with a {', '.join(SEPARATORS.values())} between its columns",
         )
 
-    # Records, each with its first line.
+    # A record with a line break in a cell has several lines: its place is its first line.
     reader = csv.reader(lines, delimiter=separator, strict=True)
     records = list[tuple[int, list[str]]]()
     start = 0
@@ -243,7 +250,7 @@ def _cells_of_file(path: Path) -> _Cells:
 
 
 def _cells_of_frame(frame: pd.DataFrame) -> _Cells:
-    """The cells of a frame, in which a missing value is an empty cell."""
+    """The cells of a data frame. A missing value becomes an empty cell."""
     present = frame.astype(object).where(frame.notna(), None)
     rows = [[*map(_text, row)] for row in present.itertuples(index=False, name=None)]
     places = [f"cars, row {label}" for label in frame.index]
@@ -251,7 +258,9 @@ def _cells_of_frame(frame: pd.DataFrame) -> _Cells:
 
 
 def _cells_of_mapping(cars: Mapping[Any, Any], place: str) -> _Cells:
-    """The cells of a mapping, in which None is an empty cell, as is a value that a car lacks."""
+    """The cells of a mapping from cars to values. A value None becomes an empty cell, and so does a
+    value that only other cars have.
+    """
     for car, values in cars.items():
         if not isinstance(values, Mapping):
             raise InputError(
@@ -267,7 +276,7 @@ def _cells_of_mapping(cars: Mapping[Any, Any], place: str) -> _Cells:
 
 
 def _text(cell: object) -> str:
-    """A value as text, a number with all its digits."""
+    """A value as text; a number has all its digits, and None is ""."""
     if isinstance(cell, Real) and not isinstance(cell, bool):
         return str(int(cell)) if isinstance(cell, Integral) else repr(float(cell))
     return "" if cell is None else str(cell)
@@ -280,9 +289,12 @@ def _columns(
     ignore: Sequence[str],
     answer_columns: Collection[str],
 ) -> tuple[int, dict[int, int]]:
-    """The column that names the cars, and the numbers of characteristics by column."""
+    """The position of the column that names the cars, and, by the position of each other column
+    that is read, the number of its characteristic.
+    """
     with about(cells.place):
-        # Columns that are read, by name and unit; the first one names the cars.
+        # A header is a name, or a name with a unit, such as `mass [kg]`. The first column that is
+        # read must not be a characteristic: the list would lack the names of the cars.
         header = [text.strip() for text in cells.header]
         for name in ignore:
             check_name("", f"--ignore {name}: there is no such column", name, header)
@@ -303,7 +315,7 @@ def _columns(
                 "", f"{problem}{looks}", "a first column that names the car"
             )
 
-        # Each name once, and none that means something else.
+        # Refuse a name that is there twice, or means something else than a characteristic.
         varied = {*study.ranges}.union(*map(study.axes_of, study.tests))
         for column, name in enumerate(names):
             if names.count(name) > 1:
@@ -329,7 +341,9 @@ def _columns(
 
 
 def _characteristic(name: str, header: str, vehicle: CharacteristicSet) -> int:
-    """The number of the characteristic that a column's header names, with its unit or none."""
+    """The number of the characteristic that a column's header names. If the header states a unit,
+    this must be the characteristic's unit.
+    """
     problem = f"the column {header!r} is no characteristic"
     check_name("", problem, name, vehicle.names, "; --ignore leaves a column out")
     number = vehicle.names.index(name)
@@ -343,7 +357,7 @@ def _characteristic(name: str, header: str, vehicle: CharacteristicSet) -> int:
 
 
 def _names(cells: _Cells, naming: int) -> list[str]:
-    """The names of the cars."""
+    """The names of the cars. A name that is not printable, or that another car has, is refused."""
     places = dict[str, str]()
     names = [row[naming].strip() for row in cells.rows]
     for name, place in zip(names, cells.places, strict=True):
@@ -354,7 +368,7 @@ def _names(cells: _Cells, naming: int) -> list[str]:
                     f"{name!r} is no name of a car",
                     "a text of one line that does not begin with =, +, - or @, as formulas do",
                 )
-            # Names that differ in case, blanks or the form of their characters are one.
+            # Names are equal if they differ only in case, blanks or the form of their characters.
             key = " ".join(unicodedata.normalize("NFKC", name).casefold().split())
             if key in places:
                 legal = f"a name that no other car has ({places[key]})"
@@ -366,9 +380,11 @@ def _names(cells: _Cells, naming: int) -> list[str]:
 def _values(
     cells: _Cells, columns: Mapping[int, int], vehicle: CharacteristicSet
 ) -> tuple[FloatArray, BoolArray]:
-    """The values of all cells, nan where one is empty, and which cells have one."""
-    # Commas are decimal marks of the whole file where semicolons separate its columns, and in an
-    # answer about such a file.
+    """The values of K cars, shape (K, n), with NaN for an empty cell or a missing column; and which
+    values the list states, shape (K, n).
+    """
+    # A decimal comma is possible if semicolons separate the columns, or once did so (",;"). Then a
+    # single number with a comma shows that the whole file has decimal commas.
     stated = [row[column].strip() for row in cells.rows for column in columns]
     has_commas = any("," in text and NUMBERS[","].fullmatch(text) for text in stated)
     mark = ";" if cells.separator == ";" else "."
@@ -392,15 +408,17 @@ def _values(
 
 
 def _number(text: str, mark: str, item: Characteristic) -> float:
-    """The value of a cell; refuses what is no number with the decimal mark, or outside of the
-    domain.
+    """The value of a cell. A text that is no number with the decimal mark `mark` (a key of
+    `NUMBERS`), or a value outside of the characteristic's domain, is refused.
     """
     domain = f"a number in [{item.lower:g}, {item.upper:g}]{item.suffix}"
     if not NUMBERS[mark].fullmatch(text):
         raise InputError("", f"{text!r} is no number with {MARKS[mark]}", domain)
     value = float(text.replace(",", "."))
     if item.is_legal(value, beyond=False):
-        # Beyond the domain no vehicle is driven.
+        # The true value differs from the measured one by up to the measuring error. It must lie in
+        # the domain, too, because no vehicle is simulated beyond it. An end that is the original's
+        # value is exempt.
         if all(
             np.round(abs(value - end), 12) >= item.error
             for end in {item.lower, item.upper} - {item.original}
@@ -412,7 +430,8 @@ def _number(text: str, mark: str, item: Characteristic) -> float:
             f"{domain}, also by that",
         )
 
-    # A part may be measured better than that of a new car, where that is an end of the domain.
+    # If the new car's value is the upper end of the domain, a part may be measured as better than
+    # new. The user may enter the new car's value then.
     problem = (
         f"{value:{EXACT}} is outside {item.lower:g} to {item.upper:g}{item.suffix}"
     )
@@ -420,7 +439,8 @@ def _number(text: str, mark: str, item: Characteristic) -> float:
         raise InputError(
             "", problem, f"{domain}; at most {item.upper:g}: enter {item.upper:g}"
         )
-    # Any other value may be of another unit, with which no end of the domain is its advice.
+    # Any other value may have another unit, such as percent. Then the message recommends no end of
+    # the domain.
     is_share = not item.suffix and item.is_legal(value / 100, beyond=False)
     unit = "percent" if is_share else "of another unit"
     raise InputError("", f"{problem}: is this {unit}?", domain)
@@ -433,8 +453,9 @@ def _completed(
     vehicle: CharacteristicSet,
     others: str | None,
 ) -> FloatArray:
-    """Settings with the study's values of what was not measured, then the original's if the user
-    says so; whatever still lacks a value is refused.
+    """Settings in which a missing value (NaN) is replaced by the value under [unmeasured] of the
+    study, or else, with `others` = "new", by the original's value. Settings in which a value is
+    still missing are refused.
     """
     unmeasured = study.unmeasured_values
     stated = np.array([unmeasured.get(name, np.nan) for name in vehicle.names])
@@ -460,7 +481,9 @@ def _completed(
 def _check_constraints(
     cells: _Cells, settings: FloatArray, study: Study, vehicle: CharacteristicSet
 ) -> None:
-    """Refuse a car that violates a constraint among the vehicle's characteristics."""
+    """Refuse a car that violates a constraint of the study in which only characteristics of the
+    vehicle occur.
+    """
     with about(study.source):
         region = region_of(study)
     names = {*vehicle.names}
