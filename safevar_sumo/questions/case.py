@@ -1,5 +1,5 @@
-"""The results of one study, which all questions read: solutions by algorithm and run, and the
-metrics of the original vehicle.
+"""A case holds the results of one study: the solutions by algorithm and run, and the metrics of the
+original vehicle. All questions read cases.
 """
 
 from __future__ import annotations
@@ -32,12 +32,14 @@ from safevar_sumo.vehicles import CharacteristicSet
 NSGA2 = "nsga2"
 """The algorithm that RQ2 compares with the others, and whose solutions RQ3 analyses."""
 OF_ALGORITHMS = ("titles", "stop_by_themselves")
-"""What a manifest says of algorithms."""
+"""Keys of a manifest (the description of a results directory) whose values become attributes of a
+case, although they may be missing.
+"""
 ALGORITHM_TITLES = {"nsga2": "NSGA-II", "rs": "RS", "safe_fuzzer": "SafeFuzzer"}
 
 
 class UnanswerableError(InputError):
-    """The results lack the data for a question."""
+    """The results lack the data that a question needs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,22 +54,24 @@ class Case:
         The study as it was run.
     original
         The original vehicle's metrics by name; NaN where undefined.
-    solutions, evaluations
-        Frames that `safevar_sumo.results.load_runs` returns.
+    solutions
+        The vehicles that the searches returned, as `safevar_sumo.results.load_runs` returns them.
+    evaluations
+        All simulated vehicles, as `load_runs` returns them.
     finished_runs
         Algorithm and number of every finished run.
     scoring
-        The metrics and the minimised objectives.
+        The metrics, and the objectives that the search minimises.
     has_runs
         False for imported solutions, whose runs are unknown.
     failures
         Settings that could not be simulated.
     titles
-        Names of algorithms for readers, by label, as far as their classes have them.
+        Names of algorithms for readers, by label. Only algorithms whose class has a name are in it.
     stop_by_themselves
         Labels of algorithms that may end before they have used their budget.
     stated
-        What is unsafe if a user states it.
+        The criterion for unsafe solutions that a user states; None for the default.
     """
 
     name: str
@@ -93,22 +97,28 @@ class Case:
 
     @property
     def settings(self) -> FloatArray:
-        """The original vehicle, then the solutions; shape (1 + M, n)."""
+        """The settings of the original vehicle and of the M solutions, shape (1 + M, n)."""
         solutions = self.solutions[list(self.characteristics.names)].to_numpy(float)
         return np.concatenate([self.characteristics.original_settings, solutions])
 
     @property
     def different_solutions(self) -> pd.DataFrame:
-        """The solutions, of equal ones the first."""
+        """The solutions without duplicates: the first of several equal settings remains."""
         return self.solutions.drop_duplicates(list(self.characteristics.names))
 
     def simulated_as(
         self, study: Study, scoring: Scoring, evaluations: Evaluations
     ) -> Case:
-        """The case of another form of its study, in which its settings have been simulated
-        again.
+        """This case with another study, and with results that were simulated in that study.
+
+        Parameters
+        ----------
+        study, scoring
+            The other study and its metrics.
+        evaluations
+            The evaluations of `settings` in the other study, in the same order.
         """
-        # Columns of the new simulations.
+        # The first evaluation is that of the original vehicle.
         columns = {
             "f_safe": evaluations.f_safe,
             **evaluations.metrics,
@@ -133,21 +143,23 @@ class Case:
 
     @property
     def unsafe(self) -> Unsafe:
-        """The criterion for unsafe solutions, by default that of `Unsafe.default`."""
+        """The criterion for unsafe solutions: the stated criterion, else that of the study, else
+        the default (`Unsafe.default`).
+        """
         if self.stated is None and self.study.unsafe.criterion:
             return Unsafe.parse(self.study.unsafe.criterion)
         return self.stated or Unsafe.default(self.original, self.solutions["outcome"])
 
     @property
     def algorithms(self) -> tuple[str, ...]:
-        """Algorithms that have solutions or a finished run, in the study's order."""
+        """Labels of the algorithms with solutions or a finished run, in the study's order."""
         names = {*self.solutions["algorithm"], *dict(self.finished_runs)}
         in_order = dict.fromkeys([*self.study.search.labels, *sorted(names)])
         return tuple(filter(names.__contains__, in_order))
 
     def original_degrees(self, solutions: pd.DataFrame) -> pd.Series[float]:
-        """The original vehicle's safety degree beside each solution: in the solution's own
-        encounter, where encounters are ranges.
+        """For each solution, the safety degree of the original vehicle. If encounters are ranges,
+        the original vehicle drives in the solution's own encounter.
         """
         if ORIGINAL_DEGREE in solutions:
             return solutions[ORIGINAL_DEGREE]
@@ -155,13 +167,13 @@ class Case:
 
     @property
     def why_no_solution(self) -> str:
-        """Why there is no solution, in words; empty if there is one."""
+        """The reason for which there is no solution, in words; "" if there are solutions."""
         if len(self.solutions):
             return ""
         if not self.finished_runs:
             return "no run is finished"
 
-        # The settings that a search may return, as far as there are any.
+        # A search may return only feasible settings: perhaps no setting is feasible.
         feasible = self.evaluations[self.scoring.feasible_rows(self.evaluations)]
         if feasible.empty:
             return (
@@ -181,7 +193,7 @@ class Case:
         )
 
     def require_solutions(self) -> None:
-        """Raise `UnanswerableError` if there is no solution."""
+        """Refuse results without a solution: raise `UnanswerableError` with the reason."""
         if reason := self.why_no_solution:
             expected = "results with at least one solution"
             if self.has_runs and not self.finished_runs:
@@ -189,7 +201,7 @@ class Case:
             raise UnanswerableError(self.name, f"has no solution: {reason}", expected)
 
     def solutions_of(self, algorithm: str) -> pd.DataFrame:
-        """Pooled solutions of all finished runs of an algorithm.
+        """The solutions of all finished runs of an algorithm in one frame.
 
         Raises
         ------
@@ -206,7 +218,7 @@ class Case:
         return self.solutions[self.solutions["algorithm"] == algorithm]
 
     def runs_of(self, algorithm: str) -> list[int]:
-        """The finished runs of an algorithm.
+        """The numbers of the finished runs of an algorithm, in ascending order.
 
         Raises
         ------
@@ -228,8 +240,8 @@ class Case:
 
     @property
     def shortfall(self) -> str:
-        """Note on unfinished runs, for the readers of every answer about the solutions; empty if
-        there are none.
+        """A note on unfinished runs, which every answer about the solutions shows; "" if all runs
+        are finished, or the runs are unknown.
         """
         finished = self.run_counts
         planned = self.study.search.runs
@@ -270,8 +282,8 @@ Subject = Study | Case
 
 
 def solutions_for_metric(solutions: pd.DataFrame, metric: Measure) -> pd.DataFrame:
-    """The solutions that count for a metric; for TET and TIT only those without collision
-    (docs/method.md, section 4).
+    """The solutions that count for a metric. Some metrics, such as TET and TIT, are compared only
+    over solutions without a collision (docs/method.md, section 4).
     """
     if metric.over_collisions:
         return solutions
@@ -279,19 +291,19 @@ def solutions_for_metric(solutions: pd.DataFrame, metric: Measure) -> pd.DataFra
 
 
 def are_collisions(solutions: pd.DataFrame) -> pd.Series[bool]:
-    """Whether solutions are collisions."""
+    """Whether each solution ended with a collision."""
     return solutions["outcome"] == str(Outcome.COLLISION)
 
 
 def load_cases(directories: Iterable[str | Path]) -> list[Case]:
-    """Read results directories; the names of cases with the same name include their directories.
+    """Read results directories as cases. If several cases have the same name, their names get the
+    directory in brackets.
 
     Raises
     ------
     InputError
-        If a directory holds no results, is damaged or is given twice.
+        If a directory holds no results, is damaged, or is given twice.
     """
-    # Each directory once.
     paths = [Path(check_text("directory", directory)) for directory in directories]
     for path, count in Counter(map(Path.resolve, paths)).items():
         if count > 1:
@@ -299,7 +311,6 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
                 "directories", f"{path} is given twice", "each results directory once"
             )
 
-    # What each directory holds, as a case.
     cases = []
     for path in paths:
         try:
@@ -329,7 +340,6 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
                 "an unchanged directory of the command `study`",
             ) from error
 
-    # Names that tell them apart.
     names = Counter(case.name for case in cases)
     for place, path in enumerate(paths):
         name = cases[place].name
@@ -347,8 +357,12 @@ def build_case(
     scoring: Scoring = PUBLISHED_SCORING,
     **facts: Any,
 ) -> Case:
-    """Put a case together; in `original` an undefined metric is None or missing."""
-    # Columns that all cases of the study have.
+    """Make a case. In `original`, the original vehicle's metrics by name, an undefined metric is
+    None or missing; in the case it is NaN.
+
+    Frames get a column of NaN for each metric and objective that they lack. `facts` are further
+    attributes of `Case`.
+    """
     metrics = NamedValues()
     for metric in scoring.metrics:
         value = original.get(metric.name)

@@ -1,4 +1,7 @@
-"""What a repair is asked: the promised wear, and the parameters of the ADS that may change."""
+"""The problem that a repair solves: which parameters of the ADS (the driving system) may change,
+and
+which worn vehicles (the promise) must then be safe.
+"""
 
 from __future__ import annotations
 
@@ -39,33 +42,37 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import FeasibleRegion
 
 DIGITS = 4
-"""Significant digits of a parameter's changed value, more where its range is small beside it: the
-value that is printed is the one that has been tried.
+"""Significant digits of a parameter's changed value. A parameter whose range is small, compared
+with
+its values, has more digits. Values are rounded before they are tried, so that the printed value is
+the tried value.
 """
 ARRAY_CHECKS = 8
-"""Sets of parameters with which a user's ADS is tried as one for all vehicles."""
+"""Number of parameter sets with which a user's ADS is tried as one object that drives all
+vehicles.
+"""
 BRAKING_STAGE = "full braking"
 ALL = "all"
-"""The promise of the whole domain."""
+"""The text of a promise that is the whole domain."""
 
 
 class Parameter(NamedTuple):
-    """A parameter of the ADS that may change, with its `range` and the value of `today`."""
+    """A parameter of the ADS that may change. `range` has its bounds, `today` its present value."""
 
     name: str
     range: FreeParameter
     today: float
 
     def share(self, value: float) -> float:
-        """Where a value lies in the range, in [0, 1]; of the logarithm if the parameter is
-        logarithmic.
+        """The position of a value in the range: 0 at the lower bound, 1 at the upper bound. The
+        position of a logarithmic parameter is that of the value's logarithm.
         """
         ends = np.array([self.range.lower, self.range.upper, value])
         lower, upper, place = (np.log(ends) if self.range.log else ends).tolist()
         return float((place - lower) / (upper - lower))
 
     def values(self, shares: FloatArray) -> FloatArray:
-        """The rounded values at shares of the range, shape (M,)."""
+        """The rounded values at M positions (`shares`) in the range, shape (M,)."""
         lower = self.range.lower
         upper = self.range.upper
         digits = DIGITS + max(
@@ -82,19 +89,20 @@ class Parameter(NamedTuple):
 
 @dataclass(frozen=True)
 class Promise(Box):
-    """The promised wear: a box in which parameters of the scenario that the study searches take
-    their whole domain.
+    """The promised wear: a box of the worn vehicles that must be safe. Parameters of the scenario
+    that the study varies take their whole domain.
     """
 
     @classmethod
     def of(cls, study: Study, region: FeasibleRegion, texts: Sequence[str]) -> Promise:
-        """The promise that texts such as "treadDepth >= 2" state, or the study's own without any.
+        """The promise that `texts` such as "treadDepth >= 2" state; without texts, the promise of
+        the study.
 
         Raises
         ------
         InputError
-            If a promise cannot be read, names no characteristic, lies outside its domain, or lets
-            nothing wear.
+            If a text cannot be read, its name is no characteristic, its value is outside of the
+            domain, or no characteristic may wear.
         """
         rows = study.domains
         stated = study.repair.promise
@@ -128,8 +136,8 @@ class Promise(Box):
         return cls(region, lower, upper)
 
     def to_dict(self) -> dict[str, list[float]]:
-        """The ends of every characteristic that may wear, and of every parameter of the scenario
-        that varies.
+        """The lower and upper end of every characteristic that may wear, and of every parameter of
+        the scenario that varies, by name.
         """
         names = self.region.characteristics.names
         ends = np.transpose([self.lower, self.upper]).tolist()
@@ -141,8 +149,8 @@ class Promise(Box):
 
     @property
     def in_words(self) -> str:
-        """The worn ends, such as `treadDepth >= 2 mm, brakeTorque >= 0.8`, what is as new, and the
-        encounters.
+        """The promise in words: the limits of wear, such as `treadDepth >= 2 mm`, the values of all
+        characteristics that must be as new, and the encounters.
         """
         ends = self.to_dict()
         characteristics = self.region.characteristics
@@ -179,13 +187,14 @@ class Promise(Box):
 
 
 def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
-    """The parameters that may change: those called `names`, or all under [repair], or those of a
-    shipped ADS.
+    """The parameters of the ADS that may change: the table under [repair] of the study or, without
+    a table, the parameters of a shipped ADS. With `names`, only the parameters with these names.
 
     Raises
     ------
     InputError
-        If there is none, one is unknown, or its bounds exclude the value of today.
+        If no parameter may change, a name is unknown, or a parameter's present value is outside of
+        its bounds.
     """
     source = study.source
     shipped = CHANGEABLE.get(study.ads.model, {})
@@ -235,16 +244,19 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
 class RepairProblem:
     """A study's ADS with P parameters that may change, and the cases of vehicles within a promise.
 
-    Sets of parameters, shape (M, P), are shares of the range from lower to upper bound in [0, 1].
+    A case is a vehicle in an encounter of a world (`oracle`). A change is a set of P values of the
+    parameters, as positions in their ranges: 0 is the lower bound, 1 the upper one. `shares` are M
+    changes, shape (M, P).
 
     Attributes
     ----------
     oracle
-        The worlds of the cases: each test with each parameter set of the vehicle model.
+        Simulates cases in its worlds: each test with each parameter set of the vehicle model.
     budget
-        How many cases search for a counterexample to a change.
+        Number of cases that search for a counterexample to a change.
     drivers
-        Full braking in each world in which it was asked, by its number; None without that driver.
+        Evaluators with the driver that brakes fully at once, by the number of the world; None for
+        a world without this driver. Filled when a world is needed.
     """
 
     oracle: Oracle
@@ -260,7 +272,7 @@ class RepairProblem:
 
     @property
     def unsafe(self) -> Unsafe:
-        """What is unsafe with the study's own parameter set."""
+        """The criterion of an unsafe vehicle with the study's own parameter set."""
         return self.oracle.own.unsafe
 
     @property
@@ -275,14 +287,14 @@ class RepairProblem:
 
     @cached_property
     def today(self) -> FloatArray:
-        """The parameters of today, shape (P,)."""
+        """The present values of the parameters, as positions in their ranges, shape (P,)."""
         return np.array(
             [parameter.share(parameter.today) for parameter in self.parameters]
         )
 
     def values(self, shares: FloatArray) -> FloatArray:
-        """The parameters' values in their units, shape (M, P): today's value where a share is
-        today's.
+        """The values of the parameters in their units, shape (M, P). A position that is today's
+        becomes exactly today's value, without rounding.
         """
         columns = [
             np.where(column == today, parameter.today, parameter.values(column))
@@ -293,7 +305,7 @@ class RepairProblem:
         return np.stack(columns, axis=1)
 
     def changed_values(self, change: FloatArray) -> NamedValues:
-        """The values of the parameters that a change, one set of shape (P,), changes, by name."""
+        """The new values, by name, of the parameters that a change, shape (P,), changes."""
         (values,) = self.values(change[np.newaxis]).tolist()
         pairs = zip(self.parameters, values, strict=True)
         changed = compress(pairs, change != self.today)
@@ -301,9 +313,9 @@ class RepairProblem:
 
     @cached_property
     def arrays(self) -> bool:
-        """Whether one ADS drives vehicles with different parameters: a shipped one, or the user's
-        class if a sample has the same results to the bit; otherwise there is an instance for each
-        set.
+        """Whether one object of the ADS drives vehicles with different parameters, as arrays. A
+        shipped ADS does. A user's class does if a sample has the same results, to the bit, as with
+        an object for each change.
         """
         if self.study.ads.kind or self.study.ads.model in ADS:
             return not self.study.ads.kind
@@ -321,27 +333,31 @@ class RepairProblem:
         return not any(differences(alone.results, together.results))
 
     def _selection(self, arrays: bool) -> Selection:
-        """Settings that end with the parameters' values."""
+        """The selection for rows in which the parameters' values follow the setting."""
         names = tuple(parameter.name for parameter in self.parameters)
         return Selection(parameters=names, arrays=arrays)
 
     def evaluate(
         self, model: Model, shares: FloatArray, settings: FloatArray, stage: str
     ) -> Evaluations:
-        """The evaluations of each of M sets of parameters with each of L settings of a model."""
+        """The M * L evaluations of M changes, each with L settings of a model; settings vary
+        first.
+        """
         values = np.repeat(self.values(shares), len(settings), axis=0)
         rows = np.hstack([np.tile(settings, (len(shares), 1)), values])
         selection = self._selection(self.arrays)
         return model.evaluator.evaluate_selection(rows, selection, stage)
 
     def outcome_today(self, case: FloatArray) -> Evaluations:
-        """How the ADS of today ends with one case."""
+        """The evaluation of a case, shape (n + 1 + k,), with the present ADS."""
         model, setting = self.oracle.setting(case)
         stage = "the driving system of today"
         return self.evaluate(model, self.today[np.newaxis], setting[np.newaxis], stage)
 
     def cases_of(self, settings: FloatArray) -> FloatArray:
-        """Settings of the study as cases with its own parameter set."""
+        """Settings of the study as cases with the study's own parameter set, in the first world and
+        at phase 0.
+        """
         n = self.size
         axes = self.promise.region.characteristics.scenario
         cases = np.zeros((len(settings), n + 1 + self.oracle.places))
@@ -352,8 +368,8 @@ class RepairProblem:
 
     @cached_property
     def new_vehicles(self) -> FloatArray:
-        """The new vehicle in the original encounter, and in those promised ones in which it is
-        least safe of many drawn ones, shape (K, n).
+        """Settings of the new vehicle, shape (K, n): in the original encounter, and in the promised
+        encounters among those in which the new vehicle is least safe.
         """
         original = self.promise.region.characteristics.original
         settings = self.evaluator.critical_encounters
@@ -362,8 +378,9 @@ class RepairProblem:
     def robustness_of_each(
         self, shares: FloatArray, cases: FloatArray, stage: str
     ) -> FloatArray:
-        """What each of M sets of parameters leaves to the limit with each of L cases, shape (M, L):
-        infinite without a conflict, minus infinity if invalid.
+        """The robustness (distance to the limit of the criterion) of L cases with each of M
+        changes, shape (M, L). Minus infinity marks a case without a valid simulation. Infinity
+        marks a case that violates a constraint, or has no conflict.
         """
         robustness = np.zeros((len(shares), len(cases)))
         for number, rows, settings in self.oracle.in_worlds(cases):
@@ -377,18 +394,19 @@ class RepairProblem:
     def robustness_with(
         self, change: FloatArray, cases: FloatArray, stage: str
     ) -> FloatArray:
-        """What one set of parameters leaves to the limit with each of L cases, shape (L,)."""
+        """The robustness of L cases with one change, shape (L,)."""
         return self.robustness_of_each(change[np.newaxis], cases, stage).reshape(-1)
 
     def robustness(
         self, change: FloatArray, cases: FloatArray, stage: str
     ) -> FloatArray:
-        """What cases leave to the limit with one set of parameters, shape (L,); infinite where they
-        do not count, or no driving system keeps them safe.
+        """The robustness of L cases with one change, shape (L,). An unsafe case does not count, and
+        becomes infinity, in an encounter that is not promised, or if no driving system can keep the
+        case safe.
         """
         robustness = self.robustness_with(change, cases, stage)
 
-        # Few cases are unsafe: only there the other drivers are asked.
+        # Whether a case counts takes further simulations: only the few unsafe cases are asked.
         unsafe = np.flatnonzero(robustness < 0)
         is_failure = self.counts(cases[unsafe])
         counted = unsafe[is_failure]
@@ -397,8 +415,8 @@ class RepairProblem:
         return robustness
 
     def counts(self, cases: FloatArray) -> BoolArray:
-        """Which cases are in an encounter that counts, shape (L,): a listed one at any phase, or
-        one in which the ADS of today keeps a new vehicle safe.
+        """Which cases are in an encounter that counts, shape (L,). A listed encounter counts at any
+        phase. Any other encounter counts if the present ADS keeps a new vehicle safe in it.
         """
         is_counted = np.full(len(cases), not self.study.ranges)
         for number, rows, settings in self.oracle.in_worlds(cases):
@@ -412,43 +430,44 @@ class RepairProblem:
         return is_counted
 
     def _is_listed(self, world: CaseWorld, settings: FloatArray) -> BoolArray:
-        """Which settings of a test are in one of its listed encounters."""
+        """Which settings, shape (L, n), are in a listed encounter of the world's test."""
         places = world.listed()
         original = self.oracle.vehicle.original
         listed = world.settings(np.tile(original, (len(places), 1)), places)
 
-        # The phase, if there is one, comes after the axes.
+        # The phase, if the world has one, is the last value of a setting: it is not compared.
         axes = slice(self.size, self.size + world.places - 1)
         is_same = settings[:, np.newaxis, axes] == listed[:, axes]
         return np.asarray(is_same.all(axis=2).any(axis=1))
 
     @cached_property
     def encounters(self) -> FloatArray:
-        """The listed encounters that count, shape (E, 1 + k)."""
+        """The E listed encounters that count, shape (E, 1 + k), as the last numbers of a case."""
         listed = np.unique(self.oracle.listed(), axis=0)
         originals = product_of(self.oracle.vehicle.original[np.newaxis], listed)
         return listed[self.counts(originals)]
 
     def space(self, fit: int) -> Space:
-        """The promised cases with a parameter set."""
+        """The space of the promised cases with the parameter set number `fit`."""
         n = self.size
         return self.oracle.space(fit, self.promise.lower[:n], self.promise.upper[:n])
 
     def with_sets(self, cases: FloatArray, fits: IntArray | int) -> FloatArray:
-        """Cases with other parameter sets."""
+        """The same cases, but with the parameter sets number `fits`."""
         worlds = self.oracle.fits.count(0)
         cases = cases.copy()
         cases[:, self.size] = cases[:, self.size] % worlds + worlds * fits
         return cases
 
     def best_driver(self, model: Model) -> Evaluator | None:
-        """Full braking at the first possible moment; None where it has no approach
-        (`approach_parameters`), and by a bound of a measure, of which it need not be the best.
+        """The evaluator with a driver that brakes fully at the first possible moment. The result is
+        None if this driver cannot approach as the ADS does (`approach_parameters`), or if the
+        criterion bounds a metric, because full braking need not be best for a metric.
         """
         if self.unsafe.bound:
             return None
         system = model.evaluator.system
-        # A vehicle approaches as fast at each phase.
+        # The phase does not change the approach: the system without the phase has one encounter.
         if system.characteristics.scenario.names == (PHASE,):
             system = self.evaluator.system
         approach = approach_parameters(system)
@@ -459,8 +478,8 @@ class RepairProblem:
         return model.evaluator.for_study(study, verified=0)
 
     def repairable(self, cases: FloatArray) -> BoolArray:
-        """Which cases full braking at the first possible moment, or else the ADS of today, keeps
-        safe; all without that driver.
+        """Which cases a driving system can keep safe: a driver that brakes fully at the first
+        possible moment, or the present ADS. In a world without this driver, all cases count.
         """
         is_safe = np.ones(len(cases), dtype=bool)
         for number, rows, settings in self.oracle.in_worlds(cases):
@@ -472,7 +491,8 @@ class RepairProblem:
                 runs = driver.evaluate(settings, BRAKING_STAGE)
                 is_safe[rows] = runs.valid & (model.unsafe.robustness(runs) >= 0)
 
-        # A driver who brakes later may be the better one.
+        # The present ADS may keep a case safe that full braking does not: braking later can be
+        # better.
         robustness = self.robustness_with(self.today, cases[~is_safe], BRAKING_STAGE)
         is_safe[~is_safe] = robustness >= 0
         return is_safe
