@@ -1,5 +1,5 @@
-"""What is better and what is worse in B than in A: limits, needless braking, when the new vehicle
-brakes.
+"""The differences between two versions A and B of a study: what is better and what is worse in B.
+Compared are limits, unsafe vehicles, needless braking, and where the new vehicle begins to brake.
 """
 
 from __future__ import annotations
@@ -45,20 +45,23 @@ SHRUNK = "shrunk"
 BOTH = "both"
 SAME = "the same"
 CHANGES = (SAME, GROWN, SHRUNK, BOTH)
-"""What becomes of an interval: it grows (1), it shrinks (2), or it does both (3)."""
+"""How an interval of A changes in B. The position is a sum: 1 if the interval grows on a side, and
+2 if it shrinks on a side.
+"""
 UNDEFINED = (np.nan, np.nan)
-"""The ends of no interval."""
+"""The ends of an interval that does not exist."""
 MAX_LIMITS_NAMED = 3
 """Maximum number of limits that a sentence names."""
 COMFORT, SAFETY, COLLISION = range(3)
-"""Weights of differences: needless braking, what concerns safety, and new collisions of the
-original vehicle.
+"""Weights of differences, the largest for the most important kind: needless braking (0), safety
+(1),
+and a new collision of the original vehicle (2).
 """
 
 
 class Difference(NamedTuple):
-    """What B does in comparison with A, by a template and what fills it beside the names of both;
-    whether it is better, and how much it weighs.
+    """A difference between the versions A and B. `template` and its `values` give the sentence,
+    together with the names of A and B. `is_better` says whether B is better.
     """
 
     template: Sentence
@@ -70,7 +73,9 @@ class Difference(NamedTuple):
 def summary_of(
     numbers: JsonObject, pairs: pd.DataFrame, titles: Mapping[str, str]
 ) -> AnswerTable:
-    """The table of what is compared: the new car, changed cars, needless braking, and limits."""
+    """The table with a row for each compared quantity, and a column for each version. `numbers` are
+    those of the answer; `pairs` has the safety degrees of A and B.
+    """
     number_in_both = numbers["both"]
     values: JsonObject = {
         "safety degree of the original vehicle [m, or -m/s after a collision]": [
@@ -100,7 +105,9 @@ def summary_of(
 
 
 def compare_counts(counts: Mapping[str, int]) -> Iterator[Difference]:
-    """The settings that are unsafe in one system only."""
+    """The differences by the numbers of settings that are unsafe in one version only. `counts`
+    holds the numbers `only_a_unsafe`, `only_b_unsafe`, `both` and `neither`.
+    """
     for template, name, complement, is_better in (
         (words.SAFE_NOW, "only_a_unsafe", "both", True),
         (words.UNSAFE_NOW, "only_b_unsafe", "neither", False),
@@ -115,7 +122,9 @@ def compare_counts(counts: Mapping[str, int]) -> Iterator[Difference]:
 
 
 def compare_values(p: float, a12: float) -> Iterator[Difference]:
-    """A significant difference of the safety degree over all pairs; p is NaN without pairs."""
+    """The difference of the safety degree over all pairs, if it is significant; p is NaN without
+    pairs. An A12 below 0.5 means that B is better.
+    """
     is_better = a12 < 0.5
     if p < ALPHA:
         higher = "higher" if is_better else "lower"
@@ -129,8 +138,9 @@ def limits_of_both(
     *,
     at_tests: bool,
 ) -> AnswerTable:
-    """The table of limits alone with the study's own set, as in `tolerance`, within the user's
-    limits; no interval where the original is unsafe.
+    """The table of the limits of each characteristic alone, in both versions. The limits are those
+    of `tolerance` with the study's own parameter set, cut to the user's `limits`. A version whose
+    original vehicle is unsafe has no limits.
     """
     vehicles = [side.characteristics.vehicle for side in evaluators]
     requests = list[Asked]()
@@ -138,7 +148,8 @@ def limits_of_both(
         models = Models((Model(0, side, unsafe),), ())
         columns = range(len(vehicle))
         requests.append(asked_of(models, unsafe, columns, {}, at_tests=at_tests))
-    # Few simulations search both alike: what the first one takes does not shrink the second.
+    # The remaining simulations limit the effort. Both versions get the smaller effort: otherwise
+    # different efforts might find different limits.
     effort = min(requests, key=lambda request: request.effort.cases).effort
     alone = [_safe_alone(request._replace(effort=effort)) for request in requests]
     rows = []
@@ -160,7 +171,9 @@ def limits_of_both(
 
 
 def _safe_alone(request: Asked) -> list[Interval | None]:
-    """What is safe of each characteristic alone, rounded inwards; None if the original is not."""
+    """The safe interval of each characteristic alone, rounded inwards; None for all characteristics
+    if the original vehicle is unsafe.
+    """
     model = request.oracle.own
     members = request.oracle.vehicle.members
     if model.are_unsafe(model.characteristics.original_settings, "original vehicle")[0]:
@@ -171,12 +184,12 @@ def _safe_alone(request: Asked) -> list[Interval | None]:
 
 
 def _within(safe: Interval | None, ends: Interval) -> Interval | None:
-    """What is safe alone and between the ends."""
+    """The part of the safe interval that lies between the ends; None without a safe interval."""
     return None if safe is None else (max(safe[0], ends[0]), min(safe[1], ends[1]))
 
 
 def _change_of(a: Interval | None, b: Interval | None) -> str:
-    """What becomes of A's interval in B."""
+    """How A's interval changes in B (`CHANGES`); an interval is None if it does not exist."""
     grows = b is not None
     shrinks = a is not None
     if a and b:
@@ -188,7 +201,9 @@ def _change_of(a: Interval | None, b: Interval | None) -> str:
 def compare_limits(
     limits: pd.DataFrame, members: CharacteristicSet
 ) -> Iterator[Difference]:
-    """The limits that grow, shrink or move and exist in both systems."""
+    """The differences by limits that exist in both versions, and change. An interval that grows on
+    one side and shrinks on the other gives two differences: B is better, and B is worse.
+    """
     exist = limits[limits[["a_low", "b_low"]].notna().all(axis=1)]
     for change, wider, signs in (
         (GROWN, "wider", (True,)),
@@ -209,10 +224,10 @@ def compare_originals(
     originals: Sequence[Evaluations],
     criteria: Sequence[Unsafe],
 ) -> tuple[JsonObject, list[Difference]]:
-    """How both original vehicles end, how often they brake needlessly, and how much earlier B's
-    brakes: the numbers, and what they say.
+    """Compare the original vehicles of A and B: how they end, how often they brake needlessly, and
+    how much earlier B's original vehicle brakes. Returns the numbers of the answer, and the
+    differences.
     """
-    # How both end and brake.
     in_a, in_b = (
         bool(unsafe.of(original)[0])
         for unsafe, original in zip(criteria, originals, strict=True)
@@ -221,7 +236,6 @@ def compare_originals(
     ends = _ends_of_originals(evaluators, originals)
     numbers = {**ends, **braking, **_metres_earlier(*evaluators)}
 
-    # What differs, and in whose favour.
     differences = [*_new_collisions(evaluators)]
     if in_a != in_b:
         template = words.ORIGINAL_UNSAFE if in_b else words.ORIGINAL_SAFE
@@ -237,15 +251,14 @@ def compare_originals(
 
 
 def _new_collisions(evaluators: Sequence[Evaluator]) -> Iterator[Difference]:
-    """The fastest collision of B's original vehicle in a test case in which A's does not collide,
-    if there is one. Test cases that A lacks show nothing about a change.
+    """The difference by new collisions: B's original vehicle collides in a test case in which A's
+    does not. The sentence names the fastest new collision. Test cases that A lacks do not count,
+    because they show nothing about a change.
     """
-    # Collisions of both original vehicles, by test case.
     of_a, of_b = map(_collisions_of_original, evaluators)
     cases_of_collisions = [case for case, _, _ in of_a]
     cases_of_a = [case for _, _, case in cases_of(evaluators[0])]
 
-    # Those that are new in B, of which the fastest is named.
     new = [
         (speed, point)
         for case, point, speed in of_b
@@ -262,7 +275,9 @@ def _new_collisions(evaluators: Sequence[Evaluator]) -> Iterator[Difference]:
 
 
 def _collisions_of_original(side: Evaluator) -> list[tuple[TestCase, Point, float]]:
-    """The test cases in which a system's original vehicle collides, with point and speed [m/s]."""
+    """The test cases in which a version's original vehicle collides, each with the point of the
+    matrix and the speed of the collision [m/s].
+    """
     original = side.characteristics.original[np.newaxis]
     results = simulate_all_points(side.system, original)
     return [
@@ -275,7 +290,9 @@ def _collisions_of_original(side: Evaluator) -> list[tuple[TestCase, Point, floa
 def _ends_of_originals(
     evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]
 ) -> JsonObject:
-    """How both original vehicles end, with the gap where bodies do not touch at a degree of 0."""
+    """The outcome and the safety degree of both original vehicles. The gap between the bodies [m]
+    is added if the safety degree is not measured between bumpers.
+    """
     numbers: JsonObject = {}
     for side, evaluator, original in zip(SIDES, evaluators, originals, strict=True):
         numbers |= {
@@ -288,10 +305,10 @@ def _ends_of_originals(
 
 
 def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
-    """In how many of A's benign scenes the original vehicles of A and B brake, None without any;
-    and the number of these scenes.
+    """The numbers of A's benign scenes (nobody needs to brake there) in which the original vehicles
+    of A and B brake, None without such scenes; and the number of these scenes.
     """
-    # What a study searches in its scenario, these scenes do not have.
+    # A benign scene has no searched parameters of the scenario: only the vehicle's values remain.
     systems = [
         replace(side.system, characteristics=side.characteristics.vehicle)
         for side in (a, b)
@@ -309,8 +326,9 @@ def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
 
 
 def _metres_earlier(a: Evaluator, b: Evaluator) -> JsonObject:
-    """By how much B's original vehicle begins to brake earlier, and later, where the difference is
-    largest [m]; None in other scenarios than A's, and where either does not brake.
+    """The largest distances over all points by which B's original vehicle begins to brake earlier,
+    and later, than A's [m]. Both are None if the scenarios differ, or if at no point both vehicles
+    brake.
     """
     metres = np.empty(0)
     is_same_scenario = (a.study.scenario, a.study.matrix) == (
@@ -329,8 +347,8 @@ def _metres_earlier(a: Evaluator, b: Evaluator) -> JsonObject:
 
 
 def _onset_places(evaluator: Evaluator) -> FloatArray:
-    """Where the original vehicle begins to brake at each of N points, shape (N,), NaN if it does
-    not [m].
+    """The position at which the original vehicle begins to brake at each of N points of the matrix
+    [m], shape (N,); NaN if the vehicle does not brake.
     """
     onsets, _ = drive_new_cars(
         evaluator.system, evaluator.characteristics.original[np.newaxis]

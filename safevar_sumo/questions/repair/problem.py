@@ -314,8 +314,8 @@ class RepairProblem:
     @cached_property
     def arrays(self) -> bool:
         """Whether one object of the ADS drives vehicles with different parameters, as arrays. A
-        shipped ADS does. A user's class does if a sample has the same results, to the bit, as with
-        an object for each change.
+        shipped ADS does, an FMU or a TraCI controller does not. A user's class does if a sample has
+        the same results, to the bit, as with an object for each change.
         """
         if self.study.ads.kind or self.study.ads.model in ADS:
             return not self.study.ads.kind
