@@ -1,16 +1,16 @@
-"""RQ1 and RQ2: algorithms against the original vehicle and against each other, over pooled
-solutions and over runs.
+"""Statistical tests for RQ1 (an algorithm's solutions against the original vehicle) and RQ2 (an
+algorithm against the others). Tests use pooled solutions, as in the paper, or runs.
 
 The paper pools the solutions of all runs and compares them with a second sample: the original's
 single value, repeated once for each solution. Solutions of one run resemble each other, and a
-repeated value is no sample: p-values become too small. Over runs, each run contributes one value,
-and Holm's method corrects for the number of tests of the question: those of RQ1 and those of RQ2
-are a family each.
+repeated value is no sample: p-values become too small. Over runs, each run contributes one value.
+Holm's method then corrects the p-values for the number of tests, separately for RQ1 and RQ2.
 
-In the frames, `method` holds the name of the test, `enough_runs` whether a test with so many runs
-can be significant, and `significant` whether it is, undefined where nothing was tested; undefined
-values are NaN. Functions of a case raise `UnanswerableError` if no run is finished, if an algorithm
-that they compare is missing, and over runs if the solutions belong to no run.
+In the frames, `method` holds the name of the test. `enough_runs` says whether a test of so many
+runs
+can be significant. `significant` says whether the test is significant, and is undefined if nothing
+was tested. Undefined values are NaN. Functions of a case raise `UnanswerableError` if no run is
+finished, if a compared algorithm is missing, or, over runs, if the solutions belong to no run.
 """
 
 from __future__ import annotations
@@ -55,17 +55,27 @@ from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE
 
 CAUSES, BEST = "causes", "best_safety_degree"
 BETTER = {CAUSES: True, BEST: False}
-"""Whether more is better in the samples of runs that only some tables have."""
+"""For samples that only some tables have: whether a larger value means a better algorithm. CAUSES
+is the number of minimal causes of a run, BEST is the lowest safety degree of a run.
+"""
 MARKS = {"large": "L", "medium": "M", "small": "S", "negligible": ""}
-"""Magnitudes of effects in a table for a paper."""
+"""Letters for the magnitudes of effects in the table for a paper."""
 Samples = Mapping[tuple[str, str], "pd.Series[float]"]
 """Values by algorithm and name of a metric or quality indicator."""
 
 
 class Choices(NamedTuple):
-    """What a reader chooses: the algorithm that is compared with all others, the level of
-    significance, and, by a case's name, the minimal causes of its runs, if they were counted:
-    columns algorithm, run, causes.
+    """What a reader chooses.
+
+    Attributes
+    ----------
+    algorithm
+        The algorithm that RQ2 compares with all others; "" for the default of `opponents_of`.
+    alpha
+        The level of significance.
+    causes
+        By a case's name, the numbers of minimal causes of its runs, in the columns algorithm, run
+        and causes; only cases whose causes were counted.
     """
 
     algorithm: str = ""
@@ -129,14 +139,16 @@ def rq2_runs(
     are as in `rq1_runs`, for all tests of RQ2.
     """
     tests = compare_over_runs(case, choices, further)
-    # It raises if RQ2 has no answer.
+    # The call raises an error if RQ2 has no answer.
     opponents_of(case, choices.algorithm)
     return tests[tests.index == "RQ2"]
 
 
 def rq2_common(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """The tests of `rq2_runs` where one rule says what a run returns, whatever the algorithm: all
-    that no other evaluation of the run dominates; and a test of the best safety degree of a run.
+    """The tests of `rq2_runs`, but with one rule for the solutions of a run, whatever the
+    algorithm:
+    all evaluations that no other evaluation of the run dominates. A further test compares the best
+    safety degree of a run.
 
     Raises
     ------
@@ -159,7 +171,6 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """`rq2_runs` in short, for a paper: columns algorithm, metric, baseline, effect_size,
     significant, and a12, the effect size with marks.
     """
-    # An effect, marked if it is significant, with its size.
     tests = rq2_runs(case, choices)
     texts = []
     facts = tests[["effect_size", "significant", "magnitude"]]
@@ -176,8 +187,8 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 def compare_over_runs(
     case: Case, choices: Choices = DEFAULT, further: Samples | None = None
 ) -> pd.DataFrame:
-    """Every test of RQ1 and, if it has an answer, of RQ2 over runs, also of `further` samples; the
-    index is the question, RQ1 or RQ2.
+    """Every test of RQ1 over runs and, if there are two algorithms, every test of RQ2, which also
+    compares the `further` samples. The index is the question, RQ1 or RQ2.
     """
     rows = {"RQ1": _test_original(case, choices, over_runs=True)}
     if len(case.algorithms) > 1:
@@ -190,7 +201,7 @@ def compare_over_runs(
 
 
 def _corrected(question: str, rows: list[JsonObject], alpha: float) -> pd.DataFrame:
-    """The tests of a question over runs, which are corrected as a family."""
+    """The tests of a question over runs, with p-values that are corrected for all these tests."""
     tests = pd.DataFrame(rows)
     count = int(tests["p_value"].count())
     tests["p_holm"] = correct_by_holm(tests["p_value"])
@@ -201,9 +212,9 @@ def _corrected(question: str, rows: list[JsonObject], alpha: float) -> pd.DataFr
 
 
 def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:
-    """Tests with the column `significant`: where p-values are corrected, the corrected one counts;
-    where solutions of runs are pooled, there have to be enough runs for a test. Over runs, effects
-    have intervals.
+    """Add the column `significant`. A test is significant if its p-value is below the level, and
+    the runs are enough for a test. If there is a corrected p-value, the corrected one counts, and
+    the effect sizes get intervals, too.
     """
     p_values = tests["p_holm" if "p_holm" in tests else "p_value"]
     is_significant = ((p_values < choices.alpha) & tests["enough_runs"]).astype(
@@ -216,8 +227,8 @@ def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:
 
 
 def with_intervals(tests: pd.DataFrame, alpha: float) -> pd.DataFrame:
-    """Tests with the intervals of their effect sizes, of `n1` runs against `n2` runs, or of RQ1, by
-    the index, against one value.
+    """Add the intervals of the effect sizes. A test of RQ2 compares `n1` with `n2` runs, and a test
+    of RQ1 compares `n1` runs with one value; the index says which question it is.
     """
     sizes = tests["n2"].where(tests.index != "RQ1")
     intervals = map(
@@ -228,8 +239,8 @@ def with_intervals(tests: pd.DataFrame, alpha: float) -> pd.DataFrame:
 
 
 def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """The median over the runs of each algorithm, of every indicator and metric; columns algorithm,
-    metric, runs, median, median_low, median_high.
+    """The medians, with intervals, of every indicator and metric over the runs of each algorithm.
+    The columns are algorithm, metric, runs, median, median_low and median_high.
     """
     case.require_solutions()
     samples = _samples(case, choices, over_runs=True)
@@ -244,14 +255,14 @@ def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 
 
 def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
-    """Distinct minimal causes that the runs found, as they were counted.
+    """The numbers of distinct minimal causes that the runs found, as `Choices.causes` holds them.
 
     Raises
     ------
     UnanswerableError
-        If they were not counted, or the solutions belong to no run.
+        If the causes were not counted, or the solutions belong to no run.
     """
-    # It raises if the solutions are imported.
+    # The call raises an error if the solutions are imported.
     case.runs_of(NSGA2)
     if case.name not in choices.causes:
         raise UnanswerableError(
@@ -263,8 +274,8 @@ def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
 
 
 def opponents_of(case: Case, algorithm: str) -> tuple[str, list[str]]:
-    """The algorithm that RQ2 compares, by default NSGA-II or else the study's first with results,
-    and the others.
+    """The algorithm that RQ2 compares, and all other algorithms. The default is NSGA-II, else the
+    study's first algorithm with results.
 
     Raises
     ------
@@ -274,7 +285,7 @@ def opponents_of(case: Case, algorithm: str) -> tuple[str, list[str]]:
     case.require_solutions()
     if not algorithm:
         algorithm = NSGA2 if NSGA2 in case.algorithms else case.algorithms[0]
-    # Without them it raises.
+    # The call raises an error if the algorithm has no finished run.
     case.solutions_of(algorithm)
     opponents = [name for name in case.algorithms if name != algorithm]
     if not opponents:
@@ -292,10 +303,8 @@ def opponents_of(case: Case, algorithm: str) -> tuple[str, list[str]]:
 def _test_original(
     case: Case, choices: Choices, *, over_runs: bool = False
 ) -> list[JsonObject]:
-    """A row for each algorithm and metric, against the original vehicle."""
+    """The tests of RQ1: a row for each algorithm and metric, against the original vehicle."""
     case.require_solutions()
-
-    # A test for each algorithm and metric.
     rows = []
     for algorithm, metric in product(case.algorithms, case.scoring.metrics):
         values = _values(case, algorithm, metric, over_runs)
@@ -325,11 +334,13 @@ def _test_opponents(
     over_runs: bool = False,
     further: Samples | None = None,
 ) -> list[JsonObject]:
-    """A row for each baseline and metric, also of `further` samples."""
+    """The tests of RQ2: a row for each baseline (other algorithm) and each indicator or metric,
+    also of the `further` samples.
+    """
     algorithm, opponents = opponents_of(case, choices.algorithm)
     samples = {**_samples(case, choices, over_runs), **(further or {})}
-    # Whether larger values speak for an algorithm: a better front, more unsafe solutions, or more
-    # causes.
+    # By name, whether a larger value means a better algorithm: a better front, more unsafe
+    # solutions, or more causes.
     directions = {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
     directions = MORE_IS_BETTER | directions | BETTER
     rows = []
@@ -347,10 +358,9 @@ def _test_opponents(
 
 
 def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
-    """The values of every metric and, unless the solutions belong to no run, of every indicator;
-    over runs, of the minimal causes.
+    """The values of every metric and, unless the solutions belong to no run, of every quality
+    indicator. Over runs, the numbers of minimal causes are added, if they were counted.
     """
-    # Metrics of solutions, indicators of fronts, and causes.
     samples = {}
     for name, metric in product(case.algorithms, case.scoring.metrics):
         samples[name, metric.name] = _values(case, name, metric, over_runs)
@@ -368,8 +378,8 @@ def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
 def _values(
     case: Case, algorithm: str, metric: Measure, over_runs: bool
 ) -> pd.Series[float]:
-    """A metric's defined values over the solutions that count for it; over runs, the mean of each
-    run.
+    """The defined values of a metric over the solutions that count for it, or, with `over_runs`,
+    their mean in each run.
     """
     solutions = solutions_for_metric(case.solutions_of(algorithm), metric).dropna(
         subset=metric.name
@@ -377,7 +387,7 @@ def _values(
     values = solutions[metric.name].astype(float)
     if not over_runs:
         return values
-    # Without them it raises.
+    # The call raises an error if the solutions belong to no run.
     case.runs_of(algorithm)
     return values.groupby(solutions["run"]).agg(
         lambda sample: np.mean(sample.to_numpy())
@@ -387,8 +397,9 @@ def _values(
 def _originals(
     case: Case, algorithm: str, metric: Measure, over_runs: bool
 ) -> pd.Series[float]:
-    """The original vehicle's metric beside each of `_values`; in a study that searches its
-    scenario, the safety degree in the same encounters, and undefined for other metrics.
+    """The original vehicle's metric beside each of `_values`. If encounters are ranges, only the
+    safety degree of the original vehicle is known in the same encounters: then other metrics are
+    NaN.
     """
     values = _values(case, algorithm, metric, over_runs)
     if not case.study.ranges:
@@ -407,7 +418,6 @@ def describe_runs_without_solutions(case: Case) -> str:
     if not case.has_runs:
         return ""
 
-    # How many runs of each algorithm have solutions.
     runs_with_solutions = case.solutions.groupby("algorithm")["run"].nunique()
     texts = []
     for name in case.algorithms:
