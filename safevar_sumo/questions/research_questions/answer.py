@@ -75,7 +75,7 @@ LESS_SAFE = (
         " in the same encounter."
     ),
 )
-"""Of listed encounters, and of encounters that are ranges."""
+"""The sentence if the study lists its encounters, and the sentence if encounters are ranges."""
 REMARK = note("Remark: {remark}")
 
 
@@ -118,7 +118,6 @@ def tables(
     table
         Print only this table of the answer. The line "More:" of an answer names the tables.
     """
-    # The options, the cases, and the algorithm that is compared.
     {option.name: option for option in options_of(tables)}["alpha"].check(alpha)
     if table:
         check_name(
@@ -145,7 +144,6 @@ def tables(
         if causes and case.has_runs
     }
 
-    # Tables, figures, and the command that gives them.
     names: Collection[str] = FUNCTIONS
     options = {"algorithm": algorithm, "alpha": alpha, "causes": causes}
     if table in ON_REQUEST:
@@ -185,7 +183,9 @@ def _directories_of(results: Sequence[Results | str | Path]) -> list[Any]:
 
 
 def _causes_of_runs(case: Case, limit: int, jobs: int | None) -> pd.DataFrame:
-    """The minimal causes of a case's runs, which are simulated."""
+    """The numbers of minimal causes of a case's runs. Up to `limit` unsafe solutions of each run
+    are reduced to their causes by simulation.
+    """
     from safevar_sumo.questions.causes import causes_of_runs
     from safevar_sumo.questions.evaluator import open_evaluator
 
@@ -201,15 +201,14 @@ def answer_questions(
     choices: Choices = DEFAULT,
     names: Collection[str] = FUNCTIONS,
 ) -> Answer:
-    """Every named table of the cases; a table that no case answers has no row, and a remark says
-    why.
+    """The tables called `names`, each with the rows of all cases. A case that cannot answer a table
+    has no row in it, and a remark says why.
 
     Raises
     ------
     UnanswerableError
-        If no question has an answer.
+        If no case answers any table.
     """
-    # Each table, of every case that can answer it.
     words = titles_of(cases)
     tables = {}
     remarks = []
@@ -241,13 +240,11 @@ def answer_questions(
             title, {**columns, label: of_case}, rows, wide=wide, words=words
         )
 
-    # Nothing at all is an error; remarks stand once.
     if errors and all(table.frame.empty for table in tables.values()):
         raise errors[0]
     sentences = [*chain.from_iterable(map(_verdict, cases))]
     of_all = []
     for case in cases:
-        # Which runs and settings are in no table.
         sentences += [REMARK(remark=remark) for remark in case.remarks]
         of_all += [
             *case.remarks,
@@ -272,7 +269,9 @@ def answer_questions(
 
 
 def _verdict(case: Case) -> Iterator[Sentence]:
-    """How many of a case's solutions collide, and how many of NSGA-II's are critical."""
+    """Say how many solutions of a case collide, and how many solutions of NSGA-II are critical
+    (less safe than the original vehicle).
+    """
     if case.why_no_solution:
         yield NO_SOLUTION(
             name=case.name,
@@ -280,7 +279,6 @@ def _verdict(case: Case) -> Iterator[Sentence]:
         )
         return
 
-    # Collisions, and solutions that are less safe than the original.
     solutions = case.different_solutions
     yield COLLISIONS(
         count=are_collisions(solutions).sum(), total=len(solutions), name=case.name
@@ -299,8 +297,8 @@ def _verdict(case: Case) -> Iterator[Sentence]:
 
 
 def _equal_solutions(case: Case) -> str:
-    """How many solutions of pooled tables are equal to another one of their run, in a sentence; ""
-    if none is.
+    """A sentence that says how many solutions equal an earlier solution of the same run; "" if no
+    solutions are equal. Tables of pooled solutions count all of them.
     """
     run = ["algorithm", "run"] if case.has_runs else ["algorithm"]
     count = int(case.solutions.duplicated([*run, *case.characteristics.names]).sum())
@@ -316,8 +314,7 @@ def _equal_solutions(case: Case) -> str:
 def _remarks(
     table: str, case: Case, frame: pd.DataFrame, alpha: float
 ) -> Iterator[str]:
-    """What a case's frame leaves out."""
-    # What each table cannot say.
+    """Yield the remarks on a table of a case: what the table leaves out, and how it was tested."""
     remarks = list[str]()
     if table in AS_PUBLISHED:
         remarks += _on_pooled_tests(table, case, frame, alpha)
@@ -343,10 +340,9 @@ def _remarks(
 def _on_pooled_tests(
     table: str, case: Case, frame: pd.DataFrame, alpha: float
 ) -> Iterator[str]:
-    """What tests of pooled solutions leave out: algorithms with too few runs, and undefined
-    values.
+    """Yield remarks on the tests of pooled solutions: algorithms with too few runs, metrics that
+    are undefined in some solutions, and the numbers of simulations.
     """
-    # What cannot be significant, or is undefined.
     tested = "algorithm" if table == "rq1" else "baseline"
     with_few_runs = frame.loc[~frame["enough_runs"], tested].unique()
     if len(with_few_runs):
@@ -366,7 +362,8 @@ def _on_pooled_tests(
             )
     if table == "rq1":
         values = pd.Series(case.original, dtype=float)
-        # In a solution's encounter only this value is known.
+        # If encounters are ranges, only the original's safety degree is known in the encounters of
+        # the solutions.
         if case.study.ranges:
             values = values.where(values.index == SAFETY_DEGREE)
         omitted = [*values.index[values.isna()]]
@@ -390,7 +387,9 @@ def _on_pooled_tests(
 def remarks_on_runs(
     table: str, frame: pd.DataFrame, alpha: float = ALPHA
 ) -> Iterator[str]:
-    """Which tests of runs have too few runs, and how tests are corrected."""
+    """Yield remarks on tests over runs: how many tests have too few runs, and how the p-values are
+    corrected.
+    """
     rq = table.partition("-")[0].upper()
     tests = frame.dropna(subset="effect_size")
     tests_in_words = number_of(len(tests), "test")
