@@ -1,8 +1,8 @@
-"""Every question is one function `(subject, evaluator, *, options) -> Answer`; here it becomes a
-call of the library.
+"""A question is a function `(subject, evaluator, *, options) -> Answer`. The class `Question` makes
+a function of the library of it, which loads the subjects and opens the evaluator.
 
-The command line makes its command from the same signature and docstring (`cli/command.py`), as of
-every other public function.
+The command line (`cli/command.py`) makes a command of the same signature and docstring, as it does
+for every other public function.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ with <, <=, > or >= and a number; by default a collision if any evaluated settin
 safety degree below half of the original's.
 """
 QUICK = "quick"
-"""The option of questions that have a rough answer, too."""
+"""The option that asks for a rough answer. Only some questions have it."""
 ROUGH = answer(
     "Rough answer (--quick): at most an eighth of the search was simulated, with one parameter set,"
     " and proves nothing."
@@ -82,25 +82,24 @@ ROUGH = answer(
 ROUGH_OF_FEW = answer(
     "Rough answer (--simulations {most}): fewer simulations than usual were allowed."
 )
-"""The beginning of such answers."""
+"""The first sentence of a rough answer, with `--quick` and with `--simulations`."""
 CRITERION_OF_STUDY = note("Criterion: {criterion} ({source}).")
 NOT_SIMULATED = note("Not simulated: {parts}.")
-"""Where a study's own criterion comes from, and what it leaves out."""
+"""Notes on the criterion that a study states: its source, and the parts that are not simulated."""
 
 
 class Question:
     """A question as a function of the library: `risk("rain", samples=1000)`."""
 
     def __init__(self, compute: Callable[..., Answer]) -> None:
-        # Its name, as in commands.
         update_wrapper(self, compute)
         is_own = compute.__module__.partition(".")[0] == PACKAGE.name
         self.compute = compute
         self.name = f"{'' if is_own else f'{compute.__module__}:'}{compute.__name__}"
 
-        # Its parameters: what it is about, and options.
+        # The first two parameters must be positional. Kinds of parameters are ordered: all
+        # positional kinds are at most POSITIONAL_OR_KEYWORD.
         parameters = list(inspect.signature(compute).parameters.values())
-        # Kinds of parameters are in order: positional ones come first.
         last_kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
         if len(parameters) < 2 or parameters[1].kind > last_kind:
             raise InputError(
@@ -114,11 +113,10 @@ class Question:
             for parameter in parameters[2:]
             if parameter.kind is not parameter.KEYWORD_ONLY
         }
-        """Further positional parameters, and whether each is a file instead of a subject."""
-        # Options that all questions have.
+        """Whether each further positional parameter is a file instead of a subject, by name."""
         names = [parameter.name for parameter in parameters]
         common_parameters = inspect.signature(Question.__call__).parameters
-        # The evaluator is no subject.
+        # A user passes no evaluator: the signature for users lacks it.
         parameters.pop(1)
         texts = [inspect.cleandoc(compute.__doc__ or "")]
         for option in COMMON_OPTIONS:
@@ -130,7 +128,7 @@ class Question:
 
     @cached_property
     def options(self) -> list[Option]:
-        """The options by signature and docstring, without those that all questions have."""
+        """The question's own options; the options that all questions have are left out."""
         return options_of(self.compute)
 
     @property
@@ -185,13 +183,13 @@ class Question:
         fresh
             Simulate everything again. Default: use simulations of earlier commands again.
         """
-        # Where the question itself cuts encounters, it gets the whole of them.
+        # A question with an option `up_to` of its own leaves out encounters itself: its subjects
+        # keep all encounters.
         options = {option.name: option for option in self.options}
         cut = up_to
         if UP_TO in options:
             cut = None
             values[UP_TO] = up_to
-        # Options that it has, with legal values.
         for name in values.keys() - options.keys():
             raise TypeError(
                 f"{self.name}() got an unexpected keyword argument {name!r}"
@@ -211,7 +209,6 @@ class Question:
 
         from safevar_sumo.campaign.cache import keep_simulations
 
-        # What it is about, as studies, results or files.
         cuts = {"point": point, "up_to": cut}
         names = [_name(source), *map(_name, further_sources)]
         command = self.command_line(names, cuts, values, ["--ranges"] * ranges)
@@ -221,7 +218,8 @@ class Question:
         for further, is_file in zip(further_sources, self.others.values(), strict=True):
             subjects.append(Path(str(further)) if is_file else subject_of(further))
         with keep_simulations(command, fresh=fresh):
-            # A rough answer, which comes much earlier, may be shown before the answer.
+            # On a terminal, a rough answer is computed and shown first, because it comes much
+            # earlier than the answer.
             is_long = self.has_rough_answer and simulations is None
             is_short = values.get(QUICK) or values.get("out")
             is_shown = progress is True and sys.stderr.isatty()
@@ -251,19 +249,30 @@ class Question:
         as_it_is_now: bool = False,
         questions: int = 1,
     ) -> Answer:
-        """The answer about subjects that have been loaded, and files; `values` are those of
-        options. The command that comes next is about the first subject as it is `called`. The
-        answer's own command is the end of its command line: how many simulations it may do. It is
-        one of so many `questions` that share the time.
+        """The answer about subjects that have been loaded.
+
+        The answer's `command` is only the end of a command line: the option for the largest number
+        of simulations, if there is such a number.
+
+        Parameters
+        ----------
+        subjects
+            Studies, results, or paths of files.
+        values
+            Values of options, by name.
+        called
+            The name of the first subject in the command that the answer recommends next; "" for no
+            command.
+        questions
+            Number of questions that share the time, such as all questions of a page.
         """
         from safevar_sumo.questions.answer import Answer
         from safevar_sumo.questions.by_criterion import subject_by
         from safevar_sumo.questions.case import Case
 
-        # SUMO takes long to load.
+        # The evaluator loads SUMO, which takes long: import it only when a question is asked.
         from safevar_sumo.questions.evaluator import open_evaluator
 
-        # Simulations by the criterion that is asked for.
         if values.get(QUICK):
             subjects = list(map(with_own_set, subjects))
         study = study_in(subjects[0])
@@ -285,7 +294,6 @@ class Question:
                 evaluator = evaluator.for_study(study)
                 evaluator.use(unsafe)
 
-            # The question's own function.
             with user_errors(self.name):
                 result = self.compute(subjects[0], evaluator, *subjects[1:], **values)
             if not isinstance(result, Answer):
@@ -293,7 +301,7 @@ class Question:
                     self.name, f"returns {type(result).__name__}", "an Answer"
                 )
 
-            # An answer about a driving system that fails by itself begins with that.
+            # If the driving system fails by itself, the answer begins with a sentence that says so.
             if result.study is not study:
                 reason = evaluator.for_study(result.study).no_verdict
             else:
@@ -322,14 +330,16 @@ class Question:
     def _criterion(
         self, values: JsonObject, study: Study
     ) -> tuple[Unsafe | None, JsonObject, Sequence[Sentence]]:
-        """What is unsafe, the values of options with it, and where it comes from: a study's own
-        criterion stands where neither a criterion nor a margin is asked for.
+        """The criterion of an unsafe vehicle, the values of options with it, and notes on its
+        source. If a user states neither a criterion nor a margin, the criterion of the study
+        counts. The criterion is None if nobody states one, or if the question uses none.
         """
         names = [option.name for option in self.options if option.metavar == CRITERION]
         if not names:
             return None, values, ()
         (name,) = names
-        # Who states a distance to keep means a collision, whatever the study calls unsafe.
+        # A user who states a distance to keep (margin) means collisions, even if the study states
+        # another criterion.
         if values.get(name) is not None or values.get("margin") is not None:
             return values.get(name), values, ()
         stated = study.unsafe
@@ -348,8 +358,9 @@ class Question:
     def _next(
         self, subject: Subject, evaluator: Evaluator, called: str, values: JsonObject
     ) -> str:
-        """The command that comes next, if it has an answer: the page is about results of `study`,
-        and where nobody else is on the road nothing is unsafe by itself.
+        """The command that a user should call next; "" if it could give no answer. After results
+        the next command needs only their directory. A study must be searched (`study`) before a
+        page can report on it. If nobody else is on the road, a criterion must say what is unsafe.
         """
         from safevar_sumo.questions.answer import contents_of
 
@@ -375,8 +386,8 @@ class Question:
         values: JsonObject,
         flags: Sequence[str] = (),
     ) -> str:
-        """The command that asks this question; it has a flag for each option that is not at its
-        default.
+        """The command line that asks this question. It has a flag for each option whose value is
+        not the default.
         """
         words = [PROGRAM_COMMAND, self.name, *map(quote, subjects)]
         for option in self.options:
@@ -402,37 +413,37 @@ COMMON_OPTIONS = options_of(Question.__call__)
 
 
 def question(compute: Callable[..., Answer]) -> Question:
-    """Decorator: makes a function `(subject, evaluator, *, options) -> Answer` a question.
+    """Decorator that makes a question of a function `(subject, evaluator, *, options) -> Answer`.
 
-    Defaults are those of its signature, ranges those of `Annotated` types, texts those of its
-    numpydoc docstring. A first parameter of type `Case` takes results only; further positional
-    parameters are further subjects, of type `Path` files.
+    The function's signature states the defaults of the options, `Annotated` types state their
+    ranges, and the numpydoc docstring explains them. If the first parameter has the type `Case`,
+    the question takes only results. Each further positional parameter is a further subject, or a
+    file if its type is `Path`.
     """
     return Question(compute)
 
 
 def find_question(name: str) -> Question:
-    """A question of this package, or one of the user's as `module:name`.
+    """The question with a name: a question of this package or, as `module:name`, of the user.
 
     Raises
     ------
     InputError
         If there is no such question.
     """
-    # A question of this package, or of the user's.
     legal = f"{', '.join(QUESTIONS)}, or module:name of a function with @question"
     if not (":" in name or name in QUESTIONS):
         raise InputError("question", f"there is no {name!r}", legal)
     if ":" in name:
         module, _, function = name.partition(":")
-        # The working directory, which an installed program does not have on its path.
+        # The user's module may be in the working directory, which is not on the path of an
+        # installed program.
         add_import_folders(())
     else:
         module, function = QUESTIONS[name], name
-    # The module may have been written a moment ago.
+    # Python's caches of folders would hide a module that was written a moment ago.
     invalidate_caches()
 
-    # Its module has a function with the decorator.
     try:
         with user_errors(name):
             imported = import_module(module)
@@ -454,7 +465,7 @@ def find_question(name: str) -> Question:
 
 
 def _name(source: StudyLike | Results) -> str:
-    """How a command line names a subject."""
+    """The name of a subject on the command line: a directory of results, or a study."""
     if isinstance(source, Results):
         return str(source.directory)
     if isinstance(source, Study):

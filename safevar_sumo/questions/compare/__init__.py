@@ -1,8 +1,9 @@
-"""What changes from one system to another: another driving system, vehicle, weather or version?
+"""The question `compare`: what changes from a version A of a study to a version B? The versions
+differ in the driving system, the vehicle or the weather, for example.
 
-The same settings are simulated in both systems, A and B: all solutions of results on either side
-that both domains hold, and settings drawn on lines from the original vehicles into the common
-domain, near to where the systems begin to fail.
+The same settings are simulated in both versions. They are the solutions of both sides' results, if
+they lie in both domains, and sampled settings. Sampled settings lie on lines from the original
+vehicle into the common domain, near the place where the vehicles begin to fail.
 """
 
 from __future__ import annotations
@@ -144,7 +145,6 @@ def compare(
         Compare limits only at the listed test cases. Default: also at speeds and places between the
         listed values.
     """
-    # Both studies, in one common domain and by one criterion.
     study = evaluator.study
     evaluator.begin({BOTH_STAGE: 2 * samples, STAGE: 2 * usual_alone(evaluator)})
     second = evaluator.for_study(in_order_of(study, study_in(other)))
@@ -155,8 +155,8 @@ def compare(
     originals = [evaluator.evaluate_original(), second.evaluate_original()]
     criteria = _criteria((subject, other), evaluators, originals, unsafe, margin)
 
-    # The same settings in both.
-    # Of few simulations a third, a sixth in each study; the others are for the limits.
+    # With few simulations, a third of them drives the pairs: a sixth in each version. The other two
+    # thirds are for the limits.
     pairs, outside = pairs_of(
         (subject, other), common, criteria, evaluator.at_most(samples, 6)
     )
@@ -169,7 +169,6 @@ def compare(
         zip(SIDES, ("A", "B") if names[0] == names[1] else names, strict=True)
     )
 
-    # What differs: settings, limits, the original vehicles, safety degrees.
     alone = limits_of_both(evaluators, criteria, restriction, at_tests=at_tests)
     changes = alone.frame["change"]
     of_originals, of_new_cars = compare_originals(evaluators, originals, criteria)
@@ -236,10 +235,10 @@ def _criteria(
     unsafe: Unsafe | None,
     margin: float | None,
 ) -> list[Unsafe]:
-    """The criterion of both systems, as `tolerance` chooses it, each with the degree at which its
-    bodies touch.
+    """The criterion of both versions, as `tolerance` would choose it. Both versions get the larger
+    of their clearances to keep. Each version has the safety degree at which its bodies touch.
     """
-    # The stated criterion, a distance to keep, or what results suggest.
+    # The user states a criterion, or only a clearance to keep, or nothing.
     stated = Unsafe() if unsafe is None and margin is not None else unsafe
     criterion = stated or _default_criterion(subjects, evaluators, originals)
     is_stated = unsafe is not None
@@ -256,7 +255,9 @@ def _default_criterion(
     evaluators: Sequence[Evaluator],
     originals: Sequence[Evaluations],
 ) -> Unsafe:
-    """A collision if any vehicle of either system collides, else a safety degree."""
+    """The criterion if the user states nothing: a collision if that is the default criterion of
+    either version, else the default criterion of A.
+    """
     defaults = list[Unsafe]()
     for subject, evaluator, original in zip(
         subjects, evaluators, originals, strict=True
@@ -271,7 +272,10 @@ def _default_criterion(
 def _settings_frame(
     common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]
 ) -> pd.DataFrame:
-    """The settings with their values in A, B's values where they differ, and `SETTING_COLUMNS`."""
+    """The frame of the settings, with a row for each pair of vehicles. It has `SETTING_COLUMNS`,
+    the
+    values in A, and the values in B of all characteristics whose original values differ.
+    """
     names = common.evaluators[0].characteristics.names
     frame, settings, runs = pairs
     of_pairs = table_of_pairs(frame["solution"], runs, criteria)
@@ -291,7 +295,9 @@ def _settings_frame(
 
 
 def _table(common: CommonDomain, settings: pd.DataFrame) -> AnswerTable:
-    """The table of settings, those first that are unsafe in one system only."""
+    """The table of the settings. The order of `UNSAFE_IN` is the order of its rows: first the
+    settings that are unsafe in only one version.
+    """
     members = common.evaluators[0].characteristics.members
     columns = {
         "source": Column(
@@ -317,7 +323,9 @@ def _table(common: CommonDomain, settings: pd.DataFrame) -> AnswerTable:
 
 
 class _PairedTest(NamedTuple):
-    """The p-value and A12 of a test in pairs, the table of the pairs, and what they are."""
+    """A paired test of the safety degree: the p-value, A12 (above 0.5 A is safer), the table of the
+    pairs, and `groups`, the words that say which settings a pair is the mean of.
+    """
 
     p: float
     a12: float
@@ -326,10 +334,10 @@ class _PairedTest(NamedTuple):
 
 
 def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
-    """Test the safety degree in A and B in pairs.
+    """Test the difference of the safety degree between A and B in pairs.
 
-    A pair is the mean over the solutions of a run or, if there are fewer runs than the test needs,
-    over the settings that were drawn on a line.
+    A pair has the mean safety degrees in A and in B over the same settings. These are the solutions
+    of a run or, if there are fewer runs than the test needs, the sampled settings on a line.
     """
     a, b = (run.f_safe for run in runs.runs)
     frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
@@ -345,7 +353,7 @@ def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
                 for side, name, run in pairs.index
             ]
             groups = "the solutions of one run"
-    # The p-value of pairs, and the probability that A's value is greater: above 0.5 A is better.
+    # A12 is the probability that A's safety degree is greater: above 0.5 A is safer.
     sides = pairs.to_numpy(dtype=float).T
     p = signed_rank_test(*sides).p_value
     a12 = compare_samples(*sides).effect_size
@@ -362,10 +370,16 @@ def _decide(
     of_originals: JsonObject,
     lacks: Sequence[Sentence],
 ) -> tuple[str, list[Sentence]]:
-    """Whether to release B, and why: with a new collision never, and not if it is worse in safety
-    and better in needless braking at most. What is better in some and worse in other things is for
-    a person to decide; so is every change whose needless braking was not measured. Where one side
-    `lacks` what the other is simulated in, only a new collision decides.
+    """Decide whether to release B, and say why.
+
+    - B is not released with a new collision, or if it is less safe, and better in needless braking
+      at most.
+    - A person decides if B is better in some things and worse in others, or if B is only worse in
+      needless braking. A person also decides if needless braking was not measured, although B is
+      better or brakes elsewhere.
+    - A person also decides if one version `lacks` tests of the other, unless there is a new
+      collision.
+    - Otherwise B is released.
     """
     in_order = sorted(differences, key=lambda difference: -difference.weight)
     worse = [difference for difference in in_order if not difference.is_better]
@@ -413,13 +427,14 @@ def _basis(
     limits: Sequence[str],
     titles: Mapping[str, str],
 ) -> Iterator[Sentence]:
-    """What counts as unsafe, within which limits, and around which originals."""
+    """Yield the sentences on the basis of the comparison: what counts as unsafe, the user's limits,
+    and original values that differ.
+    """
     if not unsafe.is_collision or unsafe.keep:
         yield UNSAFE_MEANS(description=unsafe.description)
     if limits:
         yield words.WITHIN(limits=join_phrases(limits))
 
-    # Original values that differ.
     a, b = (side.characteristics.members for side in common.evaluators)
     values = [
         f"{a[column].short_name} {a[column].original:g} and"
