@@ -1,4 +1,4 @@
-"""Criteria of an unsafe vehicle: a collision, a safety degree or a metric beyond a limit."""
+"""Criteria by which a vehicle is unsafe: a collision, or a value beyond a limit."""
 
 from __future__ import annotations
 
@@ -43,13 +43,15 @@ CRITERIA = (
 )
 COLLISION = str(Outcome.COLLISION)
 DEGREE_SHARE, LIMIT_DIGITS = 0.5, 6
-"""The default limit if nothing collides: this share of the original's safety degree, to this many
-significant digits.
+"""Default limit if nothing collides: this share of the original vehicle's safety degree, rounded to
+`LIMIT_DIGITS` significant digits.
 """
 SHARE_DECIMALS = 9
-"""Decimals of a sum of shares."""
+"""Decimals to which a sum of shares is rounded, so that three thirds are 1."""
 LEAST = 1e-9
-"""The least by which what is unsafe is beyond a limit, in its unit."""
+"""Least distance of an unsafe value from the limit, in the limit's unit: without it, a vehicle
+exactly at a limit (`>=`) would have the robustness 0, like a safe vehicle.
+"""
 
 
 ColumnOf = Callable[[str], Quantity]
@@ -58,12 +60,14 @@ ColumnOf = Callable[[str], Quantity]
 
 @dataclass(frozen=True)
 class Unsafe:
-    """A criterion of an unsafe vehicle: a collision, or less distance than `keep` [m]; with
-    `below`, a collision, or a clearance below this limit [m]; with a `degree`, a safety degree of
-    the study below this limit [m, or -m/s]; with a `bound`, another metric beyond a limit, or a
-    collision. Each of these kinds is a class of its own.
+    """A criterion by which a vehicle is unsafe. Each kind of criterion is a class of its own:
 
-    `contact` is the safety degree at which bodies touch [m]: 0, or how far middles are apart then.
+    - without arguments: a collision; with `keep`, also less clearance than `keep` [m];
+    - with `below`: a collision, or a clearance below this limit [m];
+    - with `degree`: a safety degree below this limit [m, or -m/s];
+    - with `bound`: a metric beyond a limit, or a collision.
+
+    `contact` is the safety degree of bodies that touch [m]: 0, or the distance of their middles.
 
     Examples
     --------
@@ -79,22 +83,22 @@ class Unsafe:
     bound: MetricBound | None = None
     degree: float | None = None
     is_half: bool = field(default=False, compare=False, repr=False)
-    """Whether `degree` is half of the original's safety degree, the default if nothing collides."""
+    """Whether `degree` is half of the original vehicle's, the default if nothing collides."""
 
     is_collision = True
-    """Whether a collision alone, or less distance than `keep`, is unsafe."""
+    """Whether the criterion is a collision alone, or less clearance than `keep`."""
     verbs = "collides", "collide"
-    """What an unsafe vehicle does, and what several do, in short."""
+    """What an unsafe vehicle does, and what several unsafe vehicles do."""
     event = "a collision"
     effects = "causes a collision", "cause a collision"
-    """What changes lead to; what one of them does, and what several do."""
+    """What a change does that makes the vehicle unsafe, and what several changes do."""
     option = "--margin"
-    """The option by which a user asks for less."""
+    """The option by which a user states a weaker criterion."""
     is_of_impacts = False
-    """Whether a bound on the impact decides, which may be allowed."""
+    """Whether the criterion bounds impacts: a slow impact may then be allowed."""
 
     def __new__(cls, below: float | None = None, **fields: Any) -> Self:
-        """An object of the class of its kind."""
+        """Create an object of the class for this kind of criterion."""
         kind: type = cls
         if bound := fields.get("bound"):
             kind = METRIC_KINDS.get(bound.measure, UnsafeMetric)
@@ -109,25 +113,25 @@ class Unsafe:
 
     @property
     def measure(self) -> str:
-        """The column that decides: a metric, or the safety degree."""
+        """The name of the column that is compared with the limit: a metric, or the safety
+        degree.
+        """
         return F_SAFE.name
 
     @property
     def distance(self) -> float:
-        """The clearance below which a vehicle is unsafe [m], between bumpers; 0 if a collision
-        alone is.
-        """
+        """The clearance between bumpers below which a vehicle is unsafe [m]; 0: only collisions."""
         return self.keep
 
     @property
     def limit(self) -> float:
-        """What is limited: a safety degree, or the value of a metric."""
+        """The limit of the safety degree, or of the bounded metric."""
         return self.contact + self.distance
 
     @property
     def worst(self) -> Callable[..., float]:
-        """Which of several values is the worst: `min`, or `max` where a bound forbids large
-        ones.
+        """The function that returns the worst of values: `min`, or `max` if large ones are
+        unsafe.
         """
         return min
 
@@ -145,23 +149,27 @@ class Unsafe:
 
     @property
     def remark(self) -> str:
-        """What to know of a screening limit, in a sentence; empty for any other criterion."""
+        """A sentence about a default limit, which replaces collisions; "" for any other
+        criterion.
+        """
         return ""
 
     def smaller_demand(self, original: Evaluations) -> str:
-        """What to do where the original vehicle is unsafe; "" if it collides, and that counts."""
+        """What a user does if the original vehicle is unsafe; "" if no weaker criterion would
+        help.
+        """
         if self.is_collision and (not self.keep or original.collided[0]):
             return ""
         return f"Ask again with a weaker criterion ({self.option})."
 
     def of(self, evaluations: Evaluations) -> BoolArray:
-        """Which evaluations are unsafe; shape (M,). An undefined measure is not, a collision is by
-        every bound.
+        """Return which of M evaluations are unsafe in any run, shape (M,). An undefined measure is
+        safe; a collision is unsafe for every bound that does not stand alone.
         """
         return np.asarray(self.runs(evaluations).any(axis=0))
 
     def runs(self, evaluations: Evaluations) -> BoolArray:
-        """Which of M evaluations are unsafe in which of their R repeats; shape (R, M), R is 1
+        """Return which of the R runs of each of M evaluations are unsafe, shape (R, M). R is 1
         without repeats.
         """
         rounds = self._rounds(evaluations)
@@ -173,16 +181,16 @@ class Unsafe:
         return evaluations.rounds or [evaluations]
 
     def number(self, evaluations: Evaluations) -> float:
-        """How many evaluations are unsafe; each counts by the share of its repeats."""
+        """The number of unsafe evaluations. With repeats, an evaluation adds its share of unsafe
+        runs.
+        """
         total = round(float(self.runs(evaluations).mean(axis=0).sum()), SHARE_DECIMALS)
         if total == int(total):
             return int(total)
         return total
 
     def rows(self, solutions: pd.DataFrame) -> pd.Series[bool]:
-        """Which rows of `solutions`, a data frame from `safevar_sumo.results.load_runs`, are
-        unsafe.
-        """
+        """Return which rows of a data frame from `safevar_sumo.results.load_runs` are unsafe."""
         return self._holds(solutions["outcome"], solutions.__getitem__)  # type: ignore[no-any-return]
 
     def _holds(self, outcome: Any, column: ColumnOf) -> Quantity:
@@ -192,9 +200,9 @@ class Unsafe:
         return collides | (column(F_SAFE.name) < self.limit)
 
     def robustness(self, evaluations: Evaluations) -> FloatArray:
-        """How far evaluations are from the limit, in its unit, shape (M,): below 0 where they are
-        unsafe; infinite where the measure is undefined; on a collision by a bound, minus the speed
-        of the collision. Of repeats the worst counts.
+        """The distance of M evaluations from the limit, in its unit, shape (M,): below 0 if unsafe,
+        infinite if undefined. After a collision, a bound that does not stand alone gives minus the
+        speed of the collision. With repeats, the worst run counts.
         """
         rounds = self._rounds(evaluations)
         return np.asarray(np.min(list(map(self._robustness, rounds)), axis=0))
@@ -208,22 +216,23 @@ class Unsafe:
         )
 
     def _excess(self, evaluations: Evaluations) -> FloatArray:
-        """By how much evaluations are on the safe side of the limit; NaN where undefined."""
+        """The distance of evaluations from the limit, positive on the safe side; NaN if
+        undefined.
+        """
         return evaluations.f_safe - self.limit
 
     def value(self, robustness: float) -> float:
-        """What has a robustness: a distance between bumpers [m], or the value that is
-        limited.
-        """
+        """The limited value: a clearance between bumpers [m], a safety degree or a metric."""
         return self.distance + robustness
 
     def value_in_words(self, value: float) -> str:
-        """What a safe vehicle has: `keeps 0.31 m of clearance`, `has drac 5.9`."""
+        """What a safe vehicle does, in words: `keeps 0.31 m of clearance`, `has drac 5.9`."""
         return f"keeps {value:.2f} m of clearance"
 
     def breach_in_words(self, vehicle: Evaluations) -> str:
         """What a single unsafe vehicle does, with its value: `has drac 6.77 > 5.3`, `collides at
-        3.21 m/s`, `keeps 0.04 m of clearance, less than 0.3 m`; with repeats, in how many runs.
+        3.21 m/s`, `keeps 0.04 m of clearance, less than 0.3 m`. With repeats the text also says how
+        many runs are unsafe.
         """
         return (
             f"{self._breach_in_words(vehicle)}{runs_in_words(self.runs(vehicle)[:, 0])}"
@@ -315,7 +324,7 @@ class Unsafe:
 
 
 class UnsafeStated(Unsafe):
-    """A criterion that a user states."""
+    """A criterion that a user states, or that replaces collisions if nothing collides."""
 
     is_collision = False
     verbs = "is unsafe", "are unsafe"
@@ -361,7 +370,7 @@ class UnsafeDegree(UnsafeStated):
 
     @property
     def remark(self) -> str:
-        """What to know of a screening limit."""
+        """A sentence that says that a default limit stands in for a collision."""
         if not self.is_half:
             return ""
         return (
@@ -382,7 +391,7 @@ class UnsafeDegree(UnsafeStated):
 
     def _breach_in_words(self, vehicle: Evaluations) -> str:
         degree = float(vehicle.f_safe[0])
-        # A collision is below a limit that is a distance whatever its speed.
+        # If the limit is a distance, every collision is beyond it, and the text states the speed.
         if degree < 0 <= self.degree:
             return super()._breach_in_words(vehicle)
         unit = unit_of_degree(degree)
@@ -391,11 +400,11 @@ class UnsafeDegree(UnsafeStated):
 
 
 class UnsafeMetric(UnsafeStated):
-    """A metric beyond a limit, or a collision."""
+    """A metric beyond a limit, or (unless `stands_alone`) a collision."""
 
     bound: MetricBound
     stands_alone = False
-    """Whether a collision is not unsafe in itself."""
+    """Whether only the metric decides: a collision alone is then not unsafe."""
 
     def __str__(self) -> str:
         return str(self.bound)
@@ -456,7 +465,7 @@ class UnsafeMetric(UnsafeStated):
 
 
 class UnsafeImpact(UnsafeMetric):
-    """A bound on the impact, which may be allowed."""
+    """A bound on the impact: an impact up to an allowed speed is safe."""
 
     is_of_impacts = stands_alone = True
 
@@ -470,7 +479,7 @@ class UnsafeImpact(UnsafeMetric):
 
 
 class UnsafeShare(UnsafeMetric):
-    """A bound on the share of unsafe runs."""
+    """A bound on the share of unsafe runs of a vehicle."""
 
     stands_alone = True
 
@@ -479,7 +488,7 @@ class UnsafeShare(UnsafeMetric):
 
 
 METRIC_KINDS = {IMPACT_EXCESS.name: UnsafeImpact, UNSAFE_SHARE.name: UnsafeShare}
-"""The classes of criteria by a metric that are not `UnsafeMetric`."""
+"""The classes of criteria for metrics whose criterion is not an `UnsafeMetric`."""
 
 
 CriterionLike = Unsafe | float | str
