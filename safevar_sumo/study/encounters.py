@@ -1,4 +1,6 @@
-"""What the vehicles of a study meet: tests, whose axes list values or are ranges of them."""
+"""The encounters of a study: tests, whose axes (parameters of encounters) list values or have
+ranges.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +25,16 @@ from safevar_sumo.study.parameters import free_parameters, searched
 
 Parameters = dict[str, Any]
 WORST = "worst"
-"""The aggregate of a matrix by which the least safety degree decides."""
+"""The aggregate of a matrix by which the test case with the least safety degree gives the
+result.
+"""
 TESTS: Final = "tests"
 RANGES: Final = "ranges"
-"""What the vehicles of a study meet: listed encounters, or any in the ranges of its axes."""
+"""Values of the key `encounters`: vehicles meet the listed encounters, or any encounter in the
+ranges of the axes.
+"""
 BY_EXCESS = "impact_excess >"
-"""The aggregate of a matrix in which impacts may be allowed."""
+"""The aggregate of a matrix with a test that allows an impact."""
 
 
 class ModelTable(Table, frozen=True, kw_only=True):
@@ -59,8 +65,8 @@ class ModelTable(Table, frozen=True, kw_only=True):
 
 
 ORIGINAL_MARGIN = 0.3
-"""Distance that the original vehicle must keep in an encounter that is searched, unless the study
-says another [m].
+"""Least distance that the original vehicle must keep in an encounter of a range, unless the study
+states another distance [m].
 """
 
 
@@ -87,12 +93,14 @@ class AxisTable(Table, frozen=True, kw_only=True):
     short_name: ShortText = ""
 
     def __post_init__(self) -> None:
-        # An illegal range is refused here, with the path of the axis.
+        # Building the range checks its ends, so that the error names the path of this axis.
         _ = self.range
 
     @property
     def range(self) -> Domain | None:
-        """The range; None without one, as of texts and seeds."""
+        """The range of the axis; None without a range. The values of an axis may be texts or seeds,
+        which have no range.
+        """
         if self.lower is None or self.upper is None or self.original is None:
             return None
         fields = asdict(self)
@@ -101,16 +109,16 @@ class AxisTable(Table, frozen=True, kw_only=True):
 
 
 AxisTables = dict[str, AxisTable]
-"""Axes by their names."""
+"""Axes by their names, all as tables."""
 
 
 def axis_of(domain: Domain) -> AxisTable:
-    """An axis whose range is a domain."""
+    """An axis that has the range of a domain, and lists no values."""
     return AxisTable(**asdict(domain))
 
 
 Axes = dict[str, Annotated[list[Any], Meta(min_length=1)] | AxisTable]
-"""Axes of encounters by name."""
+"""Axes by their names, as in a study: each axis is a list of values, or a table."""
 
 
 class ScenarioTable(ModelTable, frozen=True, kw_only=True):
@@ -174,7 +182,7 @@ def are_numbers(values: Iterable[object]) -> bool:
 
 
 def as_axes(over: Parameters) -> AxisTables:
-    """Axes as tables."""
+    """Convert axes to tables: an axis that is a list becomes the key `at` of a table."""
     axes = dict(over)
     for name, at in over.items():
         if not isinstance(at, AxisTable):
@@ -183,17 +191,17 @@ def as_axes(over: Parameters) -> AxisTables:
 
 
 def _ranges_of(axes: Iterable[tuple[str, AxisTable]]) -> Domains:
-    """The ranges of axes that have one."""
+    """The ranges of all axes that have a range."""
     return {name: axis.range for name, axis in axes if axis.range is not None}
 
 
 def _lists_of(axes: AxisTables) -> Axes:
-    """The lists of axes that have one."""
+    """The lists of all axes that list values."""
     return {name: axis.at for name, axis in axes.items() if axis.at}
 
 
 def _widest(domains: Sequence[Domain]) -> Domain:
-    """The first of several domains, as wide as all of them together."""
+    """The first of several domains, with ends that include all of these domains."""
     lower = min(domain.lower for domain in domains)
     upper = max(domain.upper for domain in domains)
     return replace(domains[0], lower=lower, upper=upper)
@@ -225,7 +233,7 @@ class MatrixTest(Table, frozen=True, kw_only=True):
 
     @property
     def axes(self) -> AxisTables:
-        """The axes of `over`."""
+        """The axes that the test states under `over`, as tables."""
         return as_axes(self.over)
 
 
@@ -253,16 +261,16 @@ class MatrixTable(Table, frozen=True, kw_only=True):
 
 
 class Encounters(Table, frozen=True, kw_only=True):
-    """What vehicles meet: a scenario in a weather, or the tests of a matrix; listed encounters, or
-    any in the ranges of the axes.
+    """The encounters of a study: a scenario in a weather, or the tests of a matrix. Vehicles meet
+    the listed encounters, or any encounter in the ranges of the axes.
 
-    A setting meets the tests whose ranges and constraints hold its encounter (`Point.meets`), and
-    the worst of them decides (`safevar_sumo.sumo.encounters.worst_points`).
+    A setting belongs to the tests whose ranges and constraints contain its encounter
+    (`Point.meets`). The worst of these tests decides (`safevar_sumo.sumo.encounters.worst_points`).
 
-    Which encounters count: listed ones always; with ranges a setting counts where the original
-    vehicle keeps the `margin` in all tests that it meets. Without a margin (`all_count`) all count:
-    in `permit`, and at other phases of listed encounters. Between listed ones an encounter counts
-    unless the original is unsafe there (`Model.new_car`).
+    Listed encounters always count. With ranges, a setting counts if the original vehicle keeps the
+    `margin` in all tests to which the setting belongs. Without a margin (`all_count`) all settings
+    count: in `permit`, and at other phases of listed encounters. Between listed encounters, an
+    encounter counts unless the original vehicle is unsafe in this encounter (`Model.new_car`).
     """
 
     scenario: Annotated[ScenarioTable, PART_OF_SYSTEM, OF_SCENARIO]
@@ -272,7 +280,11 @@ class Encounters(Table, frozen=True, kw_only=True):
     constraints: list[Constraint] = []
 
     def check_axes(self, characteristics: Domains) -> None:
-        """Refuse axes that something else sets, too, and what is about ranges without any."""
+        """Refuse axes that contradict the rest of the study.
+
+        An axis must not share its name with a characteristic, and must not lack values. Ranges and
+        a margin need an axis with a range, and constraints need existing names.
+        """
         axes = self._named_axes
         for name, axis in axes:
             if name in characteristics:
@@ -310,19 +322,21 @@ class Encounters(Table, frozen=True, kw_only=True):
 
     @property
     def tests(self) -> list[MatrixTest]:
-        """The tests of the matrix; none without one."""
+        """The tests of the matrix; an empty list without a matrix."""
         if self.matrix is None:
             return []
         return self.matrix.tests
 
     @property
     def axes(self) -> set[str]:
-        """The names of the axes that a test has."""
+        """The names of all axes of all tests."""
         return {*dict(self._named_axes)}
 
     @property
     def _named_axes(self) -> list[tuple[str, AxisTable]]:
-        """The axes of all tests, with their names."""
+        """The axes of all tests, with their names; a name occurs once for each test that has the
+        axis.
+        """
         pairs = list[tuple[str, AxisTable]]()
         for test in self._tests_or_none:
             pairs += self.axes_of(test).items()
@@ -330,11 +344,14 @@ class Encounters(Table, frozen=True, kw_only=True):
 
     @property
     def _tests_or_none(self) -> list[MatrixTest | None]:
-        """The tests; None for the encounters of a study without any."""
+        """The tests; [None] for a study without a matrix, whose only encounter is its scenario."""
         return [*self.tests] or [None]
 
     def axes_of(self, test: MatrixTest | None) -> AxisTables:
-        """The axes of a test, its own first; those of all tests, unless it has values of them."""
+        """The axes of a test: first its own axes, then the axes of [scenario.over] that the test
+        does not state itself. The weathers of a test replace axes of the weather. For None: the
+        axes of [scenario.over].
+        """
         shared = as_axes(self.scenario.over)
         if test is None:
             return shared
@@ -345,27 +362,31 @@ class Encounters(Table, frozen=True, kw_only=True):
         return axes | shared | axes
 
     def lists_of(self, test: MatrixTest | None) -> dict[str, list[Any]]:
-        """The axes of a test whose values are driven one after another."""
+        """The lists of values at which a test is driven, for each axis that has no range in use."""
         ranges = self.ranges_of(test)
         axes = self.axes_of(test).items()
         return {name: axis.at for name, axis in axes if axis.at and name not in ranges}
 
     def ranges_of(self, test: MatrixTest | None) -> Domains:
-        """The axes of a test of which any value may occur."""
+        """The axes of a test on which any value in a range may occur; none if encounters are
+        listed.
+        """
         if self.encounters == TESTS:
             return {}
         return _ranges_of(self.axes_of(test).items())
 
     @property
     def states_ranges(self) -> bool:
-        """Whether an axis has a range beside or without listed values."""
+        """Whether an axis of any test has a range, with or without listed values."""
         return bool(_ranges_of(self._named_axes))
 
     @property
     def ranges(self) -> Domains:
-        """Of which parameters of its encounter each setting has a value beside the vehicle: the
-        axes of all tests whose values may be any, each as wide as in its widest test; those of
-        [scenario.over] alone come last.
+        """The parameters of the encounter that are part of each setting, after the values of the
+        vehicle.
+
+        These parameters are the axes with ranges of all tests. The range of an axis includes its
+        ranges in all tests. Axes that only [scenario.over] states come last.
         """
         domains: dict[str, list[Domain]] = {}
         for test in self.tests:
@@ -378,8 +399,8 @@ class Encounters(Table, frozen=True, kw_only=True):
         return dict(zip(domains, map(_widest, domains.values()), strict=True))
 
     def points_of(self, test: MatrixTest) -> list[MatrixTest]:
-        """A test at each of its points alone: at each combination of its listed values, in each of
-        its weathers.
+        """Split a test into tests of a single test case: one test for each combination of its
+        listed values, in each of its weathers.
         """
         lists = self.lists_of(test)
         points = []
@@ -395,7 +416,9 @@ class Encounters(Table, frozen=True, kw_only=True):
         return points
 
     def mapped(self, change: Callable[[AxisTables], Axes]) -> Self:
-        """The study with other axes of each test, and of all; lists alone are written as such."""
+        """The study with changed axes. `change` maps the axes of each test, and the axes of
+        [scenario.over]. An axis that has nothing but a list becomes a list again.
+        """
 
         def changed(over: Axes) -> Axes:
             axes = {}
@@ -412,18 +435,22 @@ class Encounters(Table, frozen=True, kw_only=True):
         return replace(self, matrix=matrix, scenario=scenario)
 
     def listed(self) -> Self:
-        """The study without the ranges of axes that list values; itself if any value may occur."""
+        """The study without the ranges of axes that list values. The same study if any value in a
+        range may occur.
+        """
         if self.encounters == RANGES:
             return self
         return self.mapped(_lists_of)
 
     @property
     def all_count(self) -> Self:
-        """The study whose encounters all count, whatever the original vehicle does in them."""
+        """The study without a margin: every encounter counts, whatever the original vehicle does in
+        it.
+        """
         return replace(self, scenario=replace(self.scenario, margin=None))
 
     def with_tests(self, tests: Sequence[MatrixTest]) -> Self:
-        """The study in these tests alone, with the constraints that concern them."""
+        """The study with these tests alone, and with the constraints that apply in any of them."""
         assert self.matrix is not None
         names = {test.name for test in tests}
         constraints = []
