@@ -1,6 +1,4 @@
-"""Simulate one setting beside the original vehicle, with a trace of every step, or many settings at
-once.
-"""
+"""Simulate one setting beside the original vehicle, and record a trace of every step."""
 
 from __future__ import annotations
 
@@ -57,14 +55,14 @@ OBSERVATION_HEADS = {
 def trace_frame(
     runs: SimulationRuns, observations: Sequence[Observation], row: int
 ) -> pd.DataFrame:
-    """One row for each step of a simulation of one vehicle, until its end; it is in this row of the
-    observations.
+    """The trace of one vehicle's simulation: one row for each step until the simulation ends.
 
     The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold
-    the obstacle's true position; the columns that begin with "seen" hold what the ADS observed.
-    `ttc` is empty while no gap closes or the vehicle stands, `gap` while no obstacle is ahead.
+    the obstacle's true position. The columns that begin with "seen" hold what the ADS observed:
+    element `row` of the `observations`. `ttc` is empty while no gap closes or the vehicle stands.
+    `gap` is empty while no obstacle is ahead.
     """
-    # It takes longer to load than the simulation.
+    # Loading pandas takes longer than the simulation.
     import pandas as pd
 
     trace = runs.trace
@@ -88,7 +86,7 @@ def trace_frame(
     for name, column in columns.items():
         frame[name] = column[active, 0]
 
-    # The driving system of a simulator of the user's own is inside, and says nothing.
+    # A simulator of the user's own has the driving system inside, and returns no observations.
     if not observations:
         return frame.replace([np.inf, -np.inf], np.nan).dropna(
             axis="columns", how="all"
@@ -107,11 +105,11 @@ def trace_frame(
 
 
 class Pair(NamedTuple):
-    """The original vehicle (row 0) and a changed one (row 1, if it differs), which `system` drove
-    together at a point.
+    """The original vehicle (row 0) and the changed vehicle (row 1), driven together at one point.
+    If the setting equals the original, the pair has row 0 only.
 
-    `observations` hold what the driving systems observed at every sample, arrays of shape (1,) or
-    (2,).
+    `system` drove both vehicles. `observations` hold what the driving systems observed at every
+    sample, in arrays of shape (1,) or (2,).
     """
 
     point: Point
@@ -203,7 +201,7 @@ class Simulation:
     @property
     def units(self) -> dict[str, str]:
         """The unit of every number of `to_dict`, by its name."""
-        # Metrics may be objectives, too.
+        # Objectives may be metrics, too: the dictionary has their names once.
         measures = (*self.scoring.metrics, *self.scoring.objectives)
         return {
             "collision_speed": "m/s",
@@ -225,15 +223,15 @@ class Simulation:
 
     @property
     def gap(self) -> float:
-        """The least distance between bodies during the encounter [m]; 0 on a collision, NaN without
-        an encounter.
+        """The least clearance between bodies in the encounter [m]: 0 on a collision, NaN without
+        encounter.
         """
         return float(self.evaluation.gaps(self.runs.middles_apart)[0])
 
     @property
     def numbers(self) -> JsonObject:
-        """Outcome, metrics, objectives and gap as plain values, None where undefined; `driven` is
-        false if simulations of the study tell nothing about its ADS.
+        """Outcome, metrics, objectives and gap as plain values; None means undefined. `driven` is
+        false if simulations of the study say nothing about its ADS.
         """
         gap = finite_or_none(self.gap)
         return {
@@ -244,7 +242,9 @@ class Simulation:
 
     @property
     def verdict(self) -> str:
-        """How the simulation ended, in words; with repeats, in how many of them it is unsafe."""
+        """How the simulation ended, in words. With repeats, the text says how many runs are
+        unsafe.
+        """
         runs = runs_in_words(self.pair.system.criterion.runs(self.evaluation)[:, 0])
         is_breach = (
             self.pair.system.criterion.of(self.evaluation)[0]
@@ -275,7 +275,9 @@ class Simulation:
 
     @property
     def _digits(self) -> int:
-        """Decimals of a safety degree: 2, or as many more as make both of the pair differ."""
+        """Decimals of a safety degree: 2, or as many as it takes until the two vehicles of the pair
+        differ.
+        """
         difference = np.ptp(self.pair.evaluations.column(SAFETY_DEGREE))
         if difference > 0:
             return max(2, math.ceil(-math.log10(difference)))
@@ -369,8 +371,10 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
 def changed_setting(
     system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool
 ) -> FloatArray:
-    """The unfiltered setting with these changes, shape (n,); raises InputError if it is illegal or,
-    after the filter if `filtered`, infeasible.
+    """The unfiltered setting with these changes, shape (n,).
+
+    The function raises an InputError if the setting is illegal, or infeasible. If `filtered`, the
+    setting must be feasible after the filter.
     """
     with about("changes"):
         setting = system.characteristics.setting(
@@ -385,8 +389,8 @@ def changed_setting(
 def simulate_with_original(
     study: Study, system: System, requested: FloatArray, *, filtered: bool
 ) -> Simulation:
-    """Simulate a setting, shape (n,), which is filtered first if `filtered`, beside the original
-    vehicle; in a matrix, both at the setting's worst point.
+    """Simulate a setting, shape (n,), beside the original vehicle. In a matrix, both vehicles drive
+    at the setting's worst point. If `filtered`, the filter first resets small changes.
     """
     characteristics = system.characteristics
     filtered_setting = characteristics.filter(requested)
