@@ -1,6 +1,6 @@
-"""The tables of a study about its characteristics, and their checks: values and domains; how
-characteristics vary in the world; constraints that they satisfy together; and limits that a user
-sets, under [limits] or on the command line as `NAME >= X` and `NAME <= X`.
+"""The tables of a study about its characteristics, and the checks of these tables: domains,
+variation between vehicles, constraints on several characteristics, and limits. A user states limits
+under [limits], or on the command line as `NAME >= X` and `NAME <= X`.
 """
 
 from __future__ import annotations
@@ -21,20 +21,22 @@ PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
 ShortText = Annotated[str, Meta(max_length=200), WITHOUT_EFFECT]
 LongText = Annotated[str, Meta(max_length=400)]
 MAX_MAGNITUDE = 1e12
-"""Largest magnitude of a characteristic."""
+"""Largest magnitude of a characteristic's values, in its unit."""
 
 
 def mistake(problem: str, legal: str) -> ValueError:
-    """The error for a record whose values contradict each other; `convert_table` adds its path."""
+    """The error for a record whose values contradict each other. `convert_table` adds the record's
+    path.
+    """
     return ValueError(f"{problem}\n{legal}")
 
 
 class Domain(Table, frozen=True, kw_only=True):
-    """What a search varies: its `original` value, and the ends `lower` and `upper` of its domain,
-    in `unit`.
+    """A domain is the range of a quantity that a search varies, from `lower` to `upper` in `unit`.
+    `original` is the quantity's value for the original vehicle.
 
-    `meaning` describes it; `short_name` is its name in sentences, by default the beginning of
-    `meaning` up to the first comma or bracket.
+    `meaning` describes the quantity. `short_name` is the quantity's name in sentences, by default
+    the beginning of `meaning` up to the first comma or bracket.
     """
 
     unit: str
@@ -62,7 +64,7 @@ class Domain(Table, frozen=True, kw_only=True):
 
 
 Interval = tuple[float, float]
-"""A smallest and a largest value."""
+"""The smallest and the largest value of a range."""
 Domains = Mapping[str, Domain]
 """Domains by the names of their characteristics."""
 
@@ -104,7 +106,7 @@ def unit_text(unit: str) -> str:
 
 
 def _number_within(lower: float, upper: float, row: Domain) -> str:
-    """What an error expects of a value of a characteristic."""
+    """The legal values of a characteristic, in the words of an error."""
     return f"a number in [{lower:g}, {upper:g}]{unit_text(row.unit)}"
 
 
@@ -233,18 +235,18 @@ class Constraint(Table, frozen=True, kw_only=True):
     def quantity(self) -> str:
         """The sum in words, such as `mass - 2 radius`."""
         text = " ".join(starmap(_term, self.sum.items()))
-        # The first term has its sign without a space.
+        # "- mass" reads as a difference: a sign at the beginning of the sum stands without a space.
         return re.sub("^- ", "-", text.removeprefix("+ "))
 
     @property
     def ends(self) -> Interval:
-        """The bounds; infinite where none is stated."""
+        """The least and the largest allowed sum; infinite for a bound that is not stated."""
         low = -math.inf if self.at_least is None else self.at_least
         return low, math.inf if self.at_most is None else self.at_most
 
     def allows(self, values: Mapping[str, Any]) -> Any:
-        """Whether the sum is within its bounds at these values, numbers or arrays of shape (N,), or
-        one of its terms has no value among them.
+        """Whether the sum is within its bounds. The `values` are numbers or arrays of shape (N,). A
+        constraint allows everything if one of its characteristics has no value.
         """
         if not self.sum.keys() <= values.keys():
             return True
@@ -253,7 +255,9 @@ class Constraint(Table, frozen=True, kw_only=True):
         return (total >= low) & (total <= high)
 
     def unit_of(self, rows: Domains) -> str:
-        """The unit of the sum; `rows` are the characteristics of the vehicle."""
+        """The unit of the sum: the stated unit, or that of its first characteristic among
+        `rows`.
+        """
         if self.unit is not None:
             return self.unit
         return next((rows[name].unit for name in self.sum if name in rows), "-")
@@ -278,7 +282,7 @@ def _term(name: str, weight: float) -> str:
 
 
 def check_bounds(at_least: float | None, at_most: float | None) -> None:
-    """Refuse bounds that are missing or cross."""
+    """Refuse a pair of missing bounds, and a lower bound above the upper bound."""
     if at_least is None and at_most is None:
         raise mistake("neither at_least nor at_most", "one of them, or both")
     if at_least is not None and at_most is not None and at_least > at_most:
@@ -332,7 +336,9 @@ class Limit(Table, frozen=True, kw_only=True):
         check_bounds(self.at_least, self.at_most)
 
     def interval(self, row: Domain) -> Interval:
-        """The limited interval [unit]; a side without a limit ends with the domain."""
+        """The allowed interval of a characteristic [its unit]. A side without limit ends with the
+        domain.
+        """
         low, high = self.at_least, self.at_most
         if low is None:
             low = row.lower
@@ -368,8 +374,9 @@ def limits_of(
     rows: Domains,
     stated: Mapping[str, Limit] | None = None,
 ) -> dict[str, Limit]:
-    """Limits by characteristic, in the order of `rows`: those of `texts`, such as `treadDepth >=
-    3`, and where a text does not replace them, those `stated` in a study.
+    """Combine typed and stated limits into one limit for each characteristic, in the order of
+    `rows`. A limit that is typed (in `texts`, such as `treadDepth >= 3`) replaces the limit that is
+    `stated` in a study.
 
     Raises
     ------
@@ -393,15 +400,15 @@ def limits_of(
         problem, _, legal = str(error).partition("\n")
         raise InputError("", f"{', '.join(texts)}: {problem}", legal) from None
 
-    # Limits that are typed replace stated ones.
+    # A typed limit replaces the stated limit of the same characteristic, with both of its sides.
     check_limits(rows, typed)
     limits = {**(stated or {}), **typed}
     return {name: limits[name] for name in rows if name in limits}
 
 
 def check_limits(rows: Domains, limits: Mapping[str, Limit], table: str = "") -> None:
-    """Refuse limits of unknown characteristics, outside the domain, or that exclude the
-    original.
+    """Refuse limits of unknown characteristics, limits outside the domain, and limits that exclude
+    the original value. `table` is the prefix of names in errors.
     """
     for name, limit in limits.items():
         _check_characteristic(table, name, rows)
