@@ -41,7 +41,7 @@ from safevar_sumo.study.parameters import FreeParameter
 PositiveInt = Annotated[int, Meta(ge=1, le=10_000_000)]
 Seed = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Tables = Mapping[str, Any]
-"""A study's tables, as in a file."""
+"""A study's tables, as in its file."""
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]*\Z"
 Name = Annotated[
     str,
@@ -51,15 +51,15 @@ Name = Annotated[
     ),
 ]
 SPREAD_TABLES = ("vehicle.parameters.", "ads.parameters.", "weather.")
-"""Prefixes of the parameters that may stand in [spread]."""
+"""Prefixes of the parameters that [spread] may list."""
 SAFETY_DEGREE: Final = "safety_degree"
-"""Column and key of the safety degree."""
+"""The name of the safety degree, as a column of results and as a key."""
 ORIGINAL_DEGREE: Final = "original_safety_degree"
-"""Column of the original vehicle's safety degree in the same encounter, where encounters are
-ranges.
+"""The name of the column with the original vehicle's safety degree in the same encounter. Only
+studies with ranges of encounters have this column.
 """
 OBJECTIVES = (SAFETY_DEGREE, "f_diff", "f_num_diff")
-"""Objectives of the published study."""
+"""Objectives of a search, as in the published study."""
 
 
 class VehicleTable(Table, frozen=True, kw_only=True):
@@ -139,7 +139,7 @@ PYMOO = "pymoo:"
 
 
 def label_of(algorithm: str) -> str:
-    """Label of an algorithm in results: pymoo_NSGA3 for `pymoo:NSGA3`, the Name of any other
+    """The label of an algorithm in results: pymoo_NSGA3 for `pymoo:NSGA3`, and Name for
     `package.module:Name`.
     """
     if algorithm.startswith(PYMOO):
@@ -184,14 +184,23 @@ class RepairTable(Table, frozen=True, kw_only=True):
 
 
 class Origin(Table, frozen=True, kw_only=True):
-    """Where a study comes from; results do not depend on it.
+    """Where a study comes from. Results do not depend on the origin.
 
-    `called` is the study's path as given on the command line, empty if the study was given by its
-    name; `point` is the test, or the point of the matrix, to which the study was reduced, empty for
-    a whole study, `ranges` whether its encounters are ranges by the option of this name, and
-    `up_to` where they end by that option; `places` are the folders of its file and of the files
-    that it extends, where user code is looked up first; `files` are those of these files that are
-    not shipped.
+    Attributes
+    ----------
+    called
+        The study's path as typed on the command line; "" if the user typed the study's name.
+    point
+        The test or test case to which an option reduced the study; "" for a whole study.
+    ranges
+        Whether the option `--ranges` made the study's encounters ranges.
+    up_to
+        The text of the option `--up-to`, which cuts off encounters; "" without this option.
+    places
+        The folders of the study's file and of the files that the study extends. User code is looked
+        up in these folders first.
+    files
+        The files of the study, and the files that the study extends, that are not shipped.
     """
 
     called: str = ""
@@ -231,7 +240,7 @@ class Study(Encounters, frozen=True, kw_only=True):
     - `unsafe` states which vehicles the study calls unsafe.
     """
 
-    # A key without the mark WITHOUT_EFFECT is part of the identity of results.
+    # Only keys without the mark WITHOUT_EFFECT are part of the identity of results.
     name: Name
     title: Annotated[str, WITHOUT_EFFECT, OF_SYSTEM]
     vehicle: Annotated[VehicleTable, PART_OF_SYSTEM]
@@ -291,8 +300,8 @@ class Study(Encounters, frozen=True, kw_only=True):
 
     @property
     def shared_constraints(self) -> list[Constraint]:
-        """The constraints that every setting has to satisfy: those that concern all tests, and no
-        parameter that a setting does not have.
+        """The constraints that every setting has to satisfy: constraints that apply in all tests,
+        and whose names are all in the study's `domains`.
         """
         tests = {test.name for test in self.tests} or {""}
         names = self.domains.keys()
@@ -305,7 +314,9 @@ class Study(Encounters, frozen=True, kw_only=True):
 
     @property
     def domains(self) -> Domains:
-        """What a search varies: the vehicle's characteristics, then parameters of encounters."""
+        """The domains that a search varies: the vehicle's characteristics, then parameters of
+        encounters.
+        """
         return {**self.vehicle.characteristics, **self.ranges}
 
     @property
@@ -319,12 +330,14 @@ class Study(Encounters, frozen=True, kw_only=True):
 
     @property
     def source(self) -> str:
-        """The study's name in errors: its file, or its own name if it has no file."""
+        """The study's name in errors: the path that the user typed, or else the name of the
+        study.
+        """
         return self.origin.called or f"study {self.name!r}"
 
     @property
     def words(self) -> str:
-        """How a command line names the study, at the point to which it was reduced."""
+        """The words by which a command names the study, with the options that reduced the study."""
         words = [self.origin.called or self.name]
         if self.origin.ranges:
             words.append("--ranges")
@@ -336,7 +349,7 @@ class Study(Encounters, frozen=True, kw_only=True):
 
 
 def tables_of(study: Study) -> Parameters:
-    """A study as plain tables as in a file, without its origin and without keys that have their
+    """A study as plain tables, as in a file. The tables lack the study's origin, and all keys with
     default values.
     """
     tables: Parameters = _without_defaults(study)
@@ -366,12 +379,8 @@ def _without_defaults(value: Any) -> Any:
 
 
 def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str]:
-    """The table or list that holds a parameter of a study, and the parameter's key or index in it.
-
-    Raises
-    ------
-    InputError
-        If the study has no such number.
+    """The table or list that holds a parameter, and the parameter's key or index. `name` is the
+    path of the parameter from `tables`, with dots.
     """
     *path, parameter = name.split(".")
     table = tables
@@ -381,7 +390,7 @@ def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str]:
         key_or_index = _key_or_index(table, parameter)
         is_number = isinstance(table[key_or_index], int | float)
     except (KeyError, IndexError, ValueError, TypeError):
-        # A shipped weather is looked up later.
+        # A shipped weather is only a name here: its numbers are looked up later.
         is_number = path[:1] == ["weather"] and isinstance(tables["weather"], str)
         key_or_index = parameter
     if not (is_number and name.startswith(SPREAD_TABLES)):
@@ -395,8 +404,8 @@ def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str]:
 
 
 def _key_or_index(table: Any, name: str) -> int | str:
-    """The key in a table, or the index in a list; an index has one spelling, so that each parameter
-    has one name.
+    """The name as a key of a table, or as an index of a list. An index in another spelling, such as
+    01, stays a text: each parameter has only one name.
     """
     if isinstance(table, list) and name == str(int(name)):
         return int(name)
