@@ -34,34 +34,35 @@ from safevar_sumo.records import (
 )
 
 PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
-"""A driver's parameter above 0, in SI units."""
+"""A driver's parameter above 0, in the SI unit of its quantity."""
 NonNegativeParameter = Annotated[float, Meta(ge=0, le=1e3)]
-"""A driver's parameter that may be 0, in SI units."""
+"""A driver's parameter that may be 0, in the SI unit of its quantity."""
 
 Memory = Any
-"""What an ADS remembers of N vehicles: an object of its own class with named attributes."""
+"""What an ADS remembers of N vehicles between two calls: an object of the ADS's own class."""
 
 
 class Ads:
-    """An ADS that drives N vehicles at once. The study's table `ads.parameters` fills its fields.
+    """An ADS that drives N vehicles at once. The study's table `ads.parameters` fills the class's
+    fields.
 
-    It gets an `Observation` and knows the original vehicle (`Nominal`), never the setting. Element
-    i of a command depends only on element i of the observations, bit for bit: neither on N nor on
-    other vehicles.
+    The ADS gets an `Observation` and knows the original vehicle (`Nominal`), never the setting.
+    Element i of a command depends only on element i of the observations, bit for bit: neither N nor
+    other vehicles change a command.
 
     Attributes
     ----------
     recognition_delay, hesitation
-        Delays of its reaction [s]; a study may raise them in bad weather.
+        Delays of the ADS's reaction [s]; a study may raise them in bad weather.
     max_vehicles
-        Largest number of vehicles at once; None if any number will do.
+        Largest number of vehicles that the ADS can drive at once; None without a limit.
     tau_parameter
-        The parameter in whose place an ADS that is SUMO's driver takes the headway `tau` of the
-        setting; "" for others.
+        The name of the parameter that the headway `tau` of the setting replaces. Only an ADS that
+        is SUMO's driver has such a parameter; "" for others.
     RETURNS
         What the methods of a user's class must return.
     HELPERS
-        Methods that a class may call, and replace by others of the same name.
+        Methods that a user's class may call, and may define differently under the same name.
     """
 
     __slots__ = ()
@@ -97,17 +98,17 @@ class Ads:
         nominal: Nominal | None = None,
         trim: Trim | None = None,
     ) -> Command:
-        """Pedals with which the original vehicle has an acceleration [m/s^2] at a speed [m/s] on a
-        dry, level road, shape (N,).
+        """The pedals with which the original vehicle reaches an acceleration [m/s^2] at a speed
+        [m/s] on a dry, level road. Both arrays have shape (N,).
 
         `nominal` is the original vehicle, by default the attribute `nominal` that `start` has set.
-        A `trim` is added; see `trim_at`.
+        The `trim` is added to the pedals; see `trim_at`.
         """
         return pedals_for(nominal or self.nominal, speed, acceleration, trim or NO_TRIM)
 
 
 class FullBrake(Ads):
-    """Brakes fully from the start on; drives where a scenario brakes by itself."""
+    """Brakes fully from the start on. This ADS drives in scenarios that brake by themselves."""
 
     def start(self, n: int, nominal: Nominal, step: float) -> Command:
         return Command(np.zeros(n), np.ones(n))
@@ -119,49 +120,48 @@ class FullBrake(Ads):
 
 
 Pedals = tuple[float, float]
-"""Throttle and brake, each in [0, 1]."""
+"""Throttle and brake of one vehicle, each in [0, 1]."""
 
 
 class ScalarAds(ABC):
-    """Base of an ADS for one vehicle; every simulated vehicle gets its own instance.
+    """Base of an ADS for one vehicle. Every simulated vehicle gets its own instance of the class.
 
-    A study names it as `package.module:Name`; its parameters are the arguments of `__init__`.
+    A study names the class as `package.module:Name`. The study's `ads.parameters` are the arguments
+    of `__init__`.
     """
 
     HELPERS: ClassVar[tuple[str, ...]] = ("pedals",)
     nominal: Nominal
     step: float
     warns = False
-    """Whether the ADS warns its driver; `drive` may set it."""
+    """Whether the ADS warns its driver now; `drive` may set this attribute."""
 
     def start(self, nominal: Nominal, step: float) -> None:
-        """Called once before the run, with the original vehicle and the time between two calls of
-        `drive` [s].
+        """Prepare a run. `start` is called once before the run, with the original vehicle and the
+        time between two calls of `drive` [s].
         """
         self.nominal = nominal
         self.step = step
 
     @abstractmethod
     def drive(self, observation: Observation) -> Pedals:
-        """Command throttle and brake, each in [0, 1], from an observation whose fields are
-        numbers.
-        """
+        """Command throttle and brake, each in [0, 1]. The fields of the observation are numbers."""
 
     def pedals(
         self, acceleration: Quantity, speed: Quantity, trim: Trim | None = None
     ) -> Pedals:
-        """Throttle and brake with which the original vehicle has an acceleration [m/s^2] at a
-        speed [m/s] on a dry, level road.
+        """The throttle and brake with which the original vehicle reaches an acceleration [m/s^2] at
+        a speed [m/s] on a dry, level road.
 
-        A `trim` is added; see `trim_at`.
+        The `trim` is added to the pedals; see `trim_at`.
         """
         throttle, brake = pedals_for(self.nominal, speed, acceleration, trim or NO_TRIM)
         return float(throttle), float(brake)
 
 
 def library(model: str, extra: str, module: str) -> Any:
-    """A module of the library of a shipped driving system; raises an InputError without the
-    extra.
+    """Import a module of the library that a shipped driving system needs. Raise an InputError if
+    the package's `extra` with this library is not installed.
     """
     try:
         return import_module(module)
@@ -192,7 +192,8 @@ class PerVehicleAds(Ads):
             values[row] = value
         observations = list(map(Observation._make, values.T.tolist()))
         pedals = [(0.0, 0.0)] * n
-        # A vehicle whose run has ended may have left what its driver expects.
+        # The driver of a vehicle whose run has ended is not called: the vehicle may be in a state
+        # that the driver does not expect.
         rows = open_rows(np.ones(n, bool)).tolist()
         with np.errstate():
             for i in rows:
@@ -206,7 +207,8 @@ class PerVehicleAds(Ads):
     def _checked_pedals(self, command: Any) -> Pedals:
         if type(command) is tuple and len(command) == 2:
             throttle, brake = command
-            # The fast path: this runs for every vehicle in every step.
+            # The fast path skips the general check, because this code runs for every vehicle in
+            # every step.
             if (
                 type(throttle) is type(brake) is float
                 and 0 <= throttle <= 1
@@ -226,11 +228,12 @@ class PerVehicleAds(Ads):
 
 
 def pedal_tables_at(nominal: Nominal, speed: Quantity) -> list[FloatArray]:
-    """The tables of coasting and of full throttle, interpolated linearly at `speed`; their speeds
-    are equally spaced.
+    """Return the original vehicle's deceleration without pedals, and its acceleration at full
+    throttle, at these speeds [m/s^2]. The values are interpolated linearly between the equally
+    spaced speeds of the tables.
     """
     tables = nominal.tables()
-    # Just before the last row at most, so that there is a next one.
+    # A speed beyond the table counts as just below the last row, because row + 1 must exist.
     position = np.minimum(speed / tables.speeds[1], len(tables.speeds) - 1.001)
     row = position.astype(np.intp)
     share = position - row
@@ -245,8 +248,10 @@ STEP_DECIMALS = 6
 
 
 class DelayLine(NamedTuple):
-    """A delay line: the delay as `steps` and a `fraction` of a step, one for all vehicles or one
-    for each, and the past values, oldest first.
+    """Delays the values of N vehicles.
+
+    The delay is `steps` whole steps and a `fraction` of a step; the fraction is a number, or an
+    array with a value for each vehicle. `past` has the past values, oldest first.
     """
 
     steps: int
@@ -261,23 +266,24 @@ class DelayLine(NamedTuple):
 
     @staticmethod
     def parts(delay: FloatOrArray, step: float) -> tuple[FloatArray, FloatArray]:
-        """Whole steps and the fraction of a step of a delay [s], or of several."""
+        """Split a delay [s], or an array of delays, into whole steps and the fraction of a step."""
         steps, fraction = np.divmod(
             np.round(np.asarray(delay) / step, STEP_DECIMALS), 1
         )
         return steps, fraction
 
     def delayed(self, values: FloatArray) -> tuple[FloatArray, DelayLine]:
-        """The values one delay ago, linear between two steps, and the next delay line.
+        """Return the values one delay ago (linear between two steps), and the delay line for the
+        next step.
 
-        Before the first step the first values hold. A value that appears or vanishes between the
-        two steps, infinite in one of them, is that of the earlier step.
+        Until the first values are one delay old, `delayed` returns the first values. If a value is
+        infinite in one of the two steps, no mean is defined: the value of the earlier step holds.
         """
         past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
         older = past[0]
         newer = past[1]
         if np.ndim(self.fraction) or self.fraction:
-            # The difference of two infinities is not defined.
+            # infinity - infinity is NaN: such values are replaced below.
             with np.errstate(invalid="ignore"):
                 mixture = newer + (older - newer) * self.fraction
             if not (is_defined := np.isfinite(mixture)).all():
@@ -288,8 +294,8 @@ class DelayLine(NamedTuple):
 
 
 class Trim(NamedTuple):
-    """The pedals of a rolling vehicle beyond those that hold the speed of the original vehicle on a
-    level road [-].
+    """The pedals of a rolling vehicle, minus the pedals with which the original vehicle holds this
+    speed on a level road [-]. On a slope, the trim balances gravity.
     """
 
     throttle: FloatArray
@@ -301,11 +307,13 @@ NO_TRIM = Trim(np.zeros(()), np.zeros(()))
 
 
 def trim_at(nominal: Nominal, observation: Observation) -> Trim:
-    """The trim of a driver who already holds the speed of a rolling vehicle; 0 at standstill."""
+    """The trim of a driver who already holds the speed of a rolling vehicle. The trim is 0 at
+    standstill.
+    """
     is_rolling = observation.speed > 0
     coasting, full_throttle = pedal_tables_at(nominal, observation.speed)
     holding_throttle = coasting / (full_throttle + coasting)
-    # Negative: it would have to push the vehicle.
+    # A negative brake would push the vehicle: without pedals, the vehicle slows down by `coasting`.
     holding_brake = -coasting / nominal.braking
     throttle = np.where(is_rolling, observation.throttle - holding_throttle, 0.0)
     return Trim(
@@ -319,7 +327,9 @@ def trim_at(nominal: Nominal, observation: Observation) -> Trim:
 def cruise_at(
     nominal: Nominal, observation: Observation, speed: float | None
 ) -> tuple[FloatArray, Trim]:
-    """The speed that a cruise control holds [m/s], by default that of now, and its trim."""
+    """The speed that a cruise control holds [m/s], and its trim. If `speed` is None, the cruise
+    control holds the present speed.
+    """
     speeds = (
         observation.speed if speed is None else np.full_like(observation.speed, speed)
     )
@@ -329,8 +339,8 @@ def cruise_at(
 def pedals_for(
     nominal: Nominal, speed: Quantity, acceleration: Quantity, pedal_trim: Trim
 ) -> Command:
-    """Pedals for an acceleration [m/s^2] at a speed [m/s], from the tables of the original vehicle
-    and a trim.
+    """The pedals for an acceleration [m/s^2] at a speed [m/s], according to the tables of the
+    original vehicle. `pedal_trim` is added to the pedals.
     """
     coasting, full_throttle = pedal_tables_at(nominal, speed)
     excess = acceleration + coasting - nominal.braking * pedal_trim.brake
@@ -344,20 +354,23 @@ def pedals_for(
 
 
 CORRIDOR = 1.15
-"""Half the width of the corridor that a driver watches [m]: an adult in it has his middle up to 1.4
-m from the lane's middle, a car, which is 1.7 m wide, up to 2.0 m.
+"""Half the width of the corridor that a driver watches [m]. An obstacle with a side in the corridor
+is in the way. The middle of an adult in the way is up to 1.4 m from the lane's middle, and the
+middle of a car (1.7 m wide) up to 2.0 m.
 """
 LEAST_CLOSING_SPEED = 0.1
-"""Lower bound of a positive closing speed [m/s]; keeps times finite."""
+"""Lower bound of a positive closing speed [m/s]. Without this bound, times would become
+infinite.
+"""
 LARGEST_GAP = 1e6
-"""Upper bound of gaps [m], also the time [s] or lateral position [m] without an obstacle; keeps
-them finite.
+"""Upper bound of gaps [m]. The same number stands for an infinite time [s], and for the lateral
+position of a missing obstacle [m], because arithmetic with infinities gives NaN.
 """
 
 
 def time_to_reach(observation: Observation) -> FloatArray:
-    """Time to collision, gap over closing speed [s], shape (N,); `LARGEST_GAP` while the gap does
-    not shrink.
+    """The time to collision (gap / closing speed) [s], shape (N,). The time is `LARGEST_GAP` while
+    the gap does not shrink.
     """
     gap = np.minimum(np.maximum(observation.gap, 0.0), LARGEST_GAP)
     return np.where(
@@ -370,8 +383,8 @@ def time_to_reach(observation: Observation) -> FloatArray:
 def is_in_the_way(
     observation: Observation, corridor: float, reach: float = np.inf
 ) -> BoolArray:
-    """Whether a side of a detected obstacle ahead is within `corridor` of the lane's middle [m], or
-    will be when the vehicle reaches it.
+    """Return whether a detected obstacle ahead has a side within `corridor` of the lane's middle
+    [m], now or when the vehicle reaches the obstacle.
 
     `reach` is the sensors' range in clear weather [m].
     """
@@ -381,8 +394,9 @@ def is_in_the_way(
 def depth_in_the_way(
     observation: Observation, corridor: float, reach: float = np.inf
 ) -> FloatArray:
-    """How far within `corridor` a side of a detected obstacle ahead is, or will be when the vehicle
-    reaches it [m]; below 0 outside, and `-LARGEST_GAP` without an obstacle.
+    """The distance by which a side of a detected obstacle ahead is inside the `corridor` [m], now
+    or when the vehicle reaches the obstacle. The distance is below 0 outside of the corridor, and
+    `-LARGEST_GAP` without an obstacle.
     """
     is_detected = is_ahead(observation) & (
         observation.gap <= reach * observation.visibility
@@ -397,18 +411,18 @@ def depth_in_the_way(
 
 
 def is_ahead(observation: Observation) -> BoolArray:
-    """Whether there is an obstacle, and it has not been passed."""
+    """Return whether an obstacle exists that the vehicle has not passed yet."""
     return np.isfinite(observation.gap) & (observation.gap > 0)
 
 
 def moves_inwards(observation: Observation) -> BoolArray:
-    """Whether an obstacle moves towards the middle of the lane."""
+    """Return whether an obstacle moves towards the middle of the lane."""
     return np.sign(observation.lateral) * observation.lateral_speed < 0
 
 
 def blocks_the_way(observation: Observation, corridor: float) -> BoolArray:
-    """Whether a side of an obstacle is within `corridor` of the lane's middle [m], or moves towards
-    the middle.
+    """Return whether an obstacle has a side within `corridor` of the lane's middle [m], or moves
+    towards the middle.
     """
     return (
         np.abs(observation.lateral) <= corridor + observation.obstacle_width / 2
