@@ -1,10 +1,10 @@
-"""The contracts of users' classes: the methods that they must have, and what these may return; and
-errors of user code.
+"""Contracts of users' classes (the methods that a class must have, and what these methods may
+return), and errors of user code.
 
-A user's class is completed with the defaults of its base class, and its methods are replaced by
-ones that get read-only arguments and check what they return. An exception of user code becomes an
-error with its file and line. What user code tells numpy about floating-point errors (`np.seterr`)
-ends with the call: `np.errstate()` restores it.
+`checked_class` completes a user's class with the defaults of its base class. The methods of the
+completed class get read-only arguments, and their results are checked. An exception of user code
+becomes an error with its file and line. User code may change numpy's handling of floating-point
+errors (`np.seterr`): `np.errstate()` restores the handling at the end of each call.
 """
 
 from __future__ import annotations
@@ -39,20 +39,22 @@ from safevar_sumo.plugins.process import (
 from safevar_sumo.records import BoolArray, FloatArray, IntArray
 
 UserValue = Any
-"""What user code returns, before it is checked."""
+"""A value that user code returned, and that nobody has checked yet."""
 INFINITY = float("inf")
 ABSTRACT = "__isabstractmethod__"
-"""Attribute of an abstract method."""
+"""The attribute that Python sets on abstract methods."""
 MAX_QUOTED_ELEMENTS, MAX_QUOTE = 4, 80
-"""Largest size of an array, and of any other value's text [characters], that an error quotes."""
+"""Largest size of an array, and of the text of any other value [characters], that an error
+quotes.
+"""
 _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
-"""Which of N runs have not ended yet, shape (N,); None outside a simulation."""
+"""Which of N runs have not ended yet, shape (N,); None outside of a simulation."""
 
 
 @contextmanager
 def user_errors(source: str) -> Iterator[None]:
-    """Turn an exception that user code raises, other than Ctrl-C, into a `UserCodeError`; errors
-    are about the study `source`.
+    """Within the block, turn every exception of user code into a `UserCodeError`, except Ctrl-C.
+    Errors name the study `source`.
     """
     with about(source), mark_interrupts():
         try:
@@ -73,8 +75,8 @@ def user_errors(source: str) -> Iterator[None]:
 
 
 def user_error_of(error: BaseException) -> UserCodeError | None:
-    """The error with the innermost line of user code that raised an exception; None if there is no
-    such line.
+    """The error that names the innermost line of user code that an exception passed; None if the
+    exception passed no user code.
     """
     frames = traceback.extract_tb(error.__traceback__)
     if isinstance(error, SyntaxError) and error.filename:
@@ -92,7 +94,7 @@ def user_error_of(error: BaseException) -> UserCodeError | None:
 
 
 def _reason_of(error: BaseException) -> tuple[str, str]:
-    """An exception in words, and what is expected."""
+    """Describe an exception, and what is expected instead ("" if unknown)."""
     if isinstance(error, InputError):
         return f"{error.source}: {error.problem}", error.legal
     return describe_error(error), ""
@@ -100,10 +102,11 @@ def _reason_of(error: BaseException) -> tuple[str, str]:
 
 @contextmanager
 def check_open_runs(are_open: BoolArray) -> Iterator[None]:
-    """Within the block, wrong values are ignored unless their run is open, `are_open`, shape (N,).
+    """Within the block, ignore wrong values of runs that have ended. `are_open`, shape (N,), says
+    which runs have not ended.
 
-    A vehicle whose run has ended still moves while others in its batch drive. `are_open` may change
-    during the block.
+    A vehicle whose run has ended still moves while other vehicles of its batch drive. `are_open`
+    may change during the block.
     """
     token = _open_runs.set(are_open)
     try:
@@ -113,7 +116,9 @@ def check_open_runs(are_open: BoolArray) -> Iterator[None]:
 
 
 def open_rows(holds: BoolArray) -> IntArray:
-    """The indices at which `holds` is true, shape (N,), without those of runs that have ended."""
+    """Return the indices at which `holds` is true, shape (N,), except indices of runs that have
+    ended.
+    """
     are_open = _open_runs.get()
     if are_open is not None and are_open.shape == holds.shape:
         holds = holds & are_open
@@ -121,8 +126,18 @@ def open_rows(holds: BoolArray) -> IntArray:
 
 
 class Legal(NamedTuple):
-    """Legal numbers: from `lowest`, or above it, to `highest`; `infinite` and `undefined` allow
-    infinities and NaN, and `scalar` a number for all vehicles.
+    """A range of legal numbers.
+
+    Attributes
+    ----------
+    lowest, highest
+        The ends of the range.
+    is_open
+        Whether `lowest` itself is illegal.
+    infinite, undefined
+        Whether infinities, and NaN, are legal.
+    scalar
+        Whether a single number for all vehicles is legal.
     """
 
     lowest: float = -INFINITY
@@ -132,7 +147,7 @@ class Legal(NamedTuple):
     undefined: bool = False
     scalar: bool = False
     kinds: str = "biuf"
-    """Numpy's letters of the legal types."""
+    """The letters of the legal types, as numpy's `dtype.kind`."""
 
     def __str__(self) -> str:
         if self.kinds == "b":
@@ -144,7 +159,7 @@ class Legal(NamedTuple):
         return f"{text}, finite"
 
     def holds(self, numbers: FloatArray) -> BoolArray:
-        """Which numbers are legal."""
+        """Return which numbers are legal."""
         is_legal = numbers >= self.lowest
         if self.is_open:
             is_legal = numbers > self.lowest
@@ -161,16 +176,16 @@ FINITE, POSITIVE, SHARE, TRUTH = (
 
 
 class UserCode(NamedTuple):
-    """User code as errors name it: its key and name in the study, such as `ads.model =
-    'my_ads:Careful'`; and the class, function or record itself.
+    """User code, as errors name it: `name` is its key and name in the study, such as `ads.model =
+    'my_ads:Careful'`. `target` is the class, function or record.
     """
 
     name: str
     target: Any = None
 
     def definition(self, method: str = "") -> str:
-        """File and line at which a method begins, else the class or function; "" for FMUs and
-        compiled code.
+        """The file and line at which a method begins, or else the class or function. "" if Python
+        knows no source, as for FMUs and compiled code.
         """
         target = getattr(self.target, "function", self.target)
         function = inspect.unwrap(getattr(target, method, target))
@@ -180,7 +195,7 @@ class UserCode(NamedTuple):
             return ""
 
     def wrong(self, method: str, result: str, expected: str) -> UserCodeError:
-        """The error for a wrong result of a method."""
+        """The error that says that a method returned a wrong result."""
         place = self.definition(method)
         problem = f"{self.name} returned {result} from {method}"
         if place:
@@ -188,8 +203,8 @@ class UserCode(NamedTuple):
         return UserCodeError("", problem, expected, place)
 
     def call(self, method: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call an FMU, or what sets attributes of a user's object: exceptions may show no line of
-        user code.
+        """Call a function of user code. Any exception becomes a `UserCodeError`, even if no line of
+        user code is in its traceback, as with an FMU.
         """
         try:
             return function(*arguments)
@@ -211,12 +226,12 @@ class UserCode(NamedTuple):
         shape: tuple[int, ...] | None,
         legal: Legal = FINITE,
     ) -> np.ndarray:
-        """A result as an array, after a check of its type, shape and numbers.
+        """Check the type, shape and numbers of a result, and return the result as an array.
 
         Parameters
         ----------
         shape
-            The shape; None accepts any.
+            The shape that the result must have; None accepts any shape.
         """
         expected = str(legal)
         if shape is not None:
@@ -249,8 +264,8 @@ class UserCode(NamedTuple):
         legal: Legal,
         count: Callable[[Any], int],
     ) -> Callable[..., FloatArray]:
-        """A function that gets read-only arguments, and whose result of shape (N,) is checked;
-        `count` returns N of the first argument.
+        """Wrap a function of user code: the wrapped function gets read-only arguments, and its
+        result of shape (N,) is checked. `count` returns N for the first argument.
         """
 
         def checked(*arguments: Any) -> FloatArray:
@@ -264,17 +279,20 @@ class UserCode(NamedTuple):
 
 
 class Returned(NamedTuple):
-    """What a method returns: an object, or a tuple of several, with these attributes.
+    """A description of what a method must return: an object, or a tuple of objects, with
+    attributes.
 
     Attributes
     ----------
     parts
-        The legal numbers of the attributes of each object.
+        For each object, the names of its attributes, with their legal numbers. The name "" stands
+        for the object itself.
     like
-        Number of the argument whose speeds or pedals have the shape of the attributes, which is
-        passed read-only; None without such an argument: all others are the user's own.
+        The index of an argument. The attributes must have the shape of the speeds or pedals of this
+        argument, and the method gets this argument read-only. None without such an argument.
     then
-        A further check with the arguments of this one; its result takes the result's place.
+        A further check, which gets the code, the method's name, the result and the arguments. The
+        value that `then` returns replaces the result.
     """
 
     parts: tuple[Mapping[str, Legal], ...] = ()
@@ -284,7 +302,7 @@ class Returned(NamedTuple):
     def check(
         self, code: UserCode, method: str, result: UserValue, arguments: Sequence[Any]
     ) -> UserValue:
-        """The result after the check."""
+        """Check a result, and return it, or what `then` makes of it."""
         values = result
         if len(self.parts) <= 1:
             values = (result,)
@@ -315,19 +333,21 @@ class Returned(NamedTuple):
 
 
 Contract = Mapping[str, Returned]
-"""What the methods of a class may return, by their names."""
+"""What the methods of a class must return, by the methods' names."""
 
 
 def _shape_of(argument: Any) -> tuple[int, ...]:
-    """The shape of an array, of the speeds or pedals of a record, or of the speeds in a world."""
+    """The shape of an argument: of an array, of the speeds or pedals of a record, or of the speeds
+    in a world.
+    """
     if hasattr(argument, "speeds"):
         return np.shape(argument.speeds())
     return np.shape(getattr(argument, "speed", getattr(argument, "throttle", argument)))
 
 
 def checked_class(code: UserCode, base: type) -> type:
-    """The user's class with the defaults of a base class for members that it lacks, and with checks
-    of what those methods return that the base has in its `RETURNS`.
+    """Complete a user's class with the defaults of a base class. The result also checks what those
+    methods return that the base lists in its `RETURNS`.
     """
     candidate = code.target
 
@@ -364,11 +384,11 @@ def checked_class(code: UserCode, base: type) -> type:
 
 
 def violation(candidate: Any, base: type) -> str:
-    """The reason why a class does not meet the contract of a base class, found by inspection only;
-    "" if it does.
+    """The reason why a class violates the contract of a base class; "" if the class fulfils the
+    contract. No code of the class is run.
 
-    The abstract methods of the base must exist, and every method of the base must take the
-    parameters that it takes there. The class need not derive from the base.
+    The class must define the abstract methods of the base. Every method of the base must take the
+    same parameters in the class. The class need not derive from the base.
     """
     if not inspect.isclass(candidate):
         return f"is a {type(candidate).__name__}, not a class"
@@ -377,7 +397,7 @@ def violation(candidate: Any, base: type) -> str:
         method = f"{name}({', '.join(parameters)})"
         if hasattr(attribute, ABSTRACT) or not callable(attribute):
             return f"has no method {method}"
-        # A static or class method takes no `self`.
+        # A static method or a class method is called without `self`.
         takes_self = not isinstance(
             vars(base)[name], classmethod
         ) and inspect.isfunction(
@@ -391,7 +411,7 @@ def violation(candidate: Any, base: type) -> str:
 
 
 def contract_of(base: type) -> str:
-    """What a class of this base must have, in words."""
+    """Describe the class and the abstract methods that a user's class must have."""
     methods = []
     for name, parameters in _methods(base).items():
         if hasattr(getattr(base, name), ABSTRACT):
@@ -403,8 +423,8 @@ def contract_of(base: type) -> str:
 
 
 def _methods(base: type) -> dict[str, list[str]]:
-    """The public methods of a class that the package calls, and the names of their parameters
-    without default and without `self`.
+    """The public methods of a base class except its helpers, with the names of their parameters.
+    Parameters with a default are left out, and so is `self`.
     """
     helpers = getattr(base, "HELPERS", ())
     methods = {}
@@ -425,7 +445,9 @@ def _methods(base: type) -> dict[str, list[str]]:
 
 
 def read_only(value: UserValue) -> Any:
-    """A record in which every array is a read-only view, or a world whose arrays are."""
+    """Return a read-only version of a value: arrays become read-only views, also inside of tuples,
+    records, mappings and worlds.
+    """
     if isinstance(value, np.ndarray):
         view = value.view()
         view.flags.writeable = False
@@ -448,7 +470,7 @@ def read_only(value: UserValue) -> Any:
 
 
 class _ReadOnlyWorld:
-    """A world for scenarios whose methods return read-only arrays."""
+    """A world whose methods return read-only arrays, for the scenarios of users."""
 
     def __init__(self, world: Any) -> None:
         self._world = world
@@ -459,7 +481,7 @@ class _ReadOnlyWorld:
 
 
 def quoted(value: object) -> str:
-    """A returned value in a few words on one line."""
+    """A returned value as a short text on one line."""
     if isinstance(value, np.ndarray) and value.size > MAX_QUOTED_ELEMENTS:
         return f"an array of {value.dtype}, shape {value.shape}"
     text = " ".join(repr(value).split())
