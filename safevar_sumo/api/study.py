@@ -1,4 +1,4 @@
-"""The command `study`: a search with its summary, and how far it is."""
+"""The command `study`: runs a search for unsafe vehicles, and summarises the search."""
 
 from __future__ import annotations
 
@@ -57,16 +57,16 @@ INTERRUPTED = (
     "finished evaluations are kept in {}: run the same command again to continue"
 )
 VERDICT_COST = 80_000
-"""Number of simulations of a search that take as long as the verdict on it, roughly; the search
-states its own number.
+"""The verdict on a search takes about as long as this number of simulations. (The bar of progress
+adds this number to the simulations of the search.)
 """
 FEW = 60
 """Number of simulations that the verdict takes in a simulator of the user's own, roughly."""
 ALGORITHMS, CHANGES = shipped_columns("study").values()
 MAX_LISTED = 3
-"""Largest number of changes that the verdict lists; the table has them all."""
+"""Largest number of changes that the verdict lists; the table lists all changes."""
 RUN_TESTS = ("rq1-runs", "rq2-runs")
-"""The tables of the tests over runs."""
+"""The tables with statistical tests over runs."""
 
 
 @contents(
@@ -164,7 +164,7 @@ def study(
         as_written, algorithms, runs=runs, evaluations=evaluations, seed=seed
     )
     loaded, system = load_for_search(changed)
-    # What no study has is refused before the search.
+    # A criterion that the study cannot have is refused now: the search may take hours.
     if unsafe is not None:
         study_by(loaded, unsafe)
     for remark in dict.fromkeys(without_effect(system)):
@@ -201,7 +201,7 @@ def _found(
     progress: Progress,
     study: str,
 ) -> Answer:
-    """What was found, and what to ask next."""
+    """The answer after a search: a summary, the verdict, and the advice what to ask next."""
     progress("the fewest unsafe changes", 0, 1)
     answer = summarise(results)
     reason = why_no_verdict(system)
@@ -209,7 +209,7 @@ def _found(
     criterion = "" if unsafe is None else f" --unsafe {quote(str(unsafe))}"
     advice = f"{PROGRAM_COMMAND} explain {study}{criterion}"
 
-    # Questions refuse an original encounter in which the original vehicle is not safe.
+    # Questions refuse studies whose original vehicle is unsafe in the original encounter.
     demanded = results.case.scoring.safe_original
     if demanded is not None and results.original[ORIGINAL_DEGREE] < demanded:
         advice = (
@@ -239,14 +239,16 @@ def _found(
 
 
 def directory_name(study: Study) -> str:
-    """The name of a directory of results: that of the study, and of the part that is searched."""
+    """The name of a directory for results: the name of the study, and of the part that is
+    searched.
+    """
     origin = study.origin
     parts = (study.name, "ranges" * origin.ranges, origin.point, origin.up_to)
     return re.sub(r"[^A-Za-z0-9_.=-]+", "_", "-".join(filter(None, parts)))
 
 
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
-    """The study with the numbers and algorithms of its search that the command states."""
+    """The study with the options of the command that change its search."""
     search = study.search
     changes: JsonObject = {
         name: value for name, value in numbers.items() if value is not None
@@ -258,8 +260,8 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
 
 
 def _breach_of_original(case: Case) -> str:
-    """How the original vehicle is unsafe itself, in words; empty if it is not, or if it depends on
-    the encounter.
+    """How the original vehicle is unsafe, in words. "" if the original vehicle is safe, or if the
+    study searches encounters.
     """
     system = assemble(case.study)
     if case.characteristics.scenario:
@@ -273,8 +275,8 @@ def _breach_of_original(case: Case) -> str:
 def _verdict(
     results: Results, case: Case, jobs: int | None, study: str
 ) -> tuple[list[Sentence], Rows]:
-    """How many solutions of a case of the results are unsafe, and how few changes are enough; and
-    the rows of `CHANGES` of a vehicle with these.
+    """The verdict on a case: how many solutions are unsafe, and how few changes suffice. The rows
+    of `CHANGES` list the changes of the vehicle with the fewest changes.
     """
     members = case.characteristics
     unsafe = case.unsafe
@@ -328,8 +330,8 @@ def _verdict(
 
 
 def summarise(results: Results) -> Answer:
-    """How far a study is: a row for each algorithm, and RQ1 and RQ2 over runs as far as they have
-    an answer.
+    """Summarise a study, even before it is finished: a row for each algorithm, and the answers to
+    RQ1 and RQ2 if the runs suffice.
 
     Raises
     ------
@@ -369,7 +371,7 @@ def summarise(results: Results) -> Answer:
     table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))
     tables = {"algorithms": table}
 
-    # Tests that none of so few runs can pass are folded, with a remark.
+    # If no test can be significant with so few runs, its table is folded, with a remark.
     untested = []
     with suppress(UnanswerableError):
         of_runs = answer_questions([case], names=RUN_TESTS).tables
@@ -377,7 +379,7 @@ def summarise(results: Results) -> Answer:
         untested = [
             name for name in RUN_TESTS if not of_runs[name]["enough_runs"].any()
         ]
-        # The first remark on tests of which none can be significant says how many runs are needed.
+        # The first remark of such a table says how many runs are needed.
         if few := " ".join(
             next(remarks_on_runs(name, of_runs[name]), "") for name in untested
         ):
