@@ -1,4 +1,4 @@
-"""The contract of a scenario, its actors and the geometry of the encounter."""
+"""The contract of a scenario: what a scenario must say about its network, actors and encounter."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios.roads import Roads, World
 
 VUT = "vut"
-"""Id of the vehicle under test in every network's traffic."""
+"""The id of the vehicle under test in the traffic of every network."""
 MAX_GRADE = 30.0
-"""Steepest road [%]."""
+"""Largest rise of a road [%]."""
 Grade = Annotated[float, Meta(ge=-MAX_GRADE, le=MAX_GRADE)]
 XmlChanges = Mapping[str, Mapping[str, str] | None]
-"""Changes to a network's traffic or lanes: attributes by the XPath of an element below the file's
-root; None removes the element.
+"""Changes to a network's traffic or lanes. A key is the XPath of an element below the file's root;
+the value has attributes to set, or is None to remove the element.
 """
 
 
 PEDESTRIAN, CROSSING_LANE = "pedestrian", ":crossing_c0_0"
-"""Id of a person who walks across the road, and of the lane that he walks on, in every network with
-one.
+"""The id of a person who walks across the road, and the lane on which the person walks, in every
+network with such a person.
 """
 
 
 class Scene(NamedTuple):
-    """The obstacle relative to N vehicles; arrays of shape (N,); see `Observation` for the
+    """The obstacle as N vehicles meet it; arrays have shape (N,). See `Observation` for the
     quantities.
 
-    `over` is true where the encounter has ended for good, `visible` where the obstacle is not
-    occluded. A scenario whose `centre_to_centre` is true states the `obstacle_length`.
+    `over` is true after the encounter has ended for good. `visible` is true while nothing occludes
+    the obstacle. A scenario whose `centre_to_centre` is true must state the `obstacle_length`.
     """
 
     gap: FloatArray
@@ -61,9 +61,9 @@ class Scene(NamedTuple):
 
 
 MAX_DURATION = 3600.0
-"""Longest run [s]."""
+"""Longest duration of a run [s]."""
 MAX_TEST_SPEED = 100.0
-"""Highest speed of a test [m/s]."""
+"""Highest speed of the vehicle in a test [m/s]."""
 LEGAL_SCENE = {
     **dict.fromkeys(Scene._fields, Legal(scalar=True)),
     "gap": Legal(infinite=True),
@@ -79,8 +79,8 @@ LEGAL_ENCOUNTER = {
 def check_encounter(
     code: UserCode, method: str, encounter: Encounter, trace: Trace
 ) -> Encounter:
-    """Refuse an encounter that is undefined while it counts, or that never has a separation: its
-    metrics would be undefined or infinite.
+    """Refuse an encounter that makes metrics undefined or infinite: an encounter with NaN where
+    `in_conflict` is true, or without any finite separation.
     """
     is_counted = encounter.in_conflict & trace.active
     for name, values in zip(Encounter._fields, encounter, strict=True):
@@ -101,19 +101,21 @@ def check_encounter(
 def check_changes(
     code: UserCode, method: str, changes: Any, roads: Roads
 ) -> XmlChanges:
-    """Refuse changes to a network or its traffic that are no mapping; values become texts."""
+    """Refuse changes to a network or its traffic that are no mapping, and convert values to
+    texts.
+    """
     if not isinstance(changes, Mapping):
         raise code.wrong(method, quoted(changes), "a mapping from XPaths to attributes")
     texts = {}
     for path, change in changes.items():
-        # None, which removes an element, stays None.
+        # None removes an element, and stays None.
         texts[path] = change and {name: str(value) for name, value in change.items()}
     return texts
 
 
 def check_fields(code: UserCode, scenario: Any, **further: Legal) -> None:
-    """Refuse a user's scenario without a network, or with an illegal duration, grade or speed, or
-    illegal numbers of `further` fields.
+    """Refuse a user's scenario without a network, or with an illegal duration, grade or speed.
+    `further` has the legal numbers of more fields.
     """
     if not isinstance(getattr(scenario, "network", None), str):
         raise code.wrong(
@@ -141,26 +143,26 @@ Part = Literal[
     "sumo-gui",
     "weather",
 ]
-"""What a mover may lack, as refusals name it."""
+"""Parts that a mover may lack, in the words of refusals."""
 
 
 class Mover(NamedTuple):
-    """Who moves the vehicles of a scenario.
+    """A mover is the simulator that moves the vehicles of a scenario.
 
     Attributes
     ----------
     kind
-        What a scenario of it is, in words. All tests of a matrix have one kind.
+        The kind of the mover's scenarios, in words. All tests of a matrix have one kind.
     takes_long
-        Whether simulations take so long that questions count them, as it simulates one setting at
-        once; others simulate as many as fit into memory.
+        Whether the mover simulates one setting at a time. Questions then count and limit the
+        simulations. Other movers simulate as many settings at once as fit into memory.
     is_exact
-        Whether it repeats itself to the bit. If not, a study may repeat each setting; without
-        repeats, another process tries whether results are the same.
+        Whether a repeated simulation gives the same result to the bit. If not, a study may repeat
+        each setting. Without repeats, another process checks whether results are the same.
     has_own_step
-        Whether it has a time step of its own, which no study states.
+        Whether the mover decides the time step, so that no study may state the step.
     lacks
-        What it lacks; each with the reason, with which it is refused.
+        The parts that the mover lacks, each with the reason that a refusal states.
     """
 
     kind: str
@@ -170,16 +172,18 @@ class Mover(NamedTuple):
     lacks: Mapping[Part, str] = {}
 
     def has(self, part: Part) -> bool:
-        """Whether it does not lack a part."""
+        """Return whether the mover has a part."""
         return part not in self.lacks
 
 
 SUMO = Mover("a scenario of SUMO")
-"""SUMO, or a scene that it has played once, or tracks of bodies."""
+"""The mover of all shipped scenarios: SUMO itself, a scene that SUMO has played once, or tracks of
+bodies.
+"""
 
 
 ScenarioMemory = Any
-"""What a scenario remembers of a run: an object of its own class with named attributes."""
+"""What a scenario remembers of a run between two steps: an object of the scenario's own class."""
 
 
 Quantities = Mapping[str, Quantity]
@@ -187,13 +191,21 @@ Quantities = Mapping[str, Quantity]
 
 
 class Layout(NamedTuple):
-    """Where the actors of N runs are whose scenarios differ in parameters that a study searches.
+    """The places of the actors of N runs, if a study searches parameters that move actors.
 
-    `front` is the position of the vehicle under test on its lane at the start [m], a number or of
-    shape (N,); None if no parameter moves it. `pedestrian` is the id of a person who walks across
-    that lane, "" if no parameter moves one: at T samples, where his recorded way crosses the lane,
-    he is to the `left` of its middle [m], with the `speed` [m/s]; shape (T, N). `backwards` is true
-    where he has turned round.
+    Attributes
+    ----------
+    front
+        Position of the vehicle's front on its lane at the start [m], a number or shape (N,); None
+        if no parameter moves the vehicle.
+    pedestrian
+        Id of a person who walks across the lane; "" if no parameter moves a person.
+    left
+        Position of the person to the left of the lane's middle at T samples [m], shape (T, N).
+    speed
+        Speed of the person [m/s].
+    backwards
+        Whether the person has turned round, shape (T, N).
     """
 
     front: Quantity | None
@@ -204,21 +216,22 @@ class Layout(NamedTuple):
 
 
 def as_text(value: Quantity) -> str:
-    """A number as SUMO's files have it."""
+    """A number as a text for SUMO's files, without rounding."""
     return repr(float(value))
 
 
 class Scenario:
-    """What all scenarios have. A class's fields are the parameters of `scenario.parameters`.
+    """Base of all scenarios. The fields of a scenario's class are the parameters that a study
+    states under `scenario.parameters`.
 
     Attributes
     ----------
     mover
-        Who moves the vehicles.
+        The simulator that moves the vehicles.
     LIBRARIES
-        Distributions on whose versions results depend, such as `metadrive-simulator`.
+        Distributions whose versions change results, such as `metadrive-simulator`.
     version
-        A version of the class itself on which they depend, such as its simulator's.
+        A further version that changes results, such as the simulator's.
     network
         A folder of `sumo_nets/`, or the path of a folder with the same files; "" without roads.
     duration
@@ -227,29 +240,29 @@ class Scenario:
         False declares that no actor reacts to the vehicle under test: SUMO can play the scene once
         for all vehicles.
     grade
-        Rise of the road [%]. SUMO's plane then stands for the inclined road; the vehicle models add
-        the force of gravity.
+        Rise of the road [%]. In SUMO the road is level; the vehicle models add the force of
+        gravity.
     centre_to_centre
         Whether the safety degree is the distance between the centres of two vehicles.
     border
-        The parameter of which smaller values are more dangerous, which says how far a change moves
-        what is avoidable; "" if it has none.
+        The parameter of which smaller values are more dangerous; "" without such a parameter. With
+        one, drivers for lanes (`OF_LANES`) also answer what another driver would have avoided.
     pre_crash
-        The scenario's type in NHTSA's typology; "" if it has none.
+        The scenario's type in NHTSA's typology; "" without a type.
     test_speed
         Speed that a robot holds until the ADS brakes [m/s]; None without a robot. A run that leaves
         the speed tolerance before the ADS brakes is an invalid test.
     is_hit_in_front
         Whether only contacts at the vehicle's front are collisions.
     goes_on
-        Whether a run goes on beyond `duration` while the vehicle still closes on somebody.
+        Whether a run goes on after `duration` while the vehicle still approaches somebody.
     has_phase
-        Whether all of an encounter can begin later by a part of a step, while the driving system
-        decides at the same times as ever.
+        Whether the whole encounter can begin later by a part of a step. The driving system then
+        still decides at the same times.
     brakes_fully
-        Whether the scenario itself brakes, fully and from the start on, and asks no ADS.
+        Whether the vehicle brakes fully from the start on. Then no ADS is asked.
     is_user_code
-        Whether the class is a user's.
+        Whether a user wrote the class.
     """
 
     __slots__ = ()
@@ -264,8 +277,8 @@ class Scenario:
     brakes_fully: bool = False
     border: ClassVar[str] = ""
     goes_on: ClassVar[bool] = False
-    # A scenario may have fields or properties of these names: type checkers see properties.
-    # `duration` and `start_speed` have no default.
+    # A user's scenario may have fields or properties of these names. Therefore type checkers see
+    # properties, and only the other attributes have defaults.
     if TYPE_CHECKING:
 
         @property
@@ -285,27 +298,27 @@ class Scenario:
 
     @property
     def is_hit_in_front(self) -> bool:
-        """By default in a test at its speed."""
+        """By default true for a test in which a robot holds the speed."""
         return self.test_speed is not None
 
     def at(self, values: Quantities) -> Scenario:
-        """This scenario at other values of parameters, created anew."""
+        """A new scenario of the same class, with other values of these parameters."""
         create: Any = dataclasses.replace
         if isinstance(self, msgspec.Struct):
             create = msgspec.structs.replace
         return create(self, **values)  # type: ignore[no-any-return]
 
     def lanes(self, roads: Roads) -> XmlChanges:
-        """Changes to the lanes of the built network."""
+        """Changes to the lanes of the built network; none by default."""
         return {}
 
     def actors(self, roads: Roads) -> XmlChanges:
-        """Changes to the network's traffic."""
+        """Changes to the network's traffic; none by default."""
         return {}
 
     def check(self) -> None:
-        """Refuse parameters of a study's test, by an `InputError`; those of searched encounters are
-        not checked.
+        """Refuse illegal parameters of a test by an `InputError`. Encounters that a search proposes
+        are not checked.
         """
 
     def remarks(self) -> list[str]:
@@ -313,7 +326,7 @@ class Scenario:
         return []
 
     def benign(self) -> NamedScenarios:
-        """Scenes like this one in which nobody needs to brake, each with a description; none by
+        """Similar scenes in which nobody needs to brake, each with a description; none by
         default.
         """
         return ()
@@ -324,11 +337,12 @@ class Scenario:
 
 
 NamedScenarios = Iterable[tuple[str, Scenario]]
-"""Scenarios, each with what it is in words."""
+"""Scenarios, each with a description in words."""
 
 
 class WorldScenario(Scenario):
-    """A scenario that observes the actors of its network itself, in the world that moves them.
+    """A scenario that observes the actors itself, in the world (the simulated traffic) of its
+    network.
 
     Attributes
     ----------
@@ -347,23 +361,24 @@ class WorldScenario(Scenario):
 
     @abstractmethod
     def begin(self, world: World) -> ScenarioMemory:
-        """Prepare a run, before the first step; returns the memory for `observe`."""
+        """Prepare a run before its first step, and return the memory for `observe`."""
 
     @abstractmethod
     def observe(
         self, world: World, step: float, memory: ScenarioMemory
     ) -> tuple[Scene, ScenarioMemory]:
-        """The obstacle now, `step` seconds after the last call, and the new memory; may also
-        command the actors.
+        """Observe the obstacle, `step` seconds after the last call, and return the new memory.
+        `observe` may also command the actors.
         """
 
     @abstractmethod
     def encounter(self, trace: Trace) -> Encounter:
-        """The geometry that the metrics are computed from."""
+        """The geometry of the encounter, from which the metrics are computed."""
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
-        """Where the actors are at samples `step` seconds apart, if parameters of this scenario are
-        arrays of N values: the same as `actors` and `observe` make SUMO do.
+        """The places of the actors at samples that are `step` seconds apart. Parameters of this
+        scenario may be arrays of N values. The places are those to which `actors` and `observe`
+        would move the actors in SUMO.
         """
         raise NotImplementedError
 
@@ -393,4 +408,4 @@ OBSTACLES: Mapping[str, str] = {
     PreCrash.LEAD_SLOWER: "a slower vehicle ahead",
     PreCrash.LEAD_DECELERATING: "a braking vehicle ahead",
 }
-"""What is in the way, by the pre-crash type."""
+"""What the vehicle hits, in words, by the pre-crash type."""
