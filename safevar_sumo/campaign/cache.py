@@ -1,9 +1,10 @@
-"""The cache of simulations: what questions have simulated, on disk, by its content. A question that
-is asked again, or was interrupted, simulates only what it lacks.
+"""The cache of simulations keeps results of simulations on disk. A question that is asked again, or
+that was interrupted, simulates only the settings that the cache lacks. A digest of everything that
+results depend on is the key of an entry.
 
-What user code reads cannot be known, so that its simulations are kept for the running command
-alone, in a folder of their own, which is removed at the end of the command. A command that was
-killed or interrupted leaves it, and the same command continues from it within a day.
+Nobody can know which files user code reads. Therefore the simulations of user code are kept for the
+running command only, in a separate folder. The end of the command removes this folder. After a kill
+or an interruption the folder stays, and the same command continues from it within a day.
 """
 
 from __future__ import annotations
@@ -43,29 +44,35 @@ from safevar_sumo.shipped import PACKAGE
 from safevar_sumo.study import Study, user_code_names
 
 FOLDER_VARIABLE = "SAFEVAR_CACHE"
-"""The environment variable that names the cache's folder."""
+"""The environment variable that names the folder of the cache."""
 OFF = "off"
-"""The value of this variable with which nothing is kept."""
+"""The value of this variable that turns the cache off."""
 SIZE_LIMIT = 1_000_000_000
-"""Size from which on the simulations that have not been asked for the longest make room [bytes]."""
+"""Largest size of the cache [bytes]. Beyond this size, the entries that have not been read for the
+longest time are removed.
+"""
 DIGEST_SIZE = 32
-"""Size of the digest with which an entry begins [bytes]."""
+"""Size of the digest at the beginning of an entry [bytes]."""
 FAST = 1
-"""The level of zlib's compression: results take a sixth of their size, at 100 MB/s."""
+"""The level of zlib's compression. Compressed results take a sixth of their size, at 100 MB/s."""
 COMMANDS, DAY = "commands", 86_400.0
-"""Name of the folder of what commands with user code have simulated, and how long they may be
-continued [s].
+"""The name of the folder for simulations of commands with user code, and the time within which an
+interrupted command can be continued [s].
 """
 NUMBER = b"number"
-"""The key of an entry with the number of settings that a command has kept."""
+"""The key of the entry that counts the settings whose results a cache has."""
 METRIC, POINTS = "metric ", "worst_points"
-"""Names of an entry's further arrays, or their beginnings."""
+"""The prefix of the names of an entry's arrays with metrics, and the name of the array with the
+worst points.
+"""
 UNUSABLE = (OSError, sqlite3.Error, diskcache.Timeout)
-"""What a cache raises that cannot be read or written."""
+"""The exceptions of a cache that cannot be read or written."""
 
 
 class _PlainBytes(diskcache.Disk):  # type: ignore[misc]
-    """Reads bytes alone: the library would unpickle what somebody else has written."""
+    """Reads only bytes. The library would unpickle other entries, and an entry that somebody else
+    wrote could then run code.
+    """
 
     def fetch(self, mode: int, filename: str | None, value: Any, read: bool) -> Any:
         if mode not in (MODE_RAW, MODE_BINARY):
@@ -74,15 +81,15 @@ class _PlainBytes(diskcache.Disk):  # type: ignore[misc]
 
 
 class Cache:
-    """The entries of a folder, which several processes may use at the same time. Where it cannot be
-    read or written, the user is warned once, and nothing is kept any more.
+    """The entries of a folder. Several processes may use the folder at the same time. If the folder
+    cannot be read or written, the user gets one warning, and the cache keeps nothing any more.
 
     Parameters
     ----------
     is_read
-        Whether entries are read, besides written.
+        Whether entries are read; entries are written in any case.
     is_counted
-        Whether an entry, `NUMBER`, counts the settings that are kept.
+        Whether the entry `NUMBER` counts the settings whose results are kept.
     """
 
     def __init__(
@@ -96,14 +103,14 @@ class Cache:
         self._guarded(self._open, None)
 
     def key_of(self, study: Study, opened: Sequence[str]) -> bytes:
-        """What the simulations of a study depend on besides their settings, as a digest; `opened`
-        are the names of the files that its user code opens.
+        """The digest of everything that simulations of a study depend on, except their settings.
+        `opened` are the names of the files that the study's user code opens.
         """
         packed_study = msgspec.msgpack.encode(study)
         if packed_study not in self._keys:
-            # The study and its files count as in the identity of results, and besides that where
-            # the files are, this package's own files, and the versions of Python and of all that
-            # is installed.
+            # The key contains the identity of results (the study and its files). The key also
+            # contains the places of the files, this package's files, and the versions of Python and
+            # of all installed distributions.
             manifest = manifest_now(study, system_of(study), opened)
             paths = [
                 os.path.abspath(file_by_name(name, study.origin.places))
@@ -114,8 +121,8 @@ class Cache:
         return self._keys[packed_study]
 
     def get(self, key: bytes) -> bytes | None:
-        """The content of an entry; None if there is none, or it has been altered."""
-        # Another thread may end the cache meanwhile.
+        """The content of an entry; None if the entry is missing, or somebody has altered it."""
+        # Another thread may set `_entries` to None during this call, after an error of the folder.
         entries = self._entries
         if entries is None or not self._is_read:
             return None
@@ -128,7 +135,7 @@ class Cache:
         return None
 
     def put(self, key: bytes, content: bytes, settings: int = 0) -> None:
-        """Keep an entry, with the results of so many settings."""
+        """Keep an entry. `settings` is the number of settings whose results the entry has."""
         entries = self._entries
         if entries is not None:
             self._guarded(entries.set, None, key, _digest(key, content) + content)
@@ -141,11 +148,11 @@ class Cache:
             self._guarded(self._entries.clear, None)
 
     def number_kept(self) -> int:
-        """Number of settings whose results a counted cache has."""
+        """The number of settings whose results a counted cache has."""
         return int(self.get(NUMBER) or 0)
 
     def extent(self) -> tuple[int, int]:
-        """How many entries there are, and their size on disk [bytes]."""
+        """The number of entries, and their size on disk [bytes]."""
         if self._entries is None:
             return 0, 0
         extent: tuple[int, int] = self._guarded(
@@ -168,7 +175,9 @@ class Cache:
     def _guarded(
         self, function: Callable[..., Any], otherwise: Any, *arguments: Any
     ) -> Any:
-        """What a function returns; where the folder is at fault, the cache ends."""
+        """Call a function that uses the folder, and return its result. If the folder fails, the
+        cache ends, and the result is `otherwise`.
+        """
         try:
             return function(*arguments)
         except UNUSABLE as error:
@@ -179,15 +188,15 @@ class Cache:
 
 
 class CommandCache:
-    """What a command keeps: simulations of shipped parts for everybody, those of user code for
-    itself.
+    """The caches of a command. Simulations of shipped code go to a cache that all commands share.
+    Simulations of user code go to a cache of this command alone.
 
     Parameters
     ----------
     command
-        The command line.
+        The text of the command line.
     is_fresh
-        Whether nothing is read that an earlier command has simulated.
+        Whether to ignore all results of earlier commands.
     """
 
     def __init__(self, folder: Path, command: str, *, is_fresh: bool) -> None:
@@ -200,8 +209,8 @@ class CommandCache:
         self._of_everybody = Cache(folder, is_read=not is_fresh)
 
     def of(self, study: Study, opened: Sequence[str]) -> Cache | None:
-        """The cache of a study's simulations; `opened` are the names of the files that its user
-        code opens. None if another process runs the same command with the same code.
+        """The cache for the simulations of a study; None if another process runs the same command
+        with the same code. `opened` are the names of the files that the study's user code opens.
         """
         if not user_code_names(study):
             return self._of_everybody
@@ -210,7 +219,9 @@ class CommandCache:
         return self._own
 
     def end(self, *, is_interrupted: bool) -> None:
-        """Close the caches; that of user code is removed unless the command was interrupted."""
+        """Close the caches. Unless the command was interrupted, remove the cache of its user
+        code.
+        """
         self._of_everybody.close()
         if self._own is not None and self._own_folder is not None:
             self._own.close()
@@ -224,13 +235,14 @@ class CommandCache:
             self._folder / sha256(key + self._command.encode()).hexdigest()
         )
         try:
-            # Nobody continues what is older than a day.
+            # Folders older than a day are removed, because no command continues from them.
             self._folder.mkdir(parents=True, exist_ok=True)
             for old in self._folder.iterdir():
                 if time.time() - old.stat().st_mtime > DAY:
                     (shutil.rmtree if old.is_dir() else Path.unlink)(old)
 
-            # The lock of a process ends with it.
+            # The operating system releases the lock when the process ends, even if the process is
+            # killed.
             lock_file = self._own_folder.with_suffix(".lock")
             lock = portalocker.Lock(lock_file, "a", timeout=0, fail_when_locked=True)
             lock.acquire()
@@ -253,7 +265,7 @@ _is_forbidden = ContextVar("is_forbidden", default=False)
 
 
 def cache_folder() -> Path | None:
-    """The folder of the cache; None if nothing is to be kept."""
+    """The folder of the cache; None if the user turned the cache off."""
     named = os.environ.get(FOLDER_VARIABLE, "")
     if named == OFF:
         return None
@@ -264,8 +276,8 @@ def cache_folder() -> Path | None:
 
 @contextmanager
 def keep_simulations(command: str = "", *, fresh: bool = False) -> Iterator[None]:
-    """Within the block, which carries out a command, simulations are kept, and those that were kept
-    are not simulated again; with `fresh` they are.
+    """Within the block, which carries out a command, keep the results of simulations, and use kept
+    results instead of new simulations. With `fresh`, ignore results of earlier commands.
     """
     folder = cache_folder()
     if folder is None or _is_forbidden.get() or _cache.get() is not None:
@@ -286,7 +298,9 @@ def keep_simulations(command: str = "", *, fresh: bool = False) -> Iterator[None
 
 @contextmanager
 def simulate_anew() -> Iterator[None]:
-    """Within the block, no cache is read or written: evidence must not check itself."""
+    """Within the block, read and write no cache. Otherwise a check would compare results with
+    themselves.
+    """
     token = _is_forbidden.set(True)
     try:
         yield
@@ -295,8 +309,8 @@ def simulate_anew() -> Iterator[None]:
 
 
 def cache_of(study: Study, opened: Sequence[str]) -> Cache | None:
-    """Where simulations of a study are kept while a question is asked, if they are; `opened` are
-    the names of the files that its user code opens.
+    """The cache for the simulations of a study; None if nothing is kept. `opened` are the names of
+    the files that the study's user code opens.
     """
     cache = _cache.get()
     if cache:
@@ -307,7 +321,9 @@ def cache_of(study: Study, opened: Sequence[str]) -> Cache | None:
 def key_of_settings(
     study_key: bytes, selection: Selection, settings: FloatArray
 ) -> bytes:
-    """The key of settings of a study, as a selection restricts and varies them."""
+    """The key of settings of a study. A `selection` says with which points and variations the
+    settings are simulated.
+    """
     digest = sha256(study_key)
     digest.update(msgspec.json.encode([selection, settings.shape]))
     digest.update(np.ascontiguousarray(settings).tobytes())
@@ -315,7 +331,7 @@ def key_of_settings(
 
 
 def content_of(evaluations: Evaluations) -> bytes:
-    """Evaluations without failures as the content of an entry."""
+    """Convert evaluations without failures into the content of an entry."""
     arrays = {name: getattr(evaluations, name) for name in COLUMNS}
     for name, values in evaluations.metrics.items():
         arrays[f"{METRIC}{name}"] = values
@@ -327,7 +343,9 @@ def content_of(evaluations: Evaluations) -> bytes:
 
 
 def evaluations_in(content: bytes | None) -> Evaluations | None:
-    """The evaluations in an entry's content; None if it holds none, or there is no entry."""
+    """Read the evaluations in the content of an entry; None if there is no content, or it is
+    damaged.
+    """
     if content is None:
         return None
     try:
@@ -349,15 +367,15 @@ def _digest(key: bytes, content: bytes) -> bytes:
 
 
 def package_digest() -> str:
-    """A digest of the version of Python and of this package's files."""
+    """A digest of the version of Python, and of this package's files."""
     python, _, files = _environment()
     return sha256(msgspec.json.encode([python, files])).hexdigest()
 
 
 @lru_cache(maxsize=1)
 def _environment() -> Any:
-    """The versions of Python and of all installed distributions, and the digests of this package's
-    files.
+    """The version of Python, the versions of all installed distributions, and the digests of this
+    package's files.
     """
     # A distribution may lack a name or a version.
     versions = sorted(
