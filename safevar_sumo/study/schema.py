@@ -381,6 +381,11 @@ def _without_defaults(value: Any) -> Any:
 def locate_parameter(tables: Any, name: str) -> tuple[Any, int | str]:
     """The table or list that holds a parameter, and the parameter's key or index. `name` is the
     path of the parameter from `tables`, with dots.
+
+    Raises
+    ------
+    InputError
+        If the study has no such number.
     """
     *path, parameter = name.split(".")
     table = tables
