@@ -1,7 +1,7 @@
-"""Turns a name in a study into a class, function or record.
+"""Finds the class, function or record that a name in a study stands for.
 
-The name belongs to this package, or is `package.module:Name` of a module beside the study, in the
-working directory or installed.
+The name is a name of this package, or `package.module:Name`. The module is in a file beside the
+study, in the working directory, or installed.
 """
 
 from __future__ import annotations
@@ -48,8 +48,10 @@ A_DAY = 86_400.0
 
 
 class Member(NamedTuple):
-    """The class or record that a name in a study stands for; `code` is how errors name it if it is
-    user code, else None; `time_limit` is that of its `__init__` [s].
+    """A class or record that a name in a study stands for.
+
+    `code` is the user code as errors name it; None for code of this package. `time_limit` limits
+    the time of the class's `__init__` [s].
     """
 
     target: Any
@@ -58,11 +60,11 @@ class Member(NamedTuple):
 
 
 class Lookup:
-    """Looks up the names of a study, each class once.
+    """Finds what the names of a study stand for, and checks each class only once.
 
-    `folders`, searched before the working directory, are those of the study's file and of the files
-    that it extends; `files` are the paths of its data files by the names that it gives them;
-    `time_limit` is that of the import of user code [s].
+    `folders` are the folders of the study's file and of the files that the study extends. They are
+    searched before the working directory. `files` maps the names of the study's data files to their
+    paths. `time_limit` limits the import of user code [s].
     """
 
     def __init__(
@@ -82,8 +84,8 @@ class Lookup:
         return cls(study.origin.places, data_files(study), study.search.time_limit)
 
     def find(self, shipped: Mapping[str, Any], name: str, key: str) -> Member:
-        """The object called `name` among the `shipped` ones, or the object that
-        `package.module:Name` names.
+        """Find the object called `name` among the `shipped` objects, or the object that
+        `package.module:Name` names. `key` is the study's key with this name, for errors.
 
         Raises
         ------
@@ -140,11 +142,10 @@ class Lookup:
         *bases: type,
         otherwise: str = "",
     ) -> Member:
-        """A class by name; a user's class must meet the contract of the first base that it derives
-        from, else of that which it meets, else of that of which it has an abstract method, else of
-        the last one.
+        """Find a class by its name. A user's class must meet the contract of one of the `bases`
+        (see `_base_of`).
 
-        `otherwise` is what the study may give in place of a class, for the error.
+        `otherwise` says what the study may state instead of a class, for the error.
         """
         if (name, bases) in self._classes:
             return self._classes[name, bases]
@@ -167,14 +168,15 @@ class Lookup:
     def with_paths(
         self, member: Member, parameters: Parameters, key: str
     ) -> Parameters:
-        """Parameters of a member; the names of the study's data files become absolute paths: for
-        user code all, otherwise that of the parameter `file`.
+        """Replace the names of the study's data files in parameters by absolute paths. In
+        parameters of user code, every text that names a data file is replaced; otherwise only the
+        parameter `file`.
 
         Raises
         ------
         InputError
-            If a text names a file that is none of the data files: results would depend on it
-            unnoticed.
+            If a text names an existing file that the study does not list as a data file.
+            Results would depend on this file unnoticed.
         """
         if member.code is not None:
             return dict(self._with_paths(parameters, key))
@@ -192,7 +194,7 @@ class Lookup:
             }
         if isinstance(value, list):
             return [self._with_paths(item, key) for item in value]
-        # A network counts anyway.
+        # The files of a network belong to the identity of results without being listed.
         is_name = isinstance(value, str) and not key.endswith(".network")
         if (
             is_name
@@ -214,7 +216,7 @@ class Lookup:
                 "a module in a file of its own",
             )
 
-        # Modules beside the study come before those of the working directory.
+        # A module beside the study wins over a module of the same name in the working directory.
         folders = list(dict.fromkeys((*self.folders, os.getcwd())))
         importlib.invalidate_caches()
         add_import_folders(folders)
@@ -247,8 +249,9 @@ class Lookup:
 
 
 def _import_beside(name: str, folders: Sequence[str]) -> ModuleType | None:
-    """A module beside the study with the name of one of Python or of a library that is loaded, such
-    as random.py, which stays: under a name of its own. None for any other name.
+    """Import a module beside the study whose name equals the name of a loaded module of Python or
+    of a library, such as random.py. The loaded module stays: the user's module gets another name.
+    None if no such file or no such loaded module exists.
     """
     file = file_beside(f"{name}.py", folders)
     if not file or name not in sys.modules or is_user_file(file_of_module(name)):
@@ -264,8 +267,9 @@ def _import_beside(name: str, folders: Sequence[str]) -> ModuleType | None:
 
 
 def _base_of(candidate: Any, bases: Sequence[type]) -> type:
-    """The first base that a class derives from; else that whose contract it meets; else the only
-    one of which it has an abstract method; else the last one.
+    """The base whose contract a class has to meet: the first base that the class derives from. If
+    the class derives from none, the first base whose contract it meets. Otherwise the only base of
+    which the class has an abstract method. Otherwise the last base.
     """
     for base in bases:
         if isinstance(candidate, type) and issubclass(candidate, base):
@@ -288,7 +292,7 @@ def _has_some(candidate: Any, base: type) -> bool:
 
 
 def unload_user_modules() -> None:
-    """Unload all modules that user code is made of, so that the next lookup loads them again."""
+    """Unload all modules with user code, so that the next lookup loads the modules again."""
     for name in this_process.modules:
         if is_user_file(file_of_module(name)):
             del sys.modules[name]
@@ -296,8 +300,8 @@ def unload_user_modules() -> None:
 
 
 def add_import_folders(folders: Iterable[str]) -> None:
-    """Let modules import from `folders` and the working directory. The folders come directly before
-    the working directory on Python's path: what is listed before it keeps precedence.
+    """Let modules import from `folders` and the working directory. The folders are inserted into
+    Python's path just before the working directory. Entries before this place still win.
     """
     sys.path[:] = [
         folder for folder in sys.path if folder not in this_process.added_folders
@@ -314,26 +318,28 @@ def add_import_folders(folders: Iterable[str]) -> None:
 
 
 class ImportPath(NamedTuple):
-    """Python's path, and those of its folders that `add_import_folders` has added."""
+    """Python's path (`folders`), and the entries that `add_import_folders` has inserted
+    (`added`).
+    """
 
     folders: list[str]
     added: list[str]
 
     @classmethod
     def here(cls) -> ImportPath:
-        """The path of this process."""
+        """The present path of this process."""
         return cls(sys.path[:], this_process.added_folders)
 
     def inherit(self) -> None:
-        """Make this the path of this process."""
+        """Set Python's path of this process to this path."""
         sys.path[:], this_process.added_folders = self
 
 
 @contextmanager
 def only_from(folder: str) -> Iterator[None]:
-    """Within the block, also in processes that start in it, user code and files that it names
-    without their folder are those of one folder, the working directory; only libraries are imported
-    from elsewhere.
+    """Within the block, find user code and its files in one folder only, which becomes the working
+    directory. Other folders only provide libraries. Processes that start within the block do the
+    same.
     """
     path = ImportPath.here()
     modules = dict(sys.modules)
@@ -357,7 +363,9 @@ def only_from(folder: str) -> Iterator[None]:
 
 
 def _is_of_libraries(entry: str) -> bool:
-    """Whether an entry of Python's path, "" for the working directory, holds no user code."""
+    """Return whether an entry of Python's path has libraries, but no user code. "" stands for the
+    working directory, which may have user code.
+    """
     return bool(entry) and not is_user_file(os.path.join(entry, ""))
 
 
@@ -381,7 +389,7 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> 
         np.errstate(),
         end_if_longer(member.time_limit, "`__init__`"),
     ):
-        # A class of the package forbids what it does not have.
+        # Classes of the package refuse unknown parameters by themselves.
         if member.code is not None:
             accepted = inspect.signature(member.target).parameters
             if not any(item.kind is item.VAR_KEYWORD for item in accepted.values()):
