@@ -1,5 +1,5 @@
-"""The command of a function: its parameters and its help are those of the function's signature and
-docstring.
+"""Makes a command of a function: the function's signature and docstring give the command's options
+and help.
 """
 
 from __future__ import annotations
@@ -33,10 +33,12 @@ from safevar_sumo.study import study_names
 
 GATE_EXIT_CODE = 3
 DECIDE_EXIT_CODE = 4
-"""Exit code of a command if a condition of --fail-if holds, or a limit is not kept."""
+"""Exit codes of a command: GATE if a condition of --fail-if holds or a limit is not kept, DECIDE if
+a person has to decide.
+"""
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 LIBRARY_ONLY = ("pool", "progress")
-"""Options that only calls of the library have; a command shows its progress."""
+"""Parameters that only the library's functions have. (A command always shows its progress.)"""
 METAVARS = {
     "source": "STUDY|DIR",
     "subject": "STUDY|DIR",
@@ -44,26 +46,29 @@ METAVARS = {
     "results": "DIR",
     "directory": "DIR",
 }
-"""How the help names positional parameters, unless by their names."""
+"""The names of positional parameters in the help. Other parameters have their own names."""
 COMMON_NAMES = {
     "Which encounters": ("point", "ranges", "up_to"),
     "How to simulate": ("jobs", "cluster", "simulations", "as_it_is_now", "fresh"),
     "How to print": ("format", "json", "details", "table", "plot", "fail_if"),
 }
-"""Options that many commands have: with one meaning, help names them in a few lines."""
+"""Options that many commands have. If such an option has its usual meaning, the help only lists
+it.
+"""
 ENDED_OPTIONS = {
     "simulate --spread": "the page of `report`, which has the band, or simulate --fit K",
     "study --dry-run": "no such option: the bar of a search shows the time that is left",
     "study --shard": "sv.run(study, only=...), or --cluster",
 }
-"""Options that commands had, and what stands in their place."""
+"""Options of earlier releases, with the text that says what replaces each option."""
 CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")
 
 
 class _Command(click.Command):
-    """A command that refuses an option with one value that is given twice, and options of earlier
-    releases. `--help` explains its own options, and `--help-all` those that many commands have,
-    too.
+    """A command that refuses options of earlier releases, and an option that is given twice
+    although it has one value.
+
+    `--help` explains the command's own options, and `--help-all` also explains common options.
     """
 
     def format_options(
@@ -78,7 +83,7 @@ class _Command(click.Command):
             for option in self.get_params(ctx)
             if isinstance(option, click.Option)
         }
-        # An option that means something else in this command is explained, too.
+        # A common option with another meaning in this command is explained like the command's own.
         meanings = {option.name: option.meaning for option in COMMON_OPTIONS}
         lines = []
         for title, names in COMMON_NAMES.items():
@@ -161,14 +166,14 @@ def _give_answer(
         End with exit code 3 if this condition holds, such as "probability > 0.01"; may be repeated.
         The name is that of a number in --json.
     """
-    # What the answer will not have is refused before it is computed.
+    # A condition or table that the answer cannot have is refused before hours of simulation.
     conditions = list(map(_parse, fail_if))
     if declared:
         _check_names(declared, values, [key for key, _, _ in conditions], table)
     if plot is not None:
         check_writable(plot, "plot", PICTURE_ENDINGS)
 
-    # Only the answer goes to standard output.
+    # Standard output has nothing but the answer, so that other programs can read it.
     if json:
         format = "json"
     with nullcontext() if format == "text" else prints_to_standard_error():
@@ -183,10 +188,11 @@ def _give_answer(
 
 
 def command_of(name: str, function: Callable[..., Any]) -> click.Command:
-    """The command that calls a function.
+    """Make the command that calls a function.
 
-    An answer is printed, and the exit code is 3 if one of the user's limits is not kept, or a
-    condition of --fail-if holds, and 1 if its number `passed` is false. A text is printed, too.
+    The command prints the function's answer or text. The exit code of an answer is 3 if a user's
+    limit is not kept or a condition of --fail-if holds, 4 if a person has to decide, and 1 if the
+    answer's number `passed` is false.
     """
     signature = inspect.signature(function)
     positional = [
@@ -234,8 +240,10 @@ def _check_names(
     keys: Sequence[str],
     table: str | None,
 ) -> None:
-    """Refuse keys of conditions, and a table, that no answer of the command has."""
-    # Answers such as that of `simulate` have the metrics of their study.
+    """Refuse keys of conditions, and the name of a table, that no answer of the command can
+    have.
+    """
+    # Some answers, such as that of `simulate`, also have the metrics of their study.
     if keys and ... in declared.numbers:
         declared = declared.in_study(names_in_study(values))
     for key in keys:
@@ -247,8 +255,8 @@ def _check_names(
 def _exit_on_failures(
     answer: Answer, conditions: Sequence[tuple[str, str, float]]
 ) -> None:
-    """End with an exit code if a limit is not kept, a condition holds, a check has findings, or a
-    person has to decide; the verdict's reasons are not said again.
+    """End with the exit code of the answer. Print the reasons for the code, unless the verdict
+    states them already.
     """
     failures = list(answer.failures)
     for condition in conditions:
@@ -267,8 +275,8 @@ def _exit_on_failures(
 
 
 def names_in_study(values: Mapping[str, Any]) -> list[str]:
-    """Names of what the study of a simulation measures."""
-    # It takes long to load.
+    """The names of the measures of the study that a command simulates."""
+    # The import takes long, and most commands do not need it.
     from safevar_sumo.sumo import assemble
 
     study = study_in(
@@ -279,8 +287,8 @@ def names_in_study(values: Mapping[str, Any]) -> list[str]:
 
 @contextmanager
 def prints_to_standard_error() -> Iterator[None]:
-    """Within the block, what user code, SUMO and workers print goes to standard error, so that
-    standard output has the answer alone.
+    """Within the block, redirect standard output to standard error, also of user code, SUMO and
+    workers. Standard output then has the answer alone.
     """
     sys.stdout.flush()
     standard_output = os.dup(1)
@@ -308,7 +316,7 @@ def _argument(parameter: inspect.Parameter) -> click.Argument:
 def _complete_study(
     _ctx: click.Context, _param: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
-    """Complete names of studies, files and directories."""
+    """Complete the name of a study, a file or a directory."""
     names = [
         CompletionItem(name) for name in study_names() if name.startswith(incomplete)
     ]
@@ -316,7 +324,7 @@ def _complete_study(
 
 
 class _Path(click.Path):
-    """A path, which is not empty."""
+    """A path on the command line that must not be empty."""
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
@@ -350,8 +358,8 @@ def _flag(option: Option) -> click.Option:
 
 
 def _print(answer: Answer, form: str, table: str | None, *, details: bool) -> None:
-    """Print an answer or one of its tables; the whole answer if it lacks the table, which may have
-    taken long.
+    """Print an answer, or one of its tables. If the answer lacks the table, print the whole answer
+    before the error: its simulations may have taken long.
     """
     try:
         if table:
@@ -367,7 +375,7 @@ def _print(answer: Answer, form: str, table: str | None, *, details: bool) -> No
 
 
 def _parse(text: str) -> tuple[str, str, float]:
-    """The key, the operator and the limit of a condition."""
+    """Parse a condition: its key, operator and limit."""
     match = CONDITION.fullmatch(text)
     if match is None or not math.isfinite(limit := float(match[3])):
         raise InputError(
@@ -379,8 +387,8 @@ def _parse(text: str) -> tuple[str, str, float]:
 
 
 def _fulfilments(answer: Answer, key: str, sign: str, limit: float) -> Iterator[str]:
-    """A sentence for each number of the answer for which a condition holds; a note if no number is
-    there.
+    """Yield a sentence for each number of the answer that fulfils a condition. If the answer has no
+    such number, print a note.
     """
     values = answer.values(key)
     if None in values or not values:
@@ -388,7 +396,7 @@ def _fulfilments(answer: Answer, key: str, sign: str, limit: float) -> Iterator[
         click.echo(f"note: --fail-if: {key} is {state} here", err=True)
     rows = [""] * len(values)
     table = key.rpartition(".")[0]
-    # The first column says which row it is.
+    # The first column of a table names the row.
     if table in answer.tables:
         rows = [f" in the row {row}" for row in answer.tables[table].iloc[:, 0]]
     for value, row in zip(values, rows, strict=True):
