@@ -1,5 +1,5 @@
-"""What a pool computes for a study besides its runs: many settings for a question; whether
-simulations tell anything about the ADS; and the check of user code.
+"""Work for the processes of a pool: evaluate many settings for a question, check user code, and
+find out whether simulations of a study say anything about its ADS.
 """
 
 from __future__ import annotations
@@ -46,29 +46,33 @@ from safevar_sumo.terminal import Progress
 from safevar_sumo.vehicles import VEHICLES, Vehicle
 
 BATCHES_PER_WORKER = 4
-"""Largest number of batches per worker: with several, no worker waits long for another, and the
-time left is known.
+"""Largest number of batches for each worker. With several batches, no worker waits long for the
+last worker, and progress can estimate the time left.
 """
 MAX_REPEATS = 5
-"""Largest number of simulations that are repeated where the number is limited."""
+"""Largest number of simulations that are repeated as a check, if simulations are limited."""
 FEW_SKIPPED = 100
-"""Number of settings up to which a question skips as many as of these."""
+"""The share of skipped settings is computed as if a question had at least this number of settings.
+Otherwise a single failure among the first settings would end the question.
+"""
 PORTION = 4096
-"""Number of settings whose results are kept together."""
+"""Number of settings whose results are kept together, in one entry of the cache."""
 SMALL_PORTION = 256
-"""That number where vehicles take turns or SUMO itself simulates, so that each costs time."""
+"""The same number if vehicles drive one after another, or in SUMO itself. Simulations then take
+long, and an interruption should lose only a few of them.
+"""
 COMPILING = "compiling the vehicle model, for the first time"
-"""The phase of progress in which one worker compiles, and no simulation has begun."""
+"""The phase of progress during which a worker compiles the vehicle model."""
 ECONOMICAL_FRACTION = 1 / 4
-"""Fraction of the most economical batch size from which on the steps of a simulation cost no more
-than its vehicles. Settings that fill no larger batch make one: two would pay for the same steps
-twice. Where each vehicle takes a turn of its own, they make one for each worker.
+"""A batch of at least this fraction of the most economical size is economical: a step of a smaller
+batch costs as much as a step of this batch. Therefore few settings make one batch instead of two.
+If vehicles drive one after another, few settings make one batch for each worker instead.
 """
 
 
 def refuse_other_worker(study: Study, manifest: JsonObject, package: str) -> None:
-    """Refuse a worker of a cluster that has other versions, files of the study, or code of this
-    package.
+    """Refuse a worker of a cluster that has other versions of libraries, other files of the study,
+    or other code of this package.
     """
     refuse_changed_inputs(study, system_of(study), manifest)
     if package != package_digest():
@@ -86,8 +90,9 @@ def _refuse_other_workers(study: Study, used: Iterable[str], pool: Pool) -> None
 
 
 def spare(limit: int, minimum: int) -> tuple[int, int]:
-    """How many of the allowed simulations the check of a simulator's class may take, and the
-    repeats of first batches; what an answer takes at least is left.
+    """Split the simulations that are not needed for an answer. Return how many simulations the
+    check of a simulator's class may take, and how many the repetition of first batches may take.
+    `limit` is the number of allowed simulations, `minimum` the least number for an answer.
     """
     check = min(limit // 10, max(limit - minimum, 0))
     return check, min(limit // 10, MAX_REPEATS, max(limit - minimum - check, 0))
@@ -102,13 +107,13 @@ def evaluate_all(
     selection: Selection = EVERYTHING,
     begin: Callable[[], None] = lambda: None,
 ) -> Evaluations:
-    """Evaluate M filtered settings of n characteristics, shape (M, n); equal settings are simulated
-    once, and those that another question of a page or the cache of simulations has are not.
+    """Evaluate M filtered settings of n characteristics, shape (M, n). Equal settings are simulated
+    once. Settings are not simulated if another question of a page or the cache has their results.
 
-    User code is checked first (`check_code`), and `begin` is called before anything is simulated. A
-    sample of the settings in a recorded scene is also simulated in SUMO, until `verified` ones of
-    the study have been. `finish` is called with the number of settings of each finished batch. Of a
-    `selection`, nothing is verified in SUMO.
+    First `check_code` checks user code. `begin` is called before the first simulation, and `finish`
+    with the number of settings of each finished batch. Recorded scenes are verified: a sample of
+    the settings is simulated again in SUMO, until `verified` settings of the study are verified.
+    Nothing is verified if a `selection` restricts or varies the study.
     """
     packed_study = msgspec.msgpack.encode(study)
     if pool.shared is not None:
@@ -121,7 +126,8 @@ def evaluate_all(
         pool.inputs[packed_study] = manifest_now(study, system, opened)
         _refuse_other_workers(study, opened, pool)
 
-    # The cache has an entry for each portion.
+    # Each portion has its own entry in the cache, so that an interruption loses one portion at
+    # most.
     distinct_settings, row_of = np.unique(settings, axis=0, return_inverse=True)
     batches = choose_batches(study, selection)
     cache = cache_of(study, opened)
@@ -175,7 +181,9 @@ def _evaluate_shared(
     selection: Selection,
     begin: Callable[[], None],
 ) -> Evaluations:
-    """As `evaluate_all`, with what other questions of a page have simulated."""
+    """Evaluate settings like `evaluate_all`, but take the results that other questions of the page
+    have.
+    """
     shared = pool.shared
     pool.shared = None
     assert shared is not None
@@ -198,8 +206,9 @@ def _evaluate_shared(
 
 
 def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:
-    """Forget what an interrupted command has simulated if the original vehicle, which has just been
-    simulated again, does otherwise than then.
+    """Forget the results of an interrupted command if the simulator has changed. `original` is a
+    new simulation of the original vehicle: if its result differs from the kept result, nothing is
+    kept.
     """
     opened = opened_by(study, pool)
     if cache := cache_of(study, opened):
@@ -214,8 +223,8 @@ def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:
 
 
 def repeat_first_batches(study: Study, pool: Pool) -> None:
-    """Have each worker simulate its first batch of a study with user code again; raises the error
-    of `repeat_first_batch`.
+    """Let each worker simulate its first batch of a study with user code again. Results that differ
+    raise the error of `repeat_first_batch`.
     """
     if user_code_names(study):
         limit = pool.spare and pool.spare[1] // simulations_of_setting(system_of(study))
@@ -223,8 +232,8 @@ def repeat_first_batches(study: Study, pool: Pool) -> None:
 
 
 def opened_by(study: Study, pool: Pool) -> list[str]:
-    """The names of the files that the user code of a study opens. A study's code is checked once in
-    a pool, whatever else of the study questions vary.
+    """The names of the files that the user code of a study opens. The first call checks the code.
+    Other variants of the study with the same code are not checked again in this pool.
     """
     names = frozenset(user_code_names(study))
     places = (study.name, *study.origin.places)
@@ -244,8 +253,8 @@ def _simulate(
     finish: Callable[[int], None],
     sample_size: int,
 ) -> Evaluations:
-    """Simulate distinct settings, shape (k, n), in batches for the workers; where recorded scenes
-    replace SUMO, some of the results are repeated in SUMO.
+    """Simulate distinct settings, shape (k, n), in batches. If recorded scenes replace SUMO,
+    simulate a sample of `sample_size` settings again in SUMO.
     """
     jobs = [
         (task, rows)
@@ -272,15 +281,15 @@ def _simulate(
 
 
 class Batches(NamedTuple):
-    """How settings of a study fill batches.
+    """The sizes of batches for the settings of a study.
 
     Attributes
     ----------
     best
         The most economical number of settings in a batch.
     share_steps
-        Whether the vehicles of a batch take each step together, so that a small batch costs as much
-        as a larger one.
+        Whether the vehicles of a batch take each step together. A small batch then costs as much as
+        a larger batch.
     are_recorded
         Whether a recorded scene replaces SUMO.
     """
@@ -291,13 +300,13 @@ class Batches(NamedTuple):
 
     @property
     def portion(self) -> int:
-        """Number of settings that are simulated before their results are kept."""
+        """The number of settings that are simulated before their results are kept."""
         if self.share_steps:
             return PORTION
         return SMALL_PORTION
 
     def number(self, settings: int, pool: Pool) -> int:
-        """The number of batches for so many settings."""
+        """The number of batches into which a number of settings is divided."""
         per_worker = settings / pool.workers
         economical = ECONOMICAL_FRACTION * self.best
         if not self.share_steps:
@@ -307,7 +316,7 @@ class Batches(NamedTuple):
 
 
 def choose_batches(study: Study, selection: Selection) -> Batches:
-    """Choose how settings of a study fill batches."""
+    """Choose the sizes of batches for the settings of a study."""
     system = selection.of(system_of(study))
     are_recorded = not reason_against_scenes(system)
     have_turns = (
@@ -319,14 +328,14 @@ def choose_batches(study: Study, selection: Selection) -> Batches:
 
 
 def compile_vehicle(study: Study, pool: Pool, progress: Progress) -> None:
-    """Have one worker compile what a study's vehicle computes with, unless an earlier process has,
-    and say so; the other workers load it.
+    """Let one worker compile the code of a study's vehicle model, and show this phase of progress.
+    The other workers then load the compiled code. Nothing happens if the code is already compiled.
     """
     if study.vehicle.model in pool.compiled:
         return
     pool.compiled.add(study.vehicle.model)
     shipped = VEHICLES.get(study.vehicle.model)
-    # It compiles nothing, and no worker needs to start to say so.
+    # Most vehicles compile nothing: no worker has to start only to say so.
     if shipped is not None and shipped.compile is Vehicle.compile:
         return
     task = Task(study=study)
@@ -342,8 +351,9 @@ def _compile_vehicle(task: Task, only_load: bool) -> bool:
 def ask_why_no_verdict(
     study: Study, pool: Pool, begin: Callable[[], None] = lambda: None
 ) -> str:
-    """Why simulations of a study tell nothing about its ADS, as `why_no_verdict` finds in a worker;
-    "" if they do. `begin` is called before anything is simulated.
+    """The reason why simulations of a study say nothing about its ADS; "" if simulations do say
+    something. A worker finds the reason with `why_no_verdict`. `begin` is called before a
+    simulation.
     """
     opened = opened_by(study, pool)
     cache = cache_of(study, opened)
