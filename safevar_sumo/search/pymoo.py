@@ -1,5 +1,5 @@
-"""The algorithms of pymoo (Blank and Deb 2020) by name, such as `pymoo:NSGA3`: its ask and tell
-behind our contract.
+"""Algorithms of pymoo (Blank and Deb 2020) as algorithms of this package. A study names an
+algorithm as `pymoo:NSGA3`. pymoo's algorithm asks for settings, and is told their objectives.
 """
 
 from __future__ import annotations
@@ -57,21 +57,23 @@ MODULES = {
     "soo.nonconvex.pso_ep": "EPPSO",
     "soo.nonconvex.sres": "SRES",
 }
-"""pymoo's algorithms for real numbers by their module: `moo` for several objectives, `soo` for one.
+"""The names of pymoo's algorithms for real numbers, by their modules. Modules of `moo` have
+algorithms for several objectives, modules of `soo` for one objective.
 """
 PYMOO_ALGORITHMS = {
     PYMOO + name: module for module, names in MODULES.items() for name in names.split()
 }
-"""The module of each algorithm, by its name in a study. Not here: algorithms for problems that
-change over time (DNSGA2, KGB), for bits (BGA) and for a person who decides (PINSGA2), and a second
-random search.
+"""The module of each algorithm, by the algorithm's name in a study.
+
+Left out are pymoo's second random search, and algorithms for problems that change over time
+(DNSGA2, KGB), for bits (BGA), and for a person who decides (PINSGA2).
 """
 PARTITIONS = 12
-"""Partitions of each objective in Das and Dennis's directions (1998), where a study gives no
-others.
+"""Partitions of each objective in the reference directions of Das and Dennis (1998), if a study
+states no number.
 """
 MAX_DIRECTIONS = 100_000
-"""Largest number of reference directions, and of individuals."""
+"""Largest number of reference directions, and of individuals in a population."""
 DirectionCount = Annotated[int, Meta(ge=1, le=MAX_DIRECTIONS)]
 TYPES: Parameters = {
     "ref_dirs": DirectionCount | list[list[float]],
@@ -82,7 +84,7 @@ TYPES: Parameters = {
     "weights": list[float],
     "F": float | list[float],
 }
-"""Types of arguments whose default value in pymoo does not tell them."""
+"""Types of arguments whose default value in pymoo does not show the type."""
 HIDDEN = {
     "verb_log",
     "cmaes_verbose",
@@ -90,11 +92,15 @@ HIDDEN = {
     "n_diffs",
     "advance_after_initial_infill",
 }
-"""Arguments that write files, print, or are no choice of the user's."""
+"""Arguments that a study cannot state, because they write files, print, or have nothing to
+choose.
+"""
 LEAST_POPULATION = 4
-"""With fewer individuals GDE3 and NSDE draw for ever."""
+"""Least size of a population. With fewer individuals, GDE3 and NSDE draw random numbers for
+ever.
+"""
 FAILED = 1e9
-"""Objectives and violation, for pymoo, of a setting that could not be scored."""
+"""The objectives and the violation that pymoo is told for a setting that could not be scored."""
 
 
 class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
@@ -156,7 +162,7 @@ class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
         return result.take(problem.scoring.valid(result))
 
     def try_out(self, problem: Problem) -> None:
-        """Refuse arguments that pymoo refuses before its first request."""
+        """Refuse arguments that pymoo refuses when its algorithm is created."""
         size = getattr(self, "pop_size", UNSET)
         if size is not UNSET and size > problem.evaluations:
             raise InputError(
@@ -168,11 +174,11 @@ class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
             self.begin(problem, 0)
 
     def begin(self, problem: Problem, seed: int) -> Any:
-        """pymoo's algorithm before its first request."""
+        """Create pymoo's algorithm, before its first request."""
         from pymoo.core.problem import Problem as PymooProblem
         from pymoo.util.ref_dirs import get_reference_directions
 
-        # The user's values come before the study's population, and this before pymoo's defaults.
+        # The user's arguments win over the study's population, which wins over pymoo's defaults.
         objectives = 1
         if PYMOO_ALGORITHMS[self.name].startswith("moo."):
             objectives = len(problem.scoring.objectives)
@@ -208,7 +214,7 @@ class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
                 )
         lower = problem.characteristics.lower
         upper = problem.characteristics.upper
-        # MOEAD refuses constraints.
+        # MOEAD raises an error for problems with constraints.
         task = PymooProblem(
             len(lower),
             objectives,
@@ -216,7 +222,7 @@ class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
             xl=lower,
             xu=upper,
         )
-        # Without a copy, runs would share the defaults of pymoo's classes.
+        # pymoo's classes have default objects that runs would share: each run gets a copy.
         algorithm = copy.deepcopy(_class_of(self.name)(**arguments))
         return algorithm.setup(
             task, termination=("n_eval", problem.evaluations), seed=seed
@@ -224,7 +230,7 @@ class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
 
 
 def _settings(population: Any, problem: Problem) -> FloatArray:
-    """The filtered settings of pymoo's individuals, shape (k, n)."""
+    """The filtered settings of a population of pymoo, shape (k, n)."""
     characteristics = problem.characteristics
     values = population.get("X").astype(float).reshape(-1, len(characteristics))
     values = np.clip(values, characteristics.lower, characteristics.upper)
@@ -234,7 +240,7 @@ def _settings(population: Any, problem: Problem) -> FloatArray:
 def _score(
     population: Any, evaluations: Evaluations, problem: Problem, algorithm: Any
 ) -> None:
-    """Give pymoo's individuals their objectives and violations."""
+    """Write objectives and violations into the individuals of a population."""
     scoring = problem.scoring
     valid = scoring.valid(evaluations)
     violations = scoring.violation(evaluations)
@@ -252,9 +258,11 @@ def _score(
 
 
 class _Randomness:
-    """Blocks in which the randomness of pymoo is that of one run, and its errors are the user's.
+    """Within its blocks, pymoo draws the random numbers of one run, and errors of pymoo become
+    errors about the user's arguments.
 
-    pymoo and pycma draw from numpy's global state, and from generators without a seed, too.
+    pymoo and pycma draw from numpy's global state, and from generators without a seed. Therefore a
+    block sets numpy's global state, and replaces `default_rng` in pymoo.
     """
 
     def __init__(self, name: str, rng: Generator) -> None:
@@ -264,7 +272,7 @@ class _Randomness:
         self._inside = np.random.RandomState(self.seed).get_state()
 
     def default_rng(self, seed: int | None) -> Generator:
-        """What pymoo takes for numpy's function."""
+        """The function that replaces `numpy.random.default_rng` in pymoo."""
         if seed is None:
             return self._unseeded
         return default_rng(seed)
@@ -289,12 +297,12 @@ class _Randomness:
 
 
 def pymoo_algorithm(name: str) -> type[PymooAlgorithm]:
-    """The class of an algorithm of pymoo by its name in a study.
+    """Make the class of an algorithm of pymoo, by the algorithm's name in a study.
 
     Raises
     ------
     InputError
-        If pymoo is not installed or has no such algorithm.
+        If pymoo is not installed, or has no such algorithm.
     """
     check_name("", f"search.algorithms = {name!r}", name, PYMOO_ALGORITHMS)
     fields = list[Any]()
@@ -312,7 +320,7 @@ def pymoo_algorithm(name: str) -> type[PymooAlgorithm]:
 
 
 def _class_of(name: str) -> Any:
-    """pymoo's class of an algorithm; raises an InputError if pymoo is not installed."""
+    """The class of an algorithm in pymoo. Raise an InputError if pymoo is not installed."""
     try:
         from pymoo.config import Config
     except ImportError:
@@ -322,8 +330,8 @@ def _class_of(name: str) -> Any:
     Config.warnings["not_compiled"] = False
     from pymoo.functions import FunctionLoader
 
-    # Its compiled crowding distances end the process (GDE3PCD in 0.6.2), and all machines have the
-    # other ones.
+    # The compiled crowding distance of GDE3PCD ends the process in pymoo 0.6.2. Not every machine
+    # has compiled functions, and results must not depend on the machine.
     FunctionLoader.get_instance().is_compiled = False
     return getattr(
         importlib.import_module(f"pymoo.algorithms.{PYMOO_ALGORITHMS[name]}"),
@@ -332,12 +340,12 @@ def _class_of(name: str) -> Any:
 
 
 def _plain_arguments(name: str) -> Parameters:
-    """Arguments of an algorithm's class and its bases that a file can give, with their default
-    values.
+    """The arguments that a study's file can state, with their default values. The arguments are
+    those of the algorithm's class and of its bases.
     """
     algorithm = _class_of(name)
     arguments = dict[str, inspect.Parameter]()
-    # The arguments of DE are those of a class Variant.
+    # The class DE takes its arguments from a class Variant, without naming them.
     variant = getattr(
         importlib.import_module(algorithm.__module__), "Variant", algorithm
     )
