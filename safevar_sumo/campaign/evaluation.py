@@ -1,6 +1,5 @@
-"""What a worker computes with the settings of a study: a task, the evaluation of a batch of
-settings, a pure function for any process on any machine, and the comparison of its results with
-SUMO.
+"""Evaluates batches of settings in a worker process, and verifies results in SUMO. A task and the
+settings determine the results: they are the same in any process on any machine.
 """
 
 from __future__ import annotations
@@ -43,27 +42,28 @@ from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.vehicles import CharacteristicSet
 
 VERIFIED_SETTINGS = 50
-"""Number of settings of a study to verify in SUMO in questions."""
+"""Number of settings of a study that questions verify in SUMO."""
 KNOWN_SYSTEMS = 64
-"""Number of systems that a process keeps: questions about the fits of a vehicle change between
-them.
+"""Number of systems that a process keeps. Questions alternate between the parameter sets of a
+vehicle model, and each set has a system of its own.
 """
 _first_batches = dict[bytes, tuple["Task", FloatArray, Evaluations]]()
-"""The first batch of each study with user code that this process has simulated, by packed study."""
+"""For each study with user code (packed): the first batch that this process has simulated."""
 
 
 class Selection(msgspec.Struct, frozen=True):
-    """Restricts a task to some points of a study, or varies parameters of its ADS; every encounter
-    counts then, so that no original vehicle drives beside a setting.
+    """Restricts a task to some points of a study, or varies parameters of the study's ADS. Every
+    encounter then counts: no original vehicle drives beside a setting.
 
     Attributes
     ----------
     parameters
-        Parameters of the ADS whose values follow the characteristics in every row of the settings.
+        Names of parameters of the ADS. In every row of settings, their values follow the values of
+        the characteristics.
     points
-        Numbers of the points of a matrix to simulate; None for all.
+        Numbers of the matrix's points that are simulated; None for all points.
     arrays
-        Whether one ADS drives all rows, with arrays as parameters.
+        Whether one ADS can drive all rows, with an array of values for each parameter.
     """
 
     parameters: tuple[str, ...] = ()
@@ -80,20 +80,23 @@ class Selection(msgspec.Struct, frozen=True):
 
 
 EVERYTHING = Selection()
-"""All points, the study's own values of the ADS's parameters, and its own rule of what counts."""
+"""Selects all points, the study's own values of the ADS's parameters, and the study's own rule
+which encounters count.
+"""
 
 
 class Task(msgspec.Struct, frozen=True, kw_only=True):
-    """What a worker computes with every setting of a study.
+    """What a worker has to do with settings: simulate them in a study, in the way that the
+    attributes say.
 
     Attributes
     ----------
     in_sumo
-        Whether SUMO moves the vehicles, also where recorded scenes suffice.
+        Whether SUMO moves the vehicles even where a recorded scene suffices.
     batch_size
-        Maximum number of settings in a batch.
+        Largest number of settings in a batch.
     selection
-        Parameters of the ADS that vary, and points; by default no parameter, and all points.
+        The points, and the parameters of the ADS that vary.
     """
 
     study: Study
@@ -103,7 +106,7 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def system_of(study: Study) -> System:
-    """The system of a study, which this process assembles once."""
+    """Return the system of a study. This process assembles the system only once."""
     return _assemble_packed(msgspec.msgpack.encode(study))
 
 
@@ -118,12 +121,13 @@ def carry_out(
     pool: Pool,
     look: Look = lambda ended: None,
 ) -> list[Any]:
-    """The results of a function for the arguments of each job: a task, and what to compute.
+    """Call a function with the arguments of each job in the pool, and return the results. The first
+    argument of a job is its task.
 
     Raises
     ------
     SafevarError
-        If two workers die of a job; the error names the study, the job and user code.
+        If two workers die in the same job; the error names the study, the job and user code.
     """
     try:
         return pool.map(function, jobs, look)
@@ -147,16 +151,16 @@ def carry_out(
 
 
 def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
-    """Evaluate settings of n characteristics, and values of the selected parameters, shape (k, n +
-    p), in equal batches.
+    """Evaluate settings of n characteristics and p selected parameters, shape (k, n + p), in
+    batches of equal size.
 
-    A batch that fails is halved until the failing settings are alone: a setting that SUMO cannot
+    A batch that fails is halved until the failing settings are alone. A setting that SUMO cannot
     simulate gets the outcome `simulator-error`.
 
     Raises
     ------
     UserCodeError
-        With the command that simulates the setting on which user code fails.
+        If user code fails; the error has the command that simulates the failing setting.
     EnvironmentFault
         If this machine lacks memory, disk space or files.
     """
@@ -175,7 +179,7 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
         ) from None
     if len(rows) == 1:
         characteristics = CharacteristicSet.of(task.study)
-        # Parameters of the ADS stand behind the characteristics.
+        # In a row, values of selected parameters follow the characteristics.
         setting = rows[:, : len(characteristics)]
         if isinstance(failure, UserCodeError):
             command = reproduction_command(task.study, setting[0])
@@ -196,15 +200,15 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
 
 
 def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
-    """Evaluate settings as a task says, shape (k, n + p), in one batch. A worker that takes longer
-    than the study's time limit ends.
+    """Evaluate settings, shape (k, n + p), in one batch. If the batch takes longer than the study's
+    time limit, the worker ends.
     """
     system = system_of(task.study)
     if task.in_sumo:
         system = replace(system, in_sumo=True)
-    # To compile may take longer than a batch may.
+    # Compilation comes first, because it may take longer than the time limit of a batch.
     system.vehicle.compile()
-    # Of runs that take long, each has the time limit.
+    # With a simulator that takes long, each run has the time limit instead of the batch.
     limit = end_if_longer(task.study.search.time_limit)
     with nullcontext() if system.mover.takes_long else limit:
         if task.selection != EVERYTHING:
@@ -219,12 +223,13 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
 
 
 def repeat_first_batch(study: Study) -> None:
-    """Simulate the first batch of a study with user code in this process again, and forget it.
+    """Simulate the first batch of a study with user code in this process again, and forget all kept
+    first batches.
 
     Raises
     ------
     UserCodeError
-        If a result differs: user code depends on what it has simulated before.
+        If a result differs. The user code then depends on what it has simulated before.
     """
     batch = _first_batches.pop(msgspec.msgpack.encode(study), None)
     if batch is None:
@@ -244,13 +249,15 @@ def repeat_first_batch(study: Study) -> None:
 
 
 def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evaluations:
-    """Evaluate rows of n characteristics and values of the selected parameters of the ADS."""
+    """Evaluate rows that have n values of characteristics, and values of selected parameters of the
+    ADS.
+    """
     selection = task.selection
     settings, values = np.split(rows, [len(system.characteristics)], axis=1)
     if not values.size:
         return drive_and_score(system, settings, with_originals=False)
 
-    # A driving system that takes an array for each parameter drives all at once.
+    # If the ADS can take an array for each parameter, it drives all rows at once.
     if selection.arrays:
         system = replace(
             system, ads=VariedAds(system.ads, selection.parameters, values)
@@ -259,7 +266,7 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
             drive_and_score(system, settings, with_originals=False), settings=rows
         )
 
-    # Any other one drives once for each set of values.
+    # Any other ADS drives once for each set of values, with all rows that have this set.
     parameter_sets, set_of_row = np.unique(values, axis=0, return_inverse=True)
     groups = []
     rows_of_groups = []
@@ -272,25 +279,25 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
         evaluations = drive_and_score(driven, settings[group], with_originals=False)
         groups.append(replace(evaluations, settings=rows[group]))
         rows_of_groups.append(group)
-    # The evaluations get the order of the rows.
+    # The groups are in the order of their sets of values: the result gets the order of the rows.
     return Evaluations.concatenate(groups).take(
         np.argsort(np.concatenate(rows_of_groups))
     )
 
 
 def with_parameters(study: Study, values: NamedValues) -> Study:
-    """A study with other values of parameters of its ADS."""
+    """The study with these values of parameters of its ADS."""
     ads = replace_in(study.ads, parameters={**study.ads.parameters, **values})
     return replace_in(study, ads=ads)
 
 
 def reproduction_command(study: Study, setting: FloatArray) -> str:
-    """The command that simulates a setting of n characteristics, shape (n,), in a study, or at the
-    only point to which the study was reduced.
+    """The command that simulates a setting of n characteristics, shape (n,). If the study was
+    reduced to a point, the command names this point.
     """
     return f"{simulate_command(study)} {CharacteristicSet.of(study).options(setting)}".rstrip()
 
 
 def verify_settings(task: Task, settings: FloatArray, worst: IntArray) -> str:
-    """Verify recorded scenes of a task; see `verify_in_sumo`."""
+    """Simulate settings of a task again in SUMO; see `verify_in_sumo`."""
     return verify_in_sumo(system_of(task.study), settings, worst)
