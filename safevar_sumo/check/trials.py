@@ -1,5 +1,5 @@
-"""Trials of user code: simulations, repeated, in another order and alone, and searches,
-repeated.
+"""Trials of user code. Simulations are repeated, in another order and alone, and searches are
+repeated: results must be the same.
 """
 
 from __future__ import annotations
@@ -36,31 +36,46 @@ from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 
 SIMULATED = 100
-"""Number of settings that are simulated, unless that takes longer than `LONGEST`."""
+"""Number of settings that are simulated, if this takes at most `LONGEST`."""
 LONGEST = 60.0
-"""Longest time of the simulations [s]."""
+"""Time after which the simulations should end [s]."""
 LEAST_SIMULATED = 3
-"""Least number of settings, however slow the code: the original, and the ends of the domains."""
+"""Least number of settings, however slow the code is: the original and two corners of the
+domains.
+"""
 FEW_UNUSED, MANY_UNUSED = 5, 20
-"""Number of settings in which a metric is defined somewhere, and each characteristic is read: where
-each takes long, the original and corners of the domains alone.
+"""Number of settings in which a metric must be defined at least once, and each characteristic must
+be read. `FEW_UNUSED` holds if simulations take long: the original and four corners of the domains.
 """
 TIMED, RUNS_OF_ALL = 5, 5
-"""Number of settings whose time is taken; in how many runs all settings are simulated, roughly."""
+"""Number of settings whose time is measured, and the approximate number of runs of all settings."""
 SMALLER_BATCHES = 4
-"""Number of batches into which the settings are divided for the check `alone`."""
+"""Number of parts into which the settings are divided for the check `alone`."""
 MATRIX_POINTS = 2
-"""Approximate number of a study's test points that are simulated."""
+"""Approximate number of a study's points that are simulated."""
 TRIED_VALUES = np.nan, 0.0, -1e6, 1e6
-"""Values that a quantity has at all samples, by which a metric that reads it is found."""
+"""Values that replace a quantity at all samples. If a metric changes, it reads this quantity."""
 MAX_EVALUATIONS, MAX_POPULATION = 57, 20
-"""Largest budget, and largest population, of an algorithm's runs."""
+"""Largest number of evaluations, and largest population, in a run of an algorithm."""
 _Rows = IntArray
 
 
 class Finding(NamedTuple):
-    """A failed check: its name and the wrong result, the place of the user code, which a trial does
-    not know, the input that shows it, and what is expected.
+    """A failed check.
+
+    Attributes
+    ----------
+    check
+        The name of the check.
+    finding
+        The wrong result.
+    where
+        The file and line of the user code; "" in a finding of a trial, which does not know the
+        place.
+    input
+        The vehicle with the wrong result, in words.
+    expected
+        The right result.
     """
 
     check: str
@@ -80,12 +95,20 @@ class Finding(NamedTuple):
 
 
 Findings = Iterator[Finding]
-"""Findings, each of which is computed when it is asked for."""
+"""Findings that are computed one by one, when the caller asks for the next finding."""
 
 
 class Extent(NamedTuple):
-    """How many vehicles are simulated, of how many if time allows, at how many points of the study,
-    and how long that takes [s].
+    """The size of a trial.
+
+    Attributes
+    ----------
+    vehicles, points
+        The numbers of vehicles and of the study's points that are simulated.
+    all_vehicles, all_points
+        The numbers without a limit of time.
+    seconds
+        The expected duration of the simulations [s].
     """
 
     vehicles: int
@@ -102,16 +125,19 @@ def try_simulations(
     tell: Callable[[Extent], None] = lambda extent: None,
     limit: int | None = None,
 ) -> Findings:
-    """Simulate a study with the original vehicle, the corners of the domains and random settings:
-    so many `vehicles`, by default as many as the time allows, in a simulator of the user's own with
-    at most so many simulations. `tell` is called with their number.
+    """Simulate a study with the original vehicle, the corners of the domains and random settings,
+    and compare repeated simulations.
+
+    The number of settings is `vehicles`, by default as many as fit into the time. In a simulator of
+    the user's own, at most `limit` simulations are done. `tell` is called with the size of the
+    trial.
     """
     region = region_of(study)
     settings = _settings(region.characteristics, max(vehicles or 0, SIMULATED))
     settings = region.repaired(region.characteristics.filter(settings))
     system = _system(study)
     if system.mover.takes_long and limit is not None:
-        # Each vehicle is in four runs, and both ends of the list are alone in one more.
+        # Each vehicle takes part in four runs; the first and the last vehicle also drive alone.
         simulations = simulations_of_setting(system)
         remaining_simulations = limit - system.repeats - 2 * simulations
         vehicles = remaining_simulations // (
@@ -142,7 +168,7 @@ def try_simulations(
         )
     )
 
-    # The study says that its simulator is not deterministic.
+    # With repeats, the study says that results of its simulator differ: nothing can be compared.
     if system.repeats > 1:
         drive_and_score(system, settings[:LEAST_SIMULATED])
         return
@@ -158,7 +184,7 @@ def try_simulations(
         )
     yield from _try(load, region.characteristics, settings, progress, expected)
 
-    # Recorded scenes of a user's scenario hold in SUMO, too.
+    # Recorded scenes of a user's scenario must give the same results as SUMO.
     system = _system(study)
     if ":" in study.scenario.model and not reason_against_scenes(system):
         try:
@@ -172,8 +198,8 @@ def try_simulations(
 
 
 def try_original(system: System, runs: SimulationRuns) -> Findings:
-    """What is wrong in the run of the original vehicle: units of a simulator of the user's own, and
-    metrics that change with a quantity that they do not state.
+    """Find mistakes in the run of the original vehicle: wrong units of a simulator of the user's
+    own, and metrics that read a quantity that their `needs` do not state.
     """
     if not system.mover.is_exact and (contradiction := unit_contradiction(runs.trace)):
         expected = "speeds in m/s, and distances in m"
@@ -204,8 +230,8 @@ def try_original(system: System, runs: SimulationRuns) -> Findings:
 
 
 def find_unused(study: Study) -> Findings:
-    """Metrics that the study names and that are undefined in all of a few runs, and characteristics
-    that a simulator of the user's own reads in none of them.
+    """Find metrics of the study that are undefined in all of a few runs, and characteristics that a
+    simulator of the user's own never reads.
     """
     system = _system(study)
     number = FEW_UNUSED if system.mover.takes_long else MANY_UNUSED
@@ -226,12 +252,12 @@ def find_unused(study: Study) -> Findings:
 
 
 def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
-    """The number of settings whose simulations take at most `LONGEST`, by the time of a few, or of
-    one in a simulator of the user's own; and the time that they take [s].
+    """Measure the time of a few settings, and return how many settings take at most `LONGEST`, and
+    their time [s]. In a simulator of the user's own, only one setting is measured.
     """
     timed = settings[: 1 if system.mover.takes_long else TIMED]
-    # The first simulation loads what any does, and ends a driving system that does not end; a
-    # simulator of the user's own has simulated once.
+    # The first simulation takes longer, because it loads libraries. Its time limit is short, in
+    # case the driving system never ends. A simulator of the user's own has simulated before.
     if not system.mover.takes_long:
         short = replace(system, time_limit=min(system.time_limit, LONGEST))
         drive_and_score(short, timed[:1])
@@ -243,7 +269,9 @@ def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
 
 
 def try_algorithm(study: Study, name: str) -> Findings:
-    """Let an algorithm search twice, the second time after another run."""
+    """Let an algorithm search twice with the same seed, the second time after a run with another
+    seed. Both searches must request and return the same settings.
+    """
     outputs = _search(study, name, seeds=(1,))
     repeated = _search(study, name, seeds=(2, 1))
     expected = "the same in every run with the same random numbers, to the bit"
@@ -265,7 +293,9 @@ def _try(
     progress: Progress,
     expected: str,
 ) -> Findings:
-    """Compare a run of all settings with other runs; `load` loads all user code again."""
+    """Compare a run of all settings with other runs of the same settings. `load` loads all user
+    code again, and returns a function that simulates rows of settings.
+    """
     run = load()
     all_rows = np.arange(len(settings))
     total = RUNS_OF_ALL * len(settings)
@@ -294,7 +324,7 @@ def _try(
 
 
 def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
-    """The original, four corners of the domains, and random settings; shape (count, n)."""
+    """The original, four corners of the domains, and random settings, shape (count, n)."""
     lower = characteristics.lower
     upper = characteristics.upper
     is_odd = np.arange(len(characteristics)) % 2 == 1
@@ -311,7 +341,7 @@ def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
 
 
 def _system(study: Study) -> System:
-    """The system of a study, with only a few points of its matrix; `assemble` loads all user code
+    """Assemble the system of a study with only a few points of its matrix. This loads user code
     again.
     """
     system = assemble(study)
@@ -320,8 +350,8 @@ def _system(study: Study) -> System:
 
 
 def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
-    """All settings that a run with the last seed, after runs with the others, requests, and then
-    those that it returns; shape (k, n).
+    """Run an algorithm with one seed after another. Return the settings that the last run requests,
+    and then the settings that it returns, shape (k, n).
     """
     system = _system(study)
     lookup = Lookup.of(study)
@@ -343,7 +373,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
         algorithm = instance_of(
             member, parameters, f"search.algorithms = {name!r}", f"search.{label}"
         )
-        # A method that is no generator raises its errors here.
+        # If `search` is no generator, its code already runs in this call.
         with user_errors(study.source):
             search = algorithm.search(problem, default_rng(seed))
         settings = []
