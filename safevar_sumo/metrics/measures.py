@@ -1,5 +1,5 @@
-"""The safety metrics of the published study (method section 4; Minderhoud and Bovy 2001), metrics
-of conflicts.
+"""The safety metrics of the published study (method section 4; Minderhoud and Bovy 2001), and
+metrics of conflicts between the paths of two road users.
 """
 
 from __future__ import annotations
@@ -23,16 +23,18 @@ from safevar_sumo.records import (
 from safevar_sumo.study import SAFETY_DEGREE, MetricsTable
 
 OF_APPROACH = "speed", "gap", "obstacle_speed"
-"""What times to collision need."""
+"""The quantities from which times to collision are computed."""
 PATH_TOLERANCE = 1e-6
-"""Margin of the vehicle's path [m]: a body that is exactly at its edge is in it."""
+"""Margin on each side of the vehicle's path [m]: without it, rounding errors decide whether a body
+at the edge is in the path.
+"""
 
 
 def safety_degree(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Least separation during the encounter [m, > 0], or minus the closing speed of the collision
-    [m/s, < 0].
+    """The least separation during the encounter [m, > 0]. After a collision, minus the closing
+    speed of the collision [m/s, < 0].
 
-    Shape (N,); NaN where there was neither an encounter nor a collision.
+    Shape (N,); NaN without an encounter and without a collision.
     """
     is_counted = runs.trace.active & runs.encounter.in_conflict
     least_separation = np.min(
@@ -58,8 +60,9 @@ SAFETY_DEGREE_METRIC = Measure(
 
 
 def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s]; shape (N,), NaN on a
-    collision.
+    """TET* = sum of dt over the samples with 0 <= TTC(t) <= TTC* [s].
+
+    Shape (N,); NaN after a collision. TTC* is the study's threshold `ttc_threshold`.
     """
     critical_ttc, interval = _critical_ttc(runs, thresholds)
     return mask_collisions(
@@ -72,8 +75,9 @@ def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
 
 
 def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """TIT* = sum of (TTC* - TTC(t)) dt over the samples of TET* [s^2]; shape (N,), NaN on a
-    collision.
+    """TIT* = sum of (TTC* - TTC(t)) dt over the samples of TET* [s^2].
+
+    Shape (N,); NaN after a collision. TTC* is the study's threshold `ttc_threshold`.
     """
     critical_ttc, interval = _critical_ttc(runs, thresholds)
     deficit = np.where(
@@ -85,8 +89,8 @@ def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArra
 def _critical_ttc(
     runs: SimulationRuns, thresholds: MetricsTable
 ) -> tuple[FloatArray, float]:
-    """TTC at every sample, infinite where it is not critical; and the time between two samples
-    [s].
+    """TTC at every sample [s], infinite where TTC exceeds the threshold, and the time between two
+    samples [s].
     """
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
     ttc = runs.time_to_collision[::stride]
@@ -124,22 +128,21 @@ TIT = Measure(
 
 
 def conflict(runs: SimulationRuns) -> tuple[FloatArray, FloatArray]:
-    """The closing speed along the vehicle's path [m/s], and the time to collision along it [s];
-    shape (T, N) each.
+    """The closing speed of the vehicle and the other body along the vehicle's path [m/s], and the
+    time to collision TTC_p along the path [s]. Both arrays have shape (T, N).
 
-    TTC_p(t) = gap / (v - u), with the speeds v and u of the vehicle and of the other body along the
-    path. The other body is in the path, or will be when the vehicle reaches it at these speeds.
-    TTC_p is infinite at all other samples, and where the gap does not shrink or TTC(t) does not
-    count.
+    TTC_p(t) = gap / (v - u). v is the speed of the vehicle, and u the speed of the other body along
+    the path. TTC_p is finite only if the gap shrinks, TTC(t) counts, and the other body is in the
+    path now or when the vehicle reaches it at these speeds.
 
-    The speed across the path of somebody who crosses changes neither the gap nor this closing
-    speed. Behind a leader, who never leaves the path, TTC_p(t) is TTC(t).
+    The speed of a crossing body across the path changes neither the gap nor this closing speed.
+    Behind a leader, who never leaves the path, TTC_p(t) equals TTC(t).
     """
     trace = runs.trace
     reach = (trace.vehicle_width + trace.obstacle_width) / 2 + PATH_TOLERANCE
     is_in_path = np.abs(trace.lateral) <= reach
 
-    # The time until the vehicle reaches the body, and where the body is then.
+    # The time in which the vehicle reaches the body; then the body's place at that time.
     closing_speed = trace.speed - trace.obstacle_speed
     is_counted = (
         runs.is_approach
@@ -153,7 +156,8 @@ def conflict(runs: SimulationRuns) -> tuple[FloatArray, FloatArray]:
     is_met = is_in_path | (np.abs(trace.lateral + trace.lateral_speed * ttc) <= reach)
     ttc = np.where(is_counted & is_met, ttc, np.inf)
 
-    # Behind a leader, and wherever else the distance is the gap, it is TTC(t).
+    # If the encounter's distance is the gap, as behind a leader, TTC_p(t) must equal TTC(t) to the
+    # bit.
     is_led = ~(runs.is_approach & ~is_in_path).any(axis=0)
     is_one = is_led | (runs.encounter.distance == trace.gap)
     closing_speed = np.where(is_one, runs.encounter.closing_speed, closing_speed)
@@ -163,7 +167,7 @@ def conflict(runs: SimulationRuns) -> tuple[FloatArray, FloatArray]:
 def least_time_to_collision(
     runs: SimulationRuns, thresholds: MetricsTable
 ) -> FloatArray:
-    """The least TTC_p(t) [s] (Hayward 1972); shape (N,), NaN on a collision, and for a vehicle that
+    """The least TTC_p(t) [s] (Hayward 1972), shape (N,). NaN after a collision, and if the vehicle
     approaches nobody in its path.
     """
     _, ttc = conflict(runs)
@@ -174,13 +178,16 @@ def least_time_to_collision(
 def largest_deceleration_rate(
     runs: SimulationRuns, thresholds: MetricsTable
 ) -> FloatArray:
-    """The largest deceleration that would just avoid the collision, (v - u)^2 / (2 gap), which is
-    (v - u) / (2 TTC_p) [m/s^2] (Cooper and Ferguson 1976; DRAC of SUMO's SSM device), over the
-    samples with a TTC_p; shape (N,), NaN as for the least TTC_p.
+    """The largest DRAC (deceleration rate to avoid the crash) [m/s^2], shape (N,). NaN after a
+    collision, and if the vehicle approaches nobody in its path.
 
-    Behind a leader, TTC and DRAC are the device's. With who crosses they are other quantities, and
-    not compared: the device predicts at which constant speeds both enter and leave the place that
-    two lanes share, and has a TTC only where one enters before the other has left.
+    DRAC is the deceleration that just avoids the collision, (v - u)^2 / (2 gap) = (v - u) / (2
+    TTC_p) (Cooper and Ferguson 1976), at a sample with a TTC_p.
+
+    Behind a leader, TTC and DRAC equal the values of SUMO's SSM device. For crossing bodies the
+    device has other definitions: it predicts when both bodies, at constant speeds, enter and leave
+    the place that two lanes share. The device has a TTC only if one body enters before the other
+    has left.
     """
     closing_speed, ttc = conflict(runs)
     is_counted = np.isfinite(ttc) & (ttc > 0)
@@ -221,13 +228,14 @@ DRAC = Measure(
 def post_encroachment_time(
     runs: SimulationRuns, thresholds: MetricsTable
 ) -> FloatArray:
-    """Time from the first one's leaving the place that both paths share to the second one's
-    entering it [s] (Allen, Shin and Cooper 1978); shape (N,), NaN unless the vehicle and a body
-    that crosses pass without a stop.
+    """The time from the moment at which the first road user leaves the place that both paths share,
+    to the moment at which the second road user enters it [s] (Allen, Shin and Cooper 1978).
 
-    The run ends when the first one has left: the body the vehicle's path, or the vehicle's rear the
-    body's. The second one arrives at its speed then. PET of SUMO's SSM device takes lanes for
-    bodies: it is shorter by the share of both widths that lanes are wider.
+    Shape (N,); NaN unless the vehicle and a crossing body pass each other without a stop.
+
+    The run ends when the first road user has left the shared place. From then on, the second road
+    user is assumed to keep its speed. SUMO's SSM device takes lanes in place of bodies. Its PET is
+    shorter, because lanes are wider than bodies.
     """
     trace = runs.trace
 
@@ -244,7 +252,8 @@ def post_encroachment_time(
         )
     )
 
-    # Who leaves the shared place last, and how far the other one is from it.
+    # Either the body has left the vehicle's path (`leaves`), or the vehicle has passed the body
+    # (`comes`). The way is the distance of the second road user from the shared place.
     lateral_gap = np.abs(lateral) - (trace.vehicle_width + obstacle_width) / 2
     crossing = np.abs(lateral_speed)
     leaves = (lateral * lateral_speed > 0) & (gap > 0)
@@ -259,9 +268,11 @@ def post_encroachment_time(
 
 
 def reaction_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Time from the first sample at which nothing hides the body ahead to the first brake command
-    from then on [s], as of a driver (Olson and Sivak 1986: perception-response time); shape (N,),
-    NaN for a vehicle that sees nobody, or does not brake.
+    """The time from the first sample at which nothing hides the body ahead to the first brake
+    command at or after this sample [s]. (Olson and Sivak 1986: perception-response time of a
+    driver.)
+
+    Shape (N,); NaN if the vehicle sees nobody, or does not brake.
     """
     trace = runs.trace
     visible = trace.active & trace.visible
@@ -298,10 +309,10 @@ REACTION_TIME = Measure(
 
 
 def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-    """Mean deceleration over the samples in which the brake is commanded and the vehicle moves
-    [m/s^2].
+    """The mean deceleration over the samples at which the brake is commanded and the vehicle moves
+    [m/s^2]. A loss of speed is positive.
 
-    Positive for a loss of speed; shape (N,); NaN for a vehicle that never braked.
+    Shape (N,); NaN if the vehicle never brakes.
     """
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
     speed = runs.trace.speed[::stride]
@@ -336,7 +347,7 @@ UNSAFE_SHARE = Measure(
     title="share of unsafe runs",
     unit="-",
     more_is_unsafe=True,
-    # A single run has no share.
+    # A single run has no share. `sumo/simulators.py` computes the share over repeats.
     function=lambda runs, _: nans(len(runs)),
     description="Share of the repeats of a run that are unsafe by the study's own criterion.",
 )
