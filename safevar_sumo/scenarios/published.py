@@ -1,5 +1,5 @@
-"""The two scenarios of the published study: a pedestrian walks into the lane; parked vehicles block
-both lanes.
+"""The two scenarios of the published study: a pedestrian walks into the lane, and parked vehicles
+block both lanes.
 """
 
 from __future__ import annotations
@@ -40,18 +40,20 @@ from safevar_sumo.study import Table, searched
 
 _Positive = Annotated[float, Meta(gt=0, le=3600)]
 ROUNDING = 1e-6
-"""How far beyond the place where he turns a pedestrian may get by rounding errors [m]."""
+"""How far a pedestrian may get beyond the place of the turn by rounding errors [m]."""
 VUT_LANE, FOOTPATH_LANE = "approach_0", "footpath_0"
 WALKING_SPEED, LATERAL_START = 1.8, 5.16
-"""The pedestrian's speed [m/s], and start to the right of the lane's middle [m], in the traffic
-file.
+"""The pedestrian's speed [m/s], and start to the right of the lane's middle [m], as the traffic
+file states them.
 """
 
 
 SLOW_SPEEDS = (10.0, 15.0, 20.0)
-"""Speeds near which vehicles reach the pedestrian [km/h]."""
+"""Speeds of benign scenes, near which vehicles reach the pedestrian [km/h]."""
 CITY_SPEEDS = (20.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
-"""Speeds with a car in the next lane, of a vehicle that starts at rest [km/h]."""
+"""Speeds of benign scenes with a car in the next lane [km/h]. (The tested vehicle starts at
+rest.)
+"""
 
 
 def approach(roads: Roads | World) -> Frame:
@@ -60,8 +62,8 @@ def approach(roads: Roads | World) -> Frame:
 
 
 def _place(position: float, name: str) -> str:
-    """A place at the start [m], which a parameter decides, as text; SUMO counts one below 0 from
-    the lane's end.
+    """A departure position [m] as text for SUMO. SUMO would count a position below 0 from the
+    lane's end: such a position is refused, and the error names the parameter `name`.
     """
     if position < 0:
         raise InputError(
@@ -73,17 +75,18 @@ def _place(position: float, name: str) -> str:
 
 
 class _Memory(NamedTuple):
-    """What the scenario remembers of a run.
+    """The scenario's memory of a run.
 
     Attributes
     ----------
     frame
-        Frame of the vehicle's lane.
+        Coordinates along and across the vehicle's lane.
     conflict_point, clear_point
         Positions of the vehicle's front at which the conflict begins and ends [m].
-    last_lateral, has_turned
-        The pedestrians' last lateral positions [m], and which of them have turned round; shape
-        (N,).
+    last_lateral
+        Lateral positions of the pedestrians at the last step [m], shape (N,).
+    has_turned
+        Whether each pedestrian has turned round, shape (N,).
     """
 
     frame: Frame
@@ -156,7 +159,9 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
     pre_crash = PreCrash.PEDESTRIAN_AFTER_MANOEUVRE
 
     def actors(self, roads: Roads) -> XmlChanges:
-        """The vehicle, the pedestrian's start and speed, as far as the study sets them."""
+        """Set the vehicle's position, and the pedestrian's start and speed, if the study states
+        them.
+        """
         changes = {}
         if self.distance is not None:
             changes["vehicle[@id='vut']"] = {
@@ -175,16 +180,16 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
         return changes
 
     def _front(self, roads: Roads) -> Quantity:
-        """Position of the vehicle's front on its lane at the start [m]; None as in the traffic
-        file.
+        """Position of the vehicle's front on its lane at the start [m]; None if the traffic file
+        states it.
         """
         if self.distance is None:
             return None
         return approach(roads).crossing_position(roads, CROSSING_LANE) - self.distance
 
     def benign(self) -> NamedScenarios:
-        """Pedestrians at this one's speed, near those that vehicles reach him with, who cross for
-        nobody.
+        """Scenes with a pedestrian of the same speed, and vehicles at the `SLOW_SPEEDS`. The
+        pedestrian stops before the vehicle's path, or leaves the path in time.
         """
         adult = Crossing(
             test="CPNA", target_speed=WALKING_SPEED * KMH_PER_MS, time_to_impact=7.0
@@ -206,7 +211,7 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
             is_past = lateral > self.turns_after + ROUNDING
             turn = np.where(is_past[-1], np.argmax(is_past, axis=0), samples)
             turned = times >= turn
-            # When he turns round, he is already back at his place two steps before.
+            # At the sample of the turn, the pedestrian is back at the place of two steps before.
             lateral = lateral - 2 * speed * step * np.maximum(times - turn + 1, 0)
         return Layout(self._front(roads), PEDESTRIAN, lateral, speed, turned)
 
@@ -264,11 +269,11 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
         return scene, memory._replace(last_lateral=lateral)
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Distance from the front bumper to the pedestrian's path; TTC along the line of sight from
-        the vehicle's centre.
+        """The geometry of the encounter. The separation is the distance from the front bumper to
+        the pedestrian's path. TTC is computed along the line of sight from the vehicle's centre.
 
         TTC = (centre distance - half length) / (v cos(theta) + v_ped sin(theta)) (docs/method.md,
-        section 4); theta is the angle between the lane and the line of sight.
+        section 4). theta is the angle between the lane and the line of sight.
         """
         half_length = trace.vehicle_length / 2
         centre_gap = trace.gap + half_length
@@ -287,15 +292,23 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
 
 
 PARKED_VEHICLE, PARKED_POSITION, VUT_FRONT = "parked_ahead", 85.0, 20.0
-"""Id of the parked vehicle ahead; fronts of this vehicle and of the one under test in the traffic
-file [m].
+"""Id of the parked vehicle ahead, and the positions of the fronts of the parked vehicle and of the
+tested vehicle in the traffic file [m].
 """
 PARKED_LENGTH = 4.7
 
 
 class _Parked(NamedTuple):
-    """The frame of the vehicle's lane; the parked vehicle's rear in it, shape (N,), and length
-    [m].
+    """The scenario's memory of a run.
+
+    Attributes
+    ----------
+    frame
+        Coordinates along and across the vehicle's lane.
+    rear
+        Position of the parked vehicle's rear [m], shape (N,).
+    length
+        Length of the parked vehicle [m].
     """
 
     frame: Frame
@@ -341,7 +354,9 @@ class LeadVehicleStopped(WorldScenario, Table, frozen=True, kw_only=True):
     centre_to_centre = True
 
     def actors(self, roads: Roads) -> XmlChanges:
-        """The vehicle at its distance from the parked one, if the study sets it."""
+        """Place the vehicle at its distance from the parked vehicle, if the study states the
+        distance.
+        """
         if self.distance is None:
             return {}
         return {"vehicle[@id='vut']": {"departPos": _place(self._front, "distance")}}
@@ -354,7 +369,7 @@ class LeadVehicleStopped(WorldScenario, Table, frozen=True, kw_only=True):
         return PARKED_POSITION - PARKED_LENGTH - self.distance
 
     def benign(self) -> NamedScenarios:
-        """A car is in the next lane."""
+        """A car stands in the next lane."""
         for speed in CITY_SPEEDS:
             yield from CarToCar(speed=speed).benign()
 
@@ -381,8 +396,8 @@ class LeadVehicleStopped(WorldScenario, Table, frozen=True, kw_only=True):
         ), memory
 
     def encounter(self, trace: Trace) -> Encounter:
-        """Safety degree: distance between the centres of two vehicles; TTC = gap / v
-        (docs/method.md, section 4).
+        """The geometry of the encounter. The separation is the distance between the centres of both
+        vehicles. TTC = gap / v (docs/method.md, section 4).
         """
         return Encounter(
             separation=trace.gap + (trace.vehicle_length + trace.obstacle_length) / 2,
