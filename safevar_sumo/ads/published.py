@@ -26,7 +26,7 @@ HOLDING_DECELERATION = 2.0  # m/s^2, commanded to hold at standstill
 TAPER_TIME = 0.3  # s, over which the deceleration fades into the creep
 CREEP_MARGIN = 0.1  # m/s, above the creep speed, where the creep begins
 LEAST_DISTANCE = 0.05  # m, smallest distance over which a deceleration is planned
-# m/s^2, lower bound of a rise of the needed deceleration, which is a divisor.
+# m/s^2. The rise of the needed deceleration is a divisor: without this lower bound it could be 0.
 LEAST_RISE = 1e-9
 FIRST_COMMAND_ROUNDING = 1e-9  # s
 
@@ -39,14 +39,14 @@ class _ApolloMemory(NamedTuple):
     nominal, step
         The original vehicle, and the time between two calls of `drive` [s].
     has_begun_to_stop
-        Whether it has begun to brake for its stop; it then stops for good.
+        Whether the vehicle has begun to brake for its stop. Such a vehicle stops for good.
     needed_after_lag
-        Deceleration needed to stop once the pedals have followed, which decides on the onset of
-        braking [m/s^2].
+        The deceleration needed for the stop after the lag of the pedals [m/s^2]. This deceleration
+        decides when braking begins.
     commanded_acceleration
         Acceleration of the last command [m/s^2].
     creeping_time
-        Time that it has crept [s].
+        Time for which the vehicle has crept so far [s].
     """
 
     nominal: Nominal
@@ -127,8 +127,8 @@ class Apollo(Ads, Table, frozen=True, kw_only=True):
         return Command(*pedals), _ApolloMemory(nominal, step, *arrays)
 
     def _plan(self, observation: Observation, memory: _ApolloMemory) -> _ApolloMemory:
-        """Plan an acceleration: cruise, or brake with v^2 / (2 d) to stop within the distance d;
-        then creep and hold.
+        """Plan an acceleration: cruise, then brake with v^2 / (2 d) to stop within the distance d,
+        then creep, and finally hold.
         """
         speed = observation.speed
         is_detected = observation.gap <= self.perception_range * observation.visibility
@@ -138,8 +138,8 @@ class Apollo(Ads, Table, frozen=True, kw_only=True):
             np.inf,
         )
         needed_deceleration = speed * speed / (2 * np.maximum(distance, LEAST_DISTANCE))
-        # The onset allows for the distance lost by the lag of the pedals and while the deceleration
-        # rises at the jerk limit.
+        # While the pedals lag, and while the deceleration rises at the jerk limit, the vehicle
+        # covers distance that braking cannot use.
         lost_distance = speed * (
             self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk
         )
@@ -153,9 +153,9 @@ class Apollo(Ads, Table, frozen=True, kw_only=True):
         last_acceleration = memory.commanded_acceleration
         largest_change = np.array(self.jerk * memory.step)
         if np.count_nonzero(begins_braking):
-            # Planning is continuous in time: braking began within the last step, when
-            # `needed_after_lag` passed `comfortable_deceleration`. The acceleration has changed
-            # since then only.
+            # Apollo plans in continuous time. Braking began within the last step, when
+            # `needed_after_lag` passed `comfortable_deceleration`. Only since then, the
+            # acceleration has changed.
             rise = np.maximum(needed_after_lag - memory.needed_after_lag, LEAST_RISE)
             share_since_onset = np.minimum(
                 (needed_after_lag - self.comfortable_deceleration) / rise, 1.0
@@ -191,7 +191,7 @@ class Apollo(Ads, Table, frozen=True, kw_only=True):
         )
 
     def _pedals(self, observation: Observation, memory: _ApolloMemory) -> Command:
-        """Pedals for the commanded acceleration, from the calibration table of the original
+        """The pedals for the commanded acceleration, according to the tables of the original
         vehicle.
         """
         pedals = self.pedals(
@@ -209,12 +209,12 @@ Delay = Annotated[float, Meta(ge=0, le=5)]
 SPEED_LIMIT = 20 / KMH_PER_MS
 """Speed above which the agent releases the throttle [m/s] (20 km/h in its source code)."""
 SPEED_LEVEL = 8 / 3
-"""Distance between the policy's speed levels [m/s]: four, from 0 to 8 m/s, in its source code. The
-throttle is linear between the first three, and constant above.
+"""Distance between the policy's speed levels [m/s]. Its source code has four levels from 0 to 8
+m/s. The throttle is linear between the first three levels, and constant above.
 """
 PASSED_GAP = -0.5
-"""Gap at which an obstacle is beside the vehicle rather than ahead [m]; the policy does not begin
-to brake for it.
+"""Gap below which an obstacle is beside the vehicle instead of ahead [m]. The policy does not begin
+to brake for such an obstacle.
 """
 
 
@@ -224,11 +224,13 @@ class _RailsMemory(NamedTuple):
     Attributes
     ----------
     is_braking
-        Whether the policy brakes; shape (N,).
+        Whether the policy brakes, shape (N,).
     pending_commands
-        Commands not yet carried out, newest last.
-    recognition_line, hesitation_line
-        Delay lines of gap and lateral position, and of the brake command.
+        Commands that wait for the policy's latency, newest last.
+    recognition_line
+        Delay line of the gap and the lateral position.
+    hesitation_line
+        Delay line of the brake command.
     """
 
     is_braking: BoolArray
@@ -334,10 +336,11 @@ class WorldOnRails(Ads, Table, frozen=True, kw_only=True):
         lateral: FloatArray,
         was_braking: BoolArray,
     ) -> BoolArray:
-        """Whether the policy brakes for the recognised obstacle, which is in the corridor and was
-        near.
+        """Decide for which vehicles the policy brakes, shape (N,). The recognised obstacle must be
+        in the corridor. Braking begins when the obstacle is near, and lasts until the obstacle is
+        out of sight or out of the corridor.
         """
-        # Negative before that place.
+        # Negative while the obstacle has not reached `brake_place`.
         past = lateral - self.brake_place
         reduction_past = self.brake_gap_past * np.maximum(past, 0.0)
         reduction = reduction_past + self.brake_gap_before * np.maximum(-past, 0.0)
