@@ -1,7 +1,8 @@
-"""Automatic emergency braking by braking distance on top of a cruise control.
+"""Automatic emergency braking, which begins when the gap falls below a braking distance. Before, a
+cruise control drives.
 
-`Aeb` brakes like production systems; `AutowareAeb` replaces Autoware's module, with its published
-formula, parameters and stop operator.
+`Aeb` brakes like production systems. `AutowareAeb` stands in for Autoware's module, with its
+published formula and parameters, and with the deceleration of its stop operator.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ from safevar_sumo.records import (
 from safevar_sumo.study import Table
 
 LEAST_DECELERATION = 0.5
-"""Smallest deceleration of an obstacle that counts as braking [m/s^2]."""
+"""Least deceleration of an obstacle that counts as braking [m/s^2]."""
 NO_BRAKING, PARTIAL_BRAKING, FULL_BRAKING = 0.0, 1.0, 2.0
-"""The braking stages of `Aeb`."""
+"""The numbers of the braking stages of `Aeb`."""
 
 
 class _Memory(NamedTuple):
@@ -47,13 +48,15 @@ class _Memory(NamedTuple):
     nominal, step
         The original vehicle, and the time between two calls of `drive` [s].
     cruise
-        Speed to hold [m/s] and the trim at the first call; None before that call.
-    stage, intervened
-        Braking stage, and whether it has ever braked.
+        The speed to hold [m/s] and the trim at the first call; None before the first call.
+    stage
+        The braking stage.
+    intervened
+        Whether the system has braked at any time so far.
     obstacle, obstacle_speed
-        The obstacle's number and speed at the last call [-, m/s].
+        The obstacle's number [-] and speed [m/s] at the last call.
     warns
-        Whether it warns its driver now.
+        Whether the system warns its driver now.
     """
 
     nominal: Nominal
@@ -138,7 +141,8 @@ class Aeb(Ads, Table, frozen=True, kw_only=True):
     ) -> tuple[Command, _Memory]:
         nominal = memory.nominal
 
-        # Without a threat it holds its speed; once it has intervened, it no longer accelerates.
+        # Without a threat, the system holds its speed. After its first braking, it never
+        # accelerates.
         cruise = memory.cruise or cruise_at(nominal, observation, self.cruise_speed)
         cruise_speed, cruise_trim = cruise
         blocks = is_in_the_way(observation, self.corridor, self.reach)
@@ -156,7 +160,7 @@ class Aeb(Ads, Table, frozen=True, kw_only=True):
             throttle, np.where(stage > NO_BRAKING, stage_brake, cruise_brake)
         )
 
-        # It warns before it brakes.
+        # The system warns earlier than it brakes.
         warns = is_threatened & (time_to_reach(observation) < self.warning_time)
         return command, memory._replace(
             cruise=cruise,
@@ -168,19 +172,20 @@ class Aeb(Ads, Table, frozen=True, kw_only=True):
         )
 
     def warns(self, memory: _Memory) -> BoolArray:
-        """Whether each driver is warned now."""
+        """Return whether the system warns each driver now."""
         return memory.warns
 
     def _stage(
         self, observation: Observation, memory: _Memory, is_threatened: BoolArray
     ) -> FloatArray:
-        """The braking stage; it does not fall while the obstacle blocks the way, nor at
-        standstill.
+        """The braking stage of each vehicle. The stage does not fall while the obstacle still
+        blocks the way, or while the vehicle stands.
         """
         speed = observation.speed
         obstacle_speed = observation.obstacle_speed
 
-        # How hard the obstacle has braked since the last step.
+        # The deceleration of the obstacle since the last step. A new obstacle has lost no speed
+        # yet.
         deceleration = self.braking_share * memory.nominal.decel
         lost_speed = np.where(
             observation.obstacle == memory.obstacle,
@@ -189,7 +194,8 @@ class Aeb(Ads, Table, frozen=True, kw_only=True):
         )
         obstacle_deceleration = lost_speed / memory.step
 
-        # The braking distance until speeds are equal, or until both stand.
+        # The distance that the vehicle loses until both speeds are equal, or until both vehicles
+        # stand.
         obstacle_stop = (
             obstacle_speed
             * obstacle_speed
@@ -202,7 +208,7 @@ class Aeb(Ads, Table, frozen=True, kw_only=True):
             np.where(obstacle_deceleration > LEAST_DECELERATION, stop_difference, 0.0),
         )
 
-        # A braking stage begins below its gap.
+        # A braking stage begins when the gap is less than the stage's distance.
         full_gap = speed * self.response_time + braking_distance + self.margin
         partial_gap = full_gap + speed * self.partial_time
         stage_at_gap = np.where(
@@ -212,7 +218,7 @@ class Aeb(Ads, Table, frozen=True, kw_only=True):
         )
         stage = np.where(is_threatened, stage_at_gap, NO_BRAKING)
 
-        # It ends when nobody approaches any more who blocks the way.
+        # A stage ends when nobody who blocks the way comes nearer any more.
         still_blocks = (
             is_ahead(observation)
             & (closing_speed > 0)
@@ -231,9 +237,9 @@ class _AutowareMemory(NamedTuple):
     nominal, step
         The original vehicle, and the time between two calls of `drive` [s].
     cruise
-        Speed to hold [m/s] and the trim at the first call; None before that call.
+        The speed to hold [m/s] and the trim at the first call; None before the first call.
     decision_time
-        Time since the decision to brake, negative before it [s]; shape (N,).
+        Time since the decision to brake [s], shape (N,); negative before the decision.
     """
 
     nominal: Nominal
@@ -301,7 +307,7 @@ class AutowareAeb(Ads, Table, frozen=True, kw_only=True):
         decision_time = np.where(
             decision_time >= 0, decision_time + step, np.where(is_near, 0.0, -1.0)
         )
-        # The mean over the coming step:
+        # The command holds for the whole step: it gets the mean over the step, at half of the step.
         ramp = self.target_jerk * np.maximum(
             decision_time + step / 2 - self.command_delay, 0.0
         )
@@ -317,7 +323,7 @@ class AutowareAeb(Ads, Table, frozen=True, kw_only=True):
         return pedals, _AutowareMemory(nominal, step, cruise, decision_time)
 
     def distance(self, speed: FloatArray, obstacle_speed: FloatArray) -> FloatArray:
-        """The gap below which it brakes [m], at speeds [m/s] of shape (N,)."""
+        """The gap below which the system brakes [m], at speeds [m/s] of shape (N,)."""
         stop = speed * self.t_response + speed * speed / (2 * self.a_ego_min)
         obstacle_stop = obstacle_speed * obstacle_speed / (2 * self.a_obj_min)
         return stop - obstacle_stop + self.longitudinal_offset_margin
