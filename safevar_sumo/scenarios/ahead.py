@@ -40,30 +40,31 @@ from safevar_sumo.scenarios.tracks import (
 from safevar_sumo.study import searched
 
 STEADY_SPEED_LIMIT = 80.0
-"""Speed of the vehicle up to which the slower target drives at 20 km/h [km/h]; above it, the target
-is 60 km/h slower.
+"""Speed of the vehicle up to which a slower target drives at 20 km/h by default [km/h]. If the
+vehicle is faster, the target is 60 km/h slower than the vehicle.
 """
 FASTEST_TARGET = 130.0
-"""Highest speed of a target ahead [km/h], that of the vehicle in Euro NCAP's tests and in UN R157.
+"""Highest speed of a target ahead [km/h]: the highest speed of the vehicle in Euro NCAP's tests and
+in UN R157.
 """
 
 
 BESIDE = (-50.0, -40.0)
-"""Places beside the path where a benign target moves along [% of the vehicle's width from its left
-corner].
+"""Lateral places of a benign target that moves along beside the vehicle's path [% of the vehicle's
+width, from its left corner].
 """
 LANE_WIDTH = 3.5
-"""Distance of the next lane [m]."""
+"""Distance between the middles of two lanes [m]."""
 HEADWAYS = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0)
-"""Distances of a car in the next lane at the start, as time headways [s]; every fourth is enough
-where other scenes differ more from each other.
+"""Distances of a car in the next lane at the start, as time headways [s]. Scenarios with other
+benign scenes use every fourth headway.
 """
 VEHICLE_SPEED = searched(10.0, 130.0, "km/h", "speed of the vehicle at the start")
-"""The mark of the vehicle's speed, which a study may search."""
+"""Marks the vehicle's speed as a parameter that a study may search."""
 
 
 SpeedOfTime = Callable[[Quantity], Quantity]
-"""The speed of a target at a time [m/s, s]."""
+"""A function that returns the speed of a target [m/s] at a time [s]."""
 
 
 class TargetAhead(ProtocolTest, frozen=True, kw_only=True):
@@ -102,12 +103,12 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True):
 
     @property
     def direction(self) -> Direction:
-        """Direction of the target."""
+        """The direction in which the target faces."""
         return SAME_DIRECTION
 
     def tracks(self, times: FloatArray) -> list[Track]:
-        """The target: a body that the vehicle's path touches first where the gap ends, and then
-        moves ahead.
+        """The track of the target. Its first point in the vehicle's path is at the gap at the
+        start; then the target moves ahead.
         """
         target = self.parameter("target")
         direction = self.direction
@@ -159,14 +160,14 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     time_to_impact: Seconds = 6.0
 
     def benign(self) -> NamedScenarios:
-        """The target moves along beside the vehicle's path; a car is in the next lane."""
+        """The target moves along beside the vehicle's path, or a car stands in the next lane."""
         for place in BESIDE:
             name = f"{self.test}, {self.speed:g} km/h, beside at {place:g} %"
             yield name, replace(self, impact_location=place)
         yield from next_lane(self, HEADWAYS[::4])
 
     def obstacle(self) -> str:
-        """The target, which is ahead."""
+        """The target in words, with "ahead"."""
         return f"{super().obstacle()} ahead"
 
     @property
@@ -176,7 +177,7 @@ class Along(TargetAhead, frozen=True, kw_only=True):
 
     @property
     def gap(self) -> Quantity:
-        """Gap to the target at the start, which closes in the time to impact [m]."""
+        """The gap to the target at the start [m]: the gap that closes in `time_to_impact`."""
         return self.test_speed * self.time_to_impact - self._profile.travelled(
             self.time_to_impact
         )
@@ -188,7 +189,8 @@ class Along(TargetAhead, frozen=True, kw_only=True):
 
     @property
     def _profile(self) -> TargetProfile:
-        # A target that stands has the speed 0, by which a number of Python does not divide.
+        # With numpy's float, a division by the speed 0 of a standing target gives infinity, no
+        # error.
         speed = np.float64(self.parameter("target_speed")) * KMH
         return TargetProfile(0.0, speed, self.parameter("acceleration_distance"))
 
@@ -261,7 +263,9 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
 
     @property
     def duration(self) -> Quantity:
-        """Length of a run [s]: the target has stopped braking by then."""
+        """Length of a run [s]. The run ends after the impact without braking, and after the
+        target's braking.
+        """
         end = self._time_to_impact()
         if self._target_brakes:
             speed_drop = self._target_speed - self.target_speed_at(math.inf)
@@ -276,11 +280,11 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         return self.parameter("headway") * self.speed * KMH
 
     def benign(self) -> NamedScenarios:
-        """A car is in the next lane."""
+        """A car stands in the next lane."""
         return next_lane(self)
 
     def check(self) -> None:
-        """Refuse a leader who is faster than any test's."""
+        """Refuse a target that is faster than the target of any test."""
         if self._target_speed > FASTEST_TARGET * KMH:
             raise InputError(
                 "",
@@ -305,7 +309,9 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
 
     @property
     def _target_speed(self) -> Quantity:
-        """Speed of the target at the start [m/s]."""
+        """Speed of the target at the start [m/s]. Without a stated speed, the test's kind
+        decides.
+        """
         if self.target_speed is not None:
             return self.target_speed * KMH
         slower_speed = 20.0 + np.maximum(self.speed - STEADY_SPEED_LIMIT, 0.0)
@@ -325,13 +331,13 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
             first_speed - deceleration * np.maximum(time - brakes_at, 0.0), last_speed
         )
 
-    # Speeds that do not count may divide by 0.
+    # `np.where` also computes the cases that it does not choose, and these may divide by 0.
     @np.errstate(all="ignore")
     def _time_to_impact(self) -> Quantity:
-        """Time to the impact if the vehicle does not brake [s].
+        """The time from the start to the impact if the vehicle does not brake [s].
 
-        The gap closes at a constant speed. A target that brakes at b m/s^2 makes this speed rise by
-        b per second until it stops braking.
+        The gap closes at a constant speed, until the target brakes at b m/s^2. Then the closing
+        speed rises by b per second until the target stops braking.
         """
         closing_speed = self.test_speed - self._target_speed
         gap = self.gap
@@ -344,7 +350,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
                 )
             return gap / closing_speed
 
-        # The gap may end before the target brakes, while it does, or after it has braked.
+        # The gap may close before the target brakes, while the target brakes, or afterwards.
         gap_at_braking = gap - closing_speed * self.brakes_at
         b = self.target_deceleration
         speed_lost = self._target_speed - self.target_speed_at(math.inf)
@@ -366,8 +372,8 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
 
 
 def next_lane(test: LaneTest, headways: Sequence[float] = HEADWAYS) -> NamedScenarios:
-    """Benign scenes of a test in which a car stands in the next lane at these headways [s], each
-    with a description.
+    """Benign scenes of a test: a car stands in the next lane at these headways [s]. Each scene has
+    a description.
     """
     width = test.vut_width
     place = 100 * (LANE_WIDTH / width + 0.5)
