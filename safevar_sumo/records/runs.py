@@ -1,4 +1,4 @@
-"""What a simulation leaves: outcomes, traces, geometry of encounters, contacts."""
+"""Records of finished simulations: outcomes, traces, geometry of encounters, and contacts."""
 
 from __future__ import annotations
 
@@ -40,10 +40,17 @@ class Outcome(StrEnum):
 
 
 class Encounter(NamedTuple):
-    """The geometry of N vehicles and their obstacle at T samples; shape (T, N).
+    """The geometry of N vehicles and their obstacle at T samples, shape (T, N).
 
-    The safety degree uses `separation`, the time to collision `distance` and `closing_speed`
-    [m, m, m/s]; both metrics count only samples `in_conflict`.
+    Attributes
+    ----------
+    separation
+        The distance of which the safety degree is the least value [m].
+    distance, closing_speed
+        The distance, and the speed at which it shrinks [m, m/s]: their quotient is the time to
+        collision.
+    in_conflict
+        Whether the sample counts for the safety degree and for the time to collision.
     """
 
     separation: FloatArray
@@ -54,20 +61,21 @@ class Encounter(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Trace:
-    """T samples of N vehicles, `step` seconds apart; arrays of shape (T, N), `time` (T,).
+    """T samples of N vehicles, `step` seconds apart. Arrays have shape (T, N); `time` has shape
+    (T,).
 
-    A vehicle's samples count while `active`; later samples are meaningless, as SUMO continues with
-    the rest of the batch.
+    A vehicle's samples count while `active`. Later samples mean nothing: SUMO goes on with the
+    other vehicles of the batch.
 
-    - `vehicle_length`, `vehicle_width`, `position` along the path, `gap` and `lateral` are in m,
-      all speeds in m/s.
-    - `throttle` and `brake` are the pedals as commanded, `pedal` is the brake pedal's position.
-    - `obstacle_speed` is the obstacle's speed along the vehicle's path, `obstacle_length` its
-      extent along the lane and `obstacle_width` its extent across it, 0 where the scenario does not
-      state them [m].
-    - `gap` is measured from the front bumper to the obstacle, as in `Observation`: at most 0 once
-      the vehicle has reached or passed it, infinite without anybody.
-    - `visible`: nothing hides the obstacle.
+    - `vehicle_length`, `vehicle_width`, `position` along the path, `gap` and `lateral` are in m.
+      All speeds are in m/s.
+    - `throttle` and `brake` are the commanded pedals; `pedal` is the brake pedal's position.
+    - `obstacle_speed` is the obstacle's speed along the vehicle's path. `obstacle_length` is the
+      obstacle's extent along the lane [m], and `obstacle_width` its extent across the lane [m].
+      Both are 0 if the scenario does not state them.
+    - `gap` is the distance from the front bumper to the obstacle, as in `Observation`. The gap is
+      at most 0 after the vehicle has reached the obstacle, and infinite without an obstacle.
+    - `visible` is true while nothing hides the obstacle.
     """
 
     step: float
@@ -95,7 +103,7 @@ class Trace:
         return np.asarray(len(self.time) - 1 - np.argmax(self.active[::-1], axis=0))
 
     def of(self, vehicles: slice | IntArray) -> Trace:
-        """The trace of some of the vehicles."""
+        """The trace of a part of the vehicles."""
         columns = {}
         for name, value in vars(self).items():
             if np.ndim(value) == 2:
@@ -119,19 +127,24 @@ QUANTITIES: Mapping[str, tuple[str, ...]] = {
         )
     },
 }
-"""What a metric may need of a run, and the columns of its trace and its encounter that have it. A
-run with a `gap` alone meets who is ahead in its path: `lateral` is 0.
+"""Quantities that a metric may need, with the columns of `Trace` and `Encounter` that hold them. In
+a run with a `gap` alone, the obstacle is ahead in the path: `lateral` is 0.
 """
 
 
 class Contact(NamedTuple):
-    """The position of the first contact on the outline of each of N vehicles, shape (N,).
+    """The place of the first contact on the outline of each of N vehicles, shape (N,).
 
-    `side` is front, left, right or rear; empty without a contact. `place` is the position of the
-    obstacle's middle, 0 to 100; NaN without a contact. At the front or rear it is in % of the
-    vehicle's width, from the side on which `lateral` is negative; at the left or right in % of its
-    length, from the front. `speed` is the obstacle's along the vehicle's lane at that sample [m/s];
-    0 without a contact.
+    Attributes
+    ----------
+    side
+        front, left, right or rear; "" without a contact.
+    place
+        Position of the obstacle's middle, 0 to 100; NaN without a contact. At the front or rear: in
+        % of the vehicle's width, from the side on which `lateral` is negative. At the left or
+        right: in % of the vehicle's length, from the front.
+    speed
+        Speed of the obstacle along the vehicle's lane at that sample [m/s]; 0 without a contact.
     """
 
     side: TextArray
@@ -140,25 +153,36 @@ class Contact(NamedTuple):
 
 
 NO_CONTACT = Contact(np.array("", "U5"), np.array(np.nan), np.array(0.0))
-"""No contact of N vehicles."""
+"""The record of N vehicles without any contact."""
 for _array in NO_CONTACT:
     _array.flags.writeable = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationRuns:
-    """Trajectories and outcomes of N simulations; `outcome` holds values of `Outcome`,
-    `collision_speed` is NaN without a collision [m/s].
+    """Trajectories and outcomes of N simulations. Arrays have shape (N,).
 
-    `collision_speed` is the vehicle's own speed, at the end of the step in which bodies overlap.
-    `test_speed_error` is the largest deviation from the test's speed before the driving system
-    acted, NaN if no speed is prescribed [m/s]; `warning_ttc` the time to collision at which the
-    system first warned its driver, NaN if it never did [s].
-    `centre_to_centre`: the scenario measures its safety degree between the middles of bodies.
-    `allowed_impact_speed` is the relative speed up to which the test case allows an impact [m/s].
-    `lacks` says of quantities which runs do not have them, shape (N,): a run without a trace has
-    none; others are there in all runs. `stated` are values of metrics that runs state themselves,
-    shape (N,), NaN where they do not.
+    Attributes
+    ----------
+    outcome
+        Values of `Outcome`.
+    collision_speed
+        The vehicle's own speed at the end of the step in which bodies overlap [m/s]; NaN without a
+        collision.
+    test_speed_error
+        Largest deviation from the test's speed before the driving system acted [m/s]; NaN if the
+        test prescribes no speed.
+    warning_ttc
+        Time to collision at which the system first warned its driver [s]; NaN without a warning.
+    centre_to_centre
+        Whether the safety degree is measured between the middles of bodies.
+    allowed_impact_speed
+        Relative speed up to which the test case allows an impact [m/s].
+    lacks
+        For a quantity: which runs do not have it. A run without a trace has no quantity. A quantity
+        that is no key exists in all runs.
+    stated
+        Values of metrics that a simulator stated itself; NaN for runs without a stated value.
     """
 
     trace: Trace
@@ -178,8 +202,8 @@ class SimulationRuns:
 
     @cached_property
     def is_approach(self) -> BoolArray:
-        """Whether a sample is in the encounter, before the vehicle has stopped after moving; shape
-        (T, N).
+        """Whether each sample belongs to the approach, shape (T, N): the encounter up to the
+        vehicle's first stop after it has moved.
         """
         trace = self.trace
         has_moved = np.logical_or.accumulate(trace.speed > STANDSTILL, axis=0)
@@ -190,13 +214,13 @@ class SimulationRuns:
 
     @cached_property
     def time_to_collision(self) -> FloatArray:
-        """TTC(t) = L_s / v_L, the distance between both over the speed at which it shrinks [s];
-        shape (T, N).
+        """TTC(t) = L_s / v_L: the distance between both road users over the speed at which it
+        shrinks [s], shape (T, N).
 
-        Infinite while the distance does not shrink, outside the encounter, and once the vehicle has
-        stopped after moving. The distance is that of the published data (method section 4): it also
-        shrinks by the speed of who crosses the path. `conflict` of `metrics/measures.py` is along
-        the path alone.
+        TTC is infinite while the distance does not shrink, outside of the encounter, and after the
+        vehicle's first stop. The distance is the distance of the published data (method section 4):
+        the speed of a crossing road user makes it shrink, too. For times along the path alone, see
+        `conflict` in `metrics/measures.py`.
         """
         _, distance, closing_speed, _ = self.encounter
         is_counted = self.is_approach & (closing_speed > 0) & (distance >= 0)
@@ -208,7 +232,7 @@ class SimulationRuns:
         )
 
     def of(self, vehicles: slice | IntArray) -> SimulationRuns:
-        """The runs of some of the vehicles."""
+        """The runs of a part of the vehicles."""
 
         def select(value: Any) -> Any:
             if isinstance(value, Trace):
@@ -227,13 +251,15 @@ class SimulationRuns:
         )
 
     def lacking(self, *quantities: str) -> BoolArray:
-        """Which runs lack one of these quantities, shape (N,)."""
+        """Which runs lack at least one of these quantities, shape (N,)."""
         no_runs = np.zeros(len(self), bool)
         lacks = [self.lacks.get(name, no_runs) for name in quantities]
         return np.asarray(np.any([no_runs, *lacks], axis=0))
 
     def with_all(self, quantity: str, value: float) -> SimulationRuns:
-        """The runs with one value of a quantity at all samples; how hard a collision is stays."""
+        """The runs with the same value of a quantity at all samples. The speed of a collision is
+        kept.
+        """
 
         def changed(record: Trace | Encounter) -> dict[str, Any]:
             return {
@@ -249,8 +275,8 @@ class SimulationRuns:
         return runs
 
     def nearest(self, vehicle: int) -> int | None:
-        """The sample of a vehicle's impact or, without a collision, of its smallest separation in
-        conflict, if any.
+        """The sample of a vehicle's impact. Without a collision, the sample of the smallest
+        separation in conflict; None if no sample is in conflict.
         """
         active = self.trace.active[:, vehicle]
         if np.isfinite(self.collision_speed[vehicle]):
@@ -266,7 +292,7 @@ class SimulationRuns:
 
     @property
     def middles_apart(self) -> float:
-        """How far the middles of bodies that touch are apart [m], in a scenario that measures
+        """The distance between the middles of two bodies that touch [m], if the scenario measures
         between middles; else 0.
         """
         if not self.centre_to_centre:
@@ -276,8 +302,9 @@ class SimulationRuns:
 
     @property
     def closing_speed(self) -> FloatArray:
-        """Severity of a collision: `collision_speed` minus the struck body's speed along the lane
-        at that sample [m/s], shape (N,), at least `LEAST_CLOSING_SPEED`; NaN without a collision.
+        """The severity of a collision [m/s], shape (N,): `collision_speed` minus the struck body's
+        speed along the lane at that sample. At least `LEAST_CLOSING_SPEED`; NaN without a
+        collision.
         """
         return np.maximum(
             self.collision_speed - self.contact.speed, LEAST_CLOSING_SPEED
@@ -285,12 +312,13 @@ class SimulationRuns:
 
     @cached_property
     def relative_speed(self) -> FloatArray:
-        """Speed of a collision relative to the obstacle along the vehicle's path at the moment of
-        contact, as Euro NCAP takes it [m/s], shape (N,); NaN without a collision.
+        """The speed of the vehicle relative to the obstacle at the moment of contact, along the
+        vehicle's path [m/s], shape (N,). Euro NCAP uses this speed. NaN without a collision, or
+        without a trace.
 
         A gap d that closes within a time step, from the relative speed v at the relative
-        acceleration a, closes at sqrt(v^2 + 2 a d); where no gap closes, the speed at the end of
-        the step counts: `collision_speed` minus the obstacle's speed. Without a trace it is NaN.
+        acceleration a, closes at sqrt(v^2 + 2 a d). If no gap closes within the step, the speed at
+        the end of the step counts: `collision_speed` minus the obstacle's speed.
         """
         trace = self.trace
         if not len(trace.time):
@@ -306,7 +334,8 @@ class SimulationRuns:
         gap_before = trace.gap[sample_before, vehicles]
         gap_after = trace.gap[last_sample, vehicles]
 
-        # A gap that closes within the step leads to contact at the speed of an even deceleration.
+        # Within a step the acceleration is constant: the contact happens before the end of the
+        # step, at a speed between both samples.
         gap_closes = (
             (gap_before > -TOUCH_OVERLAP)
             & np.isfinite(gap_before)
@@ -324,7 +353,7 @@ class SimulationRuns:
             np.maximum(np.sqrt(np.maximum(squared_speed, 0.0)), min_speed), max_speed
         )
 
-        # Otherwise the speed at the end of the step.
+        # Otherwise the speed at the end of the step counts.
         at_end_of_step = self.collision_speed - obstacle_speed[last_sample, vehicles]
         return np.where(
             gap_closes & ~np.isnan(self.collision_speed), at_contact, at_end_of_step
