@@ -1,5 +1,7 @@
-"""May this car drive? For each of several measured cars the greatest speed up to which it is safe
-in every encounter of the study, in every parameter set, whether or not the original is safe there.
+"""The question `permit`: may this car drive? The answer states, for each of several measured cars,
+the greatest speed up to which the car is safe in every encounter of the study and in every
+parameter
+set. An encounter counts even if the original vehicle is not safe in it.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ from safevar_sumo.vehicles import CharacteristicSet
 MOST_VALUES = 10_000
 """Largest number of values of a grid."""
 SEARCHES = 2
-"""Simulations that search for a counterexample to a speed, in `LEAST_SIMULATIONS`."""
+"""Number of simulations that search for a counterexample to a speed, as a multiple of
+`LEAST_SIMULATIONS`.
+"""
 NEED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(\S.*?)?\s*")
 
 
@@ -165,7 +169,8 @@ def permit(
         fits,
         with_unsafe_originals=True,
     )
-    # A claim about all cars within limits gets the search of one about joint limits.
+    # With limits, the answer is a claim about all cars within the limits. It is searched as much as
+    # joint limits are.
     budget = cases.USUAL_BUDGET if limits else SEARCHES * cases.LEAST_SIMULATIONS
     budget = 0 if quick else evaluator.scaled(budget)
     search = PermitSearch(
@@ -183,7 +188,8 @@ def permit(
     new_car, permits, repaired = _drive(
         evaluator, search, fleet, candidates, with_repairs=has_repairs
     )
-    # Further simulations, where their number has no limit.
+    # The search for the worst assumed values needs further simulations. It is left out if the
+    # number of simulations has a limit.
     is_free = not limits and evaluator.account.allowance is evaluator.left is None
     ends = None
     if is_free:
@@ -219,7 +225,8 @@ def _drive(
     *,
     with_repairs: bool,
 ) -> tuple[Permit, list[Permit], list[Repaired]]:
-    """How far the new car and each of the others are safe, and the best repair of each.
+    """Search how far the new car and each candidate are safe, and the best repair of each
+    candidate. A repair is None if none helps, or if repairs were not searched.
 
     Raises
     ------
@@ -229,7 +236,8 @@ def _drive(
     members = evaluator.characteristics.vehicle
     cars = [Cars.one(members.original), *candidates]
     phases = search.phases(cars, with_repairs=with_repairs)
-    # Every encounter counts, so that the original vehicle drives in none beside a car.
+    # In a study in which all encounters count, the original vehicle need not be simulated in each
+    # encounter of a car.
     alone = evaluator.for_study(evaluator.study.all_count)
     alone.begin(phases, search.least, of_list=len(candidates) > 1)
     new_car, *permits = search.reach(cars, [-np.inf, *[None] * len(candidates)])
@@ -242,7 +250,7 @@ def _drive(
             f"{unit_text(search.span.unit)}: {words}",
             "a study in which it is, or another --unsafe",
         )
-    # A bound on the simulations leaves too few to search repairs, too.
+    # If the number of simulations has a limit, too few are left to search for repairs.
     if not with_repairs or evaluator.left is not None:
         return new_car, permits, [None] * len(permits)
     worn = fleet.measured & (fleet.settings != members.original)
@@ -266,8 +274,9 @@ def read_cars(
     others: str | None,
     ignore: Sequence[str],
 ) -> Fleet:
-    """The cars that are asked for; with limits one car at the original's values of those that are
-    limited, and at the stated ones of all others.
+    """The cars that the user asks about. With `limits`, this is a single car: the limited
+    characteristics have the original's values, and all others have the values that the study or
+    `others` states.
     """
     members = CharacteristicSet.of(study).vehicle
     if limits:
@@ -298,8 +307,8 @@ def _check_forms(
     *,
     is_quick: bool,
 ) -> None:
-    """Refuse several forms of cars, and none; and a file that is to be written in place of the
-    list, or with a rough answer.
+    """Refuse a call that gives cars in several ways, or in none. Also refuse an output file that is
+    the list of cars itself, or that would hold a rough answer.
     """
     forms = [
         flag
@@ -331,7 +340,9 @@ def _check_forms(
 
 
 def _demand_of(text: str | None, span: Span) -> float | None:
-    """The value that an option demands, in the study's unit."""
+    """The speed that the option `need` states, such as "40 km/h"; None if `text` is None. The unit
+    must be that of the study, and the speed must be within the range that is driven.
+    """
     if text is None:
         return None
     match = NEED.fullmatch(text)
@@ -350,7 +361,7 @@ def _demand_of(text: str | None, span: Span) -> float | None:
 
 
 def _check_driven(demand: float | None, search: PermitSearch) -> None:
-    """Refuse a demand between the values of a test that lists them."""
+    """Refuse a demanded speed at which no car is driven, because a test lists its speeds."""
     if demand is not None and len(search.listed) and demand not in search.listed:
         raise InputError(
             "need",
@@ -360,7 +371,9 @@ def _check_driven(demand: float | None, search: PermitSearch) -> None:
 
 
 def _grid(span: Span, step: float) -> FloatArray:
-    """The ends of the range, and all multiples of the step between them."""
+    """The grid of speeds, in ascending order: the ends of the range, and all multiples of `step`
+    between them.
+    """
     if (span.high - span.low) / step > MOST_VALUES:
         raise InputError(
             "step",
@@ -376,7 +389,9 @@ def _grid(span: Span, step: float) -> FloatArray:
 def _cars_within(
     members: CharacteristicSet, limits: Sequence[str], study: Study, setting: FloatArray
 ) -> Cars:
-    """All cars within limits, with a setting's values of all other characteristics."""
+    """All cars within the limits. A characteristic without a limit has its value in `setting`,
+    shape (n,).
+    """
     lower = setting.copy()
     upper = setting.copy()
     for name, limit in limits_of(limits, study.vehicle.characteristics).items():

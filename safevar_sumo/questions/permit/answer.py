@@ -1,5 +1,6 @@
-"""The answer to the question which cars may drive: its verdict, its numbers, its tables, and the
-list that fleet software reads.
+"""The answer of `permit`, which says up to which speed each car may drive: the verdict, the
+numbers,
+the tables, and the list (CSV) that fleet software reads.
 """
 
 from __future__ import annotations
@@ -52,23 +53,38 @@ from safevar_sumo.study import Study, unit_text
 from safevar_sumo.sumo.system import assemble
 
 DIGEST = "study_digest"
-"""The column of the list that holds the digest of the study, its models and versions."""
+"""The column of the list with the digest that identifies the study, its models and versions."""
 SHOWN_WHOLE = 50
-"""Number of cars up to which one screen shows all: there the list is the answer."""
+"""Largest number of cars that one screen shows completely, because the list is the answer."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PermitAnswer:
-    """What the answer about the cars of a list is made of, in its order.
+    """The parts of which the answer about the cars of a list is made. Sequences have an item for
+    each car, in the order of the list.
 
     Attributes
     ----------
+    span
+        The parameter over which cars are driven, usually the speed, and its range.
+    need
+        The speed that every car must reach; None without one.
+    step
+        The step of the grid of speeds.
+    fleet
+        The cars.
+    new_car, permits
+        How far the new car and each car are safe.
     repaired
-        The best repair of each car.
-    is_quick, is_rough
-        Whether cars drive the grid alone, and whether the answer is rough for any reason.
+        The best repair of each car; None for a car without one.
+    is_quick
+        Whether cars were driven only at the grid's speeds, without a search for counterexamples.
+    is_rough
+        Whether the answer is rough for any reason.
+    is_box
+        Whether the only "car" stands for all cars within the limits that the user states.
     ends
-        The worst end of each car; None where none was sought.
+        The assumed value that lowers the speed of each car most; None if it was not searched.
     """
 
     study: Study
@@ -87,7 +103,7 @@ class PermitAnswer:
     ends: Sequence[WorstEnd | None] | None
 
     def answer(self) -> Answer:
-        """The answer."""
+        """Make the answer: its verdict, numbers, tables and list."""
         span = self.span
         rows = self._rows()
         columns = _in_unit(CARS, span)
@@ -206,7 +222,10 @@ class PermitAnswer:
         return rows
 
     def _reason(self, permit: Permit, event: str, verdict: str) -> Sentence:
-        """Why a car may drive no faster, for a foreman."""
+        """Why a car may drive no faster, in a sentence for a foreman. `event` describes the
+        failure;
+        "" without a failure.
+        """
         span = self.span
         slots = {
             "low": span.text(span.low),
@@ -233,7 +252,7 @@ class PermitAnswer:
     def _sentences(
         self, cars: pd.DataFrame, counts: Mapping[str, int]
     ) -> Iterator[Sentence]:
-        """How far cars are safe, why no farther, and what is assumed."""
+        """Yield the first sentences: how far cars are safe, why no farther, what is assumed."""
         span = self.span
         if len(cars) == 1:
             yield self._car(cars["car"][0], cars["up_to"][0])
@@ -260,7 +279,7 @@ class PermitAnswer:
                 )
 
     def _car(self, name: str, up_to: float) -> Sentence:
-        """How far a single car is safe."""
+        """Say how far a single car is safe; NaN means that it is not safe at the least speed."""
         car = name
         if not (self.is_box or name == THIS_CAR):
             car = words.NAMED_CAR.format(name=name)
@@ -276,7 +295,7 @@ class PermitAnswer:
         )
 
     def _groups(self, counts: Mapping[str, int]) -> Iterator[Sentence]:
-        """How many cars are safe how far."""
+        """Say how many cars have each verdict; `counts` has their number by verdict."""
         span = self.span
         slots = {
             **self._verbs,
@@ -298,9 +317,11 @@ class PermitAnswer:
                 )
 
     def _notes(self) -> Iterator[Sentence]:
-        """What counts of measured values, and what was not driven."""
+        """Yield notes on exact measurements, a rough list, phases, and tests that end early or were
+        left out.
+        """
         vehicle = self.models.own.characteristics.vehicle
-        # Limits are no measurements.
+        # Limits that a user states are no measurements, so no note on their exactness is needed.
         is_measured = np.any(self.fleet.measured, axis=0) & (not self.is_box)
         if names := precise_in_words(compress(vehicle, is_measured)):
             yield words.MEASURED(names=names)
@@ -321,22 +342,24 @@ class PermitAnswer:
 
     @property
     def _verbs(self) -> dict[str, str]:
-        """What safe cars do, and unsafe ones."""
+        """The verbs of sentences about safe and unsafe cars: pass a test, or drive."""
         return words.PASSING if self._is_test else words.DRIVING
 
     def _reach(self, value: float) -> str:
-        """Up to which value cars are safe, behind the verb."""
+        """The range in which cars are safe, in words that follow the verb."""
         return self.span.up_to(value, with_low=not self._is_test)
 
     @property
     def _is_test(self) -> bool:
-        """Whether the study is a test of a regulation, which is safe by its rules alone."""
+        """Whether the study is a test of a regulation: a car passes by the regulation's rules, but
+        need not be safe otherwise.
+        """
         allows_impacts = any(test.allowed_impact_speed for test in self.study.tests)
         return allows_impacts or bool(self.study.unsafe.source)
 
     @property
     def _safe(self) -> Sentence:
-        """What a safe car does, with the study's own parameter set and with the others."""
+        """Say what "safe" means, for the study's own parameter set and for the other sets."""
         unsafe = self.models.own.unsafe
         sets = len(self.models.members)
         template = words.SAFE_WITHOUT_CONTACT
@@ -355,7 +378,7 @@ class PermitAnswer:
         )
 
     def _tested(self) -> Sentence:
-        """How cars were tested."""
+        """Say at which speeds cars were driven, and how many simulations searched for failures."""
         values = self.search.values
         driven = f"from {values[0]:g} to {self.span.text(values[-1])}"
         if len(values) == len(self.search.listed):
@@ -367,11 +390,13 @@ class PermitAnswer:
         )
 
     def _listing(self, cars: pd.DataFrame) -> pd.DataFrame:
-        """The list: the columns of the input, then those of the answer, in the input's order."""
+        """The list for fleet software: the user's columns, then the columns of the answer. The cars
+        keep the user's order.
+        """
         manifest = manifest_now(self.study, assemble(self.study))
         table = self.fleet.table.reset_index(drop=True)
         if self.is_box:
-            # Limits are no measured values of a car.
+            # With limits, the columns of values are not measured: only the name remains.
             table = table[table.columns[:1]]
         listing = pd.concat([table, cars.drop(columns="car")], axis=1)
         listing[ROUGH] = YES if self.is_rough else "no"
@@ -380,7 +405,7 @@ class PermitAnswer:
 
 
 def _in_unit(columns: Mapping[str, Column], span: Span) -> dict[str, Column]:
-    """Columns with the unit of the parameter."""
+    """The same columns; columns of speeds have the unit of the parameter."""
     named = dict(columns)
     for name in {"up_to", "new_car_up_to", "up_to_after_repair"} & named.keys():
         named[name] = named[name]._replace(unit=span.unit)

@@ -1,5 +1,6 @@
-"""The encounters of each test of a study, over a parameter such as the speed: every test is driven
-alone, and counts whether or not the original vehicle is safe in it.
+"""The encounters in which `permit` drives cars: for each test of a study, the range of a parameter
+such as the speed. Every test is driven alone. An encounter counts even if the original vehicle is
+not safe in it.
 """
 
 from __future__ import annotations
@@ -25,25 +26,32 @@ from safevar_sumo.study.encounters import are_numbers
 from safevar_sumo.sumo.system import assemble
 
 SPREAD_PLACES = 4
-"""Number of Sobol points over the other parameters that a vehicle meets at each speed."""
+"""Number of Sobol points over the other parameters at which a vehicle is driven at each speed."""
 MOST_ENDS = 4
-"""Number of them of whose ends all combinations are met, too, each with ends of the others."""
+"""A vehicle is also driven at all combinations of the ends of the first `MOST_ENDS` other
+parameters. Each combination takes random ends of further parameters.
+"""
 SPEED_UNITS = ("km/h", "m/s", "")
 """Units of parameters that may be a speed."""
 GRID_PHASES = 2
-"""Number of phases at which each of these places is met."""
+"""Number of phases (moments between two decisions of the driving system) at each of these
+points.
+"""
 MOST_VEHICLES = 16
-"""Number of vehicles that stand for a box at each of these places."""
+"""Number of vehicles that stand for a box of cars at each of these points."""
 
 
 class Span(NamedTuple):
-    """The parameter over which vehicles are driven: its name and unit, the range that is driven,
-    from the least value to the least of the tests' greatest ones, and what ends there.
+    """The parameter over which vehicles are driven, such as the speed, and its range.
 
     Attributes
     ----------
+    low
+        The least value of all tests.
+    high
+        The value at which the first test ends: above it not all tests can be driven.
     ending
-        The names of the tests that end at `high`, where others go on.
+        The names of the tests that end at `high`, if other tests go on.
     tests_above
         The names of the tests that begin above `high`, and are not driven.
     """
@@ -57,7 +65,7 @@ class Span(NamedTuple):
 
     @property
     def title(self) -> str:
-        """The parameter in a sentence."""
+        """The name of the parameter as it stands in a sentence."""
         return self.name.replace("_", " ")
 
     def text(self, value: float) -> str:
@@ -65,7 +73,7 @@ class Span(NamedTuple):
         return f"{value:g}{unit_text(self.unit)}"
 
     def up_to(self, value: float, *, with_low: bool = True) -> str:
-        """What is driven up to a value: `from 10 up to 35 km/h`, or `up to 35 km/h`."""
+        """The range up to a value in words: `from 10 up to 35 km/h`, or `up to 35 km/h`."""
         reached = self.text(value)
         if not with_low:
             return f"up to {reached}"
@@ -84,12 +92,13 @@ class EncounterRange(NamedTuple):
     test
         The name of the test; "" without a matrix.
     model
-        The parameter set, with a study that has this test alone, and searches what may vary in it.
+        A parameter set with a study that has only this test, and varies all parameters that may
+        vary in the test.
     column
-        The column of the parameter in a setting; None where it has one value.
+        The column of the parameter in a setting; None if the test has a single value of it.
     low, high
-        The range of the parameter; minus infinity where the test has no such parameter, and counts
-        at every value.
+        The range of the parameter. `low` is minus infinity if the test has no such parameter: then
+        a failure counts at every value.
     """
 
     test: str
@@ -100,15 +109,18 @@ class EncounterRange(NamedTuple):
 
     @property
     def axes(self) -> IntArray:
-        """The columns of the axes beside the parameter; the phase is the last."""
+        """The columns of all other parameters of the encounter; the phase comes last."""
         is_other = ~self.model.characteristics.of_vehicle
         if self.column is not None:
             is_other[self.column] = False
         return np.flatnonzero(is_other)
 
     def settings(self, vehicles: FloatArray, places: FloatArray) -> FloatArray:
-        """The settings of M vehicles at places, as they are printed: the value of the parameter, at
-        least the least of the test, and the share of the range of each other axis.
+        """The settings of M vehicles, each at the place in the same row, shape (M, n). Values of
+        the encounter are rounded as they are printed.
+
+        A place has the value of the parameter, and then the position of each other axis in its
+        range, from 0 to 1.
         """
         members = self.model.characteristics
         axes = self.axes
@@ -127,13 +139,14 @@ class EncounterRange(NamedTuple):
         return settings[:, self.column]
 
     def places(self, value: float) -> FloatArray:
-        """Places at a value of the parameter, shape (P, 1 + other axes): Sobol points and ends of
-        all others, each at several phases.
+        """The places at a value of the parameter, shape (P, 1 + other axes): Sobol points over the
+        other axes and ends of their ranges, each at `GRID_PHASES` phases.
         """
         has_phase = self.model.characteristics.names[-1] == PHASE
         shares = unit_places(len(self.axes) - has_phase, value)
         if has_phase:
-            # One phase in each part of a step.
+            # Each place is driven at one random phase in each of `GRID_PHASES` equal parts of a
+            # step.
             parts = np.tile(np.arange(GRID_PHASES), len(shares))
             seed = zlib.crc32(np.array([value, len(shares)]).tobytes())
             rng = np.random.default_rng(seed)
@@ -142,12 +155,13 @@ class EncounterRange(NamedTuple):
         return np.column_stack([np.full(len(shares), value), shares])
 
     def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
-        """What settings leave to the limit, shape (M,).
+        """The robustness of M settings (below 0: unsafe), shape (M,); infinity for a setting that
+        violates a constraint.
 
         Raises
         ------
         SimulationError
-            If one cannot be simulated: then no car may be called safe.
+            If a setting cannot be simulated: then no car may be called safe.
         """
         evaluations = self.model.evaluate(settings, stage)
         if evaluations.failed.any():
@@ -162,8 +176,8 @@ class EncounterRange(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def unit_places(dimensions: int, value: float) -> FloatArray:
-    """Sobol points and corners in the unit cube, shape (P, dimensions), for a value of a
-    parameter.
+    """Sobol points and corners of the unit cube, shape (P, dimensions). `value` seeds their choice,
+    so that each speed gets points of its own.
     """
     if not dimensions:
         return np.zeros((1, 0))
@@ -176,17 +190,18 @@ def unit_places(dimensions: int, value: float) -> FloatArray:
 
 
 def span_of(study: Study, by: str | None) -> Span:
-    """The speed that is chosen, and the range that all tests share.
+    """The range of the speed that the study calls `by`, by default `SPEED_DIMENSION`.
 
     Raises
     ------
     InputError
-        If the study varies no such speed; those that it varies are named.
+        If the study varies no such speed. The message names the speeds that the study varies.
     """
     study = with_ranges(study)
     tests = points_of_tests(study, assemble(study).points)
 
-    # Speeds alone are offered, also those of a simulator or a scenario's file, without a unit.
+    # Only speeds are offered. A parameter without a unit may be a speed, too: parameters of a
+    # simulator or of a scenario's file have no unit.
     units = {name: domain.unit for name, domain in study.ranges.items()}
     ends: dict[str, dict[str, tuple[float, float]]] = {}
     for test, (point, *_) in tests:
@@ -212,7 +227,7 @@ def span_of(study: Study, by: str | None) -> Span:
         raise InputError("permit", problem, "a study that varies a speed")
     check_name("by", problem, name, speeds)
 
-    # It ends at the least of the tests' greatest values.
+    # The range ends where the first test ends.
     high = min(top for _, top in ends[name].values())
     goes_on = any(top > high for _, top in ends[name].values())
     return Span(
@@ -228,7 +243,9 @@ def span_of(study: Study, by: str | None) -> Span:
 
 
 def encounters_of(model: Model, span: Span) -> list[EncounterRange]:
-    """The encounters of each test of a model alone, up to the end of the range that is driven."""
+    """The encounters of each test of a model, up to the end of `span`. Tests that begin above this
+    end are left out.
+    """
     ranges = list[EncounterRange]()
     for test, alone, fixed in _tests_alone(
         with_ranges(model.evaluator.study).all_count, span.name
@@ -251,8 +268,11 @@ def encounters_of(model: Model, span: Span) -> list[EncounterRange]:
 
 
 def _tests_alone(study: Study, by: str) -> Iterator[tuple[str, Study, float]]:
-    """Each test of a study at each combination of its axes that do not move, as a study of its own;
-    with its name and its value of a parameter, minus infinity where it has none.
+    """Yield each test of a study, at each combination of the values of its listed axes, as a study
+    with this test alone.
+
+    With it come the test's name ("" without tests), and its listed value of the parameter `by`;
+    minus infinity if the test does not list this parameter.
     """
     if not study.tests:
         yield "", study, -np.inf

@@ -1,4 +1,4 @@
-"""The rows of the answer: what each car may drive, and why no faster."""
+"""The rows of the tables of `permit`: the verdict of each car, and the failure that limits it."""
 
 from __future__ import annotations
 
@@ -24,20 +24,24 @@ from safevar_sumo.vehicles import CharacteristicSet
 DRIVE = "drive"
 LIMITED = "up to"
 STOP = "stop"
-"""Verdicts: as fast as is needed, else as was driven or as the new car; up to a speed; not at all.
+"""Verdicts on a car. DRIVE: as fast as the user needs or, without a stated need, as fast as the new
+car or the fastest test. LIMITED: up to a speed. STOP: not at all.
 """
 CARS, SETS = shipped_columns("permit").values()
 NO_FAILURE: JsonObject = dict.fromkeys(
     ("test", "encounter", "phase", "outcome", "simulate")
 )
-"""The columns that say how a car fails, where it does not."""
+"""The columns that describe a failure, for a car that does not fail."""
 
 
 def failure_columns(
     failures: Sequence[LimitingFailure | None], *, with_car: bool = False
 ) -> list[JsonObject]:
-    """The columns of failures, simulated once more as they are printed, and each in words,
-    `because`; `with_car` names the car's values in it, too.
+    """For each failure, the columns that describe it; `because` has the failure in words. A failure
+    is None for a car that does not fail.
+
+    The printed settings are simulated once more. With `with_car` the words name the car's changed
+    values, too.
     """
     columns = [{**NO_FAILURE, "because": ""}] * len(failures)
     of_range = dict[int, dict[int, LimitingFailure]]()
@@ -87,7 +91,11 @@ def verdict_of(
     *,
     is_proven: bool,
 ) -> str:
-    """What a car may do; without a search for counterexamples none may drive without a limit."""
+    """The verdict on a car that is safe up to the speed `up_to` (None: not even at the least one).
+
+    `top` is the fastest driven speed, `need` the speed that the user needs, or None. `is_proven`
+    says whether counterexamples were searched: otherwise no car may drive without a limit.
+    """
     if up_to is None:
         return STOP
     is_enough = up_to >= (min(top, new_car) if need is None else need)
@@ -97,7 +105,7 @@ def verdict_of(
 def set_rows(
     names: Sequence[str], permits: Sequence[Permit], *, with_car: bool
 ) -> list[JsonObject]:
-    """The rows of `SETS`."""
+    """The rows of the table `SETS`: a row for each car and each parameter set that was driven."""
     cells = [
         {"car": name, **reached._asdict()}
         for name, permit in zip(names, permits, strict=True)
@@ -108,8 +116,8 @@ def set_rows(
 
 
 def assumed_cells(vehicle: CharacteristicSet, fleet: Fleet) -> list[str | None]:
-    """For each car what was not measured with the value that is assumed, such as `brakeResponse
-    0.2 s, sensorLatency 0.1 s`; None if all was measured.
+    """For each car, the characteristics that were not measured, with the assumed values, such as
+    `brakeResponse 0.2 s, sensorLatency 0.1 s`; None if all values were measured.
     """
     return [
         ", ".join(_texts(vehicle, setting)[~measured]) or None
@@ -118,7 +126,7 @@ def assumed_cells(vehicle: CharacteristicSet, fleet: Fleet) -> list[str | None]:
 
 
 def _texts(vehicle: CharacteristicSet, setting: FloatArray) -> NDArray[Any]:
-    """The values of a car, such as `brakeResponse 0.2 s`, shape (n,)."""
+    """The n values of a car as texts, such as `brakeResponse 0.2 s`, shape (n,)."""
     pairs = zip(vehicle, setting, strict=True)
     return np.array(
         [f"{item.name} {value:{EXACT}}{item.suffix}" for item, value in pairs]
@@ -128,8 +136,8 @@ def _texts(vehicle: CharacteristicSet, setting: FloatArray) -> NDArray[Any]:
 def assumed_sentences(
     study: Study, vehicle: CharacteristicSet, fleet: Fleet
 ) -> Iterator[Sentence]:
-    """What is assumed of all cars, with its value and where that comes from, and in how many cars
-    more than that is.
+    """Say which values are assumed in all cars, and whether a value is stated by the study or is
+    that of the new car. Then say in how many cars further values are assumed.
     """
     is_measured = fleet.measured.any(axis=0)
     values: dict[Sentence, list[str]] = {words.ASSUMED: [], words.ASSUMED_NEW: []}
