@@ -1,5 +1,5 @@
-"""What can be named in a study, and whether the user's own code keeps the promises that results
-rest on.
+"""The commands `list` and `check`: `list` shows everything that a study can name, and `check` tests
+whether the user's own code keeps the rules on which results rest.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
             "study", f"{kind} of {study!r}", "a study after characteristics alone"
         )
 
-    # The user's own scenario, or everything.
+    # A kind with a colon is a scenario of the user: then only this scenario is listed.
     scenarios = SCENARIOS
     if kind is not None and ":" in kind:
         named = Lookup().class_of(SCENARIOS, kind, "KIND", TrackScenario, WorldScenario)
@@ -101,7 +101,6 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
     metrics = {**METRICS, **OPTIONAL_METRICS}.items()
     described_metrics = [(name, metric.description) for name, metric in metrics]
 
-    # A table for each kind.
     rows: dict[str, Any] = {
         "studies": _studies(),
         "vehicles": _characteristics(),
@@ -141,7 +140,7 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
 
 
 def _list_characteristics(name: str | None) -> Answer:
-    """The characteristics of a study, with how a workshop measures them."""
+    """The answer with the characteristics of the study `name`, and how a workshop measures them."""
     if name is None:
         raise InputError(
             "study", "no study", "its name or file, as in list characteristics wear"
@@ -164,7 +163,7 @@ def _list_characteristics(name: str | None) -> Answer:
 
 
 def _list_cache() -> Answer:
-    """Where simulations are kept, and how large they are."""
+    """The answer with the folder of earlier simulations, and its size."""
     from safevar_sumo.campaign import cache as simulations  # SUMO takes long to load
 
     folder = simulations.cache_folder()
@@ -196,8 +195,8 @@ def _list_cache() -> Answer:
 
 
 def _in_a_workshop(item: Characteristic) -> str | None:
-    """How a workshop measures a characteristic, and what it does beyond the limit; None if the
-    study says neither.
+    """How a workshop measures a characteristic, and what it does if the value is beyond the limit;
+    None if the study says neither.
     """
     texts = []
     if item.measurement:
@@ -231,7 +230,7 @@ def _described(models: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def description_of(model: Any) -> str:
-    """The first paragraph of a model's docstring."""
+    """The first paragraph of a model's docstring, in one line."""
     return " ".join((getdoc(model) or "").partition("\n\n")[0].split())
 
 
@@ -251,7 +250,7 @@ def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]
 
 
 LONG = 10.0
-"""Time from which on `check` says first how long it takes [s]."""
+"""If a check takes longer than this time, `check` first says how long it will take [s]."""
 
 
 @contents("passed", "vehicles", "points", lead="block", block=BLOCK, findings=FINDINGS)
@@ -270,7 +269,7 @@ def check(
     vehicles
         Number of vehicles that are simulated. Default: up to 100, as many as take 60 s.
     """
-    # What loads SUMO is imported where it is needed.
+    # These modules load SUMO, which takes long: import them only if something is checked.
     from safevar_sumo.campaign import check_algorithms
     from safevar_sumo.campaign.user_checks import find_in_new_process
     from safevar_sumo.check import CHECKS, check_study, study_to_check
@@ -280,7 +279,7 @@ def check(
     extents = []
 
     def tell(extent: Extent) -> None:
-        """How long it takes, if it takes long."""
+        """Warn of a check that takes long."""
         extents.append(extent)
         if extent.seconds > LONG:
             warn(
@@ -288,12 +287,12 @@ def check(
                 f" {extent.seconds:.0f} s"
             )
 
-    # First, as a simulator may end its process.
+    # The check in a new process comes first, because the user's simulator may end its process.
     in_new_process = find_in_new_process(study)
     with open_progress(True) as progress:
         findings = check_study(study, vehicles=vehicles, progress=progress, tell=tell)
     if not findings:
-        # What the command `study` would refuse.
+        # Raise the errors with which the command `study` would refuse the study.
         check_algorithms(study, assemble(study))
         findings = in_new_process
     rows = []
@@ -328,7 +327,9 @@ def check(
 def _sentences(
     name: str, findings: Sequence[Finding], extents: Iterable[Extent]
 ) -> Iterator[Sentence]:
-    """What was found, what was simulated, and what was left out."""
+    """Yield the sentences of the verdict of `check`: the first finding, then the numbers of
+    vehicles and test cases that were simulated and left out.
+    """
     if not findings:
         yield answer(f"{name} passed all checks.")
     for finding in findings[:1]:

@@ -1,5 +1,5 @@
-"""A part of a study: in the ranges of its axes, at a test or a point, up to a value of an axis; and
-the scope of a claim about it in words.
+"""Makes a part of a study: its encounters within ranges, a test or a point of its matrix, or its
+encounters up to a value of an axis. `scope_of` states in words which encounters a study has.
 """
 
 from __future__ import annotations
@@ -28,20 +28,21 @@ OPTION = "up_to"
 FORM = "NAME=V: an axis of the study's encounters, and a number"
 PARTS = 5
 DECIMALS = 9
-"""Number of parts of a searched range, and decimals of their ends, within the limits up to which
-those up to larger values lie.
+"""Number of equal parts of a searched range, and number of decimals of their ends. Limits are first
+searched up to the end of the first part, then up to the second end, and so on. Limits up to a
+larger value lie within those up to a smaller value.
 """
 
 
 class UpperEnd(NamedTuple):
-    """The largest value of an axis that encounters have; `--up-to` states it."""
+    """The largest value of an axis, such as the speed, that encounters may have (`--up-to`)."""
 
     axis: str
     value: float
 
     @classmethod
     def of(cls, text: str) -> Self:
-        """The end that an option states, such as `speed=40`.
+        """The upper end that a text states, such as `speed=40`.
 
         Raises
         ------
@@ -61,8 +62,16 @@ class UpperEnd(NamedTuple):
 def part_of_study(
     study: Study, ranges: bool, point: str | None, up_to: str | None
 ) -> Study:
-    """A study in the ranges of its axes, at a test or point, and up to a value of an axis, as far
-    as these are given.
+    """The part of a study that a question is asked about.
+
+    Parameters
+    ----------
+    ranges
+        Whether to use all encounters within the ranges of the axes.
+    point
+        The name of the only test, or point of the matrix; None for all.
+    up_to
+        The largest value of an axis, such as "speed=40"; None without such a value.
 
     Raises
     ------
@@ -86,7 +95,7 @@ def part_of_study(
 
 
 def at_point(study: Study, name: str) -> Study:
-    """The study in a test, or at one point of its matrix, alone.
+    """The study with only one test, or with only one point of its matrix.
 
     Raises
     ------
@@ -99,7 +108,7 @@ def at_point(study: Study, name: str) -> Study:
     if tests:
         return replace(study.with_tests(tests), origin=origin)
 
-    # A listed encounter has no ranges.
+    # A point of the matrix is a listed encounter: the study must not vary it in ranges.
     listed = study.listed()
     points = assemble(study).matrix
     tests_at_points = chain.from_iterable(map(listed.points_of, listed.tests))
@@ -120,16 +129,17 @@ def at_point(study: Study, name: str) -> Study:
 
 
 def study_up_to(study: Study, end: UpperEnd) -> Study:
-    """The study whose axis ends at a value.
+    """The study without the encounters whose value of an axis is above `end`.
 
-    An original value above it becomes the value. A test whose axis begins above it is left out; one
-    whose list reaches beyond it is driven at the value itself, too, if its scenario can move this
-    axis.
+    If the original value of the axis is above `end`, `end` replaces it. A test whose axis begins
+    above `end` is left out. A test with listed values on both sides of `end` is also driven at
+    `end`
+    itself, if its scenario can move this axis.
 
     Raises
     ------
     InputError
-        If the study does not vary the parameter, or the value is beyond the values that are driven.
+        If the study does not vary the axis, or `end` is outside of the values that are driven.
     """
     name, high = end
     axes = dict.fromkeys(study.ranges)
@@ -156,8 +166,9 @@ def study_up_to(study: Study, end: UpperEnd) -> Study:
 
 
 def smaller_cuts(study: Study, end: UpperEnd | None) -> list[Study]:
-    """The study whose axis ends at smaller values, in ascending order: those of the matrix, or ends
-    of equal parts of the searched range. None without an end.
+    """The study cut at each value of the axis that is smaller than `end`, in ascending order. The
+    values are those of the matrix or, if the study searches a range, the ends of `PARTS` equal
+    parts. There are no such studies if `end` is None.
     """
     if end is None:
         return []
@@ -174,19 +185,21 @@ def smaller_cuts(study: Study, end: UpperEnd | None) -> list[Study]:
 
 
 def names_left_out(study: Study, cut: Study) -> list[str]:
-    """The names of the tests of a study that are left out where it is cut."""
+    """The names of the tests of a study that its part `cut` lacks."""
     names = [test.name for test in cut.tests]
     return [test.name for test in study.tests if test.name not in names]
 
 
 def _ranges_up_to(study: Study, name: str, high: float) -> Study:
-    """The study whose ranges of a parameter end at a value; without tests that begin above it."""
+    """The study whose ranges of an axis end at the value `high`. Tests whose range begins at `high`
+    or above are left out.
+    """
 
     def cut(axes: dict[str, AxisTable]) -> Axes:
         axis = axes.get(name)
         if axis is None or axis.range is None or axis.range.upper <= high:
             return {**axes}
-        # A list may end where the range begins.
+        # The range begins above `high`: only the axis' listed values remain.
         if axis.range.lower >= high:
             return {**axes, name: axis.at}
         return {
@@ -204,7 +217,9 @@ def _ranges_up_to(study: Study, name: str, high: float) -> Study:
 
 
 def _lists_up_to(study: Study, name: str, high: float) -> Study:
-    """The study whose lists of an axis end at a value; without tests that begin above it."""
+    """The study whose lists of an axis end at the value `high`. Tests whose list begins above
+    `high` are left out.
+    """
     tests = []
     all_values = list[float]()
     unit = ""
@@ -239,8 +254,8 @@ def _lists_up_to(study: Study, name: str, high: float) -> Study:
 
 
 def _values(study: Study, test: MatrixTest, name: str) -> Sequence[float]:
-    """The listed values of an axis of a test; none without such an axis, or if they are no
-    numbers.
+    """The listed values of an axis of a test; () if the test does not list this axis, or if the
+    values are no numbers.
     """
     values = study.lists_of(test).get(name, ())
     if are_numbers(values):
@@ -251,7 +266,9 @@ def _values(study: Study, test: MatrixTest, name: str) -> Sequence[float]:
 def points_of_tests(
     study: Study, points: Sequence[Point]
 ) -> Sequence[tuple[MatrixTest | None, Sequence[Point]]]:
-    """The tests of a study, each with its points; all points of one without tests of its own."""
+    """Each test of a study with its points of the matrix. A study without tests gives None with all
+    points.
+    """
     if not study.tests:
         return [(None, points)]
     remaining_points = iter(points)
@@ -264,8 +281,10 @@ def points_of_tests(
 def moving_axes(
     study: Study, test: MatrixTest | None, points: Sequence[Point]
 ) -> dict[str, Domain]:
-    """The listed axes of a test that its scenario can move, each from its least to its greatest
-    value, or with a single value as far as is legal; none where encounters are ranges.
+    """The ranges of the listed axes of a test between whose values its scenario can drive.
+
+    A range goes from the least to the greatest listed value. An axis with a single listed value has
+    the scenario's legal range. There are no ranges if the study itself varies encounters in ranges.
     """
     searchable = {} if study.ranges else searchable_in(points[0].scenario)
     axes = dict[str, Domain]()
@@ -284,11 +303,12 @@ def moving_axes(
 
 
 def scope_of(study: Study, *, between: bool = True) -> str:
-    """What a claim about a study covers, as a phrase for a manual: `the test CPFA (scenario
-    crossing) at 10 to 40 km/h; weather wet (71 % of the grip of a dry road, 1 mm of water), by
-    day`.
+    """The encounters of a study, as a phrase for a manual: `the test CPFA (scenario crossing) at 10
+    to 40 km/h; weather wet (71 % of the grip of a dry road, 1 mm of water), by day`.
 
-    Without `between`, nothing was simulated between the values of a matrix, which are then listed.
+    `between` says whether encounters between the values of a matrix were simulated, too. If not,
+    the
+    phrase lists the values.
     """
     # Tests with the same scenario and parameters share a phrase.
     points = assemble(study).points
@@ -305,7 +325,9 @@ def scope_of(study: Study, *, between: bool = True) -> str:
 
 
 def _tests_in_words(names: Sequence[str], model: str, parameters: str) -> str:
-    """Tests with the same scenario and parameters; the scenario alone without tests."""
+    """The phrase for tests with the same scenario and parameters. Without tests it names only the
+    scenario.
+    """
     scenario = f"scenario {model.rpartition(':')[2].replace('_', ' ')}"
     tests = f"the {scenario}"
     if names:
@@ -317,10 +339,9 @@ def _tests_in_words(names: Sequence[str], model: str, parameters: str) -> str:
 def _parameters_in_words(
     study: Study, test: MatrixTest | None, points: Sequence[Point], between: bool
 ) -> str:
-    """The speeds and other parameters of a test that vary: over its axes, and in a search over the
-    scenario.
+    """The varied parameters of a test in words, the speed first: listed values and ranges. Ranges
+    stand for listed values if `between` is true, and the scenario can move the axis.
     """
-    # Axes that are listed, and those of which any value may occur.
     moving = moving_axes(study, test, points) if between else {}
     texts = {}
     for name, values in study.lists_of(test).items():
@@ -329,7 +350,7 @@ def _parameters_in_words(
     for name, domain in study.ranges_of(test).items():
         texts[name] = f"{domain.lower:g} to {domain.upper:g}{unit_text(domain.unit)}"
 
-    # Speeds first, also of tests that state none.
+    # If no axis is a speed, the scenario may state the speed of the vehicle.
     speed = texts.pop(SPEED_DIMENSION, "")
     stated = (point.scenario.test_speed for point in points)
     speeds = sorted({value for value in stated if value is not None})

@@ -1,4 +1,4 @@
-"""In which regions of the domain do failures lie, in physical units?
+"""The question `rules`: in which regions of the domain do failures lie, in physical units?
 
 A classification tree (CART, by scikit-learn) cuts the domain into boxes. The tree is pruned to the
 smallest tree whose score in cross-validation is within a standard error of the best score. Its
@@ -51,7 +51,7 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
 SAMPLED_STAGE = "vehicles sampled over the whole domain"
-"""The phase of progress."""
+"""The phase of progress in which the sampled vehicles are simulated."""
 MIN_SETTINGS = 10
 """Minimum number of unsafe settings, and of safe settings, that rules need."""
 FOLDS = 5
@@ -59,14 +59,15 @@ FOLDS = 5
 MAX_DEPTH = 6
 """Maximum depth of the tree."""
 MAX_PRUNINGS = 24
-"""Maximum number of prunings compared."""
+"""Maximum number of prunings of the tree that are compared."""
 MIN_ADDED_SHARE = 0.01
 """Share of the unsafe settings that a rule must cover in addition to the rules before it."""
 LIMIT_DIGITS = 3
-"""Limits are rounded to this many digits of the domain's width."""
+"""A limit is rounded so that the width of the domain would have this number of digits."""
 UNLIMITED = np.array([[-np.inf], [np.inf]])
-"""Ends of a characteristic without limits; a box has the lower ends in row 0 and the upper ends in
-row 1.
+"""The column of a characteristic without limits in a box. A box, shape (2, n), has the lower ends
+in
+row 0 and the upper ends in row 1.
 """
 (COLUMNS,) = shipped_columns("rules").values()
 
@@ -127,7 +128,8 @@ def rules(
     total = len(training) + len(testing)
     failures = criterion.number(evaluations.take(evaluations.valid))
 
-    # Rules are boxes in which unsafe vehicles are dense; with repeats, each run is a vehicle.
+    # Rules are boxes in which unsafe vehicles are dense. If a simulation has repeats, the tree
+    # learns from each run as from a vehicle.
     trained = np.tile(training.settings, (len(of_runs), 1))
     boxes = _boxes(trained, of_runs.ravel(), characteristics)
     groups = [is_within(box, vehicles) & ~is_first_half for box in boxes]
@@ -147,7 +149,6 @@ def rules(
     title = "Regions in which many vehicles are unsafe"
     table = tabulate(title, COLUMNS, frame.reset_index(drop=True))
 
-    # The share of unsafe vehicles, and the region that has most of them.
     low, high = clopper_pearson(failures, total)
     numbers = {
         "unsafe": str(criterion),
@@ -194,7 +195,9 @@ def rules(
 
 
 def _region_in_words(rule: pd.Series[Any], region: str) -> Iterator[Sentence]:
-    """The region of a row of the table."""
+    """Yield the sentences about the region of a rule (a row of the table): the region, the share of
+    unsafe vehicles in it, and the share of all unsafe vehicles that it holds.
+    """
     shares = 100 * rule[1:]
     is_wider = rule["density_least"] < rule["density_greatest"]
     yield words.REGION(region=region)
@@ -206,8 +209,8 @@ def _region_in_words(rule: pd.Series[Any], region: str) -> Iterator[Sentence]:
 def conditions(
     box: FloatArray, characteristics: CharacteristicSet, attribute: str = "name"
 ) -> str:
-    """The limits of a box, such as `mass above 2500 kg`, with this attribute of each
-    characteristic; `everywhere` without any.
+    """The limits of a box in words, such as `mass above 2500 kg`; `everywhere` without limits.
+    `attribute` is the characteristics' attribute that names them.
     """
     texts = []
     for item, low, high in zip(characteristics, *box.tolist(), strict=True):
@@ -224,8 +227,9 @@ def conditions(
 def shares(
     box: FloatArray, settings: FloatArray, unsafe: FloatArray | BoolArray
 ) -> list[float]:
-    """The unsafe share within a box, and the share of the unsafe settings within it, each with its
-    interval; `unsafe` is the share of each setting's runs.
+    """Two shares, each followed by the ends of its interval: the share of unsafe settings among
+    those in a box, and the share of all unsafe settings that lie in the box. `unsafe` is the unsafe
+    share of each setting's runs, shape (M,).
     """
     is_inside = is_within(box, settings)
     count = round(float(unsafe[is_inside].sum()), SHARE_DECIMALS)
@@ -237,7 +241,9 @@ def shares(
 def _boxes(
     settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet
 ) -> list[FloatArray]:
-    """The boxes that become rules; none if too few vehicles differ."""
+    """The boxes that become rules: the whole domain if all settings are unsafe, and no box if there
+    are fewer than `MIN_SETTINGS` safe or unsafe settings.
+    """
     if is_unsafe.all() and len(settings):
         return [np.repeat(UNLIMITED, len(characteristics), axis=1)]
     if min(is_unsafe.sum(), (~is_unsafe).sum()) >= MIN_SETTINGS:
@@ -248,10 +254,11 @@ def _boxes(
 def _find_boxes(
     settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet
 ) -> list[FloatArray]:
-    """The boxes that become rules, ordered by coverage; a box that adds few unsafe settings to
-    those before it is dropped.
+    """The boxes that become rules, ordered by the number of unsafe settings in them. A box that
+    adds few unsafe settings to the boxes before it is dropped.
     """
-    # Leaves of a tree in which more than half of the vehicles are unsafe.
+    # Take the leaves of the tree in which more than half of the settings are unsafe or, without
+    # such a leaf, the densest leaf.
     lower = characteristics.lower
     width = characteristics.upper - characteristics.lower
     tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
@@ -260,7 +267,6 @@ def _find_boxes(
     densest, _ = max(leaves, key=lambda leaf: leaf[1])
     dense_boxes = [box for box, density in leaves if density > 0.5] or [densest]
 
-    # Rounded, without conditions that do not help.
     digits = LIMIT_DIGITS - 1 - np.floor(np.log10(width)).astype(int)
     boxes = []
     for box in dense_boxes:
@@ -268,7 +274,6 @@ def _find_boxes(
         boxes.append(_drop_useless_conditions(np.array(rounded), settings, is_unsafe))
     boxes.sort(key=lambda box: -np.count_nonzero(is_unsafe & is_within(box, settings)))
 
-    # Boxes that add enough unsafe vehicles to those before.
     chosen = list[FloatArray]()
     is_uncovered = is_unsafe.copy()
     least_added = MIN_ADDED_SHARE * np.count_nonzero(is_unsafe)
@@ -281,8 +286,8 @@ def _find_boxes(
 
 
 def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
-    """The smallest tree whose cross-validated Brier score is within a standard error of the best
-    score.
+    """The smallest classification tree whose cross-validated Brier score is within a standard error
+    of the best score. `inputs` are settings that are scaled to the domain, shape (M, n).
     """
     from sklearn.model_selection import (  # takes a second to load
         GridSearchCV,
@@ -297,12 +302,11 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
         threshold = means[best] - results["std_test_score"][best] / math.sqrt(FOLDS - 1)
         return int(np.flatnonzero(means >= threshold)[-1])
 
-    # Trees that are pruned more and more.
     tree = DecisionTreeClassifier(
         max_depth=MAX_DEPTH, min_samples_leaf=MIN_SETTINGS // 2, random_state=0
     )
     path = tree.cost_complexity_pruning_path(inputs, is_unsafe)
-    # The strongest pruning leaves no condition.
+    # The strongest pruning leaves a tree without a condition: it is left out.
     strengths = np.unique(np.maximum(path.ccp_alphas, 0.0))[:-1]
     if len(strengths):
         places = np.linspace(0, len(strengths) - 1, MAX_PRUNINGS).round()
@@ -310,7 +314,6 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
     else:
         strengths = np.zeros(1)
 
-    # The smallest tree that predicts about as well as the best.
     folds = StratifiedKFold(FOLDS, shuffle=True, random_state=0)
     search = GridSearchCV(
         tree,
@@ -325,16 +328,15 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
 def _boxes_of_leaves(
     tree: Any, node: int, box: FloatArray, lower: FloatArray, width: FloatArray
 ) -> Iterator[tuple[FloatArray, float]]:
-    """The boxes of a tree's leaves below a node, whose own box is `box`, each with its share of
-    unsafe settings.
+    """Yield the box of each leaf below a node of a tree, and the share of unsafe settings in it.
+    `box` is the box of the node.
     """
-    # A leaf has no condition.
+    # A leaf has no children: scikit-learn states -1.
     if tree.children_left[node] < 0:
         counts = tree.value[node][0]
         yield box, float(counts[-1] / counts.sum())
         return
 
-    # Both sides of the node's condition.
     column = int(tree.feature[node])
     threshold = lower[column] + tree.threshold[node] * width[column]
     for end, children in enumerate((tree.children_right, tree.children_left)):
@@ -346,7 +348,9 @@ def _boxes_of_leaves(
 def _drop_useless_conditions(
     box: FloatArray, settings: FloatArray, is_unsafe: BoolArray
 ) -> FloatArray:
-    """Drop conditions while the lower bound of the density does not fall."""
+    """Drop the conditions of a box one after another, as long as the lower bound of the unsafe
+    share in the box does not fall.
+    """
 
     def least_density(box: FloatArray) -> float:
         flags = is_unsafe[is_within(box, settings)]
@@ -368,5 +372,5 @@ def _drop_useless_conditions(
 
 
 def is_within(box: FloatArray, settings: FloatArray) -> BoolArray:
-    """Whether each of M settings lies within a box; shape (M,)."""
+    """Whether each of M settings lies within a box, shape (M,)."""
     return np.asarray(((settings >= box[0]) & (settings <= box[1])).all(axis=1))

@@ -1,4 +1,4 @@
-"""What is told about limits: a row for each characteristic, and the verdict."""
+"""Makes the answer of `tolerance` from the limits that were found: numbers, tables and verdict."""
 
 from __future__ import annotations
 
@@ -67,7 +67,17 @@ LIMITS, FITS, NEAREST, IN_RANGES = shipped_columns("tolerance").values()
 def answer_limits(
     facts: Told, nearest: FloatArray | None, ranges: InRanges | None
 ) -> Answer:
-    """The answer with limits alone and joint limits."""
+    """The answer of `tolerance`.
+
+    Parameters
+    ----------
+    nearest
+        The safe values nearest to the specified limits, shape (2, n), NaN without such a value;
+        None
+        if they were not searched.
+    ranges
+        The searches in the ranges of the study; None if there were no such searches.
+    """
     tables = {"limits": _limits_table(facts)}
     sets = len(facts.task.fits) + len(facts.task.exclusions)
     if facts.is_safe and sets > 1:
@@ -96,7 +106,9 @@ def answer_limits(
 
 
 def _tested(facts: Told) -> Iterator[Sentence]:
-    """How joint limits were tested; nothing without such limits."""
+    """Say how the joint limits were tested. Without joint limits, say only how many encounters do
+    not count.
+    """
     if facts.study.ranges and facts.is_safe:
         yield words.NOT_COUNTED(
             share=percentage(facts.own.evaluator.share_left_out),
@@ -131,7 +143,9 @@ def _tested(facts: Told) -> Iterator[Sentence]:
 
 
 def _numbers(facts: Told) -> JsonObject:
-    """The numbers of an answer; those about joint limits are undefined without such limits."""
+    """The numbers of the answer, by the names in `NUMBERS`. Numbers about joint limits are None if
+    there are no joint limits.
+    """
     numbers: JsonObject = dict.fromkeys(NUMBERS)
     numbers |= {
         "unsafe": str(facts.unsafe),
@@ -159,7 +173,9 @@ def _numbers(facts: Told) -> JsonObject:
 
 
 def _failures(facts: Told) -> tuple[str, ...]:
-    """Why a gate must not pass."""
+    """The reasons for which a gate (a command that must succeed before a release) fails; () if it
+    passes. A rough answer confirms no specified limit.
+    """
     if not facts.is_safe:
         return (refusal_in_words(facts),)
     if facts.broken:
@@ -171,9 +187,11 @@ def _failures(facts: Told) -> tuple[str, ...]:
 
 
 def _limits_table(facts: Told) -> AnswerTable:
-    """The row of each characteristic that varies; the screen shows those that are limited."""
+    """The table of the limits, with a row for each characteristic that varies. One screen shows
+    only the characteristics with a joint limit.
+    """
     rows = [_limits_row(facts, column) for column in facts.columns]
-    # Joint limits lead, without those of each alone.
+    # If there are joint limits, one screen shows them without the limits alone.
     end = LIMITS["alone_low"]._replace(is_detail=facts.box is not None)
     columns = {**LIMITS, "alone_low": end}
     texts = [text for row in rows if (text := row["fails_first"])]
@@ -189,14 +207,14 @@ def _limits_table(facts: Told) -> AnswerTable:
         columns,
         frame,
         words=events,
-        # Without limits one screen shows all.
+        # If no characteristic has a joint limit, the list is empty: one screen shows all rows.
         lead_rows=np.flatnonzero(~is_open).tolist(),
         bars=bars_of(frame, domains),
     )
 
 
 def _limits_row(facts: Told, column: int) -> JsonObject:
-    """A row of `LIMITS`."""
+    """The row of the table `LIMITS` for the characteristic in a column of settings."""
     item = facts.members[column]
     row: JsonObject = {
         **dict.fromkeys(LIMITS),
@@ -223,13 +241,17 @@ def _limits_row(facts: Told, column: int) -> JsonObject:
 
 
 def _values_of(model: Model, failure: Failure) -> JsonObject:
-    """The vehicle that fails, with its encounter where encounters are ranges."""
+    """The values of a failing vehicle by name. If encounters are ranges, the values of the
+    encounter are added.
+    """
     names = model.characteristics.names
     return dict(zip(names, failure.setting.tolist(), strict=False))
 
 
 def _sentence(facts: Told, column: int) -> str:
-    """A sentence for a maintenance manual: all of these may be obeyed together."""
+    """The limit of a characteristic in a sentence for a maintenance manual. All these sentences
+    together state the joint limits.
+    """
     item = facts.members[column]
     box = facts.box
     name = item.short_name[:1].upper() + item.short_name[1:]
@@ -266,14 +288,16 @@ def _sentence(facts: Told, column: int) -> str:
 
 
 def _values_in_words(facts: Told, box: Box, column: int, failure: Failure) -> str:
-    """What is not at its limit in the vehicle that fails just beyond a limit: `tread depth at 1.5
-    mm and payload at 300 kg`, with the value beyond the limit at first.
+    """The values of a vehicle that fails just beyond a joint limit, such as `tread depth at 1.5 mm
+    and payload at 300 kg`. The value beyond the limit stands first. A value is left out if a reader
+    can guess it: it is at the joint limit of its characteristic.
     """
     texts = list[str]()
     for number, item in enumerate(facts.members):
         value = float(failure.setting[number])
         text = f"{item.short_name} at {limit_text(item, value)}"
-        # Others are at their limit, if they have one, and as in the original, if they have none.
+        # A reader expects a value at its only joint limit or, without a joint limit, the original
+        # value.
         ends = {float(box.lower[number]), float(box.upper[number])}
         limits = ends - {item.lower, item.upper} or {item.original}
         is_said = len(limits) == 1 and np.isclose(value, [*limits])[0]
@@ -285,7 +309,9 @@ def _values_in_words(facts: Told, box: Box, column: int, failure: Failure) -> st
 
 
 def _fit_rows(facts: Told) -> Rows:
-    """A row of `FITS` for each parameter set."""
+    """The rows of the table `FITS`: whether the limits hold in each parameter set, and the worst
+    value that was found in it; NaN if it was not searched.
+    """
     broken = facts.limits.broken
     states = {fit: "not kept" if fit in broken else "kept" for fit in facts.task.fits}
     states |= {model.fit: "left out" for model in facts.task.exclusions}
@@ -297,7 +323,9 @@ def _fit_rows(facts: Told) -> Rows:
 
 
 def _nearest_rows(facts: Told, nearest: FloatArray | None) -> Rows:
-    """A row of `NEAREST` for each end of a specified limit."""
+    """The rows of the table `NEAREST`: for each end of a specified limit, the nearest safe value;
+    None if there is no safe value.
+    """
     rows = list[tuple[object, ...]]()
     if nearest is None:
         return rows
@@ -313,8 +341,8 @@ def _nearest_rows(facts: Told, nearest: FloatArray | None) -> Rows:
 def _told_in_ranges(
     facts: Told, ranges: InRanges
 ) -> tuple[Sentence, tuple[object, ...]]:
-    """Whether the limits hold in the ranges, and the row of `IN_RANGES`; of several failures that
-    at the lowest speed.
+    """A sentence and the row of the table `IN_RANGES`, which say whether the limits hold in the
+    ranges of the study. If several vehicles fail, both name the failure at the lowest speed.
     """
     attacks = ranges.attacks.values()
     number = sum(attack.simulated for attack in attacks)
@@ -339,7 +367,9 @@ def _told_in_ranges(
 
 
 def _slowest_failure(facts: Told, oracle: Oracle, unsafe: FloatArray) -> Failure | None:
-    """How the unsafe case at the lowest speed fails; without speeds, at the lowest first value."""
+    """The failure of the unsafe case at the lowest speed. If no axis is a speed, the first axis
+    decides instead.
+    """
     members = oracle.own.characteristics
     axes = members.scenario.names
     axis = SPEED_DIMENSION if SPEED_DIMENSION in axes else axes[0]
