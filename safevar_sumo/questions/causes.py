@@ -1,5 +1,5 @@
-"""Minimal causes: the subsets of a setting's changes that are unsafe by themselves while all their
-own subsets are safe; their limits; and which changes failures need.
+"""Finds the minimal causes of failures, and counts which changes the failures need. A minimal cause
+is a subset of a setting's changes that is unsafe by itself, while all smaller parts of it are safe.
 
 Outcomes need not be monotone: a change may undo the effect of another change. So nothing is
 inferred: all subsets are simulated, size by size, except those that contain a cause.
@@ -28,18 +28,28 @@ from safevar_sumo.vehicles import CharacteristicSet
 SUBSETS = "look for the necessary changes"
 BOUNDARIES = "look for smaller changes"
 OTHER_SETS = "check other parameter sets"
-"""Stages of progress."""
+"""Phases of progress."""
 MAX_SUBSETS = 20_000
-"""Maximum number of subsets simulated in one call, which bounds the memory; and, unless another
-number is stated, of all subsets.
+"""Maximum number of subsets that are simulated in one call, which bounds the memory. The same
+number
+is the default limit on all subsets.
 """
 
 
 class Cause(NamedTuple):
-    """A minimal subset of a failure's changes that is unsafe by itself, all else as in the original
-    vehicle: the values of these characteristics in their units; outcome and safety degree
-    [m, or -m/s] of a vehicle with these changes only, and the share of its runs that is unsafe.
-    `encounter` are the failure's parameters of the scenario, in a study that searches them.
+    """A minimal subset of a failure's changes that is unsafe by itself. All other characteristics
+    are as in the original vehicle.
+
+    Attributes
+    ----------
+    changes
+        The values of the changed characteristics in their units, by name.
+    outcome, safety_degree
+        The outcome and the safety degree [m, or -m/s] of a vehicle with only these changes.
+    encounter
+        The failure's parameters of the scenario; empty unless encounters are ranges.
+    unsafe_runs
+        The share of this vehicle's runs that is unsafe; 1 without repeats.
     """
 
     changes: NamedValues
@@ -52,13 +62,16 @@ class Cause(NamedTuple):
 def find_minimal_causes(
     evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe, limit: int = MAX_SUBSETS
 ) -> list[list[Cause]]:
-    """The minimal causes of each of M settings, shape (M, n); an empty list if no subset of its
-    changes is unsafe. Up to the size `largest_complete` of `limit` simulated settings they are all;
-    beyond it a setting has only the smallest, if it has no smaller cause.
+    """The minimal causes of each of M settings, shape (M, n). The list of a setting is empty if no
+    subset of its changes is unsafe.
 
-    The empty subset counts too: if the original vehicle is unsafe, no change is needed.
+    Up to a size (`largest_complete` for the number `limit` of simulated settings), all minimal
+    causes
+    are found. Larger subsets are simulated only for settings without a cause so far.
+
+    The empty subset counts, too: if the original vehicle is unsafe, no change is needed.
     """
-    # What each setting changes; encounters stay as they are.
+    # Only changes of the vehicle are undone: all subsets keep the setting's encounter.
     members = evaluator.characteristics
     is_changed = members.changed(settings) & members.of_vehicle
     changed = [np.flatnonzero(flags).tolist() for flags in is_changed]
@@ -66,7 +79,8 @@ def find_minimal_causes(
     causes = [dict[frozenset[int], Cause]() for _ in settings]
     complete = largest_complete(list(map(len, changed)), limit)
 
-    # Subsets by size, those of all settings together, without those that contain a cause.
+    # Simulate the subsets by size, and the subsets of all settings together. A subset that contains
+    # a smaller cause cannot be minimal: it is left out.
     expected = _count_subsets(list(map(len, changed)), complete)
     with evaluator.phases.stage(SUBSETS, expected):
         for size in range(max(map(len, changed), default=0) + 1):
@@ -110,8 +124,8 @@ def _subsets(
     *,
     is_complete: bool,
 ) -> Iterator[tuple[int, list[int]]]:
-    """The rows and the changed columns of all subsets of a size that contain no cause; unless the
-    size is complete, only of rows without a cause.
+    """Yield the row and the changed columns of each subset of a size that contains no cause. If the
+    size is not complete, only rows without a cause have subsets.
     """
     for row, of_row in enumerate(causes):
         if is_complete or not of_row:
@@ -121,8 +135,8 @@ def _subsets(
 
 
 def largest_complete(numbers: Sequence[int], limit: int) -> int:
-    """The largest size of which all subsets of each number of changes are simulated, with at most
-    about `limit` settings altogether; at least 1.
+    """The largest size for which all subsets can be simulated with at most `limit` settings; at
+    least 1. `numbers` are the numbers of changes of the settings.
     """
     sizes = range(2, max(numbers, default=1) + 1)
     affordable = takewhile(lambda size: _count_subsets(numbers, size) <= limit, sizes)
@@ -132,14 +146,15 @@ def largest_complete(numbers: Sequence[int], limit: int) -> int:
 def are_causes(
     evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe
 ) -> BoolArray:
-    """Whether each of M causes is one with an evaluator's parameters: its changes alone are unsafe,
-    and safe if any one of them is left out.
+    """Whether each of M causes is also a minimal cause with the parameters of another evaluator,
+    shape (M,). All its changes together are unsafe there, and safe if any single change is left
+    out.
     """
     characteristics = evaluator.characteristics
     groups = []
     for setting in settings_of(characteristics, causes):
         is_changed = (setting != characteristics.original) & characteristics.of_vehicle
-        # A row for each change leaves it out.
+        # Each further row leaves out one of the changes.
         is_left_out = np.diag(is_changed)[is_changed]
         groups.append(
             np.vstack(
@@ -155,16 +170,18 @@ def are_causes(
 
 
 def _count_subsets(numbers: Sequence[int], largest: int) -> int:
-    """How many subsets of at most `largest` of each number of changes there are."""
+    """The number of subsets with at most `largest` changes, summed over the `numbers` of
+    changes.
+    """
     return sum(comb(number, size) for number in numbers for size in range(largest + 1))
 
 
 def select_affordable_rows(
     settings: FloatArray, evaluator: Evaluator, max_evaluations: int
 ) -> list[int]:
-    """All rows of `settings`, or a random sample of them, so that finding their minimal causes
-    takes at most about `max_evaluations`; where few simulations are allowed, at least one if its
-    single changes may be simulated.
+    """The rows of `settings` whose minimal causes can be found with about `max_evaluations`: all
+    rows, or a random sample. If only few simulations are allowed, the sample has at least one row,
+    provided that the simulations suffice for each single change.
     """
     costs = 2.0 ** evaluator.characteristics.number_changed(settings)
     if costs.sum() <= max_evaluations:
@@ -206,7 +223,7 @@ def count_needed(
         replacement from finitely many failures), the share itself if all failures were analysed.
         Ordered by needed, in_some, changed; no rows if there is no failure.
     """
-    # In how many failures a characteristic is in all causes, or in some.
+    # Count the failures in which a characteristic is in all causes, and in at least one cause.
     names = characteristics.vehicle.names
     number = max(len(changed), 1)
     changed = changed[:, characteristics.of_vehicle]
@@ -217,7 +234,7 @@ def count_needed(
         counts += np.all(is_in_cause, axis=0)
         in_some += np.any(is_in_cause, axis=0)
 
-    # Of a sample the intervals are those of all failures.
+    # If the failures are a sample, the share among all failures is uncertain.
     intervals = np.repeat(counts[:, None] / number, 2, axis=1)
     if len(changed) < failures:
         intervals = np.array([clopper_pearson(int(count), number) for count in counts])
@@ -253,7 +270,7 @@ def directions(
 def kinds_of(
     characteristics: CharacteristicSet, causes: Sequence[Cause]
 ) -> set[tuple[str, ...]]:
-    """The causes without the sizes of their changes."""
+    """The different kinds of causes: which characteristics change, and in which direction."""
     return {directions(characteristics, cause.changes) for cause in causes}
 
 
@@ -285,7 +302,7 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     pandas.DataFrame
         Columns algorithm, run, failures (different unsafe solutions), examined and causes.
     """
-    # The first failures of each run.
+    # Take the failures of each run with the fewest and smallest changes.
     keys = ["algorithm", "run"]
     order = [F_NUM_DIFF.name, F_DIFF.name]
     names = [*evaluator.characteristics.names]
@@ -300,7 +317,6 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
         f"Finding the minimal causes of {case.name} takes at most {price:,} simulations.",
     )
 
-    # Kinds of causes: which characteristics change, and in which direction.
     rows = settings.to_numpy(dtype=float)
     causes = find_minimal_causes(evaluator, rows, case.unsafe, price)
     kinds = pd.Series(
@@ -312,7 +328,6 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
         subset="kind"
     )
 
-    # How many of each run.
     counted = {
         "failures": failures,
         "examined": examined,
@@ -328,8 +343,8 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
 def settings_of(
     characteristics: CharacteristicSet, causes: Sequence[Cause]
 ) -> FloatArray:
-    """The original vehicle with the changes of each of M causes only, in its encounter; shape (M,
-    n).
+    """The settings of M causes, shape (M, n): the original vehicle with only the changes of the
+    cause, in the encounter of the cause.
     """
     settings = [
         characteristics.setting(cause.changes | cause.encounter, beyond=True)

@@ -1,5 +1,5 @@
-"""Counterexamples in sentences: unsafe vehicles with the values that are printed, simulated again
-with these values.
+"""Describes unsafe vehicles (counterexamples) in words. The values of an unsafe vehicle are rounded
+for readers, and the vehicle is simulated again, so that the printed vehicle is really unsafe.
 """
 
 from __future__ import annotations
@@ -40,19 +40,21 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case
 
 FURTHER_DIGITS = (0, 1, 2, 4, 7)
-"""Digits beyond those of a limit with which a value is tried in turn, until the printed vehicle is
-unsafe.
+"""Numbers of digits beyond the digits of a limit. They are tried one after another, until the
+vehicle with the rounded values is unsafe.
 """
 OF_ENCOUNTER = ("test", "weather")
-"""Keys of a point's parameters that are no numbers of its scenario."""
+"""Keys of a point's parameters that are no parameters of the scenario."""
 LEAST_IMPACT = 1.0
-"""A slower impact, as at the limit itself, says nothing [km/h]."""
+"""Slowest impact that is printed [km/h]. An impact just beyond a limit is slower, and says
+nothing.
+"""
 STAGE = "find what fails first"
 
 
 class Place(NamedTuple):
-    """Where a vehicle fails, as it is printed: the test, its speed, other values of the encounter,
-    each `""` without any, and the number of the parameter set.
+    """Where a vehicle fails, in words for readers: the test, its speed, and other values of the
+    encounter, each "" if there is none; and the number of the parameter set.
     """
 
     test: str
@@ -62,8 +64,8 @@ class Place(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Such as `test CPNA, driven at 40 km/h, impact location 25 %; parameter set 9`; empty
-        where there is but one.
+        """The place in words, such as `test CPNA, driven at 40 km/h, impact location 25 %;
+        parameter set 9`; "" if there is only one place. Parameter set 0 is not named.
         """
         test = f"test {self.test}" if self.test else ""
         speed = f"driven at {self.speed}" if self.speed else ""
@@ -73,24 +75,24 @@ class Place(NamedTuple):
 
 
 class Failure(NamedTuple):
-    """An unsafe vehicle.
+    """An unsafe vehicle, in words for readers.
 
     Attributes
     ----------
     setting
-        Its values as they are printed, shape (n,).
+        The vehicle's values, and those of its encounter, as they are printed, shape (n,).
     event
-        How it fails, such as `hits a pedestrian`.
+        How the vehicle fails, such as `hits a pedestrian`.
     impact
-        With which impact, such as `impact at 12 km/h`; `""` without one.
+        The impact, such as `impact at 12 km/h`; "" without a noteworthy impact.
     place
-        Where it fails.
+        Where the vehicle fails.
     point
-        The parameters of this point of the matrix.
+        The parameters of the point of the matrix at which the vehicle fails.
     breach
-        Its breach of the criterion alone.
+        How the vehicle breaks the criterion, such as `collides at 3.21 m/s`.
     command
-        The command that simulates it.
+        The command that simulates the vehicle.
     """
 
     setting: FloatArray
@@ -103,7 +105,7 @@ class Failure(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Such as `the vehicle hits a pedestrian (impact at 12 km/h; test CPNA)`."""
+        """The failure, such as `the vehicle hits a pedestrian (impact at 12 km/h; test CPNA)`."""
         details = "; ".join(filter(None, (self.impact, self.place.words)))
         return f"the vehicle {self.event}{f' ({details})' if details else ''}"
 
@@ -114,12 +116,19 @@ def describe(
     box: Box | None = None,
     single_names: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, Failure]:
-    """How unsafe settings of a model fail at their worst points, by the same names.
+    """Describe how unsafe settings of a model fail at their worst points, by the settings' names.
 
-    Values are rounded as they are printed, away from the original, and simulated again; where the
-    rounded vehicle is safe, with further digits. A setting that is safe with all of them is left
-    out. A value that lies `within` a box stays there; of a setting that has a name in `only`, this
-    characteristic alone is rounded.
+    The values of the vehicle are rounded away from the original values, and simulated again. If the
+    rounded vehicle is safe, it is rounded to further digits. A setting that is safe with all
+    numbers
+    of digits is left out.
+
+    Parameters
+    ----------
+    box
+        A value within this box stays in it when it is rounded; None for no box.
+    single_names
+        By a setting's name, the only characteristic that is rounded.
     """
     failures = dict[str, Failure]()
     waiting = dict(settings)
@@ -143,8 +152,12 @@ def describe(
 def values_as_printed(
     model: Model, vehicles: Sequence[NamedValues], single_names: Sequence[str] = ()
 ) -> list[NamedValues]:
-    """Values of unsafe vehicles, all else as in the original, as `describe` prints them; as they
-    are where it prints none, and but for one characteristic of each if `only` names them.
+    """The values of unsafe vehicles as `describe` rounds them. All characteristics without a value
+    are as in the original vehicle. A vehicle that no rounding leaves unsafe keeps its values.
+
+    `single_names` are the only characteristics that are rounded, one for each vehicle; () if all
+    are
+    rounded.
     """
     members = model.characteristics
     settings = {
@@ -158,9 +171,9 @@ def values_as_printed(
 
 
 def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
-    """The evaluation of the unsafe solution with the fewest changes, of which as many as possible
-    are undone; its values are those that are printed. None if no solution is unsafe, or it is safe
-    here.
+    """The evaluation of the smallest minimal cause of the unsafe solution with the fewest changes.
+    Its values are rounded as they are printed. None if no solution is unsafe, or if the solution is
+    safe in this simulation.
     """
     if not case.unsafe.rows(case.solutions).any():
         return None
@@ -179,12 +192,12 @@ def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
 
 
 def limit_text(item: Characteristic, value: float) -> str:
-    """A value as it is printed, without further zeros, as in tables."""
+    """A value with its unit as it is printed, without trailing zeros."""
     return f"{value:{EXACT}}{item.suffix}"
 
 
 def values_in_words(members: CharacteristicSet, values: NamedValues) -> str:
-    """Values of some characteristics: `brake torque at 0.5 and payload at 525 kg`."""
+    """Values by name in words: `brake torque at 0.5 and payload at 525 kg`."""
     return join_phrases(
         f"{item.short_name} at {limit_text(item, values[item.name])}"
         for item in members
@@ -199,8 +212,9 @@ def as_printed(
     box: Box | None = None,
     single_name: str = "",
 ) -> FloatArray:
-    """A setting with its values, or `only` one, rounded to the digits of limits and some further
-    ones: the vehicle's away from the original, those of the encounter to the nearest.
+    """A setting whose values are rounded to the digits of limits, plus `further` digits. Values of
+    the vehicle are rounded away from the original, and values of the encounter to the nearest. With
+    `single_name` only this characteristic is rounded.
     """
     printed = setting.copy()
     for column, item in enumerate(members):
@@ -222,7 +236,8 @@ def as_printed(
                 if value > item.original
                 else np.floor
             )
-            # What is a rounding error of the scaled value is none of the value.
+            # A value such as 0.3, scaled to 3.0000000000000004, must not be rounded up to 0.4:
+            # hence rounding errors are removed first.
             printed[column] = min(
                 max(round_away(np.round(value * scale, 6)) / scale, lower), upper
             )
@@ -230,7 +245,7 @@ def as_printed(
 
 
 def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
-    """How those of M settings fail that are unsafe, by their row."""
+    """The failures of the unsafe settings among M settings, by their row."""
     points = model.evaluator.system.points
     members = model.characteristics
     runs = model.evaluate(settings, STAGE)
@@ -266,8 +281,9 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
 def _command(
     model: Model, setting: FloatArray, point: Point, values: Mapping[str, float]
 ) -> str:
-    """The command that simulates a setting, shape (n,), in the encounter with these values of
-    searched parameters, where the place of a matrix can be set.
+    """The command that simulates a setting, shape (n,). It sets the parameters of the point that
+    the
+    command `simulate` can set. `values` are the searched parameters of the encounter.
     """
     system = model.evaluator.system
     members = model.evaluator.characteristics
@@ -289,13 +305,26 @@ def place_of(
     values: NamedValues,
     fit: int = 0,
 ) -> Place:
-    """Where a failure is: at one of the points of a matrix, with values of searched parameters, the
-    scenario with them, and the number of the parameter set. No sentence has the phase, which is in
-    the command.
+    """The place of a failure in words.
+
+    No sentence states the phase: the command of the failure has it.
+
+    Parameters
+    ----------
+    points
+        All points of the matrix.
+    point
+        The point at which the vehicle fails.
+    scenario
+        The scenario of the failing encounter.
+    values
+        The searched parameters of the encounter, by name.
+    fit
+        The number of the parameter set.
     """
     numbers = dict(point.parameters) | values
     test = numbers.pop("test", "")
-    # The weather has a name of its own, if there is more than one.
+    # The weather is named only if the points differ in it.
     for name in ("weather", PHASE):
         numbers.pop(name, None)
     if len({other_point.weather.name for other_point in points}) > 1:
@@ -309,7 +338,7 @@ def place_of(
 
 
 def texts_of(point: Point, values: JsonObject) -> dict[str, str]:
-    """Values of an encounter at a point, by name, as they are printed."""
+    """The values of an encounter at a point as texts with their units, by name."""
     texts = dict[str, str]()
     for name, value in values.items():
         texts[name] = str(value)
@@ -320,7 +349,7 @@ def texts_of(point: Point, values: JsonObject) -> dict[str, str]:
 
 
 def _event_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool) -> str:
-    """A failure, such as `hits a pedestrian`."""
+    """How a vehicle fails in a scenario, such as `hits a pedestrian`."""
     if collided:
         return f"hits {scenario.obstacle()}"
     if unsafe.bound is not None:
