@@ -1,4 +1,4 @@
-"""What every question returns: a verdict, numbers and tables."""
+"""The answer that every question returns: a verdict, numbers and tables."""
 
 from __future__ import annotations
 
@@ -36,9 +36,19 @@ AnswerFunction = TypeVar("AnswerFunction", bound="Callable[..., Answer]")
 
 
 class Contents(NamedTuple):
-    """The names of an answer's numbers, and of the columns of its tables; `...` among them stands
-    for names that a study gives, such as its metrics. The name of the table that leads, by default
-    the first; and of the question that comes next.
+    """The names that an answer declares, so that a command can refuse others.
+
+    Attributes
+    ----------
+    numbers
+        Names of the numbers. `...` among them stands for names that a study gives, such as its
+        metrics.
+    tables
+        Names of the columns, by the name of the table; `...` as above.
+    lead
+        Name of the table that one screen shows; "" for the first table.
+    next
+        Name of the question that a user should ask next; "" for none.
     """
 
     numbers: Collection[str | EllipsisType]
@@ -47,12 +57,14 @@ class Contents(NamedTuple):
     next: str = ""
 
     def in_study(self, measures: Collection[str]) -> Contents:
-        """The names that an answer has about a study with these measures."""
+        """The same names, but with the study's `measures` in place of `...` among the numbers."""
         return self._replace(numbers=[*_without_ellipsis(self.numbers), *measures])
 
     def check_key(self, key: str) -> None:
-        """Refuse what is no key of `Answer.values`, but for an index; raises an InputError."""
-        # A number, a number in a list, or a column.
+        """Refuse a key that `Answer.values` would not know; raises an InputError. An index into a
+        list may be of any size.
+        """
+        # A key is `number`, `number.index` or `table.column`.
         name, _, ending = key.rpartition(".")
         names = self.numbers
         number = key
@@ -74,7 +86,7 @@ class Contents(NamedTuple):
 
     @property
     def keys(self) -> list[str]:
-        """All names of numbers, and `table.column`, without those that a study gives."""
+        """All keys: names of numbers, and `table.column`. Names that a study gives are left out."""
         keys = _without_ellipsis(self.numbers)
         for table, names in self.tables.items():
             keys += [f"{table}.{name}" for name in _without_ellipsis(names)]
@@ -95,9 +107,11 @@ def contents(
     next: Any = "",
     **tables: Collection[str | EllipsisType],
 ) -> Callable[[AnswerFunction], AnswerFunction]:
-    """Decorator: declares the names of all numbers that a function's answers may hold, and of the
-    columns of their tables, so that its command refuses others before anything is computed; the
-    table that leads them, and the question that comes next. `OF_ALL` are among the numbers.
+    """Decorator that declares the `Contents` of a function's answers: the names of numbers, and
+    the names of columns by table. The command refuses other names before it computes anything.
+
+    `lead` is the table that one screen shows, `next` the question that a user should ask next.
+    `OF_ALL` are always among the numbers.
     """
     if lead:
         check_name(
@@ -118,7 +132,7 @@ def contents(
 
 
 def contents_of(function: Callable[..., Any]) -> Contents | None:
-    """What a function's answers may hold; None if it does not say so."""
+    """The contents that a function declares for its answers; None if it declares nothing."""
     return vars(function).get("contents")
 
 
@@ -189,10 +203,9 @@ class Answer:
             object.__setattr__(self, "tables", Frames(self.tables))
 
     def to_dict(self) -> JsonObject:
-        """Plain values: question, study, verdict, numbers, and of each table its columns and rows;
-        null where undefined.
+        """The answer as plain values for JSON: question, study, verdict, numbers, and the columns
+        and rows of each table. An undefined value is None.
         """
-        # Each table with units and meanings.
         tables = {}
         for name, table in self.tables.records.items():
             columns = {
@@ -273,7 +286,6 @@ class Answer:
         InputError
             If there is no such number.
         """
-        # A column, a number, or a number in a list.
         columns = {name: list(map(str, frame)) for name, frame in self.tables.items()}
         Contents(self.numbers, columns).check_key(key)
         name, _, ending = key.rpartition(".")
@@ -292,7 +304,9 @@ class Answer:
 
 
 def _draw_intervals(answer: Answer) -> Figure:
-    """The numbers of the first table with their intervals, a row for each of its rows."""
+    """Draw the first table's numbers with their intervals: a panel for each column that has an
+    interval, and a line for each row.
+    """
     from safevar_sumo.questions.figures import (
         BLUE,
         FONT_SIZE,
@@ -300,7 +314,6 @@ def _draw_intervals(answer: Answer) -> Figure:
         new_figure,
     )
 
-    # Columns that have an interval.
     frame = answer.table()
     names = []
     for name in map(str, frame):
@@ -311,7 +324,6 @@ def _draw_intervals(answer: Answer) -> Figure:
             "plot", "the answer has nothing to draw", "the answer as a table"
         )
 
-    # A panel for each column.
     size = (max(2.6 * len(names), 5.2), 1.1 + 0.35 * len(frame))
     table, *_ = answer.tables.records.values()
     figure, axes = new_figure(table.title, 1, len(names), size, sharey=True)

@@ -1,5 +1,5 @@
-"""All figures of results by name: how algorithms compare (RQ1, RQ2), and what critical solutions
-change (RQ3).
+"""Draws all figures of results: how algorithms compare (RQ1, RQ2), and what critical solutions
+(less safe than the original vehicle) change (RQ3).
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's colours, which colour-blind readers can distinguish; each also has its own
-marker.
+"""Colours by Okabe and Ito, which colour-blind readers can distinguish. Each algorithm also has a
+marker of its own (`MARKERS`).
 """
 MARKERS = ("o", "X", "^", "s", "D", "v")
 OBJECTIVE_TITLES = {
@@ -60,9 +60,9 @@ OBJECTIVE_TITLES = {
     F_NUM_DIFF.name: "f_numDiff: characteristics changed",
 }
 LONGEST_NAME = 28
-"""Number of letters of a name that fit above a small axis."""
+"""Number of letters that fit above a small panel. A longer name has a smaller font."""
 BIN_COUNT = 24
-"""Number of bins over a characteristic's domain."""
+"""Number of bins of a histogram over a characteristic's domain."""
 
 
 def draw_pareto_fronts(case: Case) -> Figure:
@@ -77,10 +77,9 @@ def draw_pareto_fronts(case: Case) -> Figure:
     UnanswerableError
         If there is no solution.
     """
-    # It raises if there is no solution.
+    # The call raises an error if there is no solution.
     reference_front(case)
 
-    # The front of each algorithm.
     objectives = case.scoring.objectives
     signs = [objective.sign for objective in objectives]
     fronts = {}
@@ -89,14 +88,13 @@ def draw_pareto_fronts(case: Case) -> Figure:
         if len(points):
             fronts[algorithm] = nondominated_points(points) * signs
 
-    # A panel for each pair of objectives.
     pairs = list(combinations(range(len(objectives)), 2))
     title = f"{case.name}: non-dominated solutions of each algorithm, all runs together"
     figure, axes = new_panels(
         title, len(pairs), 3, (3.2, 3.7), min_width=5.0, title_height=0.0
     )
 
-    # The original vehicle in the same axes.
+    # The original vehicle is drawn in the same axes, with no change of itself.
     original = {
         **case.original,
         F_DIFF.name: 0.0,
@@ -148,14 +146,17 @@ def draw_pareto_fronts(case: Case) -> Figure:
 
 
 def draw_convergence(case: Case) -> Figure:
-    """The hypervolume of all settings that a run has simulated so far, over their number, as
-    median and quartiles over the runs. A line ends with the longest run of its algorithm; a mark
-    there is the median of what the runs return. The legend says how many settings a run simulates
-    on average: fewer than its budget if it repeats some or ends early.
+    """The convergence of each algorithm: the hypervolume of all settings that a run has simulated
+    so
+    far, over their number, as median and quartiles over the runs.
+
+    A line ends with the longest run of its algorithm. The mark there is the median hypervolume of
+    the solutions that the runs return. The legend says how many settings a run simulates on
+    average:
+    fewer than the budget if the run repeats settings or ends early.
     """
     import seaborn as sns
 
-    # Growth over all evaluations, as median and quartiles.
     growth = compute_convergence(case)
     runs = growth.groupby("algorithm", sort=False)["run"].nunique()
     means = count_evaluations(case).groupby("algorithm")["simulated"].mean().to_dict()
@@ -184,7 +185,6 @@ def draw_convergence(case: Case) -> Figure:
         f"mark: of what a run returns; reference point {case.study.search.reference_point:g})"
     )
 
-    # A mark for what runs return.
     ends = growth.groupby("algorithm", sort=False)["evaluations"].max()
     returned = (
         compute_indicators(case)["hypervolume"]
@@ -213,15 +213,14 @@ def _add_legend_below(figure: Figure, axis: Axes) -> None:
 
 
 def draw_change_counts(cases: Sequence[Case]) -> Figure:
-    """RQ3.1: number of critical solutions of a run with j characteristics changed, as box plots
-    over the runs; a panel per case that has an answer.
+    """RQ3.1: the number of a run's critical solutions that change j characteristics, as box plots
+    over the runs. Each case with an answer has a panel.
 
     Raises
     ------
     UnanswerableError
         If no case has an answer.
     """
-    # Counts of each case that has an answer.
     counts_by_case = {}
     errors = []
     for case in cases:
@@ -232,7 +231,6 @@ def draw_change_counts(cases: Sequence[Case]) -> Figure:
     if not counts_by_case:
         raise errors[0]
 
-    # A panel for each of them.
     title = "number of changed characteristics"
     figure, axes = new_panels(
         title, len(counts_by_case), 3, (3.9, 3.3), min_width=6.4, title_height=0.5
@@ -262,10 +260,10 @@ def draw_changed_characteristics(case: Case) -> Figure:
     """
     import seaborn as sns
 
-    # Without them it raises.
+    # The call raises an error if there are no critical solutions.
     _critical_changes(case)
 
-    # Shares by characteristic and number of changes, the most frequent first.
+    # The most frequently changed characteristic is the first row.
     shares = rq32(case)
     ranks = shares[shares["j"] == ANY].sort_values("rank", kind="stable")
     table = shares.pivot(index="characteristic", columns="j", values="percent")
@@ -299,7 +297,6 @@ def draw_change_sizes(case: Case) -> Figure:
     changes_of_solutions = _critical_changes(case)
     title = f"{case.name}: changes in critical solutions"
 
-    # A panel for each characteristic.
     vehicle = case.characteristics.vehicle
     figure, axes = new_panels(
         title, len(vehicle), 4, (2.25, 1.85), min_width=9.0, title_height=1.0
@@ -310,7 +307,6 @@ def draw_change_sizes(case: Case) -> Figure:
         low = characteristic.lower - characteristic.original
         high = characteristic.upper - characteristic.original
 
-        # Increases and decreases over its domain.
         increases = changes[changes > 0]
         decreases = changes[changes < 0]
         axis.hist(
@@ -345,8 +341,8 @@ def draw_change_sizes(case: Case) -> Figure:
 
 
 def _critical_changes(case: Case) -> FloatArray:
-    """The changes of the critical solutions, shape (M, n); raises UnanswerableError if there are
-    none.
+    """The changes of the M critical solutions, shape (M, n). Raises UnanswerableError if there are
+    no critical solutions.
     """
     changes = changes_of(case)
     if not len(changes):
@@ -359,7 +355,7 @@ def _critical_changes(case: Case) -> FloatArray:
 
 
 COUNTS_FIGURE = "rq3.1-number-of-changes"
-"""The figure that has all cases side by side."""
+"""Name of the figure that shows all cases side by side."""
 FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
     "rq3.2-changed-characteristics": draw_changed_characteristics,
     "rq3.3-sizes-of-changes": draw_change_sizes,
@@ -381,7 +377,6 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     UnanswerableError
         If no figure can be drawn.
     """
-    # Figures of all cases, and of each.
     figures = {}
     errors = []
     drawings = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
@@ -395,7 +390,6 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
         except UnanswerableError as error:
             errors.append(error)
 
-    # What cannot be drawn is said.
     if not figures:
         raise errors[0]
     reasons = [f"no figure: {error.source}: {error.problem}" for error in errors]
