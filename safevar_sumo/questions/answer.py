@@ -107,8 +107,8 @@ def contents(
     next: Any = "",
     **tables: Collection[str | EllipsisType],
 ) -> Callable[[AnswerFunction], AnswerFunction]:
-    """Decorator that declares the `Contents` of a function's answers: the names of numbers, and
-    the names of columns by table. The command refuses other names before it computes anything.
+    """Decorator that declares the `Contents` of a function's answers: the names of numbers, and the
+    names of columns by table. The command refuses other names before it computes anything.
 
     `lead` is the table that one screen shows, `next` the question that a user should ask next.
     `OF_ALL` are always among the numbers.

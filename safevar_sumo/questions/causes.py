@@ -31,8 +31,7 @@ OTHER_SETS = "check other parameter sets"
 """Phases of progress."""
 MAX_SUBSETS = 20_000
 """Maximum number of subsets that are simulated in one call, which bounds the memory. The same
-number
-is the default limit on all subsets.
+number is the default limit on all subsets.
 """
 
 
@@ -66,8 +65,7 @@ def find_minimal_causes(
     subset of its changes is unsafe.
 
     Up to a size (`largest_complete` for the number `limit` of simulated settings), all minimal
-    causes
-    are found. Larger subsets are simulated only for settings without a cause so far.
+    causes are found. Larger subsets are simulated only for settings without a cause so far.
 
     The empty subset counts, too: if the original vehicle is unsafe, no change is needed.
     """
@@ -170,9 +168,7 @@ def are_causes(
 
 
 def _count_subsets(numbers: Sequence[int], largest: int) -> int:
-    """The number of subsets with at most `largest` changes, summed over the `numbers` of
-    changes.
-    """
+    """The number of subsets with at most `largest` changes, over all `numbers` of changes."""
     return sum(comb(number, size) for number in numbers for size in range(largest + 1))
 
 

@@ -46,8 +46,7 @@ vehicle with the rounded values is unsafe.
 OF_ENCOUNTER = ("test", "weather")
 """Keys of a point's parameters that are no parameters of the scenario."""
 LEAST_IMPACT = 1.0
-"""Slowest impact that is printed [km/h]. An impact just beyond a limit is slower, and says
-nothing.
+"""Slowest impact that is printed [km/h]. An impact just beyond a limit is slower, and says nothing.
 """
 STAGE = "find what fails first"
 
@@ -120,8 +119,7 @@ def describe(
 
     The values of the vehicle are rounded away from the original values, and simulated again. If the
     rounded vehicle is safe, it is rounded to further digits. A setting that is safe with all
-    numbers
-    of digits is left out.
+    numbers of digits is left out.
 
     Parameters
     ----------
@@ -156,8 +154,7 @@ def values_as_printed(
     are as in the original vehicle. A vehicle that no rounding leaves unsafe keeps its values.
 
     `single_names` are the only characteristics that are rounded, one for each vehicle; () if all
-    are
-    rounded.
+    are rounded.
     """
     members = model.characteristics
     settings = {
@@ -282,8 +279,7 @@ def _command(
     model: Model, setting: FloatArray, point: Point, values: Mapping[str, float]
 ) -> str:
     """The command that simulates a setting, shape (n,). It sets the parameters of the point that
-    the
-    command `simulate` can set. `values` are the searched parameters of the encounter.
+    the command `simulate` can set. `values` are the searched parameters of the encounter.
     """
     system = model.evaluator.system
     members = model.evaluator.characteristics

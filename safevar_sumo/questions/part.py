@@ -133,8 +133,7 @@ def study_up_to(study: Study, end: UpperEnd) -> Study:
 
     If the original value of the axis is above `end`, `end` replaces it. A test whose axis begins
     above `end` is left out. A test with listed values on both sides of `end` is also driven at
-    `end`
-    itself, if its scenario can move this axis.
+    `end` itself, if its scenario can move this axis.
 
     Raises
     ------
@@ -307,8 +306,7 @@ def scope_of(study: Study, *, between: bool = True) -> str:
     to 40 km/h; weather wet (71 % of the grip of a dry road, 1 mm of water), by day`.
 
     `between` says whether encounters between the values of a matrix were simulated, too. If not,
-    the
-    phrase lists the values.
+    the phrase lists the values.
     """
     # Tests with the same scenario and parameters share a phrase.
     points = assemble(study).points

@@ -273,8 +273,7 @@ def _settings_frame(
     common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]
 ) -> pd.DataFrame:
     """The frame of the settings, with a row for each pair of vehicles. It has `SETTING_COLUMNS`,
-    the
-    values in A, and the values in B of all characteristics whose original values differ.
+    the values in A, and the values in B of all characteristics whose original values differ.
     """
     names = common.evaluators[0].characteristics.names
     frame, settings, runs = pairs

@@ -54,8 +54,7 @@ MAX_LIMITS_NAMED = 3
 """Maximum number of limits that a sentence names."""
 COMFORT, SAFETY, COLLISION = range(3)
 """Weights of differences, the largest for the most important kind: needless braking (0), safety
-(1),
-and a new collision of the original vehicle (2).
+(1), and a new collision of the original vehicle (2).
 """
 
 

@@ -1,7 +1,6 @@
 """The question `permit`: may this car drive? The answer states, for each of several measured cars,
 the greatest speed up to which the car is safe in every encounter of the study and in every
-parameter
-set. An encounter counts even if the original vehicle is not safe in it.
+parameter set. An encounter counts even if the original vehicle is not safe in it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
 """The answer of `permit`, which says up to which speed each car may drive: the verdict, the
-numbers,
-the tables, and the list (CSV) that fleet software reads.
+numbers, the tables, and the list (CSV) that fleet software reads.
 """
 
 from __future__ import annotations
@@ -223,8 +222,7 @@ class PermitAnswer:
 
     def _reason(self, permit: Permit, event: str, verdict: str) -> Sentence:
         """Why a car may drive no faster, in a sentence for a foreman. `event` describes the
-        failure;
-        "" without a failure.
+        failure; "" without a failure.
         """
         span = self.span
         slots = {

@@ -34,8 +34,7 @@ parameters. Each combination takes random ends of further parameters.
 SPEED_UNITS = ("km/h", "m/s", "")
 """Units of parameters that may be a speed."""
 GRID_PHASES = 2
-"""Number of phases (moments between two decisions of the driving system) at each of these
-points.
+"""Number of phases (moments between two decisions of the driving system) at each of these points.
 """
 MOST_VEHICLES = 16
 """Number of vehicles that stand for a box of cars at each of these points."""

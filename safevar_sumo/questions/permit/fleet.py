@@ -149,8 +149,7 @@ def read_fleet(
     if not cells.rows:
         raise InputError(cells.place, "no car", "at least one car")
     # A file that `--out` wrote has commas between its columns. The columns of the user's list,
-    # which
-    # the file repeats, may still have decimal commas: hence the separator is ",;".
+    # which the file repeats, may still have decimal commas: hence the separator is ",;".
     written = {*answer_columns} - {CAR}
     is_answer = bool(written) and written <= {text.strip() for text in cells.header}
     if is_answer:

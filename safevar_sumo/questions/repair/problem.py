@@ -1,6 +1,5 @@
 """The problem that a repair solves: which parameters of the ADS (the driving system) may change,
-and
-which worn vehicles (the promise) must then be safe.
+and which worn vehicles (the promise) must then be safe.
 """
 
 from __future__ import annotations
@@ -43,13 +42,11 @@ from safevar_sumo.vehicles import FeasibleRegion
 
 DIGITS = 4
 """Significant digits of a parameter's changed value. A parameter whose range is small, compared
-with
-its values, has more digits. Values are rounded before they are tried, so that the printed value is
-the tried value.
+with its values, has more digits. Values are rounded before they are tried, so that the printed
+value is the tried value.
 """
 ARRAY_CHECKS = 8
-"""Number of parameter sets with which a user's ADS is tried as one object that drives all
-vehicles.
+"""Number of parameter sets with which a user's ADS is tried as one object that drives all vehicles.
 """
 BRAKING_STAGE = "full braking"
 ALL = "all"
@@ -255,8 +252,8 @@ class RepairProblem:
     budget
         Number of cases that search for a counterexample to a change.
     drivers
-        Evaluators with the driver that brakes fully at once, by the number of the world; None for
-        a world without this driver. Filled when a world is needed.
+        Evaluators with the driver that brakes fully at once, by the number of the world; None for a
+        world without this driver. Filled when a world is needed.
     """
 
     oracle: Oracle
@@ -340,9 +337,7 @@ class RepairProblem:
     def evaluate(
         self, model: Model, shares: FloatArray, settings: FloatArray, stage: str
     ) -> Evaluations:
-        """The M * L evaluations of M changes, each with L settings of a model; settings vary
-        first.
-        """
+        """The M * L evaluations of M changes, each with the L settings of a model in order."""
         values = np.repeat(self.values(shares), len(settings), axis=0)
         rows = np.hstack([np.tile(settings, (len(shares), 1)), values])
         selection = self._selection(self.arrays)

@@ -7,10 +7,10 @@ repeated value is no sample: p-values become too small. Over runs, each run cont
 Holm's method then corrects the p-values for the number of tests, separately for RQ1 and RQ2.
 
 In the frames, `method` holds the name of the test. `enough_runs` says whether a test of so many
-runs
-can be significant. `significant` says whether the test is significant, and is undefined if nothing
-was tested. Undefined values are NaN. Functions of a case raise `UnanswerableError` if no run is
-finished, if a compared algorithm is missing, or, over runs, if the solutions belong to no run.
+runs can be significant. `significant` says whether the test is significant, and is undefined if
+nothing was tested. Undefined values are NaN. Functions of a case raise `UnanswerableError` if no
+run is finished, if a compared algorithm is missing, or, over runs, if the solutions belong to no
+run.
 """
 
 from __future__ import annotations
@@ -146,9 +146,8 @@ def rq2_runs(
 
 def rq2_common(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """The tests of `rq2_runs`, but with one rule for the solutions of a run, whatever the
-    algorithm:
-    all evaluations that no other evaluation of the run dominates. A further test compares the best
-    safety degree of a run.
+    algorithm: all evaluations that no other evaluation of the run dominates. A further test
+    compares the best safety degree of a run.
 
     Raises
     ------

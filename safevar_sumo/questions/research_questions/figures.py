@@ -147,13 +147,11 @@ def draw_pareto_fronts(case: Case) -> Figure:
 
 def draw_convergence(case: Case) -> Figure:
     """The convergence of each algorithm: the hypervolume of all settings that a run has simulated
-    so
-    far, over their number, as median and quartiles over the runs.
+    so far, over their number, as median and quartiles over the runs.
 
     A line ends with the longest run of its algorithm. The mark there is the median hypervolume of
     the solutions that the runs return. The legend says how many settings a run simulates on
-    average:
-    fewer than the budget if the run repeats settings or ends early.
+    average: fewer than the budget if the run repeats settings or ends early.
     """
     import seaborn as sns
 

@@ -66,8 +66,7 @@ LIMIT_DIGITS = 3
 """A limit is rounded so that the width of the domain would have this number of digits."""
 UNLIMITED = np.array([[-np.inf], [np.inf]])
 """The column of a characteristic without limits in a box. A box, shape (2, n), has the lower ends
-in
-row 0 and the upper ends in row 1.
+in row 0 and the upper ends in row 1.
 """
 (COLUMNS,) = shipped_columns("rules").values()
 

@@ -73,8 +73,7 @@ def answer_limits(
     ----------
     nearest
         The safe values nearest to the specified limits, shape (2, n), NaN without such a value;
-        None
-        if they were not searched.
+        None if they were not searched.
     ranges
         The searches in the ranges of the study; None if there were no such searches.
     """
