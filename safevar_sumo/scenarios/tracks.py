@@ -1,8 +1,9 @@
-"""A scenario is who moves how: tracks of bodies, in coordinates of the vehicle's lane.
+"""Scenarios that consist of tracks: each track says how a body moves in coordinates of the
+vehicle's lane.
 
-`x` leads along the lane and `y` to its left; the front of the vehicle under test is at (0, 0) at
-the start. What is seen, measured and hit follows from the tracks (`sumo/traffic.py`), so no
-scenario needs to know a road.
+`x` is the coordinate along the lane, and `y` the coordinate to its left. The front of the vehicle
+under test is at (0, 0) at the start. `sumo/traffic.py` computes from the tracks what the vehicle
+sees and hits. Therefore no scenario needs to know a road.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ KMH = 1 / KMH_PER_MS
 VUT_LENGTH, VUT_WIDTH = 4.9016, 2.1284
 """Bounding box of CARLA's vehicle.lincoln.mkz2017 [m]."""
 Speed = Annotated[float, Meta(gt=0, le=250)]
-"""Speed of a vehicle under test [km/h]."""
+"""Speed of the vehicle under test [km/h]."""
 
 
 class BodySize(NamedTuple):
-    """Size of a body [m]: length in the direction in which it faces, width across."""
+    """The size of a body [m]: length in the direction in which the body faces, and width across."""
 
     length: float
     width: float
@@ -52,35 +53,35 @@ BODIES = {
 }
 """Bounding boxes of Euro NCAP's targets, including riders, by kind [m]."""
 MAX_LENGTH = 100.0
-"""Largest size of a vehicle [m]."""
+"""Largest length or width of a vehicle [m]."""
 PERSONS = ("adult", "child")
 """Kinds of bodies that are persons in SUMO; all others are vehicles."""
 DEPARTURE = "vehicle[@id='vut']"
-"""Where a network's traffic says how the vehicle under test departs."""
+"""The XPath of the element in a network's traffic that says how the vehicle under test departs."""
 SCREEN = "screen"
-"""Kind of a body that only hides others: it is neither hit nor in SUMO."""
+"""The kind of a body that only hides other bodies. A screen cannot be hit, and is not in SUMO."""
 
 
 class Track(NamedTuple):
-    """How a body moves; every quantity is a number or an array that broadcasts to (T, N): what is
-    the same in all N encounters has the shape (T, 1).
+    """The movement of a body. A quantity is a number, or an array that broadcasts to (T, N): T
+    samples of N encounters. An array of shape (T, 1) holds for all N encounters.
 
     Attributes
     ----------
     name
-        The body's name, of which a scenario has one each.
+        The body's name, which no other body of the scenario has.
     kind
         A kind of `BODIES`, `screen`, or any other word, such as `van`.
     length, width
-        Size in the direction in which the body faces, and across [m]. A body without size is not
-        there: it is neither seen nor hit, and does not count.
+        Size in the direction in which the body faces, and across [m]. A body without size does not
+        exist: it is neither seen nor hit, and does not count.
     x, y
         The body's middle [m].
     along, left
-        The direction in which it faces, a unit vector. (No sines in tracks: their last bits differ
-        between machines.)
+        The direction in which the body faces, a unit vector. (Tracks contain no sines, because the
+        last bits of a sine differ between machines.)
     speed
-        Its speed in this direction [m/s].
+        The body's speed in this direction [m/s].
     """
 
     name: str
@@ -104,8 +105,11 @@ class Track(NamedTuple):
         vy: Quantity = 0.0,
         size: tuple[float, float] | None = None,
     ) -> Track:
-        """A body with these velocities along the lane and to its left [m/s] that faces where it
-        moves, and along the lane while it stands; without a `size` it has that of its kind.
+        """Make the track of a body from its velocities along the lane (`vx`) and to the left (`vy`)
+        [m/s].
+
+        The body faces where it moves, and along the lane while it stands. Without a `size`, the
+        body has the size of its kind.
         """
         if size is None and kind not in BODIES:
             raise InputError(
@@ -114,7 +118,7 @@ class Track(NamedTuple):
                 f"a size, or {one_of(BODIES)}",
             )
 
-        # A standing body faces along the lane.
+        # A standing body has no direction of movement: it faces along the lane.
         length, width = size or BODIES[kind]
         speed = np.sqrt(np.square(vx) + np.square(vy))
         moves = speed > 0
@@ -125,8 +129,8 @@ class Track(NamedTuple):
 
 
 def travelled(speeds: Quantity, times: FloatArray) -> FloatArray:
-    """Distances [m] covered since the first of T `times`, shape (T, 1) [s], at speeds that are
-    linear in between.
+    """The distances [m] covered since the first of T `times`, shape (T, 1) [s]. Between two times,
+    the speed changes linearly.
     """
     at_times = speeds + np.zeros_like(times)
     covered = (at_times[1:] + at_times[:-1]) / 2 * (times[1:] - times[:-1])
@@ -136,8 +140,9 @@ def travelled(speeds: Quantity, times: FloatArray) -> FloatArray:
 
 
 def first_in_strip(body: Track, half_width: float) -> Quantity:
-    """Position along the lane [m] of the first point of a body in the strip of this half width
-    around the lane's middle; of a body beside the strip that of its first corner.
+    """The position along the lane [m] of a body's first point in the strip around the lane's
+    middle. `half_width` is half the strip's width [m]. If the body is beside the strip, the
+    position of its first corner.
     """
     corners = corners_of(body)
     first_x = np.full(np.broadcast(*chain(*corners)).shape, np.inf)
@@ -154,7 +159,7 @@ def first_in_strip(body: Track, half_width: float) -> Quantity:
 
 
 def corners_of(body: Track) -> list[tuple[Quantity, Quantity]]:
-    """The four corners of a body, once around it [m]."""
+    """The four corners of a body [m], in order around the body."""
     half_length = body.length / 2
     half_width = body.width / 2
     return [
@@ -169,8 +174,8 @@ def corners_of(body: Track) -> list[tuple[Quantity, Quantity]]:
 def check_tracks(
     code: UserCode, method: str, tracks: Any, times: FloatArray
 ) -> Sequence[Track]:
-    """Refuse what a user's scenario returns if it is no list of tracks, or if a track has no
-    number.
+    """Refuse the result of a user's `tracks` if it is no list of tracks, or if a track's value is
+    no number.
     """
     if (
         not isinstance(tracks, list | tuple)
@@ -197,29 +202,34 @@ LEGAL_FIELDS = {
     "vut_width": Legal(0.0, MAX_LENGTH, is_open=True),
     "sensor_setback": Legal(0.0, MAX_LENGTH),
 }
-"""Legal numbers of a user's scenario of tracks, besides those of every scenario."""
+"""Legal numbers of fields of a user's scenario of tracks, in addition to the fields of every
+scenario.
+"""
 
 
 class TrackScenario(Scenario):
-    """A scenario whose actors move by tracks, whatever the vehicle under test does. Its fields are
-    its parameters, each a number or, where encounters are searched, an array of N.
+    """A scenario whose actors move on tracks, whatever the vehicle under test does. The fields of
+    the class are the scenario's parameters. A field is a number, or an array of N values if
+    encounters are searched.
 
     Attributes
     ----------
     duration
         Length of a run [s].
-    speed, start_speed
-        Speed of the vehicle at the start [km/h], and the same in m/s; a scenario may have either.
+    speed
+        Speed of the vehicle at the start [km/h].
+    start_speed
+        The same speed in m/s. A class states one of both.
     test_speed
-        See `Scenario`: with it a robot holds the speed, and only contacts of the vehicle's front
-        are collisions.
+        See `Scenario`. If it is not None, a robot holds the speed, and only contacts at the
+        vehicle's front are collisions.
     vut_length, vut_width
-        The vehicle's body [m].
+        Size of the vehicle's body [m].
     sensor_setback
         Distance of the sensors behind the middle of the front bumper [m].
     network
-        Where SUMO repeats runs and pictures show them: a straight lane on which the vehicle
-        departs.
+        The network in which SUMO repeats runs, and which pictures show: a straight lane on which
+        the vehicle departs.
     """
 
     RETURNS: ClassVar[Contract] = {"tracks": Returned(then=check_tracks)}
@@ -245,19 +255,23 @@ class TrackScenario(Scenario):
 
     @abstractmethod
     def tracks(self, times: FloatArray) -> Sequence[Track]:
-        """The bodies at T `times`, shape (T, 1) [s], which begin at 0."""
+        """The tracks of all bodies at T `times`, shape (T, 1) [s]. The first time is 0."""
 
     @property
     def has_phase(self) -> bool:
-        """All bodies can begin later, unless the scenario has a parameter of that name itself."""
+        """Whether the encounter can begin later by a part of a step. A scenario with a parameter of
+        this name decides the phase itself.
+        """
         return PHASE not in free_parameters(type(self))
 
     def tracks_begun(self, times: FloatArray, later: Quantity) -> Sequence[Track]:
-        """The bodies at T `times`, shape (T, 1), of an encounter that begins `later` [s], a number
-        or of shape (N,). Until then the vehicle and all bodies go on as they do at its beginning.
+        """The tracks at T `times`, shape (T, 1), of an encounter that begins `later` [s], a number
+        or shape (N,). Before its beginning, all bodies keep the velocities of the beginning, and
+        the vehicle drives at its start speed.
 
-        The vehicle is at (0, 0) at the first time, as ever, so that all bodies are farther ahead by
-        what it covers until the encounter begins.
+        The vehicle is at (0, 0) at the first time, also if the encounter begins later. Therefore
+        all bodies are farther ahead, by the distance that the vehicle covers until the encounter
+        begins.
 
         Raises
         ------
@@ -269,7 +283,8 @@ class TrackScenario(Scenario):
         since = times - later
         tracks = self.tracks(np.maximum(since, 0.0))
 
-        # A user's class may read the first column of the times alone.
+        # A user's class that reads only the first column of `times` would give all encounters one
+        # phase.
         if self.is_user_code and since.shape[1] > 1:
             alone = self.tracks(np.maximum(since[:, -1:], 0.0))
             ends = (np.atleast_2d(track.x)[:, -1] for track in (*tracks, *alone))
@@ -281,7 +296,7 @@ class TrackScenario(Scenario):
                     "tracks that take times of shape (T, N)",
                 )
 
-        # Before its encounter each body keeps its first velocity.
+        # Before the encounter begins, each body moves at its first velocity.
         early = np.minimum(since, 0.0)
         way = self.start_speed * later
         late_tracks = []
@@ -292,7 +307,7 @@ class TrackScenario(Scenario):
         return late_tracks
 
     def actors(self, roads: Roads) -> XmlChanges:
-        """The vehicle under test, at its speed."""
+        """Set the size and the departure speed of the vehicle under test."""
         return {
             "vType[@id='vut']": {
                 "length": as_text(self.vut_length),
@@ -303,8 +318,8 @@ class TrackScenario(Scenario):
 
 
 class LaneTest(TrackScenario, Table, frozen=True, kw_only=True):
-    """Base of tests on a straight lane, at whose speed a robot holds the vehicle until its driving
-    system acts.
+    """Base of tests on a straight lane. A robot holds the vehicle's speed until the driving system
+    acts.
 
     Parameters
     ----------
