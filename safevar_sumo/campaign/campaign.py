@@ -1,6 +1,4 @@
-"""A campaign: runs of a study, dealt out in shares to the workers of a pool; and how fast they will
-be.
-"""
+"""A campaign carries out the runs of a study: shares of the runs go to the workers of a pool."""
 
 from __future__ import annotations
 
@@ -48,21 +46,25 @@ from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import Parts, Progress
 
 BATCHES_PER_SHARE = 2
-"""Number of largest batches that the populations of all runs of a share fill, at most."""
+"""Largest number of batches that the populations of all runs of a share fill."""
 MAX_RUNS = 256
-"""Maximum number of runs in a share: each keeps a file open."""
+"""Largest number of runs in a share. Each run keeps a file open."""
 UNSAFE_REPEATED = 150
-"""Largest number of unsafe solutions that SUMO repeats after a search in recorded scenes."""
+"""Largest number of unsafe solutions that SUMO simulates again after a search in recorded
+scenes.
+"""
 SUMO_COST = 60
-"""How many simulations in recorded scenes take as long as one in SUMO, roughly."""
+"""Number of simulations in recorded scenes that take as long as a simulation in SUMO, roughly."""
 SETTINGS_PER_JOB = 150
-"""Largest number of settings that a worker repeats in SUMO at once."""
+"""Largest number of settings that a worker simulates again in SUMO in one job."""
 RECORDED, SUMO = ENGINES = "recorded", "sumo"
-"""The engines that a study may name."""
+"""The engines that a command may name."""
 
 
 class Campaign(NamedTuple):
-    """Results of the runs of a study; `no_verdict` says why they tell nothing about the ADS."""
+    """Results of runs of a study. `no_verdict` is the reason why the results say nothing about the
+    ADS; "" if they do.
+    """
 
     original: Evaluations
     runs: list[RunResult]
@@ -83,26 +85,26 @@ def run_campaign(
     retry_failed: bool = False,
     batch_size: int | None = None,
 ) -> Campaign:
-    """Carry out runs of a study, or resume unfinished ones; write the solutions if these are all
-    runs of the study.
+    """Carry out runs of a study, or resume unfinished runs. If the runs are all runs of the study,
+    write its solutions.
 
     Parameters
     ----------
     directory
         The directory of the results.
     engine
-        What moves the vehicles; when the results are written, some of those from recorded scenes
-        are verified in SUMO.
+        The engine that moves the vehicles. A sample of the results from recorded scenes is
+        simulated again in SUMO at the end.
     retry_failed
         Whether to simulate settings again that failed before.
     batch_size
-        Maximum number of settings in a batch, which may hold settings of several runs; by default
-        the fastest. It changes no result.
+        Largest number of settings in a batch, which may hold settings of several runs; by default
+        the fastest size. The size changes no result.
 
     Raises
     ------
     SafevarError
-        If a journal cannot be written, another process works on a run, or the study is at fault.
+        If a journal cannot be written, another process works on a run, or the study has a mistake.
     """
     pool.spare = None
     opened = check_code(study, pool)
@@ -150,7 +152,7 @@ def run_campaign(
         chain.from_iterable(carry_out(carry_share, shares, pool, show_journals))
     )
 
-    # A part of the runs writes no solutions, which would look like those of the whole study.
+    # Solutions of a part of the runs would look like the solutions of the whole study.
     runs.sort(key=lambda run: run.key)
     for remark in _remarks_on_discarded(study, runs):
         warn(remark)
@@ -164,7 +166,7 @@ def run_campaign(
 
 
 def _remarks_on_discarded(study: Study, runs: Sequence[RunResult]) -> Iterator[str]:
-    """What algorithms returned that is no solution."""
+    """Remarks on returned settings that are no solutions."""
     for algorithm in study.search.labels:
         if count := sum(
             run.discarded for run in runs if run.key.algorithm == algorithm
@@ -179,8 +181,9 @@ def _remarks_on_discarded(study: Study, runs: Sequence[RunResult]) -> Iterator[s
 def _remarks(
     study: Study, undeclared: Sequence[str], no_verdict: str, original: Evaluations
 ) -> Iterator[str]:
-    """What makes results uncertain or useless: files that user code reads and the study does not
-    name, a driving system that fails on an empty road, an original vehicle that collides.
+    """Remarks on what makes results uncertain or useless: files that user code reads and the study
+    does not name, a driving system that fails on an empty road, and an original vehicle that
+    collides.
     """
     if undeclared:
         files = ", ".join(undeclared)
@@ -193,7 +196,9 @@ def _remarks(
 
 
 def _about_algorithms(study: Study) -> JsonObject:
-    """What a manifest says of the study's algorithms: titles, and which stop by themselves."""
+    """The entries of a manifest on the study's algorithms: titles, and algorithms that stop by
+    themselves.
+    """
     titles = {}
     stopping = []
     for name in study.search.labels:
@@ -206,7 +211,9 @@ def _about_algorithms(study: Study) -> JsonObject:
 
 
 def evaluate_original(task: Task, pool: Pool) -> Evaluations:
-    """Evaluate the original vehicle; raises an error if a search cannot compare with it."""
+    """Evaluate the original vehicle. Raise an error if the original vehicle cannot be simulated, or
+    gives no valid test: a search then has nothing to compare with.
+    """
     settings = np.array([[row.original for row in task.study.domains.values()]])
     original: Evaluations = carry_out(evaluate_settings, [(task, settings)], pool)[0]
     if original.failed[0]:
@@ -227,22 +234,23 @@ def evaluate_original(task: Task, pool: Pool) -> Evaluations:
 def deal(
     keys: Sequence[RunKey], workers: int, batch_size: int, population: int
 ) -> list[Sequence[RunKey]]:
-    """Deal runs out in shares; their number is a multiple of the number of workers.
+    """Divide runs into shares. The number of shares is a multiple of the number of workers, unless
+    the runs are too few.
 
-    All runs of a share are under way at the same time: they fill large batches, which cost least
-    for each setting.
+    All runs of a share are carried out at the same time. Together they fill large batches, in which
+    a setting costs least.
     """
     runs_at_once = min(math.ceil(BATCHES_PER_SHARE * batch_size / population), MAX_RUNS)
     count = min(workers * math.ceil(len(keys) / (workers * runs_at_once)), len(keys))
-    # Like cards: each share gets runs of all algorithms.
+    # Every `count`-th run goes to the same share, so that each share has runs of all algorithms.
     return [keys[number::count] for number in range(count)]
 
 
 def choose_sample(
     study: Study, original: Evaluations, runs: Sequence[RunResult]
 ) -> Evaluations:
-    """What SUMO repeats of a search: its unsafe solutions, or as many of them as `UNSAFE_REPEATED`
-    allows, and others that the study's seed draws.
+    """Choose the evaluations of a search that SUMO simulates again: at most `UNSAFE_REPEATED`
+    unsafe solutions, then other evaluations that the study's seed draws.
     """
     solutions = Evaluations.concatenate([run.solutions for run in runs])
     criterion = Unsafe.default(original.first_metrics, solutions.outcome)
@@ -261,8 +269,8 @@ def choose_sample(
 def repeat_in_sumo(
     task: Task, sample: Evaluations, pool: Pool, progress: Progress
 ) -> set[str]:
-    """Repeat evaluations in SUMO; returns remarks on what could not be simulated. Raises the error
-    of `verify_in_sumo`.
+    """Simulate evaluations again in SUMO. Return remarks on settings that could not be simulated.
+    If results differ, the error of `verify_in_sumo` is raised.
     """
     phase = f"{task.study.name}: verifying in SUMO"
     batches = np.array_split(
@@ -283,8 +291,8 @@ def repeat_in_sumo(
 def journal_progress(
     study: Study, keys: Sequence[RunKey], directory: Path, progress: Progress
 ) -> Look:
-    """A function that shows the evaluations that runs have asked for, as their journals tell; of
-    those that have not finished, all others are to come.
+    """Make a function that shows how many evaluations the runs have asked for, as their journals
+    say. The total includes all evaluations that unfinished runs may still ask for.
     """
     readers = []
     for key in keys:
@@ -304,8 +312,8 @@ def journal_progress(
 
 
 def choose_engine(system: System, name: str) -> tuple[System, str, str]:
-    """The system with the engine that moves its vehicles, which engine this is, and why; raises
-    InputError for an unknown engine.
+    """Choose the engine that moves a system's vehicles. Return the system with this engine, the
+    engine's name, and the reason for the choice. Raise an InputError for an unknown engine.
     """
     if name not in ENGINES:
         raise InputError("engine", repr(name), one_of(ENGINES))
