@@ -1,4 +1,4 @@
-"""Strict reading of study files, with the studies that they extend; writing of study files."""
+"""Strict reading of study files and of the studies that they extend, and writing of study files."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from safevar_sumo.study.schema import (
 from safevar_sumo.study.validation import convert_table
 
 SCHEMA_LINE = f"#:schema {STUDY_SCHEMA}\n"
-"""First line of a written study file, by which editors find the schema on this machine."""
+"""The first line of a written study file. Editors find the schema on this machine by this line."""
 
 
 RECORDED = 'scenario.model = "recorded_tracks", with a table of tracks (docs/recorded_tracks.md)'
-"""What stands in place of a file that tells how road users move."""
+"""What replaces a scenario that an earlier release read from a file."""
 ENDED_KEYS = {
     "scenario.search": (
         '[scenario.over] in its place; and encounters = "ranges", or --ranges, to search it'
@@ -50,7 +50,7 @@ ENDED_KEYS = {
     "rating": "no such table: Euro NCAP's own calculator computes points",
     "correlations": "no such key: [[constraints]] leave out vehicles that do not occur",
 }
-"""Keys that studies had, and what stands in their place."""
+"""Keys of earlier releases, with the text that says what replaces each key."""
 _IN_RANGES = 'with --ranges or encounters = "ranges"'
 ENDED_STUDIES = {
     "wear_joint": f"wear, {_IN_RANGES}",
@@ -63,7 +63,7 @@ ENDED_STUDIES = {
     "euro_ncap_rating": "euro_ncap_pedestrian or euro_ncap_car_to_car, Euro NCAP's tests",
     "metadrive_expert": "a study with the class of docs/simulators.md",
 }
-"""Shipped studies of earlier releases, and what stands in their place."""
+"""Shipped studies of earlier releases, with the text that says what replaces each study."""
 
 
 def study_names() -> list[str]:
@@ -72,12 +72,12 @@ def study_names() -> list[str]:
 
 
 def study_path(study: str) -> Path:
-    """The file of a study given by name or path.
+    """The path of a study's file. `study` is the name of a shipped study, or a path.
 
     Raises
     ------
     InputError
-        If there is neither such a study nor such a file.
+        If no such study and no such file exists.
     """
     if study in study_names():
         return STUDIES / f"{study}.toml"
@@ -109,11 +109,12 @@ def study_path(study: str) -> Path:
 
 
 def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
-    """The tables of a study, with the studies that it extends, in the shape of the records;
-    `safevar_sumo.scenarios.declared.read_study` completes and checks them.
+    """Read the tables of a study and of the studies that it extends, in the shape of the records.
+    `safevar_sumo.scenarios.declared.read_study` then completes and checks the tables.
     """
     raw = _raw_study(study)
-    # Other encounters are another view of the study, and not another study.
+    # A study with other encounters is the same study. An override would drop keys that no other
+    # study inherits, such as [unmeasured].
     if "encounters" in changes:
         raw = raw._replace(
             tables={**raw.tables, "encounters": changes.pop("encounters")}
@@ -132,18 +133,20 @@ def read_tables(study: StudyLike, **changes: Any) -> StudyTables:
 
 
 def _refuse_ended(tables: Tables) -> None:
-    """Refuse keys of earlier releases, with what to write instead."""
+    """Refuse keys of earlier releases. The error says what replaces the key."""
     for key, legal in ENDED_KEYS.items():
-        # A key without a dot stands in the study itself, here the table "".
+        # A key without a dot is a key of the study itself, which is the table "" here.
         table, _, name = key.rpartition(".")
         if name in table_in({"": tables, **tables}, table):
             raise InputError("", f"{key} is a key of releases before 0.5", legal)
 
 
 def plain_values(value: Any) -> Any:
-    """Values of numpy and pandas, at any depth of tables and lists, as Python's own: a scalar or an
-    array of no dimension as a number, a Series by names as a table, another Series or array as a
-    list.
+    """Convert values of numpy and pandas into Python's own values, at any depth of tables and
+    lists.
+
+    A scalar or an array without dimension becomes a number, a Series with names as index a table,
+    and any other Series or array a list.
     """
     if isinstance(value, Mapping):
         return {key: plain_values(item) for key, item in value.items()}
@@ -165,8 +168,8 @@ def _raw_study(study: StudyLike) -> StudyTables:
 
 
 def checked_study(raw: StudyTables) -> Study:
-    """The study of complete tables; the error of a mistake does not name its source."""
-    # Tests that are empty on purpose drop the matrix of the study that it extends.
+    """Make a study of complete tables. Errors do not name the source: the caller adds it."""
+    # An empty list of tests removes the matrix that the study inherits.
     tables = dict(raw.tables)
     vehicle = table_in(tables, "vehicle")
     if table_in(tables, "matrix").get("tests") == []:
@@ -174,7 +177,7 @@ def checked_study(raw: StudyTables) -> Study:
     if "model" in vehicle and "characteristics" not in vehicle:
         raise _without_characteristics(vehicle["model"])
 
-    # With repeats the search maximises the share of unsafe runs.
+    # With repeats, the search maximises the share of unsafe runs by default.
     search = table_in(tables, "search")
     if search and table_in(tables, "scenario").get("repeats", 1) != 1:
         tables["search"] = {"objectives": ["unsafe_share", *OBJECTIVES[1:]], **search}
@@ -186,8 +189,8 @@ def checked_study(raw: StudyTables) -> Study:
 
 
 def _without_characteristics(model: object) -> InputError:
-    """The error for a vehicle without characteristics: another model does not inherit those of the
-    study's base.
+    """The error for a vehicle model without characteristics. A study with another model than its
+    base does not inherit the base's characteristics.
     """
     models = set()
     for name in study_names():
@@ -209,8 +212,8 @@ def _without_characteristics(model: object) -> InputError:
 def _with_parameters(
     tables: Parameters, name: str, record: type[SearchTable | RepairTable]
 ) -> Parameters:
-    """Move the tables within a table, such as [search.nsga2] and those of [repair], to its
-    `parameters`.
+    """Move nested tables, such as [search.nsga2] or the tables of [repair], into `parameters` of
+    their table. Tables that `record` has as fields stay.
     """
     table = tables.get(name)
     if not isinstance(table, dict) or not isinstance(table.get("parameters", {}), dict):
@@ -224,8 +227,8 @@ def _with_parameters(
 
 
 def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
-    """Read a TOML file and the study that it `extends`; keys of the file override that study, table
-    by table.
+    """Read a TOML file and the study that it `extends`. Keys of the file override keys of that
+    study, table by table.
     """
     try:
         tables = tomllib.loads(read_file(path).decode("utf-8-sig"))
@@ -249,8 +252,8 @@ def _read_file(path: Path, visited_paths: tuple[Path, ...]) -> StudyTables:
 def _with_base(
     raw: StudyTables, path: Path, visited_paths: tuple[Path, ...]
 ) -> StudyTables:
-    """The tables of `raw`, over those of the study that it extends, if any; with the folders of
-    both.
+    """Put the tables of `raw` over the tables of the study that `raw` extends. The result has the
+    folders and files of both studies. Without `extends`, return `raw`.
     """
     tables = dict(raw.tables)
     base = tables.pop("extends", None)
@@ -261,7 +264,8 @@ def _with_base(
             raw.source, f"extends = {base!r}", "the name or path of a study"
         )
 
-    # A study takes its file's name, and its base may stand beside it.
+    # A study without a name has the name of its file. A base with a relative path is searched
+    # beside this file first.
     if "name" not in tables and re.fullmatch(NAME_PATTERN, path.stem):
         tables["name"] = path.stem
     name_or_path = base
@@ -285,15 +289,15 @@ def _with_base(
         places=tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places))),
         files=(*raw.origin.files, *base_study.origin.files),
     )
-    # Shipped studies leave keys out on purpose.
+    # Shipped studies omit keys on purpose: remarks on them would only confuse the user.
     if path.parent == STUDIES:
         return merged_study._replace(origin=origin, remarks=())
     return merged_study._replace(origin=origin)
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
-    """Write a complete study file that begins with `SCHEMA_LINE` and a comment; the study takes the
-    file's name if that is a legal name of a study.
+    """Write a complete study file, which begins with `SCHEMA_LINE` and a comment. The study gets
+    the file's name, if this name is a legal name of a study.
 
     Raises
     ------
