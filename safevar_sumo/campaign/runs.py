@@ -1,5 +1,5 @@
-"""The runs of a study: their names, algorithms and random numbers; and a run under way, its search
-and its known evaluations.
+"""The runs of a study: their names, algorithms and random numbers. A `Run` is a search under way,
+with the evaluations that it has got so far.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from safevar_sumo.study import PYMOO, SearchTable, Study, label_of
 from safevar_sumo.sumo.system import System
 
 REPEATED, MAX_REPEATED = 10, 300
-"""SUMO repeats at most one in so many simulations of a search, besides its unsafe solutions, and at
-most so many settings.
+"""After a search, SUMO simulates at most one in `REPEATED` of the simulations again, and at most
+`MAX_REPEATED` settings. (The unsafe solutions come in addition.)
 """
 
 
 class RunKey(NamedTuple):
-    """The name of a run: its algorithm, and its number from 0."""
+    """The name of a run: the label of its algorithm, and the number of the run, from 0."""
 
     algorithm: str
     run: int
@@ -45,9 +45,17 @@ class RunKey(NamedTuple):
 
 
 class RunResult(NamedTuple):
-    """A finished run: its solutions; what SUMO may repeat: one in `REPEATED` of the settings that
-    could be simulated, drawn at random, and at most `MAX_REPEATED`; and how many settings the
-    search returned that are not valid, 0 if an earlier command finished the run.
+    """A finished run.
+
+    Attributes
+    ----------
+    solutions
+        The valid settings that the search returned.
+    sample
+        Evaluations that SUMO may simulate again: one in `REPEATED` of the simulated settings, drawn
+        at random, and at most `MAX_REPEATED`.
+    discarded
+        Number of returned settings that are not valid; 0 if an earlier command finished the run.
     """
 
     key: RunKey
@@ -66,13 +74,12 @@ def all_runs(study: Study) -> list[RunKey]:
 
 
 def algorithm_of(label: str, study: Study) -> Algorithm:
-    """An algorithm by its label in results, with its parameters from the study.
+    """Create an algorithm, with its parameters from the study. `label` is its label in results.
 
     Raises
     ------
     InputError
-        If no algorithm has this label, or the algorithm does not meet its contract or does not take
-        its parameters.
+        If no algorithm has this label, violates the contract, or refuses its parameters.
     """
     with about(study.source):
         search = study.search
@@ -147,7 +154,7 @@ def check_algorithms(study: Study, system: System) -> None:
 
 
 def problem_of(study: Study, system: System, original: Evaluations) -> Problem:
-    """What the searches of a study solve."""
+    """The problem that the searches of a study have to solve."""
     return Problem(
         characteristics=system.characteristics,
         original=original,
@@ -159,7 +166,7 @@ def problem_of(study: Study, system: System, original: Evaluations) -> Problem:
 
 
 def random_generator_of(study: Study, key: RunKey) -> Generator:
-    """The random generator of a run, independent of those of other runs."""
+    """The random generator of a run. It is independent of the generators of other runs."""
     sequence = np.random.SeedSequence(
         study.search.seed, spawn_key=(zlib.crc32(key.algorithm.encode()), key.run)
     )
@@ -167,21 +174,21 @@ def random_generator_of(study: Study, key: RunKey) -> Generator:
 
 
 class Run:
-    """A search, and the table of its evaluations, which a journal continues.
+    """A search under way, with its evaluations so far. A journal keeps the evaluations on disk.
 
     Parameters
     ----------
     budget
         Number of evaluations that the search may request.
     scoring
-        Says which settings of the search's result are valid.
+        Decides which settings of the search's result are valid.
 
     Attributes
     ----------
     solutions
-        The valid part of the search's result, once it has ended.
+        The valid part of the search's result. The attribute exists after the search has ended.
     is_finished
-        Whether the journal has the result.
+        Whether the journal has the result of the search.
     """
 
     solutions: Evaluations
@@ -206,9 +213,11 @@ class Run:
         self._row_of = {setting.tobytes(): row for row, setting in enumerate(settings)}
         self._request = settings[:0]
         self._asked = 0
-        """Number of settings in all earlier requests."""
+        """Number of settings in all requests before this request."""
         self._missing = dict[bytes, int]()
-        """The first position in the run of each setting in this request that is not known."""
+        """For each setting of this request without a known evaluation: its first position in the
+        run.
+        """
         self.is_finished = self._has_ended = budget in journal.content.results
         if self.is_finished:
             self.solutions = journal.content.take_positions(
@@ -216,10 +225,10 @@ class Run:
             )
 
     def look_up(self) -> FloatArray:
-        """Answer the search while all that it asks is known; returns the distinct settings that are
-        missing, shape (k, n), none once the search has ended.
+        """Answer the requests of the search, as long as all evaluations are known. Return the
+        distinct settings that are missing, shape (k, n). k is 0 after the end of the search.
         """
-        # A generator starts with None.
+        # A generator can only be started with None.
         answer = None
         while not (self._missing or self._has_ended):
             if len(self._request):
@@ -243,7 +252,7 @@ class Run:
         )
 
     def receive(self, evaluations: Evaluations) -> None:
-        """Journal and remember evaluations of missing settings."""
+        """Write the evaluations of missing settings to the journal, and keep them."""
         positions = [
             self._missing.pop(setting.tobytes()) for setting in evaluations.settings
         ]
@@ -265,7 +274,7 @@ class Run:
         )
 
     def finish(self, rng: Generator) -> RunResult:
-        """Journal the result of a search that has ended, and close the journal."""
+        """Write the result of a search that has ended to the journal, and close the journal."""
         if not self.is_finished:
             positions = [
                 self._content.positions[self._row_of[setting.tobytes()]]
@@ -282,9 +291,9 @@ class Run:
 
     @property
     def failures(self) -> Evaluations:
-        """The evaluations that failed."""
+        """The evaluations of settings that could not be simulated."""
         return self._content.evaluations.take(self._content.evaluations.failed)
 
     def close(self) -> None:
-        """Leave the run to another process."""
+        """Close the journal, so that another process may continue the run."""
         self._journal.close()
