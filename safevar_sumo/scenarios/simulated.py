@@ -1,5 +1,5 @@
-"""The contract of a scenario in a simulator of the user's own, which moves the vehicle under test
-and drives it, too.
+"""The contract of a scenario in a simulator of the user's own. Such a simulator moves the vehicle
+under test, and has its driving system inside.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ OWN_SIMULATOR = Mover(
         "weather": "it moves and drives the vehicle in a weather of its own",
     },
 )
-"""A class with `simulate`, which drives one vehicle after another; see `Simulator`."""
+"""The mover of a class with a method `simulate`, which simulates one vehicle after another; see
+`Simulator`.
+"""
 SPEED = Legal(0.0, 1000.0)
 TIME, OUTCOME, IMPACT_SPEED, STRUCK_SPEED = (
     "time",
@@ -40,7 +42,7 @@ TIME, OUTCOME, IMPACT_SPEED, STRUCK_SPEED = (
     "struck_speed",
 )
 SAMPLED = {TIME: Legal(0.0), "speed": SPEED, "separation": Legal(0.0, infinite=True)}
-"""What a trace has at each sample."""
+"""Columns that a trace must have, with a value for each sample."""
 ALSO_SAMPLED = {
     "gap": Legal(infinite=True),
     "obstacle_speed": Legal(),
@@ -48,32 +50,38 @@ ALSO_SAMPLED = {
     "throttle": SHARE,
     "position": Legal(),
 }
-"""What a trace may have at each sample."""
+"""Columns that a trace may have, with a value for each sample."""
 OF_COLLISION = {IMPACT_SPEED: SPEED, STRUCK_SPEED: Legal()}
-"""What a collision has besides, and may have."""
+"""Numbers that only the result of a collision has. `struck_speed` may be left out."""
 OUTCOMES = [outcome.value for outcome in list(Outcome)[:6]]
-"""How a run may end: all but failures of the simulator and settings that are not simulated."""
+"""How a run may end, in the words of a result. Only this package gives the other outcomes."""
 ENDS_APART = (Outcome.PASSED, Outcome.STOPPED, Outcome.TIMEOUT)
-"""Outcomes of runs in which nothing was touched."""
+"""Outcomes of runs in which the vehicle touches nothing."""
 StatedRun = Mapping[str, Any]
-"""What a simulator states of a run, by the names of quantities and metrics."""
+"""The result of a run as a simulator returns it: values by the names of quantities and metrics."""
 MOST_DECELERATION = 20.0
-"""Largest change of the speed in a second that every trace may have [m/s^2]."""
+"""Largest deceleration that a trace may show in any case [m/s^2]. A trace with a harder braking may
+show this braking, too.
+"""
 SLACK, CREEPS = 0.1, 1.0
-"""Rounding of distances and speeds [m, m/s]; a speed up to which a vehicle has stopped [m/s]."""
+"""`SLACK` is the largest rounding error of distances [m] and of speeds [m/s]. A vehicle that is
+slower than `CREEPS` [m/s] has stopped.
+"""
 FACTOR = 1.5
-"""Least factor between speed and way that is no error of sampling."""
+"""A ratio between the way from speeds and the way from positions is a mistake in units from this
+number on. Smaller ratios may come from sampling.
+"""
 FIRST_SLACK = 0.05
-"""What the ways of the first step may differ besides [m]."""
+"""Difference that the ways of the first step may have in addition [m]."""
 STEP_TOLERANCE = 1e-6
 """Largest difference between two time steps of a trace [s]."""
 
 
 def check_result(code: UserCode, method: str, result: Any, setting: Any) -> StatedRun:
-    """Refuse a result that lacks a quantity, has an unknown one, or has illegal numbers.
+    """Refuse a result that lacks a quantity, has an unknown quantity, or has illegal numbers.
 
-    Arrays have float elements afterwards. A result without `time` is one of a rig that logs no
-    trace: names of its metrics are checked where the study's are known.
+    The returned result has arrays of floats. A result without `time` comes from a simulator that
+    keeps no trace. Its metrics are checked later, where the study's metrics are known.
     """
     if not isinstance(result, Mapping):
         raise code.wrong(
@@ -106,7 +114,9 @@ def check_result(code: UserCode, method: str, result: Any, setting: Any) -> Stat
 def _checked_trace(
     code: UserCode, method: str, result: StatedRun, has_collided: bool
 ) -> StatedRun:
-    """The columns of a trace, each of shape (T,), and what it says of a collision."""
+    """Check a result with a trace. Return its columns, each of shape (T,), and the numbers of a
+    collision.
+    """
     sampled = SAMPLED | ALSO_SAMPLED
     legal_keys = {**sampled, **OF_COLLISION, OUTCOME: None}
     for name in result:
@@ -157,13 +167,13 @@ def _contradiction(
     ends: NamedValues,
     step: float,
 ) -> str:
-    """What a trace says of the end of its run that its samples exclude, by more than may happen
-    within one step [s]; "" if nothing.
+    """The contradiction between the stated end of a run and its samples, in words; "" if they
+    agree. Within one step [s], samples may change as fast as anywhere in the trace.
     """
     speed, separation = columns["speed"], columns["separation"]
     braked = max(float(np.abs(np.diff(speed)).max()), MOST_DECELERATION * step)
     if outcome == Outcome.COLLISION:
-        # What it struck moves as fast as the trace says of anybody.
+        # The struck body may be as fast as any obstacle in the trace.
         obstacle_speeds = [ends[STRUCK_SPEED], *columns.get("obstacle_speed", ())]
         finite = separation[np.isfinite(separation)]
         reach = (speed.max() + braked + np.abs(obstacle_speeds).max()) * step
@@ -182,8 +192,9 @@ def _contradiction(
 
 
 def unit_contradiction(trace: Trace) -> str:
-    """Where the first run of a trace, or its first step, moves by another factor than its speed
-    says, as with km/h for m/s; "" if it does not, or has neither a position nor a gap.
+    """The contradiction between speeds and ways in the first run of a trace, in words. Such a
+    contradiction shows wrong units, such as km/h instead of m/s. "" if the ways agree, or if the
+    trace has neither a position nor a gap.
     """
     active = trace.active[:, 0]
     if active.sum() < 2:
@@ -193,7 +204,7 @@ def unit_contradiction(trace: Trace) -> str:
         trace.position[active, 0],
         trace.obstacle_speed[active, 0],
     )
-    # Nobody is seen at an infinite gap.
+    # The gap is infinite while no obstacle is in sight: such samples do not count.
     gap = np.where(np.isfinite(gap), gap, np.nan)
     driven = float(np.sum(speed[1:] + speed[:-1]) * trace.step / 2)
     ways = {"position": np.ptp(position)}
@@ -204,7 +215,8 @@ def unit_contradiction(trace: Trace) -> str:
         if is_apart and max(way, driven) > FACTOR * min(way, driven):
             return f"speed and {name} disagree: {driven:.3g} m and {way:.3g} m of way"
 
-    # Towards somebody who moves, the first step alone tells the factor.
+    # If the obstacle moves, the gap does not tell the driven way. The first step still shows a
+    # factor.
     closing = speed - obstacle_speed
     for name, rate, column in (("position", speed, position), ("gap", closing, -gap)):
         (way,), (low, *_, high) = np.diff(column[:2]), np.sort(rate[:2]) * trace.step
@@ -217,7 +229,7 @@ def unit_contradiction(trace: Trace) -> str:
 def _checked_metrics(
     code: UserCode, method: str, result: StatedRun, has_collided: bool
 ) -> StatedRun:
-    """The metrics of a run without a trace; NaN is one that is undefined."""
+    """Check a result without a trace, and return its metrics. An undefined metric is NaN."""
     values = {name: value for name, value in result.items() if name != OUTCOME}
     legal = dict.fromkeys(values, Legal(infinite=True, undefined=True))
     legal[SAFETY_DEGREE] = Legal(0.0)
@@ -236,18 +248,19 @@ def _numbers(
 
 
 class Simulator(Scenario):
-    """A scenario in a simulator of the user's own. A class needs no base class: it has `simulate`
-    and `UNITS`. Its fields are the parameters of `scenario.parameters`; those marked by `searched`
-    may be searched.
+    """Base of a scenario in a simulator of the user's own. A user's class need not derive from it:
+    it must have `simulate` and `UNITS`. The fields of the class are the parameters that a study
+    states under `scenario.parameters`. A study may search fields that are marked by `searched`.
 
     Attributes
     ----------
     UNITS
-        Units of the vehicle's characteristics by name.
+        The units of the vehicle's characteristics, by name.
     OPTIONAL
-        Characteristics that a study may leave out, and whose original value may be 0.
+        Characteristics that a study may leave out. The original value of such a characteristic may
+        be 0.
     worker
-        What `open_worker` returned in this process.
+        The object that `open_worker` returned in this process.
     """
 
     __slots__ = ()
@@ -263,30 +276,40 @@ class Simulator(Scenario):
     def simulate(self, setting: Mapping[str, float]) -> StatedRun:
         """Simulate one vehicle in this scenario.
 
-        `setting` has the value of each characteristic in its unit. The result depends on it and on
-        the fields alone, bit for bit, unless the study says how often each run is repeated.
+        `setting` has the value of each characteristic in its unit. The result depends only on the
+        setting and on the fields, bit for bit. (Only a study that states `repeats` allows other
+        results.)
 
-        It has, at T samples in equal steps, `time` [s], `speed` [m/s] and `separation`, the least
-        distance of the vehicle's body from any other [m]; and `outcome`, a value of `Outcome`. It
-        may have `gap` along the path to who is ahead [m], infinite without anybody, and his
-        `obstacle_speed` along the path [m/s]; the pedals `brake` and `throttle` [-]; `position`
-        along the path [m]. On a collision it has `impact_speed`, the vehicle's own speed [m/s], and
-        may have `struck_speed`, that of what it struck along its path [m/s].
+        The result has `outcome`, a value of `Outcome`, and the following values at T samples in
+        equal steps.
 
-        Without a trace it has `outcome`, `safety_degree` and any of the study's metrics by name.
+        - Always: `time` [s], `speed` [m/s], and `separation`, the least distance between the
+          vehicle's body and any other body [m].
+        - Optionally: `gap`, the distance along the path to the obstacle ahead [m], infinite without
+          an obstacle; `obstacle_speed` along the path [m/s]; the pedals `brake` and `throttle` [-];
+          `position` along the path [m].
+
+        After a collision the result also has `impact_speed`, the vehicle's own speed [m/s]. It may
+        have `struck_speed`, the speed of the struck body along the vehicle's path [m/s].
+
+        A result without a trace has `outcome`, `safety_degree`, and any metrics of the study by
+        name.
         """
 
     @classmethod
     def open_worker(cls, worker: int) -> Any:
-        """Open what is slow to start, once in a process: the objects of the class find it as
-        `self.worker`. Processes that simulate on one machine at the same time have different
-        numbers, from 0; one that replaces a dead one has its number.
+        """Open what takes long to start, such as the simulator, once in a process. Objects of the
+        class find the returned object as `self.worker`.
+
+        `worker` is the number of this process. Processes that simulate on one machine at the same
+        time have different numbers, from 0 on. A process that replaces a dead process gets its
+        number.
         """
         return None
 
     @classmethod
     def close_worker(cls, handle: Any) -> None:
-        """End what `open_worker` returned; nothing by default."""
+        """Close the object that `open_worker` returned; nothing by default."""
 
     def close(self) -> None:
         """End the simulator when its process ends; nothing by default."""
