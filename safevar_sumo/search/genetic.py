@@ -1,5 +1,5 @@
-"""NSGA-II (Deb et al. 2002) on DEAP, as published: its crossover, mutation and crowding
-distance.
+"""NSGA-II (Deb et al. 2002) with the operators of DEAP: the published crossover, mutation and
+crowding distance.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ Probability = Annotated[float, Meta(ge=0, le=1)]
 DistributionIndex = Annotated[float, Meta(ge=0, le=1000)]
 TournamentSize = Annotated[int, Meta(ge=2, le=1000)]
 MAX_MISSES = 50
-"""Maximum number of consecutive draws without a feasible child; if the next draw has none either,
-its children are repaired.
+"""Largest number of consecutive draws without a feasible child. After the next draw without a
+feasible child, its children are repaired.
 """
 
 _ONE_AT_A_TIME = Lock()
-"""Held while DEAP draws from the global `random`."""
+"""This lock is held while DEAP draws from Python's global `random`."""
 
 
 @cache
 def fitness_class(objective_count: int) -> type:
-    """The class of a fitness with this number of objectives, all minimised."""
+    """The class of DEAP's fitness for this number of objectives, all of which are minimised."""
 
     def initialise(self: base.Fitness, values: tuple[float, ...] = ()) -> None:
-        # DEAP's constructor also checks the type of the weights, which takes longer than all else.
+        # DEAP's constructor also checks the type of the weights, which takes longer than the rest.
         if values:
             self.values = values
 
@@ -51,20 +51,21 @@ def fitness_class(objective_count: int) -> type:
 
 
 class Individual(list[float]):
-    """Unfiltered values of a setting.
+    """The unfiltered values of a setting.
 
     Attributes
     ----------
-    fitness, evaluation
-        Once evaluated: the values of the objectives, and the batch of evaluations with the row in
-        it.
+    fitness
+        The values of the objectives, after the evaluation.
+    evaluation
+        The batch of evaluations with this setting, and its row in the batch, after the evaluation.
     violation
-        By how much the original vehicle is not safe in the same encounter; 0 in studies that search
-        only the vehicle.
+        The part of the required clearance that the original vehicle lacks in the same encounter; 0
+        if the original vehicle is safe, or if a study searches no encounters.
     standing
-        What survivors are compared by: less is better.
+        The place of the individual among survivors, as a tuple to compare: less is better.
     has_failed
-        Whether the evaluation is not valid.
+        Whether the setting could not be scored.
     """
 
     fitness: base.Fitness
@@ -75,7 +76,7 @@ class Individual(list[float]):
 
 
 Individuals = list[Individual]
-"""A population, or a part of it."""
+"""A population, or a part of a population."""
 
 
 class Nsga2(Algorithm, Table, frozen=True, kw_only=True):
@@ -131,7 +132,7 @@ class Nsga2(Algorithm, Table, frozen=True, kw_only=True):
 
 
 class Reproduction:
-    """Draws offspring of one run. DEAP draws from the global `random`: see `_randomness`."""
+    """Draws the offspring of a run. DEAP draws from the global `random`: see `_randomness`."""
 
     def __init__(
         self, operators: Nsga2, problem: Problem, rng: np.random.Generator
@@ -150,10 +151,10 @@ class Reproduction:
 
     @contextmanager
     def _randomness(self) -> Iterator[None]:
-        """Set the global `random`, from which DEAP draws, to this run's state; restore the caller's
-        state afterwards.
+        """Within the block, the global `random` has the state of this run. Afterwards it has the
+        caller's state again.
         """
-        # Another thread would draw from this run's state.
+        # Without the lock, another thread could draw from this run's state.
         with _ONE_AT_A_TIME:
             state_of_caller = random.getstate()
             random.setstate(self._random_state)
@@ -164,7 +165,9 @@ class Reproduction:
                 random.setstate(state_of_caller)
 
     def draw_offspring(self, population: Individuals, number: int) -> Individuals:
-        """Draw `number` new individuals, in pairs: two tournaments, crossover, mutation."""
+        """Draw `number` new individuals in pairs: two tournaments choose the parents, then
+        crossover and mutation change the pair.
+        """
         offspring = Individuals()
         operators = self._operators
         domains = (self._lower, self._upper)
@@ -189,13 +192,13 @@ class Reproduction:
         return offspring[:number]
 
     def _feasible_children(self, children: Individuals) -> Individuals:
-        """The children that satisfy the study's constraints; the caller draws again for those that
-        do not.
+        """The children that satisfy the study's constraints. The caller draws again for missing
+        children.
 
-        Under constrained domination (Deb 2000) a feasible individual dominates every infeasible
-        one. The first population is feasible, so an infeasible child would not survive, and is not
-        simulated. After `MAX_MISSES` draws in a row without a feasible child, the next children are
-        moved towards the original until they are feasible.
+        Under constrained domination (Deb 2000), a feasible individual dominates every infeasible
+        individual. All individuals are feasible, so an infeasible child would not survive: it is
+        not simulated. After more than `MAX_MISSES` draws in a row without a feasible child, the
+        children are moved towards the original until they are feasible.
         """
         if not self._problem.region:
             return children
@@ -214,7 +217,9 @@ class Reproduction:
 def request_evaluations(
     individuals: Sequence[Individual], problem: Problem
 ) -> Generator[FloatArray, Evaluations, int]:
-    """Request and store the evaluations of individuals; returns the number of evaluations."""
+    """Request the evaluations of individuals, and store them in the individuals. Return the number
+    of evaluations.
+    """
     evaluated = yield problem.characteristics.filter(np.array(individuals))
     scoring = problem.scoring
     fitness = fitness_class(len(problem.scoring.objectives))
@@ -235,10 +240,12 @@ def request_evaluations(
 
 
 def select_survivors(individuals: Individuals, number: int) -> Individuals:
-    """Select the best `number` by rank, then by crowding distance, as DEAP's slower `selNSGA2`
-    does; sets their `standing`: the rank, from 0, then the negative crowding distance. Infeasible
-    individuals follow all feasible ones, each in a rank of its own, by their violation (constrained
-    domination, Deb et al. 2002).
+    """Select the best `number` individuals, and set the `standing` of each individual.
+
+    The order is that of DEAP's `selNSGA2`, which is slower: first the rank, from 0, then the larger
+    crowding distance. Infeasible individuals follow all feasible individuals, in the order of their
+    violations (constrained domination, Deb et al. 2002). Each infeasible individual has a rank of
+    its own.
     """
     by_violation = attrgetter("violation")
     infeasible = sorted(filter(by_violation, individuals), key=by_violation)
@@ -261,10 +268,10 @@ def select_survivors(individuals: Individuals, number: int) -> Individuals:
 
 
 def sort_into_fronts(individuals: Sequence[Individual]) -> list[Individuals]:
-    """Group individuals by non-domination rank; each front keeps the given order."""
+    """Group individuals by their rank of non-domination. Each group keeps the given order."""
     if not individuals:
         return []
-    # DEAP's weighted values are the negative objectives.
+    # DEAP's weighted values are the negative objectives: larger values are better.
     ranks = moocore.pareto_rank(
         [individual.fitness.wvalues for individual in individuals], maximise=True
     ).tolist()
@@ -275,10 +282,10 @@ def sort_into_fronts(individuals: Sequence[Individual]) -> list[Individuals]:
 
 
 def run_tournament(population: Individuals, size: int = 2) -> Individual:
-    """The best, by standing, of `size` individuals drawn without replacement; chance decides
-    ties.
+    """The best of `size` individuals, drawn without replacement, by `standing`. Chance decides
+    between equal individuals.
     """
-    # A single individual draws nothing from `random`.
+    # With a single individual, nothing may be drawn: a draw would change all later random numbers.
     if len(population) == 1:
         return population[0]
     best, *rivals = random.sample(population, min(size, len(population)))
