@@ -1,5 +1,5 @@
-"""User code in this process: what it has changed here, and files that it opens, though its text may
-not tell.
+"""User code in this process: what user code has changed here, and which files it opens. (The text
+of user code does not always name the files.)
 """
 
 from __future__ import annotations
@@ -24,42 +24,45 @@ from safevar_sumo.plugins.files import CACHE, is_user_file, name_of_file
 from safevar_sumo.shipped import PACKAGE
 
 SYSTEM_FOLDERS = ("/usr/", "/etc/", "/lib", "/proc/", "/sys/", "/dev/", "/var/")
-"""Folders of the system: what libraries read there, such as time zones, is no file of the user."""
+"""Folders of the system. Libraries read files there, such as time zones, that are no files of the
+user.
+"""
 WRITING = os.O_WRONLY | os.O_RDWR
-"""Flags of a file that is not only read."""
+"""Flags of a file that is opened for writing."""
 
 
 @dataclass
 class _Process:
-    """The state of this process with regard to user code; all of its studies share it.
+    """The state of this process that user code may change. All studies in this process share the
+    state.
 
     Attributes
     ----------
     added_folders
-        Folders that are on Python's path for user code.
+        Folders that were added to Python's path for user code.
     modules
-        Names of all modules that user code has loaded, as far as is known.
+        Names of all modules that user code has loaded, as far as this process knows.
     named_files
-        Files of the modules that studies name: an error has a line of theirs also where they are
-        installed.
+        Files of the modules that studies name. Errors also quote lines of installed modules, if a
+        study names them.
     opened
-        Paths that user code has opened to read, while they are recorded.
+        Paths that user code has opened for reading; None while nobody records them.
     is_listening
-        Whether this process is told of files that are opened.
+        Whether this process has a hook that notices opened files.
     last_words
-        Where this process, if it is a worker, writes what it was doing when it crashed or exceeded
-        a time limit.
+        In a worker: the file in which this process notes its work. After a crash or an exceeded
+        time limit, the file says what the worker was doing.
     is_limited
-        Whether a time limit is counting.
+        Whether a time limit is running.
     attempts
-        The folder in which this process, if it is a worker, notes what it simulates, in case that
-        workers die of it.
+        In a worker: the folder in which this process notes what it simulates, in case workers die
+        of it.
     mark
-        Marks the child processes of simulators in this process.
+        The text by which child processes of simulators in this process can be found.
     worker
-        The number of this process among those that simulate on this machine.
+        The number of this process among the processes that simulate on this machine.
     descriptor
-        A file that is open as long as user code leaves descriptors alone.
+        An open file. If it is closed, user code has closed descriptors of this process.
     """
 
     added_folders: list[str] = field(default_factory=list)
@@ -77,17 +80,19 @@ class _Process:
 
 this_process = _Process()
 MARK = "SAFEVAR_WORKER"
-"""The environment variable that child processes of a simulator inherit."""
+"""The environment variable with the `mark`, which child processes of a simulator inherit."""
 MAX_DEATHS = 1
-"""Number of workers that may die of a job: another process may have killed one."""
+"""Number of workers that may die of a job before the job fails. Another process may have killed a
+worker by mistake.
+"""
 REPRODUCED_BY = "; to reproduce it: "
-"""What stands before a command that simulates a setting again."""
+"""The text before a command that simulates a setting again."""
 CLOSED = "user code has closed descriptors of its process"
-"""What a worker that can send no result any more writes last."""
+"""The last words of a worker that cannot send results any more."""
 
 
 def note_work(text: str) -> None:
-    """Note what this process, if it is a worker, works on, in case that it dies of it."""
+    """Note the work of this process, if it is a worker, in case that it dies of this work."""
     if (words := this_process.last_words) is not None:
         words.seek(0)
         words.truncate()
@@ -99,7 +104,9 @@ def note_work(text: str) -> None:
 def temporary_entries(
     mapping: MutableMapping[str, Any], entries: Mapping[str, Any]
 ) -> Iterator[None]:
-    """Within the block, a mapping, such as the environment, has these entries."""
+    """Within the block, a mapping, such as the environment, has these entries. Afterwards it has
+    the earlier entries again.
+    """
     earlier_values = {name: mapping.get(name) for name in entries}
     mapping.update(entries)
     try:
@@ -114,8 +121,10 @@ def temporary_entries(
 
 @contextmanager
 def find_damage() -> Iterator[list[str]]:
-    """Give a list that says after the block which parts of its process user code has closed.
-    Streams that it has replaced by None are restored; a worker without descriptors ends.
+    """Give a list. After the block, the list says which parts of its process user code has closed.
+
+    If user code replaces a stream by None, the stream is restored. A worker without descriptors
+    ends.
     """
     damage = list[str]()
     streams = sys.stdout, sys.stderr
@@ -133,7 +142,7 @@ def find_damage() -> Iterator[list[str]]:
 
 
 def _end_without_pipes() -> None:
-    """End this process, if it is a worker, and say why."""
+    """End this process, if it is a worker, after its last words."""
     if (words := this_process.last_words) is not None:
         with suppress(OSError), Path(words.name).open("r+", encoding="utf-8") as file:
             file.seek(0, os.SEEK_END)
@@ -142,9 +151,11 @@ def _end_without_pipes() -> None:
 
 
 def end_children(mark: str) -> None:
-    """Kill the processes that have inherited a mark, on systems that tell."""
+    """Kill the processes that inherited a mark, on systems that show the environment of
+    processes.
+    """
     entry = f"{MARK}={mark}".encode()
-    # What has just started tells nothing yet.
+    # A process that has just started does not show its environment yet: the second round finds it.
     for pause in (0.0, 0.02):
         time.sleep(pause)
         for path in Path("/proc").glob("[0-9]*/environ"):
@@ -155,12 +166,12 @@ def end_children(mark: str) -> None:
 
 
 class Interrupt(KeyboardInterrupt):
-    """A KeyboardInterrupt that a signal has raised, not user code."""
+    """A KeyboardInterrupt from a signal. (User code may raise a KeyboardInterrupt, too.)"""
 
 
 @contextmanager
 def mark_interrupts() -> Iterator[None]:
-    """Within the block, Ctrl-C and the like raise an `Interrupt`, where they would raise a
+    """Within the block, a signal such as Ctrl-C raises an `Interrupt` instead of a
     KeyboardInterrupt.
     """
 
@@ -170,7 +181,7 @@ def mark_interrupts() -> Iterator[None]:
         except KeyboardInterrupt:
             raise Interrupt from None
 
-    # Only the main thread is interrupted, and only it may set handlers.
+    # Python interrupts only the main thread, and only the main thread may set handlers.
     is_main = threading.current_thread() is threading.main_thread()
     handlers = dict[int, Any]()
     for number in INTERRUPTS if is_main else ():
@@ -181,21 +192,21 @@ def mark_interrupts() -> Iterator[None]:
         yield
     finally:
         for code, handler in handlers.items():
-            # User code may have set a handler of its own.
+            # If user code has set a handler of its own, this handler stays.
             if signal.getsignal(code) is interrupt:
                 signal.signal(code, handler)
 
 
 @contextmanager
 def defer_interrupts() -> Iterator[None]:
-    """Within the block, Ctrl-C and the like wait until its end: a compiler would print the
-    exception, and go on.
+    """Within the block, Ctrl-C and similar signals wait until the end of the block. Otherwise a
+    compiler would print the exception, and go on.
     """
     waiting = list[int]()
     is_main = threading.current_thread() is threading.main_thread()
     handlers = {}
     for interrupt in INTERRUPTS if is_main else ():
-        # A handler that was not set from Python could not be set again.
+        # A handler that Python has not set (None) could not be set again.
         if signal.getsignal(interrupt) is not None:
             handlers[interrupt] = signal.signal(
                 interrupt, lambda number, _: waiting.append(number)
@@ -211,13 +222,13 @@ def defer_interrupts() -> Iterator[None]:
 
 @contextmanager
 def record_opened(folders: Sequence[str]) -> Iterator[list[str]]:
-    """Record the names of the files that user code opens to read within the block: the record is
-    complete at its end.
+    """Give a list. After the block, the list has the names of the files that user code opened for
+    reading within the block.
 
-    `folders` are those of the study's file and of the files that it extends.
+    `folders` are the folders of the study's file and of the files that the study extends.
     """
     if not this_process.is_listening:
-        # A hook stays for the life of this process.
+        # A hook cannot be removed: a process needs only one.
         sys.addaudithook(_listen)
         this_process.is_listening = True
 
@@ -234,13 +245,13 @@ def record_opened(folders: Sequence[str]) -> Iterator[list[str]]:
     own_folders = tuple(
         f"{os.path.abspath(folder)}{os.sep}" for folder in (*folders, os.getcwd())
     )
-    # Libraries keep such files as lists of fonts there.
+    # In these folders, libraries keep files of their own, such as lists of fonts.
     caches = (platformdirs.user_cache_path(), platformdirs.user_config_path())
     not_the_users = (*SYSTEM_FOLDERS, *(f"{path}{os.sep}" for path in caches))
     for path in filter(is_user_file, opened):
         is_of_user = path.startswith(own_folders) or not path.startswith(not_the_users)
         is_cache = path.endswith(".pyc") or f"{os.sep}{CACHE}{os.sep}" in path
-        # What is newer than the block was written by the code.
+        # A file that is newer than the beginning of the block was written by the user code itself.
         is_older = os.path.isfile(path) and os.path.getmtime(path) < start
         if is_of_user and is_older and not is_cache:
             names.append(name_of_file(Path(path), folders))
@@ -248,8 +259,8 @@ def record_opened(folders: Sequence[str]) -> Iterator[list[str]]:
 
 
 def file_of_module(name: str) -> str:
-    """The file of a loaded module, or the folder of a package without __init__.py; "" for a module
-    of the interpreter.
+    """The file of a loaded module, or the folder of a package without __init__.py. "" for a module
+    that is part of the interpreter.
     """
     module = sys.modules.get(name)
     return str(
@@ -259,7 +270,7 @@ def file_of_module(name: str) -> str:
 
 
 def _listen(event: str, arguments: tuple[Any, ...]) -> None:
-    """Note a file or database that user code opens to read."""
+    """Note a file or database that user code opens for reading."""
     if event not in ("open", "sqlite3.connect") or this_process.opened is None:
         return
     path, mode, flags = arguments if event == "open" else (_database(*arguments), "", 0)
@@ -269,7 +280,7 @@ def _listen(event: str, arguments: tuple[Any, ...]) -> None:
 
 
 def _database(name: Any) -> Any:
-    """The file of a database, which sqlite3 calls by its path or as `file:PATH?OPTIONS`."""
+    """The file of a database. sqlite3 gets the path, or a text `file:PATH?OPTIONS`."""
     if isinstance(name, os.PathLike):
         name = os.fspath(name)
     if isinstance(name, str) and name.startswith("file:"):
@@ -278,7 +289,9 @@ def _database(name: Any) -> Any:
 
 
 def _is_from_user_code() -> bool:
-    """Whether user code calls, itself or through a library, and not this package."""
+    """Return whether user code makes the present call, directly or through a library, without code
+    of this package in between.
+    """
     frame = sys._getframe(2)
     while frame is not None:
         file = frame.f_code.co_filename
