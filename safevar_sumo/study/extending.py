@@ -1,4 +1,4 @@
-"""What a study inherits from the one that it extends."""
+"""Decides what a study inherits from the study that it extends."""
 
 from __future__ import annotations
 
@@ -18,12 +18,22 @@ from safevar_sumo.study.parameters import free_parameters
 from safevar_sumo.study.schema import Origin, Study, Tables
 
 WEATHER = tuple(free_parameters(Weather))
-"""Parameters of the weather, which a study may search as well."""
+"""Parameters of the weather that a study may search."""
 
 
 class StudyTables(NamedTuple):
-    """The tables of a study before they are checked, with its source in errors, its origin, and
-    remarks for the user on what they do not inherit.
+    """The tables of a study before they are checked.
+
+    Attributes
+    ----------
+    source
+        The name of the study in errors.
+    tables
+        The tables as in a file.
+    origin
+        The origin of the study.
+    remarks
+        Remarks for the user on tables that the study did not inherit.
     """
 
     source: object
@@ -33,10 +43,12 @@ class StudyTables(NamedTuple):
 
 
 def with_overrides(base: StudyTables, overrides: Tables, source: object) -> StudyTables:
-    """Override a study's tables, but for those that the new study does not inherit: their marks in
-    the records say when; of another weather not the axes of its parameters.
+    """Override tables of a study (`base`) by tables of a study that extends it.
+
+    Marks of the records say which tables the new study does not inherit. With another weather, the
+    new study does not inherit axes of the weather's parameters.
     """
-    # Keys about the scenario of the base say nothing of another scenario.
+    # Keys about the scenario of the base are wrong for another scenario.
     inherited = dict(base.tables)
     own_keys = keys_with(OF_STUDY, Study)
     base_model = table_in(base.tables, "scenario").get("model")
@@ -49,7 +61,7 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
         inherited["scenario"] = _with_axes_for(overrides, scenario)
     tables = _merge(inherited, overrides)
 
-    # Keys about a system say nothing of one in which these parts differ.
+    # Keys about a system are wrong for a system with another vehicle, ADS, scenario or weather.
     parts = []
     for key in keys_with(PART_OF_SYSTEM, Study):
         inherited_part = _model_and_network(inherited.get(key))
@@ -65,11 +77,11 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     if "matrix" in parts:
         tables |= _for_tests(tables, overrides)
 
-    # A study without a title of its own is called by its name.
+    # A study that does not state a title has its name as title.
     if parts or base.tables.get("title", "") == base.tables.get("name"):
         tables["title"] = overrides.get("title", tables.get("name", ""))
     remarks = base.remarks
-    # What is about one study alone is dropped without a remark: no study inherits it.
+    # Keys of a single study are dropped without a remark, because no study inherits them.
     named_keys = {*tables, *keys_with(OF_STUDY, Study)}
     dropped = []
     for key, value in base.tables.items():
@@ -86,8 +98,9 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
 
 
 def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:
-    """A table [scenario] that a study inherits: of another weather without the axes of its
-    parameters, and for tests of other models with these alone.
+    """The inherited table [scenario] with fewer axes. If the study states another weather, axes of
+    the weather's parameters are dropped. If all tests of the study have other models, only these
+    axes may stay.
     """
     axes = dict(scenario["over"])
     tests = _tables_in(table_in(overrides, "matrix"), "tests")
@@ -103,10 +116,10 @@ def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:
 
 
 def _for_tests(tables: Tables, overrides: Tables) -> Parameters:
-    """The constraints and distributions that a study with tests of its own inherits: of what can
-    vary in these tests.
+    """The constraints and distributions that a study with its own tests inherits. Their names must
+    be characteristics of the vehicle, or axes of these tests.
     """
-    # What can vary are the vehicle's characteristics and the axes.
+    # Only characteristics of the vehicle and axes of encounters can vary.
     tests = _tables_in(table_in(tables, "matrix"), "tests")
     variables = {*table_in(table_in(tables, "vehicle"), "characteristics")}
     for place in (table_in(tables, "scenario"), *tests):
@@ -128,7 +141,7 @@ def _for_tests(tables: Tables, overrides: Tables) -> Parameters:
 
 
 def _tables_in(tables: Tables, key: str) -> list[Parameters]:
-    """A list of tables; empty where there is none."""
+    """A list of tables; an empty list if the key is missing."""
     return [row for row in _list_in(tables, key) if isinstance(row, dict)]
 
 
@@ -140,28 +153,31 @@ def _list_in(tables: Tables, key: str) -> list[Any]:
 
 
 def table_in(tables: object, key: str) -> Parameters:
-    """An inner table; empty where there is none."""
+    """An inner table; an empty table if the key is missing."""
     if isinstance(tables, dict) and isinstance(tables.get(key), dict):
         return dict(tables[key])
     return {}
 
 
 def _scenario_parameters(tables: Tables) -> set[str]:
-    """The parameters that the table [scenario] sets or searches."""
+    """The names of parameters that the table [scenario] states or searches."""
     scenario = table_in(tables, "scenario")
     return {name for key in scenario for name in table_in(scenario, key)}
 
 
 def _model_and_network(table: object) -> object:
-    """The model and network that a table names; instead of a model, a weather or matrix itself."""
+    """The model and the network that a table names. For a weather or a matrix, which have no model:
+    the whole value.
+    """
     if not isinstance(table, dict):
         return table
     return table.get("model", table), table_in(table, "parameters").get("network")
 
 
 def _merge(base: Tables, overrides: Tables) -> Parameters:
-    """Override `base` by `overrides`; another `model` or `distribution`, and the tables
-    that are inherited as a whole, replace a whole table; false in place of a table leaves it out.
+    """Override `base` by `overrides`, key by key in inner tables. Some values replace a whole
+    table: tables with another `model` or `distribution`, and tables with the mark WHOLE. The value
+    false removes a table.
     """
     result = dict(base)
     for key, value in overrides.items():
@@ -175,7 +191,7 @@ def _merge(base: Tables, overrides: Tables) -> Parameters:
 
 
 def _refines(key: str, base_value: object, override: object) -> bool:
-    """Whether an override changes single keys of the table that it overrides."""
+    """Return whether an override changes single keys of the table that it overrides."""
     if key in keys_with(WHOLE, Study) or not (
         isinstance(base_value, dict) and isinstance(override, dict)
     ):
