@@ -1,8 +1,8 @@
-"""Reference drivers, with which an ADS is compared: they hold their speed until they see a danger,
-react, and brake.
+"""Reference drivers, with which a driving system is compared. A reference driver holds its speed
+until it sees a danger, reacts, and brakes.
 
-UN Regulation No. 157 means its drivers for cars that cut in, cut out or brake on motorways; their
-use for pedestrians is ours.
+UN Regulation No. 157 intends its drivers for cars that cut in, cut out or brake on motorways. This
+package also uses them for pedestrians.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from safevar_sumo.ads.reaction import (
 from safevar_sumo.records import KMH_PER_MS, FloatArray, Observation
 
 UNLIMITED_BRAKING = 1e6
-"""Deceleration beyond every brake [m/s^2]; it presses the pedal fully."""
+"""A deceleration that no brake reaches [m/s^2]: a driver who wants it presses the pedal fully."""
 GAP_ROUNDING = 1e-6
 """Difference below which two gaps count as equal [m]."""
 
@@ -85,7 +85,7 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
     def drive(self, observation: Observation, memory: Reaction) -> Reacted:
         depth = depth_in_the_way(observation, self.corridor)
 
-        # Towards somebody who does not brake, the time to collision decides.
+        # If the obstacle does not brake, the time to collision decides.
         critical_ttc = (
             observation.closing_speed / (2 * self.deceleration)
             + self.reaction_time
@@ -93,7 +93,8 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
         )
         when_steady = np.minimum(depth, critical_ttc - time_to_reach(observation))
 
-        # Was the leader too near before he braked, as far as the driver has seen him?
+        # Find out whether the gap was too short before the leader began to brake. Only gaps to a
+        # leader whom the driver has seen before count.
         is_same = observation.obstacle == memory.leader
         was_seen = is_same & (memory.leader_speed > 0) | (memory.cruise is None)
         memory = self.watch_leader(observation, memory, depth >= 0)
@@ -102,7 +103,7 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
         is_steady = was_seen & ~memory.leader_has_braked
         is_undercut = np.where(is_steady, is_near, memory.is_undercut & is_same)
 
-        # Behind a leader who brakes, that decides.
+        # If the leader brakes, only the gap before this braking decides.
         when_braking = np.where(memory.leader_brakes & ~is_undercut, np.inf, -np.inf)
         nearness = np.where(memory.leader_has_braked, when_braking, when_steady)
         danger = Danger(
@@ -157,7 +158,7 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
         return self.react(observation, memory, danger)
 
     def safe_distance(self, speed: FloatArray, leader_speed: FloatArray) -> FloatArray:
-        """Smallest safe gap [m], at speeds [m/s] of shape (N,)."""
+        """The smallest safe gap [m], at speeds [m/s] of shape (N,)."""
         rt = self.reaction_time
         reaction_speed = speed + self.reaction_time * self.acceleration
         stop = (
@@ -226,8 +227,8 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     def proactive_metric(
         self, gap: FloatArray, v: FloatArray, u: FloatArray
     ) -> FloatArray:
-        """PFS at a gap [m] and speeds v and u (leader) [m/s], shape (N,): 0 above the safe
-        distance, 1 below the unsafe distance.
+        """PFS at a gap [m], the vehicle's speed v and the leader's speed u [m/s], shape (N,). PFS
+        is 0 above the safe distance, and 1 below the unsafe distance.
         """
         unsafe_distance, safe_distance = self.proactive_distances(v, u)
         return _falling_ramp(gap - self.margin, unsafe_distance, safe_distance)
@@ -235,7 +236,9 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     def proactive_distances(
         self, v: FloatArray, u: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """The unsafe and the safe distance [m] of PFS."""
+        """The unsafe and the safe distance of PFS [m], at the vehicle's speed v and the leader's
+        speed u.
+        """
         leader_stop = u * u / (2 * self.leader_deceleration)
         safe_distance = (
             v * self.reaction_time
@@ -251,13 +254,13 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     def critical_metric(
         self, gap: FloatArray, v: FloatArray, u: FloatArray, a: FloatArray
     ) -> FloatArray:
-        """CFS in [0, 1] at a gap [m], speeds v and u [m/s] and the acceleration a of the vehicle
-        [m/s^2], shape (N,).
+        """CFS in [0, 1], shape (N,), at a gap [m], the vehicle's speed v and the leader's speed u
+        [m/s], and the vehicle's acceleration a [m/s^2].
         """
         acceleration = np.maximum(a, -self.comfortable)
         speed_after_reaction = v + self.reaction_time * acceleration
-        # How much the gap shrinks within the reaction time and, if the vehicle is slower then,
-        # until speeds are equal:
+        # The gap that is lost in the reaction time. If the vehicle is slower than the leader then,
+        # the gap that is lost until the speeds are equal.
         loss_in_reaction = (
             v + acceleration * self.reaction_time / 2 - u
         ) * self.reaction_time
@@ -277,7 +280,9 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
 
 
 def _falling_ramp(gap: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """1 below `low`, 0 above `high`, linear between them; the gap [m] may be infinite."""
+    """A ramp over the gap [m]: 1 below `low`, 0 above `high`, linear between them. The gap may be
+    infinite.
+    """
     width = np.maximum(high - low, LEAST_DIVISOR)
     finite_gap = np.minimum(gap, high + width)
     return np.minimum(np.maximum((high - finite_gap) / width, 0.0), 1.0)
