@@ -1,8 +1,8 @@
-"""The CSV format of the published package: settings before the filter, with measurements in the
-reference simulators.
+"""Reads the CSV files of the published package. These files have settings before the filter, and
+measurements in the reference simulators.
 
 A row holds one solution: the characteristics, then `MaxPercentage`, `SaftyDegree` (sic), `numbers`,
-`TIT`, `TET` and, in most files, `Dece`. There is no run column.
+`TIT`, `TET` and, in most files, `Dece`. No column names the run.
 """
 
 from __future__ import annotations
@@ -32,22 +32,23 @@ RANGES = {
     "tit": (0.0, 1e5),
     "ave_dece": (-300.0, 300.0),
 }
-"""Accepted values, wider than those of any road vehicle: m or -m/s; s; s^2; m/s^2 of either sign.
+"""The accepted values of each metric: m or -m/s; s; s^2; m/s^2 of either sign. Values of any road
+vehicle are well within these ranges.
 """
 OPTIONAL_METRIC = "ave_dece"
 FIRST_ROW = 2
-"""Number of the row after the header in the file, as errors count."""
+"""Errors count rows like a spreadsheet: the first row after the header is row 2."""
 ALIASES = {
     "dampratezeroce": "dampratezerotce",
     "dampratezerocd": "dampratezerotcd",
     "wheelradius": "radius",
 }
-"""Names of characteristics in the files of the published package -> names in its paper; in lower
-case, without underscores.
+"""Names of characteristics in the published files -> names in the paper, in lower case without
+underscores.
 """
 SHARE_DECIMALS = 3
-"""Decimals to which the published package rounds a change's share of the domain before it compares
-the share with beta.
+"""Decimals to which the published package rounds the size of a change, as a share of the domain.
+The package then compares the rounded share with beta.
 """
 ROUNDING_ERROR = 1e-12
 """Largest rounding error of such a share."""
@@ -74,7 +75,7 @@ class ReferenceData(NamedTuple):
         return self.metrics[SAFETY_DEGREE] <= 0
 
     def take(self, rows: BoolArray) -> ReferenceData:
-        """The data in the rows of a mask."""
+        """The data of the rows that a mask selects."""
         return self._replace(
             settings=self.settings[rows],
             metrics={name: values[rows] for name, values in self.metrics.items()},
@@ -82,7 +83,7 @@ class ReferenceData(NamedTuple):
 
 
 def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceData:
-    """Read a file of the published package; rows with values outside the domains are left out, with
+    """Read a file of the published package. Rows with values outside the domains are left out, with
     a warning.
 
     Raises
@@ -106,7 +107,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         raise InputError(
             path, f"cannot be read: {error.strerror or error}", "a CSV file"
         ) from None
-    # The errors of pandas are ValueErrors, too.
+    # pandas raises subclasses of ValueError for text that is no CSV.
     except ValueError as error:
         raise InputError(
             path,
@@ -157,7 +158,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     undefined = nans(len(table))
     metrics = {name: numbers.get(name, undefined)[is_in_domain] for name in COLUMNS}
     metrics["ave_dece"] = np.abs(metrics["ave_dece"])
-    # In the paper a collision has no TET and TIT.
+    # In the paper, a collision has no TET and no TIT.
     for name in ("tet", "tit"):
         metrics[name] = np.where(metrics[SAFETY_DEGREE] <= 0, np.nan, metrics[name])
     return ReferenceData(
@@ -166,7 +167,7 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
 
 
 def _plain_name(name: str) -> str:
-    # pandas calls a second column of a name NAME.1.
+    # pandas renames a second column with the name NAME to NAME.1.
     key = name.removesuffix(".1").replace("_", "").lower()
     return ALIASES.get(key, key)
 
@@ -192,8 +193,8 @@ def _parse_numbers(
 def package_filter(
     characteristics: CharacteristicSet, settings: FloatArray
 ) -> FloatArray:
-    """The published package's filter: it keeps a change if its share of the domain, rounded to
-    three decimals, is at least beta.
+    """Filter settings as the published package does. A change is kept if its size, as a share of
+    the domain rounded to three decimals, is at least beta.
     """
     width = characteristics.upper - characteristics.lower
     share = np.round(
@@ -209,8 +210,8 @@ def package_filter(
 def evaluations_of(
     data: ReferenceData, characteristics: CharacteristicSet
 ) -> Evaluations:
-    """Reference rows as evaluations, with f_diff and f_numDiff of the filtered settings (method
-    section 3).
+    """Convert reference rows to evaluations. f_diff and f_num_diff are those of the filtered
+    settings (method section 3).
     """
     return Evaluations(
         settings=data.settings,
