@@ -1,4 +1,4 @@
-"""The program, its commands, its errors and its exit codes."""
+"""The command-line program: its commands, its error messages and its exit codes."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ COMMANDS_BY_GROUP = {
         "tables": "questions.research_questions.answer:tables",
     },
 }
-"""The function of each command, by the title of its group, in the order of the help."""
+"""The function of each command. Groups and commands are in the order of the help."""
 COMMANDS = {
     name: function
     for group in COMMANDS_BY_GROUP.values()
@@ -67,14 +67,14 @@ COMMANDS = {
 ENDED_COMMANDS = {
     "rating": "study euro_ncap_pedestrian, and Euro NCAP's own calculator for its points"
 }
-"""Commands of earlier releases, and what stands in their place."""
+"""Commands of earlier releases, with the text that says what replaces each command."""
 ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
-"""An argument of a function of the library in an error, such as `method=monte_carlo`."""
+"""An argument of a library function in the text of an error, such as `method=monte_carlo`."""
 
 
 class LazyCommands(click.Group):
-    """The group of all commands; it loads a command's function, which takes long, only when the
-    command is called.
+    """The group of all commands. A command's function is imported only when the command is called,
+    because the import takes long.
     """
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -82,7 +82,7 @@ class LazyCommands(click.Group):
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         with _exit_on_interrupt():
-            # A question of the user's is module:Name.
+            # A name module:Name is a question of the user's own.
             if ":" in name:
                 from safevar_sumo.questions.ask import find_question
 
@@ -98,7 +98,9 @@ class LazyCommands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Suggest the nearest command if the name is unknown, or what stands in its place."""
+        """Refuse an unknown command. The error names the nearest command, or what replaces the
+        command.
+        """
         name = args[0] if args else "-"
         if name in ENDED_COMMANDS:
             raise InputError(
@@ -109,8 +111,8 @@ class LazyCommands(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Call a command; an error of the library, which names its arguments, then names the flags
-        that set them.
+        """Call a command. An error of the library names arguments: the error is changed to name the
+        flags that set these arguments.
         """
         try:
             return super().invoke(ctx)
@@ -120,7 +122,7 @@ class LazyCommands(click.Group):
             for option in command.params if command else ():
                 if isinstance(option, click.Option):
                     long_flags[option.name] = option.opts[-1]
-            # Only a text may name an argument.
+            # The source of an error may also be a path: only a text may name an argument.
             if isinstance(error.source, str):
                 error.source = long_flags.get(error.source, error.source)
             to_flag = partial(_to_flag, long_flags)
@@ -142,7 +144,7 @@ class LazyCommands(click.Group):
 
 
 def command_function(command: str) -> Callable[..., Any]:
-    """The function of a command, by its name."""
+    """Import and return the function of a command."""
     module, _, name = COMMANDS[command].partition(":")
     return cast(
         "Callable[..., Any]",
@@ -151,7 +153,9 @@ def command_function(command: str) -> Callable[..., Any]:
 
 
 def first_paragraph(function: str) -> str:
-    """The first paragraph of a function's docstring, read from its file: to load it takes long."""
+    """The first paragraph of a function's docstring. The text is read from the file, because an
+    import takes long.
+    """
     module, _, name = function.partition(":")
     path = Path(__file__).parents[1] / module.replace(".", "/")
     file = path.with_suffix(".py")
@@ -167,13 +171,13 @@ def first_paragraph(function: str) -> str:
 
 
 def _to_flag(flags: dict[str, str], argument: re.Match[str]) -> str:
-    """The flag that sets an argument, with its value unless the flag takes none; other words as
-    they are.
+    """The flag that sets an argument, followed by its value unless the flag takes none. A word that
+    is no argument stays.
     """
     name, value = argument.groups()
     if name not in flags:
         return argument[0]
-    # `beyond=True` is --beyond.
+    # An argument that is true is a flag without a value: `beyond=True` becomes --beyond.
     if value in (None, "True"):
         return flags[name]
     return f"{flags[name]} {value}"
@@ -197,14 +201,15 @@ def run_command_line() -> None:
     Its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input), 3 (`--fail-if`, or a
     limit is not kept), 4 (a person has to decide) or 130 (interrupted).
     """
-    # A warning is a line, without its place in the code; a signal to end is an interruption; a
-    # crash has its line.
+    # A warning becomes one line, without its place in the code. A signal to end (SIGTERM) is an
+    # interruption like Ctrl-C.
     warnings.showwarning = lambda message, *_, **__: click.echo(
         f"warning: {printable(str(message))}", err=True
     )
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-    # If compiled code crashes, its line is printed; standard error may be no file.
+    # After a crash of compiled code, Python prints the line of the crash. This fails if standard
+    # error is no file.
     with suppress(AttributeError, OSError, ValueError):
         faulthandler.enable()
 
@@ -233,7 +238,7 @@ def run_command_line() -> None:
 
 
 def _error_in_two_lines(error: click.ClickException) -> str:
-    """Put an error of click into the form of this program's errors."""
+    """Convert an error of click to the form of this program's errors."""
     command = PROGRAM_COMMAND
     if len(sys.argv) > 1 and sys.argv[1] in COMMANDS:
         command += f" {sys.argv[1]}"
@@ -242,8 +247,8 @@ def _error_in_two_lines(error: click.ClickException) -> str:
 
 @contextmanager
 def _exit_on_interrupt() -> Iterator[None]:
-    """End the program on Ctrl-C while modules load: compiled modules would swallow the exception.
-    Later, Ctrl-C raises it.
+    """Within the block, which loads modules, Ctrl-C ends the program at once: compiled modules
+    would swallow a KeyboardInterrupt. After the block, Ctrl-C raises a KeyboardInterrupt.
     """
 
     def exit_at_once(*_: object) -> None:
@@ -258,12 +263,12 @@ def _exit_on_interrupt() -> Iterator[None]:
         yield
     finally:
         for interrupt, handler in handlers.items():
-            # None is a handler that Python has not set.
+            # None stands for a handler that Python has not set, and that Python cannot set again.
             signal.signal(interrupt, handler or signal.default_int_handler)
 
 
 def _exit_with_error(message: str, code: int) -> NoReturn:
-    # Another Ctrl-C must change neither exit code nor message.
+    # A second Ctrl-C would change the exit code and the message.
     for interrupt in INTERRUPTS:
         signal.signal(interrupt, signal.SIG_IGN)
     click.echo(f"{PROGRAM}: {printable(message)}", err=True)
