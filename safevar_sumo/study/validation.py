@@ -1,7 +1,7 @@
-"""Converts tables to records: the first mistake with its path, the value, what is expected, and the
-nearest key.
+"""Converts tables to records. An error names the first mistake: its path, its value, what is
+expected, and the nearest legal key.
 
-Checks within a record, and between records, stand in `__post_init__` of the records.
+The records check single fields against each other in their `__post_init__`.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ WORDS = {
     "float": "a number",
     "bool": "true or false",
 }
-"""What msgspec expects, in words."""
+"""Types in msgspec's messages, and the words of our errors for these types."""
 
 
 def convert_table(raw: Any, table: type[T], *prefix: str) -> T:
-    """Convert a table to a record.
+    """Convert a table to a record. `prefix` is the path of the table in the study, for errors.
 
     Raises
     ------
     InputError
-        With the first mistake.
+        If the table has a mistake; the error names the first mistake.
     """
     try:
         for path, number in _infinite_numbers(raw, prefix):
@@ -49,12 +49,24 @@ def convert_table(raw: Any, table: type[T], *prefix: str) -> T:
 
 
 NO_KEY = "origin"
-"""Field of a study that no file may have."""
+"""A field of a study's record that no file may state."""
 
 
 class _Place(NamedTuple):
-    """Where a mistake is: its path, the value there and the type that is intended there, also as
-    declared; the types above; and the other values of the same table.
+    """The place of a mistake.
+
+    Attributes
+    ----------
+    path
+        The keys and indices that lead to the place.
+    value
+        The value at the place.
+    kind
+        The type that the value should have.
+    declared
+        The declared types of all values on the path; the last is the type at the place.
+    siblings
+        The table with the value, if a table holds it.
     """
 
     path: list[str | int]
@@ -65,12 +77,12 @@ class _Place(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The path and its value."""
+        """The path and the value at the place, as a text."""
         return f"{_path_text(self.path)} = {_short_text(self.value)}"
 
 
 def _place(raw: Any, table: Any, prefix: Sequence[str], location: str) -> _Place:
-    """The place that a message of msgspec names, such as `.search.runs` or `.tests[0]`."""
+    """Find the place that a message of msgspec names, such as `.search.runs` or `.tests[0]`."""
     path: list[str | int] = [*prefix]
     value = raw
     declared = [table]
@@ -92,7 +104,7 @@ def _place(raw: Any, table: Any, prefix: Sequence[str], location: str) -> _Place
 
 
 def _mistake(raw: Any, table: Any, prefix: Sequence[str], message: str) -> InputError:
-    """The error for a message of msgspec, which ends with the place of the mistake."""
+    """Make an error of a message of msgspec. The message ends with the place of the mistake."""
     problem, _, location = message.partition(" - at `$")
     place = _place(raw, table, prefix, location)
     if field := re.match(r"Object contains unknown field `(.*)`", problem):
@@ -105,13 +117,13 @@ def _mistake(raw: Any, table: Any, prefix: Sequence[str], message: str) -> Input
         return unknown_name(
             "", place.text, place.value, filter(None, get_args(place.kind))
         )
-    # The value is that of the key that names the kind of table.
+    # The value belongs to the key that names the kind of table, such as `distribution`.
     if problem.startswith("Invalid value"):
         tags = [kind.__struct_config__.tag for kind in get_args(place.declared[-2])]
         return unknown_name("", place.text, place.value, tags)
     if expected := re.match(r"Expected (.*?)(, got `?\w+`?)?$", problem):
         return InputError("", place.text, _expected_in_words(place, expected[1]))
-    # The message of a `__post_init__` has what is expected on its second line.
+    # In the message of a `__post_init__`, the second line says what is expected.
     problem, _, legal = problem.partition("\n")
     return InputError(
         "", f"{_path_text(place.path)}: {problem}".removeprefix(": "), legal
@@ -119,8 +131,8 @@ def _mistake(raw: Any, table: Any, prefix: Sequence[str], message: str) -> Input
 
 
 def _missing_key(place: _Place, key: str) -> InputError:
-    """The error for a missing key: a table without it may have a mistyped name, and thus be taken
-    for a new one.
+    """The error for a missing key. The table may have a mistyped name: then the key is missing
+    because the table counts as new. The error therefore suggests tables with this key.
     """
     names = [
         name
@@ -143,7 +155,9 @@ def _missing_key(place: _Place, key: str) -> InputError:
 
 
 def _expected_in_words(place: _Place, expected: str) -> str:
-    """What msgspec expects of a value, in words."""
+    """What a value must be, in the words of our errors. `expected` is a part of msgspec's
+    message.
+    """
     if expected == "`object`" and _is_record(place.kind):
         return f"a table of {', '.join(place.kind.__struct_fields__)}"
     for meta in getattr(place.declared[-1], "__metadata__", ()):
@@ -155,8 +169,8 @@ def _expected_in_words(place: _Place, expected: str) -> str:
 
 
 def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
-    """The error for an unknown key, with the place of a key of this name, else with the nearest key
-    of its own table, else of another table in the whole one.
+    """The error for an unknown key. The error suggests the nearest key: first a key of the same
+    name in another table, then a key of the same table, then any key.
     """
     names = [name for name in kind.__struct_fields__ if name != NO_KEY]
     places = {}
@@ -166,7 +180,7 @@ def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
             for name in getattr(record, "__struct_fields__", ()):
                 places[name] = f"{field.name}.{name}"
     places |= zip(names, names, strict=True)
-    # A key above all tables may belong to any of them.
+    # A key at the top of a study may belong to any table: all places are likely.
     likely: Collection[str] = places
     if "." in path and key not in places:
         likely = names
@@ -176,7 +190,7 @@ def _unknown_key(path: str, key: str, kind: Any, table: Any) -> InputError:
 
 
 def _intended_type(kind: Any, value: Any) -> Any:
-    """The intended type of a value, of several ones."""
+    """Choose the type that a value should have from the members of a union; other types stay."""
     if get_origin(kind) is Annotated:
         return _intended_type(get_args(kind)[0], value)
     if get_origin(kind) not in (Union, UnionType):
@@ -206,8 +220,8 @@ def _inner_type(kind: Any, name: str) -> Any:
 
 
 def _wrong_key(value: Mapping[str, Any], kind: Any) -> str:
-    """The first key of a table by names whose value cannot be converted; msgspec does not tell
-    it.
+    """The first key whose value cannot be converted, in a table with free keys. msgspec's message
+    does not name this key.
     """
     for key, item in value.items():
         try:
@@ -232,7 +246,7 @@ def _path_text(path: Sequence[str | int]) -> str:
 
 
 def _short_text(value: object) -> str:
-    """A value as an error quotes it."""
+    """The text of a value for an error, cut off if it is long."""
     text = repr(value)
     if len(text) <= MAX_QUOTE:
         return text
@@ -242,7 +256,7 @@ def _short_text(value: object) -> str:
 def _infinite_numbers(
     value: object, path: Sequence[str | int]
 ) -> Iterator[tuple[str, float]]:
-    """Numbers in tables that are not finite, with their paths."""
+    """Yield the numbers in tables that are not finite, with their paths."""
     if isinstance(value, list | tuple):
         value = dict(enumerate(value))
     if isinstance(value, Mapping):
