@@ -1,5 +1,6 @@
-"""A driving system that is an FMU of FMI 2.0 or 3.0 for co-simulation: its inputs are observations,
-its outputs are pedals or an acceleration, all in SI units; each vehicle has an instance.
+"""A driving system that is an FMU (of FMI 2.0 or 3.0, for co-simulation). The FMU's inputs are
+observations, and its outputs are pedals or an acceleration, in SI units. Each vehicle has an
+instance of the FMU.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from safevar_sumo.records import NamedValues, Nominal, Observation
 from safevar_sumo.study.encounters import ModelTable
 
 NOMINAL = "nominal_"
-"""Prefix of what an FMU may be given of the original vehicle."""
+"""Prefix of the names of numbers of the original vehicle that an FMU may receive."""
 NOMINAL_UNITS: Mapping[str, str] = {
     "mass": "kg",
     **dict.fromkeys(("accel", "decel"), "m/s2"),
@@ -31,7 +32,7 @@ NOMINAL_UNITS: Mapping[str, str] = {
     "actuator_lag": "s",
     **dict.fromkeys(("length", "width"), "m"),
 }
-"""The numbers of the original vehicle, and their units."""
+"""The numbers of the original vehicle that an FMU may receive, with their units."""
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(
         ("speed", "closing_speed", "lateral_speed", "obstacle_speed"), "m/s"
@@ -41,24 +42,26 @@ UNITS: Mapping[str, str] = {
     **{"time": "s", "step": "s", "acceleration": "m/s2"},
     **{f"{NOMINAL}{name}": unit for name, unit in NOMINAL_UNITS.items()},
 }
-"""Quantities that an FMU is given or returns, and their units. It is given observations; `detected`
-is 1 while an obstacle is detected; the numbers of the original vehicle, such as `nominal_decel`;
-and the `step` between two calls. It returns throttle and brake or an acceleration; above 0.5,
-`warns` is a warning.
+"""Quantities that an FMU may receive or return, with their units.
+
+The FMU may receive observations, numbers of the original vehicle (such as `nominal_decel`), and the
+`step` between two calls. `detected` is 1 while an obstacle is detected. The FMU returns throttle
+and brake, or an acceleration. Above 0.5, `warns` is a warning.
 """
 COMMANDS = ("throttle", "brake", "acceleration", "warns")
 MAX_INSTANCES = 200
-"""Largest number of vehicles at once, each with an instance."""
+"""Largest number of vehicles at once. Each vehicle has an instance of the FMU."""
 REAL_TYPES = ("Real", "Float64", "Float32")
 
 
 class Fmu:
-    """The FMU at `path`, with the variables that a study's table `ads` names.
+    """The FMU at `path`. The study's table [ads] names the variables that the FMU receives and
+    returns.
 
     Raises
     ------
     InputError
-        If the file is no such FMU, or the study does not fit it.
+        If the file is no such FMU, or the study does not fit the FMU.
     """
 
     def __init__(self, path: str, table: ModelTable, code: UserCode) -> None:
@@ -80,7 +83,7 @@ class Fmu:
             self._model = read_model_description(self._folder.name, validate=False)
         except ImportError:
             raise missing_extra("", f"{path} needs FMPy", "fmu") from None
-        # FMPy may raise anything about a user's file.
+        # FMPy may raise any exception for a user's file.
         except Exception as error:
             raise InputError(
                 "", f"{table.model}: {type(error).__name__}: {error}", expected
@@ -121,8 +124,8 @@ class Fmu:
     def _variable(
         self, causality: str, quantity: str, name: str, quantities: Any
     ) -> Any:
-        """The real variable of a causality that takes or holds a quantity, one of some quantities,
-        in its SI unit.
+        """Find the FMU's real variable with a name and a causality (input, output or parameter),
+        and check that its unit is the unit of a `quantity`. Only `quantities` are legal.
         """
         key = f"ads.{causality}s.{quantity}"
         check_name("", f"{key}: there is no such quantity", quantity, quantities)
@@ -152,10 +155,10 @@ class Fmu:
         return variable
 
     def new_instance(self, step: float) -> Any:
-        """A new instance at the beginning of its time."""
+        """Create an instance of the FMU, at the beginning of its time."""
         from fmpy.simulation import instantiate_fmu
 
-        # An FMU with a step of its own takes the study's.
+        # An FMU with a fixed step must have the study's step.
         kind = self._model.coSimulation
         experiment = self._model.defaultExperiment
         fixed_step = getattr(kind, "fixedInternalStepSize", None)
@@ -167,7 +170,8 @@ class Fmu:
                 f"ads.model: the FMU takes steps of {fixed_step} s",
                 f"the study's step, {step:g} s",
             )
-        # An FMU in Python imports its own modules, not namesakes.
+        # An FMU that is written in Python must import its own modules. A loaded module of the same
+        # name would be used instead.
         for file in Path(self._folder.name, "resources").glob("*.py"):
             sys.modules.pop(file.stem, None)
         slave = instantiate_fmu(
@@ -219,14 +223,15 @@ class FmuAds(ScalarAds):
         return self.pedals(outputs["acceleration"], observation.speed, self._trim)
 
     def _step(self, values: NamedValues) -> NamedValues:
-        """Advance the instance with observed values; returns its outputs."""
+        """Let the instance take a step with these observed values, and return its outputs."""
         slave = self._slave
         time = self._calls * self.step
         try:
             for name, variable in self._fmu.inputs.items():
                 write(slave, variable, float(values[name]))
             result = slave.doStep(time, self.step)
-            # FMI 3.0.
+            # In FMI 3.0, `doStep` returns whether the FMU wants to end the simulation or returned
+            # early.
             if result and any(result[1:3]):
                 raise RuntimeError("it ends the simulation or returns early")
             return {
@@ -235,14 +240,15 @@ class FmuAds(ScalarAds):
                 ]
                 for name, variable in self._fmu.outputs.items()
             }
-        # FMPy may raise anything, and any further call of an instance that failed is undefined.
+        # FMPy may raise any exception. After a failure, FMI forbids further calls of the instance:
+        # the instance is not freed.
         except Exception as error:
             self._end.detach()
             raise RuntimeError(f"{str(error).splitlines()[0]} at {time:g} s") from None
 
 
 def write(slave: Any, variable: Any, value: float) -> None:
-    """Set a real variable of an instance."""
+    """Set a real variable of an FMU's instance."""
     getattr(slave, f"set{variable.type}")([variable.valueReference], [value])
 
 
