@@ -1,4 +1,4 @@
-"""Evaluated settings: what a batch returns to the search."""
+"""Evaluations: the results of simulated settings, which a search receives for its request."""
 
 from __future__ import annotations
 
@@ -21,23 +21,36 @@ from safevar_sumo.records.runs import Outcome
 from safevar_sumo.study import SAFETY_DEGREE
 
 COLUMNS = ("settings", "outcome", "collision_speed", "f_diff", "f_num_diff")
-"""The arrays of `Evaluations` that all evaluations have, with one row for each setting."""
+"""The arrays that all evaluations have. Each array has a row for each setting."""
 ResultColumns = Mapping[str, npt.NDArray[np.generic]]
-"""Results by name, one element for each setting."""
+"""Results by name, as arrays with an element for each setting."""
 ROUNDING = 1e-9
-"""Largest accepted difference between a result in a recorded scene and in SUMO."""
+"""Largest difference between a result in a recorded scene and the same result in SUMO that counts
+as rounding.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluations:
-    """M evaluated settings with their outcomes, metrics and objectives.
+    """M evaluated settings with their outcomes, metrics and objectives. Arrays have shape (M,).
 
-    `settings` has shape (M, n) and holds the simulated values in their table units; all other
-    arrays have shape (M,). `metrics` holds `safevar_sumo.metrics.METRICS` and the study's further
-    metrics; an undefined value is NaN. `collision_speed` is in m/s, `f_diff` a fraction,
-    `f_num_diff` a count, both of the filtered values. `reasons` says, by the bytes of a setting,
-    why the setting could not be simulated. `worst_points` are the numbers of the points at which
-    the settings were worst, None without a matrix.
+    Attributes
+    ----------
+    settings
+        The simulated values in their table units, shape (M, n).
+    outcome
+        Values of `Outcome`.
+    collision_speed
+        Speed of the vehicle at the collision [m/s]; NaN without a collision.
+    metrics
+        The metrics of `safevar_sumo.metrics.METRICS`, and the study's further metrics; an undefined
+        value is NaN.
+    f_diff, f_num_diff
+        The largest change, as a fraction, and the number of changes, after the filter.
+    reasons
+        For the bytes of a setting: the reason why it could not be simulated.
+    worst_points
+        The numbers of the points at which the settings were worst; None without a matrix.
     """
 
     settings: FloatArray
@@ -59,14 +72,16 @@ class Evaluations:
 
     @property
     def points(self) -> IntArray:
-        """`worst_points`; without a matrix the only point, 0."""
+        """The numbers of the points at which the settings were worst. Without a matrix, the only
+        point is 0.
+        """
         if self.worst_points is None:
             return np.zeros(len(self), np.intp)
         return self.worst_points
 
     @property
     def results(self) -> ResultColumns:
-        """Outcomes and metrics by name."""
+        """The outcomes and metrics by name."""
         return {
             "outcome": self.outcome,
             "collision_speed": self.collision_speed,
@@ -74,16 +89,16 @@ class Evaluations:
         }
 
     def gaps(self, contact: float) -> FloatArray:
-        """Least distances between bodies during the encounter [m], shape (M,); 0 on a collision,
-        NaN where undefined.
+        """The least clearances between bodies during the encounter [m], shape (M,); 0 on a
+        collision, NaN if undefined.
 
-        Bodies touch at a safety degree of `contact` [m].
+        `contact` is the safety degree of bodies that touch [m].
         """
         return np.where(self.collided, 0.0, self.f_safe - contact)
 
     def column(self, name: str) -> FloatArray:
-        """A metric, f_safe, f_diff or f_num_diff by name; shape (M,). A metric without values is
-        NaN everywhere.
+        """A metric, f_safe, f_diff or f_num_diff by name, shape (M,). A metric without values is
+        NaN for all settings.
         """
         if name in ("f_safe", "f_diff", "f_num_diff"):
             return np.asarray(getattr(self, name))
@@ -95,8 +110,8 @@ class Evaluations:
 
     @property
     def valid(self) -> BoolArray:
-        """Where the setting can be scored: it is feasible, the test was valid, and the simulator
-        reported no error.
+        """Which settings can be scored: they are feasible, their test is valid, and their
+        simulation did not fail.
         """
         return np.asarray(
             ~self.failed & (self.outcome != Outcome.INVALID_TEST) & ~self.infeasible
@@ -104,22 +119,23 @@ class Evaluations:
 
     @property
     def infeasible(self) -> BoolArray:
-        """Where a constraint of the study is violated, so that nothing was simulated."""
+        """Which settings violate a constraint of the study. They were not simulated."""
         return np.asarray(self.outcome == Outcome.INFEASIBLE)
 
     @property
     def failed(self) -> BoolArray:
-        """Where the simulation failed."""
+        """Which simulations failed."""
         return np.asarray(self.outcome == Outcome.SIMULATOR_ERROR)
 
     def reason(self, row: int) -> str:
-        """Why a setting that is not valid could not be scored."""
+        """The reason why a setting could not be simulated."""
         return self.reasons.get(self.settings[row].tobytes(), "no reason was recorded")
 
     @property
     def rounds(self) -> list[Evaluations]:
-        """The evaluations of each repeat, where settings are repeated: their outcomes as far as
-        they collide, and the metrics that are kept of each.
+        """The evaluations of each repeat, if settings are repeated; else an empty list. A repeat
+        has its own outcome (as far as collisions are concerned), and the metrics that are kept for
+        each repeat.
         """
         rounds = list[Evaluations]()
         while (
@@ -142,22 +158,24 @@ class Evaluations:
 
     @property
     def first_metrics(self) -> NamedValues:
-        """The metrics of the first setting."""
+        """The metrics of the first setting, by name."""
         return {name: float(values[0]) for name, values in self.metrics.items()}
 
     def take(self, rows: Sequence[int] | IntArray | BoolArray) -> Evaluations:
-        """The evaluations of `rows`, in that order."""
+        """The evaluations of `rows`, in this order."""
         columns = {name: getattr(self, name)[rows] for name in COLUMNS}
         columns["metrics"] = {
             name: values[rows] for name, values in self.metrics.items()
         }
         if self.worst_points is not None:
             columns["worst_points"] = self.worst_points[rows]
-        # User code has a view of the reasons, which no process can send.
+        # User code gets the reasons as a read-only view, which cannot be sent to another process.
         return replace(self, **columns, reasons=dict(self.reasons))
 
     def where(self, is_kept: BoolArray, outcome: str) -> Evaluations:
-        """Evaluations, undefined and with this outcome where they are not kept, shape (M,)."""
+        """The evaluations with undefined results and this outcome for all settings that are not
+        kept. `is_kept` has shape (M,).
+        """
         return replace(
             self,
             outcome=np.where(is_kept, self.outcome, str(outcome)),
@@ -170,7 +188,7 @@ class Evaluations:
 
     @classmethod
     def none(cls, n: int, metrics: Iterable[str]) -> Evaluations:
-        """Empty evaluations, for settings of `n` characteristics."""
+        """Evaluations without any setting. Settings would have `n` characteristics."""
         no_changes = dict.fromkeys(("f_diff", "f_num_diff"), np.zeros(0))
         return cls.undefined(np.zeros((0, n)), "", metrics, **no_changes)
 
@@ -178,7 +196,9 @@ class Evaluations:
     def undefined(
         cls, settings: FloatArray, outcome: str, metrics: Iterable[str], **further: Any
     ) -> Evaluations:
-        """Evaluations of settings that were not simulated, all with one outcome."""
+        """Evaluations of settings that were not simulated. All have the same outcome and undefined
+        metrics.
+        """
         undefined = nans(len(settings))
         return cls(
             settings=settings,
@@ -190,10 +210,10 @@ class Evaluations:
 
     @classmethod
     def concatenate(cls, batches: Sequence[Evaluations]) -> Evaluations:
-        """Join batches of evaluations in order; a metric that a batch lacks is undefined in its
-        rows.
+        """Join batches of evaluations in order. A metric that a batch lacks is undefined for its
+        settings.
 
-        The worst point of a batch without `worst_points` is the first.
+        In a batch without `worst_points`, the worst point of all settings is point 0.
         """
         columns = {}
         for name in COLUMNS:
@@ -217,7 +237,7 @@ class Evaluations:
 def differences(
     outputs: ResultColumns, references: ResultColumns, tolerance: float = 0.0
 ) -> Iterator[tuple[int, str]]:
-    """Yield, for each result that differs, the first row where it does, and both values in
+    """Yield the first row with a difference for each result that differs, and both values in
     words.
     """
     for name, values in outputs.items():
