@@ -1,5 +1,5 @@
-"""How vehicles under test move, as a world answers it; bodies as rectangles, and where they touch
-first.
+"""The contract of worlds, in which vehicles under test move; bodies as rectangles, and the place
+of the first contact of two bodies.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from safevar_sumo.scenarios.tracks import corners_of
 from safevar_sumo.vehicles import SumoType
 
 Hits = dict[int, float]
-"""The speeds of the vehicles that hit somebody, by their numbers [m/s]."""
+"""Speeds of the vehicles that hit somebody [m/s], by the number of the vehicle."""
 
 
 class VehicleStates(NamedTuple):
-    """Where N vehicles under test are: their front bumpers, shape (N, 2) [m], their speeds, shape
-    (N,) [m/s], and the speeds of those that hit somebody in this step, by vehicle number. Vehicles
-    whose runs have ended keep their last values.
+    """The motion of N vehicles under test at one sample: the positions of their front bumpers,
+    shape (N, 2) [m], their speeds, shape (N,) [m/s], and the vehicles that hit somebody in this
+    step. A vehicle whose run has ended keeps its last position and speed.
     """
 
     fronts: FloatArray
@@ -45,8 +45,9 @@ class VehicleStates(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A vehicle or person as a rectangle, or M of them in columns [m, m/s]; `along` is its
-    direction, a unit vector, `drift` its speed to the left of it.
+    """A vehicle or a person as a rectangle, or M such bodies in columns [m, m/s]. `along` is the
+    direction that the body faces, a unit vector; `speed` is the speed in this direction, `drift`
+    the speed to the left of this direction.
     """
 
     middle: FloatArray
@@ -78,16 +79,16 @@ class Body(NamedTuple):
 
     @classmethod
     def columns(cls, bodies: Sequence[Body]) -> Body:
-        """M bodies in columns: `middle` and `along` of shape (M, 2), the other columns of shape
-        (M,).
+        """Join M bodies into columns: `middle` and `along` have the shape (M, 2), the other columns
+        have the shape (M,).
         """
         columns = map(itemgetter, range(len(cls._fields)))
         return cls._make(np.array(list(map(column, bodies))) for column in columns)
 
 
 class BodyPairs(NamedTuple):
-    """M pairs of bodies, in columns: the numbers of the vehicles under test, shape (M,), their
-    bodies, and those of the others.
+    """M pairs of bodies, in columns: the numbers of the vehicles under test, shape (M,), the bodies
+    of these vehicles, and the body of the other actor in each pair (`obstacle`).
     """
 
     vehicles: IntArray
@@ -98,18 +99,19 @@ class BodyPairs(NamedTuple):
 def distance_covered(
     old_speed: FloatArray, new_speed: FloatArray, step: float
 ) -> FloatArray:
-    """Distance [m] covered in a time step at constant acceleration, by the operations of SUMO's
-    `MSVehicle::getDeltaPos`.
+    """Distance [m] covered in a time step at constant acceleration. The operations are those of
+    SUMO's `MSVehicle::getDeltaPos`, so that the result has the same bits.
     """
     acceleration = (new_speed - old_speed) / step
     return (old_speed + 0.5 * (acceleration * step)) * step
 
 
 class Film(NamedTuple):
-    """How an actor moves: at every sample the position of its front bumper, or of a person [m], its
-    direction, a unit vector, and its speed [m/s]; shape (T, 5), or (T, N, 5) in N copies.
+    """The motion of an actor at T samples, shape (T, 5), or (T, N, 5) in N copies of the network.
 
-    Values are NaN while the actor is not on the road; `length` and `width` are in m.
+    The five values are the position x, y of a vehicle's front bumper or of a person [m], the
+    direction as a unit vector x, y, and the speed [m/s]. They are NaN while the actor is not on the
+    road. `length` and `width` are in m.
     """
 
     motion: FloatArray
@@ -136,31 +138,32 @@ Films = dict[str, Film]
 
 
 class VehicleWorld(Protocol):
-    """N vehicles under test: on a lane, in a recorded scene or in SUMO."""
+    """The contract of a world of N vehicles under test: a lane, a recorded scene or SUMO."""
 
     n: int
     step_length: float
 
     @property
     def frame(self) -> Frame:
-        """The coordinates in which the vehicles' positions are along their lane."""
+        """The coordinates along and across the lane of the vehicles under test."""
 
     def enter(
         self, types: SumoType | None, *, keeps_drivers: bool = False
     ) -> VehicleStates:
-        """Put the vehicles onto the road and return their first motion; called once, first.
+        """Put the vehicles onto the road and return their first motion. This method is called once,
+        before all others.
 
-        Without `types` any speed is possible. With `keeps_drivers` SUMO's drivers keep the
-        decelerations that the traffic file gives them.
+        If `types` is None, vehicles may have any speed. With `keeps_drivers`, SUMO's drivers keep
+        the decelerations that the traffic file states for them.
         """
 
     def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
-        """Simulate a step in which the vehicles whose runs are open reach `speeds` [m/s], shape
-        (N,).
+        """Simulate a step, in which vehicles with `is_open` (their runs have not ended) reach
+        `speeds`, shape (N,) [m/s]; return the motion after the step.
         """
 
     def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
-        """Vehicles that hit somebody in this step, each with the body that it hit."""
+        """Pairs of the given vehicles, which hit somebody in this step, and the bodies they hit."""
 
     def vehicle_length(self, actor: str) -> float:
         """Length of a vehicle [m]."""
@@ -171,24 +174,26 @@ class VehicleWorld(Protocol):
 
 
 class SceneWorld(VehicleWorld, World, Protocol):
-    """N vehicles in a scene that SUMO simulates or that was recorded; scenarios see it as
-    theirs.
+    """The contract of a world whose scene SUMO simulates or has recorded. Scenarios read and move
+    the actors of this scene.
     """
 
     def begin(self, scenario: WorldScenario) -> ScenarioMemory:
         """Start a scenario before the first step, and return its memory."""
 
     def bodies_around(self, vehicles: Sequence[int]) -> BodyPairs:
-        """Each of these vehicles with each other actor of its scene."""
+        """All pairs of one of these vehicles and another actor of the vehicle's scene."""
 
 
 TOUCH = 1e-3
-"""Overlap up to which bodies only touch [m], as in SUMO: an impact that is due exactly at a sample
-must not depend on the last bit.
+"""Overlap up to which bodies only touch, without an impact [m], as in SUMO. An impact that is due
+exactly at a sample must not depend on the last bit of a position.
 """
 FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
 COSINE_DECIMALS = 9
-"""Decimals of a cosine between directions, which SUMO states in degrees."""
+"""Decimals of a cosine between two directions: SUMO states directions in degrees, and converting
+them makes rounding errors.
+"""
 COLLISION_PLACES = (
     "vehicles in the lane of the vehicle under test or on a junction, persons on a crossing or in a"
     " network without junctions: elsewhere SUMO looks for no collisions"
@@ -196,9 +201,11 @@ COLLISION_PLACES = (
 
 
 class FirstContacts:
-    """First contacts of N vehicles, `first`.
+    """The first contact of each of N vehicles: `first` has the side, the place on that side [%],
+    and the struck body's speed in the vehicle's direction [m/s].
 
-    In a Euro NCAP test, where `is_tested`, only contacts of the vehicle's front are collisions.
+    Where `is_tested`, shape (N,), is true, only a contact of the vehicle's front is a collision, as
+    in tests by Euro NCAP.
     """
 
     def __init__(self, n: int, is_tested: BoolArray) -> None:
@@ -207,8 +214,8 @@ class FirstContacts:
         self.first = Contact(np.full(n, "", "U5"), nans(n), np.zeros(n))
 
     def count(self, world: VehicleWorld, hits: Hits, scene: Scene) -> Hits:
-        """Process the hits of one sample; returns those that are collisions: speeds [m/s] by
-        vehicle number.
+        """Note the first contacts among the hits of one sample, and return the hits that are
+        collisions.
         """
         side = self.first.side
         new_copies = [copy for copy in hits if not side[copy]]
@@ -223,25 +230,25 @@ class FirstContacts:
     def check(
         self, world: SceneWorld, scene: Scene, is_open: BoolArray, time: float
     ) -> None:
-        """Refuse a scene in which the front of an open run's vehicle drives into a body and no
-        collision is reported.
+        """Refuse a scene in which the front of a vehicle drives into a body although SUMO reports
+        no collision. Vehicles whose runs have ended (not `is_open`) are not checked.
 
-        To be called at every sample, after `count`. A body that comes into the vehicle from the
-        side is none in its path.
+        Call this method at every sample, after `count`. A body that runs into the side of the
+        vehicle is no error: SUMO reports contacts of the front alone.
 
         Raises
         ------
         InputError
-            With the time [s].
+            The error states the time [s].
         """
-        # Who enters a body without a contact that SUMO has reported?
+        # Candidates are in a body since this sample, and have had no contact that SUMO reported.
         is_inside = scene.gap < -TOUCH_OVERLAP
         enters = is_inside & ~self._was_inside & is_open & (self.first.side == "")
         self._was_inside = is_inside
         if not np.count_nonzero(enters):
             return
 
-        # Only the front counts, as SUMO reports contacts of the front alone.
+        # `scene.gap` does not say which side overlaps: the rectangles of the bodies do.
         around = world.bodies_around(np.flatnonzero(enters).tolist())
         if not len(around.vehicles):
             return
@@ -280,14 +287,16 @@ class FirstContacts:
 def distance_between(
     body: Track, middle: FloatArray, length: float, width: float
 ) -> FloatArray:
-    """Distances [m] of a body and of vehicles of this size in the lane's middle, with their middles
-    at `middle`: the least distance of a corner of either rectangle to the other one; 0 if they
-    overlap.
+    """Distances [m] between a body and vehicles in the middle of the lane, whose size is `length`
+    and `width`, and whose middles are at `middle` along the lane.
+
+    The distance of two rectangles is the least distance of a corner of one rectangle to the other
+    rectangle; 0 if they overlap.
     """
     squares = []
     for corner_x, corner_y in corners_of(body):
         squares.append(_square_outside(corner_x - middle, corner_y, length, width))
-    # In the body's axes the four corners of a vehicle are its middle plus what all vehicles share.
+    # In the body's axes a corner is the vehicle's middle plus an offset that all vehicles share.
     x = middle - body.x
     lengthwise = x * body.along - body.y * body.left
     across = -x * body.left - body.y * body.along
@@ -304,7 +313,8 @@ def distance_between(
         )
     cosine = np.abs(body.along)
     sine = np.abs(body.left)
-    # Bodies that cross each other have no corner in the other one.
+    # Two rectangles that cross like an X overlap, but neither has a corner in the other: the
+    # extents along all four axes decide (separating axis test).
     overlaps = (
         (np.abs(x) < (length + body.length * cosine + body.width * sine) / 2)
         & (np.abs(body.y) < (width + body.length * sine + body.width * cosine) / 2)
@@ -317,15 +327,16 @@ def distance_between(
 def _square_outside(
     x: Quantity, y: Quantity, length: Quantity, width: Quantity
 ) -> Quantity:
-    """The square of how far points are outside a rectangle around the origin [m^2]."""
+    """Squared distances [m^2] of points to a rectangle around the origin; 0 for a point inside."""
     dx = np.maximum(np.abs(x) - length / 2, 0.0)
     dy = np.maximum(np.abs(y) - width / 2, 0.0)
     return dx * dx + dy * dy
 
 
 class Touches(NamedTuple):
-    """First touches of M vehicles: the touched side, the time since then [s], and how far the other
-    body's middle was then behind the vehicle's front [m].
+    """First touches of M vehicles: the side of the vehicle that was touched, the time since the
+    touch (`age`) [s], and the distance of the other body's middle behind the vehicle's front at the
+    touch [m].
     """
 
     side: TextArray
@@ -334,14 +345,15 @@ class Touches(NamedTuple):
 
 
 def find_touches(body: Body, obstacle: Body) -> Touches:
-    """The first touches of M overlapping pairs, a vehicle's own body and another, if their
-    velocities were constant.
+    """The first touches of M overlapping pairs of a vehicle's body and an obstacle, if their
+    velocities were constant until now.
 
-    Two bodies of length l, l' and width w, w' at an angle a have the joint half extent r = (l + l'
-    |cos a| + w' |sin a|) / 2 along the own body and (w + l' |sin a| + w' |cos a|) / 2 across it. If
-    their middles are x apart in such a direction and approach each other at v, the overlap in it
-    began (r - |x|) / v ago. The bodies touched in the direction in which the overlap began last,
-    or, if they approach each other in neither direction, in the one with the smaller overlap.
+    A body of length l and width w and an obstacle of length l' and width w', at an angle a, have
+    the joint half extent r = (l + l' |cos a| + w' |sin a|) / 2 along the body and
+    (w + l' |sin a| + w' |cos a|) / 2 across the body. If their middles are x apart in one of these
+    directions and approach each other at v, they overlap in this direction since (r - |x|) / v. The
+    bodies touched in the direction in which the overlap began last. If they approach each other in
+    neither direction, the direction with the smaller overlap counts.
     """
     axes = _axes_of(body)
     distance = _dot(obstacle.middle - body.middle, axes)
@@ -350,7 +362,7 @@ def find_touches(body: Body, obstacle: Body) -> Touches:
     closing_speed = np.copysign(1.0, distance) * speed
     is_closing = closing_speed > 0
 
-    # Sides that do not approach each other were never apart: they touched infinitely long ago.
+    # In a direction without approach the bodies were never apart: the overlap is infinitely old.
     ages = np.where(
         is_closing,
         np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0),
@@ -368,8 +380,8 @@ def find_touches(body: Body, obstacle: Body) -> Touches:
 
 
 def find_overlaps(body: Body, obstacle: Body) -> FloatArray:
-    """How deeply M pairs of bodies overlap [m], shape (M,), in the direction in which they overlap
-    least; negative for bodies that do not touch.
+    """Depths by which M pairs of bodies overlap, shape (M,) [m]: of all directions along and across
+    the two bodies, the least overlap. A negative depth means that the bodies do not touch.
     """
     overlaps = _overlaps_along(body, obstacle)
     if (overlaps > 0).any():
@@ -378,7 +390,7 @@ def find_overlaps(body: Body, obstacle: Body) -> FloatArray:
 
 
 def _overlaps_along(body: Body, obstacle: Body) -> FloatArray:
-    """The overlaps in that direction of the own bodies in which they are less deep [m]."""
+    """The smaller of the overlaps along and across `body`, for M pairs, shape (M,) [m]."""
     axes = _axes_of(body)
     distance = _dot(obstacle.middle - body.middle, axes)
     overlaps = _joint_extent(body, obstacle, axes) - np.abs(distance)
@@ -392,8 +404,8 @@ def _axes_of(body: Body) -> FloatArray:
 
 
 def _joint_extent(body: Body, obstacle: Body, axes: FloatArray) -> FloatArray:
-    """Half the extents of M pairs of bodies along the axes of the own ones, added up, shape (2, M)
-    [m].
+    """Sums of the half extents of body and obstacle along the two axes of `body`, for M pairs,
+    shape (2, M) [m].
     """
     cosine, sine = np.abs(_dot(obstacle.along, axes))
     along = (body.length + obstacle.length * cosine + obstacle.width * sine) / 2
@@ -402,5 +414,5 @@ def _joint_extent(body: Body, obstacle: Body, axes: FloatArray) -> FloatArray:
 
 
 def _dot(vectors: FloatArray, axes: FloatArray) -> FloatArray:
-    """Components of M vectors along their two axes, shape (2, M)."""
+    """Components of M vectors along two axes of each vector, shape (2, M)."""
     return vectors[:, 0] * axes[..., 0] + vectors[:, 1] * axes[..., 1]

@@ -1,5 +1,5 @@
-"""Bodies of a scenario's tracks: what follows from a track alone, at every sample, before any
-vehicle moves.
+"""Quantities of a scenario's bodies that follow from their tracks alone: they are computed for all
+samples before any vehicle moves.
 """
 
 from __future__ import annotations
@@ -17,45 +17,50 @@ from safevar_sumo.sumo.bodies import Body
 from safevar_sumo.sumo.track_check import check_motion, check_shapes, check_start
 
 TIE = 1e-6
-"""Margin of a body's sides [m]: a body that is exactly at an edge at a sample counts, whatever the
-last bit says.
+"""Margin by which a body's sides are widened [m]: a body that is exactly at an edge at a sample
+counts, whatever the last bit of its position is.
 """
 LEAST_SINE = 1e-9
 """Sine of an angle above which a body is rotated against the lane [-]."""
 NOBODY = Track("", SCREEN, 0.0, 0.0, 1e6, 1e6, 1.0, 0.0, 0.0)
-"""Who stands in for the bodies that other scenarios of the same batch have: far away."""
+"""A body far away. It fills the place of a body that other scenarios of the same batch have, but
+this scenario lacks.
+"""
 Sampled = TypeVar("Sampled", FloatArray, BoolArray)
 BESIDE, IN_PATH = 1, 2
-"""Levels of a body that moves beside the vehicle's path, and of one that is ever in it; that of
-scenery is 0.
+"""Levels of a body that moves beside the vehicle's path, and of a body that is ever in the path.
+Scenery, which stands beside the path, has the level 0.
 """
 
 
 class Moving(NamedTuple):
-    """A body at T samples in M encounters; columns have the shapes (T or 1, M or 1): what does not
-    vary has length 1.
+    """A body at T samples in M encounters. Columns have the shape (T or 1, M or 1): the length is 1
+    along an axis along which the values do not vary.
 
     Attributes
     ----------
     track
-        The body's track with such columns.
+        The body's track, with such columns.
     edge, far_end, half_length, half_width
-        Position along the lane of the body's rear (of who faces along the lane, of its first point
-        in the vehicle's path) and of its far end; half its extent along and across the lane [m].
+        Positions along the lane of the body's rear and of its far end; half the body's extents
+        along and across the lane [m]. If the body is rotated, but rather along than across the
+        lane, `edge` is its first point in the vehicle's path.
     vx, vy, least_vx, most_vx
-        Speeds along the lane and to its left; the least and largest speed along it from now on
-        [m/s].
+        Speeds along the lane and to the left of the lane; the least and the largest speed along the
+        lane from this sample on [m/s].
     lateral, lateral_speed
-        Position of its middle across the lane, from the side that the body comes from, and its rate
-        of change [m, m/s].
+        Position of the body's middle across the lane, negative on the side from which the body
+        comes, and the rate of change of this position [m, m/s].
     is_there, is_in_path, is_cleared, is_avoidable
-        Whether it has a size; is in the vehicle's path; has left it for good, or is gone; or stays
-        in it to the end, so that a vehicle that is never faster again has avoided it.
+        Whether the body has a size; whether it is in the vehicle's path; whether it has left the
+        path for good, or is gone for good; whether it has entered the path and is in it at the end,
+        so that a vehicle that is never faster than the body again has avoided it.
     level
-        `IN_PATH`, `BESIDE` (who moves there) or 0 (who stands there); of several bodies those of
-        the highest level count. Below 0 for a body that is not met at all.
+        `IN_PATH`, `BESIDE` (moves beside the path) or 0 (stands beside the path). Only the bodies
+        with the highest level of an encounter count. Below 0 for a body that is never met.
     is_rotated, faces_along
-        Whether it is ever rotated against the lane, and whether it always faces along it.
+        Whether the body is rotated against the lane at any sample; whether it faces along the lane
+        at all samples.
     """
 
     track: Track
@@ -79,15 +84,16 @@ class Moving(NamedTuple):
 
     @classmethod
     def of(cls, track: Track, step: float, vehicle_width: float) -> Moving:
-        """What follows from a track with columns; `vehicle_width` is that of the vehicle under test
-        [m].
+        """Compute all quantities of a track with columns. `step` is the time between samples [s],
+        `vehicle_width` the width of the vehicle under test [m].
         """
         cosine = np.abs(track.along)
         sine = np.abs(track.left)
         half_length = (track.length * cosine + track.width * sine) / 2
         half_width = (track.length * sine + track.width * cosine) / 2
 
-        # The rear corner of a rotated body may be beside the path: its first point in it counts.
+        # The rear corner of a rotated body may be beside the path: the vehicle then touches the
+        # body's first point within the path.
         rear = track.x - half_length
         edge = rear
         is_lengthwise = _rotated(track) & (cosine > sine)
@@ -105,7 +111,7 @@ class Moving(NamedTuple):
         has_entered = np.maximum.accumulate(is_in_path, axis=0)
         will_touch = np.maximum.accumulate(is_in_path[::-1], axis=0)[::-1]
 
-        # Who crosses is seen from the side from which it comes.
+        # With this sign `lateral` rises while a body crosses, from whichever side it comes.
         sign = np.where((vy > 0).any(axis=0), 1.0, -1.0)
         moves = (is_there & (track.speed > 0)).any(axis=0)
         level = np.where(is_in_path.any(axis=0), IN_PATH, np.where(moves, BESIDE, 0))
@@ -131,8 +137,8 @@ class Moving(NamedTuple):
         )
 
     def covers(self, body: Moving) -> bool:
-        """Whether another body that stands is always inside this one, which then hides all that the
-        other one does.
+        """Whether another standing body is always inside this standing body: this body then hides
+        everything that the other body hides.
         """
         cover = self.track
         track = body.track
@@ -151,12 +157,12 @@ def _rotated(track: Track) -> BoolArray:
 
 
 def _from_now_on(ufunc: np.ufunc, column: FloatArray) -> FloatArray:
-    """The least or largest value of a column from each sample on."""
+    """The least or largest value of a column from each sample to the last sample."""
     return ufunc.accumulate(column[::-1], axis=0)[::-1]
 
 
 def slim(column: Sampled) -> Sampled:
-    """A column without the axes along which it does not vary."""
+    """The column with length 1 along each axis along which its values do not vary."""
     if len(column) > 1 and (column[1:] == column[:1]).all():
         column = column[:1]
     if column.shape[1] > 1 and (column[:, 1:] == column[:, :1]).all():
@@ -165,8 +171,8 @@ def slim(column: Sampled) -> Sampled:
 
 
 def row(column: Sampled, sample: int, group: IntArray | None) -> Sampled:
-    """A column at a sample: one value for all vehicles, or one for each; `group` is the encounter
-    of each vehicle.
+    """The values of a column at a sample: one for all vehicles, or one for each vehicle. `group`,
+    shape (N,), has the number of each vehicle's encounter; None if columns need no index.
     """
     values: Sampled = column[sample if len(column) > 1 else 0]
     if group is not None and len(values) > 1:
@@ -181,13 +187,13 @@ def tracks_of(
     step: float,
     vehicle: Body,
 ) -> list[Track]:
-    """The bodies at K points, each in N encounters, with columns; body b is that of all scenarios'
-    bodies b. `vehicle` is the vehicle under test at the start.
+    """The tracks of all bodies at K points, with columns for the N encounters of each point. Track
+    b joins the b-th bodies of all points. `vehicle` is the vehicle under test at the start.
 
     Raises
     ------
     InputError
-        If bodies cannot move as a scenario says.
+        If a body cannot move as its track says, or touches the vehicle at the start.
     """
     tracks_of_scenarios = [
         point.scenario.tracks_begun(times, np.asarray(point.phase) * step)
@@ -206,7 +212,9 @@ def tracks_of(
 
 
 def _joined(tracks: Sequence[Track], width: int) -> Track:
-    """A body of K scenarios as one track with columns, of at least this width for each."""
+    """Join the tracks of a body in K scenarios into one track, whose columns have at least `width`
+    values for each scenario.
+    """
     columns = []
     for values in zip(*(track[2:] for track in tracks), strict=True):
         parts = [np.atleast_2d(np.asarray(value, float)) for value in values]

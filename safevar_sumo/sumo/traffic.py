@@ -1,5 +1,5 @@
-"""What vehicles under test see, meet and hit: once for all scenarios, from the geometry of
-bodies.
+"""The bodies of scenarios that move on tracks: which body a vehicle under test sees, its distance
+to all bodies, and which body it hits, from the geometry of rectangles.
 """
 
 from __future__ import annotations
@@ -34,34 +34,35 @@ from safevar_sumo.sumo.bodies import (
 from safevar_sumo.sumo.moving import TIE, Moving, Sampled, row, tracks_of
 
 APPROACH_SPEED = 0.5
-"""Closing speed above which a vehicle approaches a body ahead [m/s]; once the vehicle cannot be
-faster than the body again, it has avoided it.
+"""Closing speed above which a vehicle approaches a body ahead [m/s]. A vehicle has avoided a body
+that it approached as soon as it is never faster than this body again.
 """
 LEAST_DISTANCE = 1e-9
 """Lower bound of a distance that is a divisor [m]."""
 LEAST_CLOSING_SPEED = 0.1
 """Lower bound of a closing speed that is a divisor [m/s]."""
 OVERTIME = 30.0
-"""How much longer a run may take whose vehicle would touch somebody by then [s]."""
+"""Time by which a run is extended if its vehicle would touch somebody within this time [s]."""
 STEADY = 0.05
-"""Closing speed up to which a vehicle follows somebody [m/s]."""
+"""Closing speed up to which a vehicle only follows a body, and does not close in on it [m/s]."""
 LANE = Frame((0.0, 0.0), (1.0, 0.0))
-"""The coordinates of the vehicle's lane, in which tracks are."""
+"""Coordinates of the vehicle's lane: tracks state positions in these coordinates."""
 BLOCK = 16_384
-"""Number of distances that are computed at once: so many fit into a processor's cache."""
+"""Number of distances that are computed at once: as many as fit into a processor's cache."""
 NOBODY = -1
-"""In place of the number of a body that a vehicle has struck."""
+"""Number that stands for "the vehicle has struck no body"."""
 OFF_THE_WAY, HIDDEN, PASSED, NOT_MET = 1e4, 1e5, 1e6, 1e7
-"""What makes a body be seen only if there is no other [m of gap]: it is beside the way, hidden,
-passed, or scenery.
+"""Penalties on the gap of a body that is beside the vehicle's way, hidden, passed, or scenery [m].
+The vehicle sees the body with the least gap and penalty, so that such a body is seen only if there
+is no better one.
 """
 
 
 class Traffic:
-    """The bodies around N vehicles.
+    """The bodies around N vehicles under test, at several points of a study.
 
-    `group`, shape (N,), is the number of each vehicle's encounter: each point has `n_encounters`,
-    those of arrays as parameters or phase.
+    `group`, shape (N,), is the number of each vehicle's encounter over all points: each point has
+    `n_encounters` encounters, more than 1 if parameters or phases of the point are arrays.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class Traffic:
         n_groups = int(group.max()) + 1
         self.n = len(group)
         self.step = step
-        # None: all vehicles share a column, or each has its own, so that no index is needed.
+        # None means that columns need no index: all vehicles share a column, or have one each.
         self.group = group if 1 < n_groups < self.n else None
         self._points = points
         self._n_encounters = n_encounters
@@ -88,11 +89,11 @@ class Traffic:
         self._struck = np.full(self.n, NOBODY)
         self._place(n_samples)
         self._ended = np.zeros((len(self._bodies), n_samples, self.n), dtype=bool)
-        # Who is not in the path at the start has been approached as soon as it comes into it.
+        # A body that comes into the path later counts as approached from the moment it does.
         self._approached = [~self._row(body.is_in_path) for body in self._bodies]
 
     def _place(self, n_samples: int) -> None:
-        """Place all bodies at this number of samples."""
+        """Compute the bodies' positions at this number of samples."""
         times = (np.arange(n_samples) * self.step).astype(float)[:, None]
         vehicle = self._vehicle_body(np.zeros(1), np.zeros(1))
         self.tracks = tracks_of(
@@ -107,7 +108,7 @@ class Traffic:
         self._encountered = []
         self._hides = list[int]()
         for k, body in enumerate(bodies):
-            # Who is met comes first; scenery is seen only where there is nobody else.
+            # Bodies that only stand beside the path (level 0) are met only if there is no other.
             if body.level.max() >= min(highest_level.max(), 1):
                 self._encountered.append(k)
             if not any(screen.covers(body) for screen in screens):
@@ -115,8 +116,8 @@ class Traffic:
         self._bodies = bodies
 
     def are_closing(self, motion: VehicleStates) -> BoolArray:
-        """Which vehicles would touch a body within `OVERTIME` at their closing speeds, at the
-        sample of the last `observe`.
+        """Whether each vehicle would touch a body within `OVERTIME` if its closing speed stayed as
+        at the current sample (the sample of the last `hits`); shape (N,).
         """
         front = motion.fronts[None, :, 0]
         speed = motion.speeds[None]
@@ -128,19 +129,19 @@ class Traffic:
         return closes
 
     def place_until(self, n_samples: int) -> None:
-        """Move all bodies up to this number of samples, if they do not yet."""
+        """Compute the bodies' positions up to this number of samples, if there are fewer."""
         shortage = n_samples - self._ended.shape[1]
         if shortage > 0:
             self._place(n_samples)
             self._ended = np.pad(self._ended, ((0, 0), (0, shortage), (0, 0)))
 
     def _row(self, column: Sampled) -> Sampled:
-        """A column at this sample."""
+        """The values of a column at the current sample; see `row`."""
         return row(column, self._sample, self.group)
 
     def observe(self, motion: VehicleStates) -> Scene:
-        """The scene at the sample of the last `hits`; to be called at every sample. Whoever touches
-        a body sees it.
+        """The scene at the sample of the last `hits`. Call this method at every sample, after
+        `hits`: it notes when encounters end. A vehicle that touches a body sees this body.
         """
         front = motion.fronts[:, 0]
         speed = motion.speeds
@@ -168,7 +169,9 @@ class Traffic:
         return self._nearest(views, over)
 
     def _is_visible(self, number: int, front: FloatArray) -> BoolArray:
-        """Whether a body is there, and nobody on the line from the sensors to its middle."""
+        """Whether a body exists at this sample and no other body is on the line from a vehicle's
+        sensors to its middle; shape (N,) or ().
+        """
         track = self._bodies[number].track
         visible = self._row(self._bodies[number].is_there)
         for k in self._hides:
@@ -181,8 +184,8 @@ class Traffic:
     def _blocks(
         self, body: Moving, sensors: Quantity, x: Quantity, y: Quantity
     ) -> BoolArray:
-        """Whether a body is on the line from sensors in the middle of the lane to a point: the slab
-        test in the body's own axes.
+        """Whether a body is on the line from a vehicle's sensors, in the middle of the lane, to the
+        point x, y: the slab test in the body's own axes.
         """
         dx = x - sensors
         dy = y
@@ -194,7 +197,7 @@ class Traffic:
             dx, dy = dx * cosine + dy * sine, dy * cosine - dx * sine
             rx, ry = rx * cosine + ry * sine, ry * cosine - rx * sine
 
-        # In shares of the line: 0 at the sensors, 1 at the point.
+        # Where the line enters and leaves the body, in shares: 0 at the sensors, 1 at the point.
         enter: Quantity = -np.inf
         leave: Quantity = np.inf
         for position, change, size in (
@@ -202,7 +205,7 @@ class Traffic:
             (ry, dy, body.track.width),
         ):
             half = self._row(size) / 2 + TIE
-            # Infinite for a line along the body.
+            # A line along the body divides by 0: infinite shares give the right answer.
             to_rear = (-half - position) / change
             to_front = (half - position) / change
             enter = np.maximum(enter, np.minimum(to_rear, to_front))
@@ -226,8 +229,8 @@ class Traffic:
         )
 
     def _nearest(self, views: Sequence[_View], over: BoolArray) -> Scene:
-        """The scene of the nearest visible body that is or comes into the way; without one, of the
-        nearest other.
+        """The scene of the nearest visible body that is in the way or comes into the way. Without
+        such a body, the scene of the nearest other body (see `OFF_THE_WAY`).
         """
         ranks = []
 
@@ -244,7 +247,7 @@ class Traffic:
             )
             reach = self.width / 2 + self._row(body.half_width)
             comes = is_closing & (np.abs(lateral_at_arrival) < reach)
-            # A leader at the vehicle's speed who makes way is nobody to brake for.
+            # A leader who makes way, at about the vehicle's speed, is no reason to brake.
             makes_way = np.sign(lateral) * drift > 0
             leaves = makes_way & (view.closing <= APPROACH_SPEED)
             is_in_way = (self._row(body.is_in_path) & ~leaves) | comes
@@ -257,7 +260,7 @@ class Traffic:
             )
             ranks.append(np.where(self._struck == view.body, -np.inf, rank))
 
-        # Most bodies are nobody's nearest: their scenes are not computed.
+        # Scenes are computed only of bodies that are nearest to some vehicle: most are not.
         chosen = np.argmin(np.stack(ranks), axis=0)
         numbers = np.flatnonzero(np.bincount(chosen))
         scene = self._scene_of(views[numbers[0]], over)
@@ -270,8 +273,8 @@ class Traffic:
     def hits(
         self, sample: int, front: FloatArray, speed: FloatArray, is_open: BoolArray
     ) -> Hits:
-        """Speeds [m/s] of the vehicles of open runs that touch a body, by number; the sample is
-        that of `observe`.
+        """Make `sample` the current sample, and return the speeds [m/s] of vehicles that touch a
+        body, by vehicle number. Vehicles whose runs have ended (not `is_open`) are left out.
         """
         self._sample = sample
         self._struck = np.full(self.n, NOBODY)
@@ -298,7 +301,7 @@ class Traffic:
     def bodies(
         self, vehicles: Sequence[int], front: FloatArray, speed: FloatArray
     ) -> BodyPairs:
-        """Vehicles that touch somebody and those whom they touch, in lane coordinates."""
+        """Pairs of each given vehicle and the body that it touches, in lane coordinates."""
         numbers = np.asarray(vehicles)
         bodies = [self._body(k, numbers) for k in range(len(self._bodies))]
         columns = (
@@ -319,12 +322,12 @@ class Traffic:
         )
 
     def _body(self, number: int, vehicles: IntArray) -> Body:
-        """A body at this sample, as the given vehicles meet it."""
+        """A body at the current sample, in the encounters of the given vehicles."""
         body = self._bodies[number]
         group = vehicles
         if self.group is not None:
             group = self.group[vehicles]
-        # A column may have one value for all encounters: then "clip" takes it for each.
+        # If a column has one value for all encounters, "clip" takes it for each of them.
         length, width, x, y, cosine, sine, speed, drift = (
             row(column, self._sample, None).take(group, mode="clip")
             for column in (*body.track[2:], body.vy)
@@ -335,8 +338,8 @@ class Traffic:
         return Body(np.stack([x, y], axis=1), along, length, width, speed, drift)
 
     def encounter(self, trace: Trace) -> Encounter:
-        """The distance to the nearest body that still counts, and how fast it shrinks, at all
-        samples of a trace whose positions are those of the vehicles' fronts.
+        """The distance to the nearest body that still counts, and the rate at which the distance
+        shrinks, at all samples of a trace. The trace's positions are the vehicles' fronts.
         """
         shape = trace.speed.shape
         n_rows = max(BLOCK // trace.speed.shape[1], 1)
@@ -364,8 +367,8 @@ class Traffic:
     def _approach(
         self, number: int, samples: slice, front: FloatArray, speed: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """The distances of vehicles to a body at some samples, how fast they shrink, and whether
-        they count.
+        """The distances between vehicles and a body at some samples [m], the rates at which they
+        shrink [m/s], and whether the body counts (the encounter with it has not ended).
         """
         body = self._bodies[number]
         edge, far_end, vx, vy, y, half_width = (
@@ -399,7 +402,7 @@ class Traffic:
         return separation, rate, counts
 
     def _table(self, column: Sampled, samples: slice) -> Sampled:
-        """A column at some samples, for each vehicle or for all of them."""
+        """The values of a column at some samples: a value for each vehicle, or one for all."""
         if len(column) > 1:
             column = column[samples]
         if self.group is None or column.shape[1] == 1:
@@ -408,8 +411,8 @@ class Traffic:
 
 
 class _View(NamedTuple):
-    """A body as N vehicles meet it at a sample: its number, gap [m] and closing speed [m/s], and
-    whether it is passed and visible.
+    """A body as N vehicles meet it at a sample: its number, the gap to it [m], the closing speed
+    [m/s], and whether a vehicle has passed it and sees it; all but the number have shape (N,).
     """
 
     body: int
