@@ -48,7 +48,7 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
     is_invalid = runs.outcome == Outcome.INVALID_TEST
     settings = np.tile(settings, (system.repeats, 1))
 
-    # In an invalid test the speed is not that of the test: metrics of its run say nothing.
+    # In an invalid test the vehicle misses the test's speed: metrics of its run mean nothing.
     metrics = {}
     with user_errors(system.source):
         for name, measure in system.measuring.measures.items():
@@ -70,8 +70,10 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
 
 
 def reason_against_scenes(system: System) -> str:
-    """Why recorded scenes do not suffice, so that SUMO, in a copy of the network for each vehicle,
-    or a simulator of the user's own simulates a system; "" if they do.
+    """The reason why recorded scenes and tracks do not suffice for a system; "" if they suffice.
+
+    With a reason, SUMO simulates the system, in a copy of the network for each vehicle, or the
+    user's simulator does.
     """
     if reason := system.mover.lacks.get("recorded scenes"):
         return reason
@@ -87,7 +89,9 @@ def reason_against_scenes(system: System) -> str:
 
 
 def _has_own_traffic(point: Point) -> bool:
-    """Whether no recorded scene can be laid out for the encounters of a point."""
+    """Whether only SUMO knows the traffic of a point's encounters: the scenario has no `layout` of
+    its own, a method that computes where the actors of each encounter are.
+    """
     scenario = point.scenario
     return (
         isinstance(scenario, WorldScenario)
@@ -102,8 +106,8 @@ def drive_all(
 
     The result holds the runs at the first point, then the runs at the second point, and so on.
     Several points must have scenarios of tracks; SUMO and other simulators simulate only one point
-    at once. `listen` is called with what the ADS observes at every sample. A study that repeats its
-    settings has all of them once, then all of them again.
+    at once. `listen` is called at every sample, with the observation that the ADS gets. A study
+    that repeats settings has the runs of all settings in the first round, then all of the second.
 
     Raises
     ------
@@ -117,11 +121,11 @@ def drive_all(
     vehicles, encounters = system.split(settings)
     on_road = system.at_encounters(encounters)
     scenario = on_road.points[0].scenario
-    # Compilation takes longer than many a simulation, and is no part of its time limit.
+    # Compilation may take longer than a simulation: it must not count in the time limit.
     system.vehicle.compile()
     with user_errors(system.source), end_if_longer(system.time_limit):
-        # SUMO is slow: it simulates only where neither bodies on tracks, at all points at once, nor
-        # a scene that it has played once can stand in for it.
+        # SUMO is slow. So it simulates only if neither tracks nor a recorded scene suffice; among
+        # tracks all points are simulated at once.
         if reason_against_scenes(system):
             traffic = traffic_of(system, encounters, OVERTIME)
             with open_points_world(system, encounters, traffic) as sumo_world:
@@ -141,8 +145,8 @@ def drive_all(
 def _recorded_world(
     system: System, encounters: FloatArray, scenario_there: Scenario
 ) -> RecordedWorld:
-    """The recorded scene of the system's only point for N encounters, shape (N, k); a scene for
-    each if the scenario differs there.
+    """The recorded scene of the system's only point, for N vehicles in `encounters`, shape (N, k).
+    If the encounters change the scenario (`scenario_there`), each has a scene of its own.
     """
     (point,) = system.points
     assert isinstance(point.scenario, WorldScenario)
@@ -151,7 +155,7 @@ def _recorded_world(
     if scenario_there is point.scenario:
         return RecordedWorld(scene, len(encounters))
 
-    # Where a variant and the original take turns, a pair shares a scene.
+    # If rows are pairs of a variant and the original in the same encounter, a pair shares a scene.
     size = 1
     if np.array_equal(encounters[::2], encounters[1::2]):
         size = 2
@@ -164,7 +168,9 @@ def _recorded_world(
 def observer_of(
     scenario: Scenario, world: SceneWorld, traffic: Traffic | None
 ) -> Observer:
-    """Who observes for the vehicles: bodies on tracks, or else the scenario itself."""
+    """The observer of the vehicles: the traffic if bodies move on tracks, else an observer that
+    asks the scenario.
+    """
     if traffic is not None:
         return traffic
     assert isinstance(scenario, WorldScenario)
@@ -172,8 +178,8 @@ def observer_of(
 
 
 def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic | None:
-    """The bodies around N vehicles in their encounters, shape (N, k), at every point, for so many
-    seconds `longer` than their scenarios take; None if the scenario observes a world itself.
+    """The bodies around N vehicles in their `encounters`, shape (N, k), at every point; None if the
+    scenario observes a world itself. Tracks last `longer` seconds more than their scenarios.
     """
     points = system.points
     if not system.has_tracks:
@@ -181,7 +187,7 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
     group = np.repeat(np.arange(len(points)), len(encounters))
     n_encounters = 1
 
-    # An encounter that several vehicles meet is there once: its bodies are computed once.
+    # The bodies of an encounter that several vehicles meet are computed only once.
     if encounters.shape[1]:
         _, distinct, group = np.unique(
             encounters, axis=0, return_index=True, return_inverse=True
@@ -201,7 +207,7 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
 
 
 def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:
-    """The speeds at the start of n vehicles at each point."""
+    """Speeds at the start of n vehicles at each of K points, shape (K * n,) [m/s]."""
     return np.concatenate(
         [np.zeros(n) + point.scenario.start_speed for point in points]
     )
@@ -226,7 +232,7 @@ def open_points_world(
         scenarios = [encounter(point, values).scenario for values in searched]
     networks = networks_for(scenarios)
 
-    # SUMO cannot drive along tracks: bodies on them are put at their places.
+    # SUMO cannot move bodies along tracks: a TrafficWorld puts them at their places.
     create: Create = SumoWorld
     if traffic is not None:
         speeds = _start_speeds(system.at_encounters(encounters).points, n)

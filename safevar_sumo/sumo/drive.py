@@ -1,5 +1,5 @@
-"""Drives vehicles through a world, sample by sample: from what they observe to the speeds that they
-reach.
+"""Drives vehicles under test through a world, sample by sample: a sample begins with what the
+vehicles observe, and leads to the speeds that they reach at the next sample.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from safevar_sumo.vehicles import LEVEL, CharacteristicSet, Sensors, slope_of
 from safevar_sumo.vehicles.base import Prepared
 
 Listener = Callable[[Observation], None]
-"""A function that is called with what the ADS observes at every sample."""
+"""A function that is called at every sample, with the observation that the ADS gets."""
 OF_ALL_RUNS = ("step", "vehicle_length", "vehicle_width", "time", "position")
-"""Fields of a trace that are no columns of a log."""
+"""Fields of a trace for which a log keeps no column of its own."""
 TRUTHS = ("active", "visible")
 """Columns of a log that are true or false."""
 
@@ -60,8 +60,8 @@ def drive(
     observer: Observer,
     listen: Listener | None = None,
 ) -> SimulationRuns:
-    """Simulate N settings of the vehicle's n characteristics, shape (N, n), in a world that has not
-    taken its first step; see `drive_all`.
+    """Simulate N settings of the vehicle's n characteristics, shape (N, n), in a `world` that has
+    not taken its first step. `observer` returns the scene of each sample; see `drive_all`.
 
     With K points, `settings` holds K groups of equal size, and group k drives at point k.
     """
@@ -94,17 +94,18 @@ def drive(
             time = sample * step
             speed = motion.speeds
             scene = observer.observe(motion)
-            # Who sees nobody drives through everybody: its run ends at the place of the encounter.
+            # An ADS that sees nobody would drive on: a run ends when the vehicle reaches the body.
             if system.sees_nobody:
                 scene = scene._replace(
                     visible=np.array(False), over=scene.over | (scene.gap <= 0)
                 )
             collisions = contacts.count(world, motion.hits, scene)
-            # SUMO misses contacts in some places; bodies on tracks touch wherever they overlap.
+            # SUMO misses contacts in some places, such as between lanes. Contacts with bodies on
+            # tracks follow from their geometry, and need no check.
             if isinstance(observer, SceneObserver):
                 is_checked = outcomes.is_open & ~scene.over
                 contacts.check(observer.world, scene, is_checked, time)
-            # Tracks go on, and so may a run among them; a scene ends by its time.
+            # Tracks have no end, so that a run among them may be extended; recorded scenes end.
             if isinstance(observer, Traffic):
                 ends = may_go_on & outcomes.is_open & (sample == last_sample)
                 if ends.any():
@@ -152,7 +153,9 @@ def drive(
 def _go_on(
     traffic: Traffic, motion: VehicleStates, ends: BoolArray, last_sample: IntArray
 ) -> BoolArray:
-    """Which of the runs that end by their time go on; their last samples are moved."""
+    """Extend those of the runs that end at this sample (`ends`) whose vehicles close in on a body:
+    `last_sample` grows by `OVERTIME`. Returns the extended runs, shape (N,).
+    """
     goes_on = ends & traffic.are_closing(motion)
     last_sample[goes_on] += round(OVERTIME / traffic.step)
     traffic.place_until(int(last_sample.max()) + 1)
@@ -160,12 +163,14 @@ def _go_on(
 
 
 def last_sample_of(point: Point, step: float) -> Quantity:
-    """The number of the last sample of runs at a point, which begin later by its phase."""
+    """The number of the last sample of runs at a point: its duration in steps, plus its phase,
+    because bodies begin to move later by the phase.
+    """
     return point.scenario.duration / step + point.phase
 
 
 class RoadVehicles(NamedTuple):
-    """Vehicles on the road: their constants, their ADS and their first motion."""
+    """Vehicles on the road: the constants of their model, their ADS, and their first motion."""
 
     prepared: Prepared
     ads: Ads
@@ -173,7 +178,7 @@ class RoadVehicles(NamedTuple):
 
 
 def enter(system: System, settings: FloatArray, world: VehicleWorld) -> RoadVehicles:
-    """Put the vehicles of N settings, shape (N, n), onto the road."""
+    """Put the vehicles of N settings, shape (N, n), into a world that has not taken a step yet."""
     vehicle = system.vehicle
     n = len(settings)
 
@@ -182,7 +187,7 @@ def enter(system: System, settings: FloatArray, world: VehicleWorld) -> RoadVehi
     prepared = vehicle.prepare(characteristics, *roads)
     types = vehicle.sumo_type(prepared)
 
-    # A controller that was written for SUMO drives in it, beside SUMO's own driver.
+    # A controller written for TraCI reads and commands the world itself, beside SUMO's own driver.
     ads = with_tau(system.ads, types.tau)
     if system.points[0].scenario.brakes_fully:
         ads = FullBrake()
@@ -215,9 +220,9 @@ def _check_finite(
 
 
 def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Quantity, ...]:
-    """What `Vehicle.prepare` gets besides the characteristics of n vehicles: factor on the tyres'
-    friction (a number if all points share it), time step and, unless all roads are level and dry,
-    slope and water.
+    """The arguments of `Vehicle.prepare` after the characteristics of n vehicles: the weather's
+    factor on the tyres' friction (a number if all points have the same), the time step, then the
+    slope and the water. Slope and water are left out if no road has a slope or water.
     """
     size = n // len(points)
     friction = per_vehicle([point.weather.road_friction for point in points], size)
@@ -232,8 +237,8 @@ def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Quantity, ...]
 
 
 def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
-    """The vehicles' sensors: the weather adds its recognition delay and scales the range by its
-    visibility.
+    """The vehicles' sensors at the system's only point. The weather adds its recognition delay to
+    the latency, and its visibility scales the range.
     """
     (point,) = system.points
     latency, reach, scale = system.vehicle.sensors(prepared) or Sensors.perfect(n)
@@ -245,8 +250,8 @@ def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
 
 
 class _Log:
-    """Up to `capacity` samples of N runs; T samples are arrays of shape (T, N), and the vehicles'
-    positions on SUMO's plane an array of shape (T, N, 2) [m].
+    """A log of up to `capacity` samples of N runs. A quantity has the shape (capacity, N); the
+    positions of the vehicles, in the world's coordinates, have the shape (capacity, N, 2) [m].
     """
 
     def __init__(self, world: VehicleWorld, capacity: int) -> None:
@@ -261,7 +266,7 @@ class _Log:
         self._columns = {}
         for field in fields(Trace):
             if field.name not in OF_ALL_RUNS:
-                # Truths keep one byte instead of eight.
+                # A truth takes one byte, a float eight.
                 kind = bool if field.name in TRUTHS else float
                 self._columns[field.name] = np.zeros((capacity, world.n), dtype=kind)
 
@@ -280,7 +285,7 @@ class _Log:
         self._samples += 1
 
     def trace(self) -> Trace:
-        """All samples that were written."""
+        """The trace of all samples that were written; positions are those along the lane [m]."""
         samples = self._samples
         columns = {name: values[:samples] for name, values in self._columns.items()}
         along = self._frame.along(self._positions[:samples].reshape(-1, 2))
@@ -295,11 +300,12 @@ class _Log:
 
 
 class _Outcomes:
-    """Outcomes of N runs (docs/method.md, section 4), shape (N,); `collision_speed` [m/s] and
-    `warning_ttc`, the true time to collision at the first warning [s], are NaN without one.
+    """Outcomes of N runs (docs/method.md, section 4); all arrays have the shape (N,).
 
-    `is_open` is true where an outcome can change; `is_checked` where user code is checked: in runs
-    that were open when their vehicles last advanced.
+    `collision_speed` [m/s] is NaN without a collision. `warning_ttc`, the true time to collision at
+    the first warning [s], is NaN without a warning. `is_open` is true while the outcome of a run
+    can change. `is_checked` is true if a run was open when its vehicle last advanced: values that
+    user code returns are checked in these runs alone.
     """
 
     def __init__(self, n: int) -> None:
@@ -318,10 +324,10 @@ class _Outcomes:
         collisions: Hits,
         is_last: BoolArray | bool,
     ) -> BoolArray:
-        """Process one sample; returns for which vehicles the sample is part of the run."""
+        """Process one sample. Returns whether the sample is part of each run, shape (N,)."""
         active = self.is_open & ~over
 
-        # A collision ends a run, and its sample counts, also where the encounter is over by then.
+        # A collision ends a run. Its sample is part of the run even if the encounter is over.
         for copy, collision_speed in collisions.items():
             if self.is_open[copy]:
                 self.collision_speed[copy] = collision_speed
@@ -338,7 +344,9 @@ class _Outcomes:
     def note_warnings(
         self, warns: BoolArray | None, speed: FloatArray, scene: Scene
     ) -> None:
-        """Note the time to collision, not as it is sensed, of each open run's first warning."""
+        """Note the time to collision at each open run's first warning. `scene` has the true gap,
+        and not the gap that sensors report.
+        """
         if warns is not None:
             closing_speed = speed - scene.obstacle_speed
             is_first = np.isnan(self.warning_ttc) & self.is_open & (closing_speed > 0)

@@ -1,5 +1,5 @@
-"""A study can judge its ADS only if the original vehicle, on an empty road, drives to the place of
-the encounter.
+"""Checks that a study can judge its ADS: on an empty road, the original vehicle must drive to the
+place of the encounter.
 """
 
 from __future__ import annotations
@@ -16,18 +16,22 @@ from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System
 
 MIN_PEDAL = 0.03
-"""Brake pedal from which on the vehicle brakes [-], as for the robot of Euro NCAP's tests."""
+"""Position of the brake pedal above which the vehicle brakes [-], as for the robot of tests by Euro
+NCAP (`driving_robot.py`).
+"""
 MIN_SLOWDOWN = 2.0
-"""Speed that braking takes off before it counts [m/s]: cruise controls brake to hold a speed, some
-by full strokes.
+"""Loss of speed above which braking counts as a fault [m/s]: cruise controls brake to hold a speed,
+some with a fully pressed pedal.
 """
 SLOW_APPROACH = 0.5
-"""Who comes closer by less need not reach anybody within a test [m/s]: he follows."""
+"""Closing speed below which a vehicle only follows the obstacle [m/s]: such a vehicle need not
+reach the obstacle within a test.
+"""
 
 
 class Reason(StrEnum):
-    """Why a first drive leads to no encounter: the ADS brakes or stands; others leave, or never
-    come.
+    """Why a drive on an empty road leads to no encounter: the ADS brakes; the vehicle never gets
+    there; or it is late, because others have left or stay beside its way.
     """
 
     BRAKES = "brakes"
@@ -36,23 +40,27 @@ class Reason(StrEnum):
 
 
 class EmptyRoadFault(NamedTuple):
-    """What the original vehicle does wrong on an empty road, with a verb in front."""
+    """A fault of the original vehicle on an empty road: its kind, and words that follow the subject
+    of a sentence ("brakes without an obstacle").
+    """
 
     reason: Reason
     words: str
 
 
 def why_no_verdict(system: System) -> str:
-    """Why simulations tell nothing about the ADS, in a sentence; "" if they do."""
+    """The reason why simulations tell nothing about the ADS, as a sentence; "" if they tell
+    something.
+    """
     return sentence_on(find_problems(system), len(system.points))
 
 
 def find_problems(system: System) -> dict[str, EmptyRoadFault]:
-    """What keeps the original vehicle from the encounter, by the name of the point.
+    """The faults that keep the original vehicle from the encounter, by the name of the point.
 
-    At every point the original vehicle drives once as on an empty road, as the ADS sees nobody. If
-    it does not reach the place of the encounter before the encounter is over, or brakes on its way,
-    the obstacle is not what keeps it from a collision.
+    At every point the original vehicle drives once with an ADS that sees nobody, as on an empty
+    road. If it does not reach the place of the encounter before the encounter is over, or brakes on
+    its way, it would avoid a collision without reacting to the obstacle.
     """
     # A simulator of the user's own cannot be told that nobody is there.
     if not system.mover.has("a driving system"):
@@ -73,8 +81,8 @@ def find_problems(system: System) -> dict[str, EmptyRoadFault]:
 
 
 def sentence_on(problems: dict[str, EmptyRoadFault], n_points: int) -> str:
-    """The first problem in a sentence, and at how many of the points it is there; "" without
-    one.
+    """A sentence on the first problem, and the number of points that have a problem of the same
+    kind; "" without problems.
     """
     if not problems:
         return ""
@@ -90,10 +98,11 @@ def sentence_on(problems: dict[str, EmptyRoadFault], n_points: int) -> str:
 
 
 def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault | None:
-    """What the original vehicle, the only one in `runs`, does wrong on an empty road.
+    """The fault of the original vehicle, the only one in `runs`, on an empty road; None if it has
+    driven as it should.
 
-    Who still has its test speed at the end, and comes closer to nobody, has driven as it should.
-    Who still has the speed that it began with when the others have left is late.
+    A vehicle that still has its test speed at the end, and closes in on nobody, has driven as it
+    should. A vehicle that still has its first speed when the others have left is late.
     """
     # The sample after the last active one ended the run.
     trace = runs.trace
@@ -110,7 +119,7 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
         :, :end, 0
     ]
 
-    # Cruise controls brake to hold a speed, but take little off it.
+    # Braking that only holds a speed, as cruise controls do, is no fault.
     is_slower = speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN
     if (is_slower & (brake > MIN_PEDAL)).any():
         return EmptyRoadFault(Reason.BRAKES, "brakes without an obstacle")
@@ -122,7 +131,7 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     if runs.outcome[0] == Outcome.COLLISION:
         return None
 
-    # Who drives past somebody beside its way has met nobody.
+    # A vehicle that drives past somebody who stays beside its way has met nobody.
     beside = np.abs(trace.lateral[:end, 0]) - (trace.vehicle_width + obstacle_width) / 2
     stays_beside = (beside > 0).all() and beside[-1] >= beside[-2:][0]
     if last_gap <= 0 and stays_beside:

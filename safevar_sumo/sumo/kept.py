@@ -1,4 +1,6 @@
-"""What a process keeps of simulators of the user's own: a handle of each class, opened once."""
+"""What this process keeps between the runs of users' simulators: for each class a handle, such as a
+connection, that is opened only once.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +21,14 @@ from safevar_sumo.scenarios import Simulator
 
 ARRAYS = (np.generic, np.ndarray, np.random.Generator, np.random.RandomState)
 PLAIN = (bool, int, float, complex, str, bytes, tuple, list, dict, set, Random, *ARRAYS)
-"""Types of attributes of a simulator that each run has for itself, unlike an open connection."""
+"""Types of attributes of which each run gets a copy of its own. Values of other types, such as an
+open connection, may pass from run to run.
+"""
 
 
 class Kept:
-    """What this process keeps of the simulators of the user's own: of each class the handle that
-    its `open_worker` returned, and the object that simulated last; and how often it has
-    `simulated`.
+    """What this process keeps of users' simulators: for each class the handle that `open_worker`
+    returned, and the object that simulated last. `simulated` is the number of simulations.
     """
 
     def __init__(self) -> None:
@@ -34,8 +37,8 @@ class Kept:
         self.simulated = 0
 
     def at(self, scenario: Simulator) -> Simulator:
-        """An object as `scenario` was when it was created with its fields, with the handle of its
-        class; a new handle if the file of the class was edited.
+        """A simulator that is a copy of `scenario`, with the handle of its class. If the file of
+        the class was edited, the old handle is closed and a new one is opened.
         """
         kind = type(scenario)
         name = f"{kind.__module__}:{kind.__qualname__}"
@@ -54,8 +57,8 @@ class Kept:
             self._handles[name] = edited, kind, handle
         handle = self._handles[name][2]
 
-        # Nothing that a run changes stays in the scenario. Without `open_worker`, what the run
-        # before opened and put into the object is handed on.
+        # A run must not change the scenario, which later runs copy, too. Without `open_worker`,
+        # this object inherits what the run before opened and stored in its own object.
         is_struct = isinstance(scenario, msgspec.Struct)
         set_field: Any = (
             msgspec.structs.force_setattr if is_struct else object.__setattr__
@@ -67,7 +70,7 @@ class Kept:
         if has_worker:
             try:
                 set_field(simulator, "worker", handle)
-            # A Struct has its fields alone.
+            # A Struct has no attributes beside its fields.
             except AttributeError:
                 kind.worker = property(lambda self: handle)
         elif not is_struct:
@@ -93,14 +96,16 @@ class Kept:
 
 
 def _attributes(simulator: Simulator) -> dict[str, Any]:
-    """The attributes of a simulator, or the fields of a Struct; none where its class has slots."""
+    """The attributes of a simulator, or the fields of a Struct, by name. A class with slots has
+    none.
+    """
     if isinstance(simulator, msgspec.Struct):
         return msgspec.structs.asdict(simulator)
     return dict(getattr(simulator, "__dict__", {}))
 
 
 def _deep_copy(value: Any) -> Any:
-    """A copy that shares nothing; the value itself, such as a lock, where there is none."""
+    """A deep copy of a value; the value itself if it cannot be copied, such as a lock."""
     try:
         return deepcopy(value)
     except (TypeError, AttributeError, ValueError, RuntimeError, Error):
@@ -108,12 +113,14 @@ def _deep_copy(value: Any) -> Any:
 
 
 KEPT = Kept()
-"""What this process keeps."""
+"""The only `Kept` of this process."""
 
 
 @atexit.register
 def close_simulator() -> None:
-    """End the simulators of this process, also where one fails to end."""
+    """End the simulators of this process and the processes that they started, even if a simulator
+    fails to end.
+    """
     with suppress(Exception):
         KEPT.close()
     end_children(this_process.mark)

@@ -13,7 +13,9 @@ from safevar_sumo.vehicles import SumoType
 
 
 class LaneWorld:
-    """N vehicles on a lane among bodies on tracks, which move by SUMO's ballistic update."""
+    """A `VehicleWorld` of N vehicles on a lane among bodies on tracks. The vehicles move by SUMO's
+    ballistic update, so that their positions are the same as in SUMO.
+    """
 
     frame = LANE
 

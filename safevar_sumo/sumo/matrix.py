@@ -1,5 +1,5 @@
-"""Evaluates settings at the points of a study: its only scenario, or a matrix, of whose points the
-worst one counts.
+"""Evaluates settings at the points of a study: its only scenario, or the points of a matrix. In a
+matrix the worst point decides about a setting.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ MAX_VEHICLES = 4000
 MB.
 """
 LONG_RUN = 60.0
-"""Length of a run up to which so many vehicles drive at once [s]; in longer ones there are fewer.
+"""Length of a run up to which `MAX_VEHICLES` drive at once [s]. In longer runs fewer vehicles
+drive at once, because traces take memory.
 """
 MAX_LANES = 100_000
 """Largest number of lanes in all copies of one simulation; loading more lanes takes minutes and
@@ -98,7 +99,7 @@ def vehicle_remarks(system: System) -> list[str]:
     if test_speed <= fitted_speed:
         return []
 
-    # The drag shows how far the model is off there.
+    # The drag at the test speed lets a user judge how wrong the model is at this speed.
     tables = system.nominal.tables()
     speed = min(test_speed, float(tables.speeds[-1]))
     drag = np.interp(speed, tables.speeds, tables.coasting)
@@ -112,14 +113,14 @@ def vehicle_remarks(system: System) -> list[str]:
 def drive_and_score(
     system: System, settings: FloatArray, *, with_originals: bool = True
 ) -> Evaluations:
-    """Simulate settings, shape (N, n), as they are given, in one batch and score them.
+    """Simulate and score settings, shape (N, n), without a filter, in as few batches as fit.
 
     A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a
-    matrix, row i holds the result of setting i at its worst point. Where an encounter counts by
-    what the original vehicle does in it, row i also holds the safety degree of that, unless
-    `with_originals` is false.
+    matrix, row i holds the result of setting i at its worst point. If encounters count only where
+    the original vehicle is safe, the original drives in each encounter, too, and row i also holds
+    its safety degree. This is left out if `with_originals` is false.
     """
-    # Beside each setting drives the original in its encounter, so that half as many fit.
+    # The original drives beside each setting, so that only half as many settings fit.
     takes_pairs = with_originals and system.measuring.scoring.safe_original is not None
     size = max(1, batch_size(system) // (system.repeats * (1 + takes_pairs)))
     if len(settings) > size:
@@ -161,15 +162,15 @@ def drive_and_score(
 def _beside(
     system: System, settings: FloatArray, originals: FloatArray
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """Settings and the original vehicle in the encounter of each, both of shape (N, n), in one
-    array; the rows of each setting and of its original in it.
+    """Join settings and the original vehicle in their encounters, both of shape (N, n), into one
+    array. Returns the array, the row of each setting, and the row of each setting's original.
     """
     n = len(settings)
-    # Among bodies on tracks the original meets an encounter of several settings once.
+    # Among bodies on tracks one run of the original serves all settings with the same encounter.
     if system.has_tracks:
         distinct, number = np.unique(originals, axis=0, return_inverse=True)
         return np.concatenate([settings, distinct]), np.arange(n), n + np.ravel(number)
-    # In recorded scenes both take turns, as pairs share a scene.
+    # In recorded scenes a setting and its original are neighbours, because a pair shares a scene.
     vehicles = np.stack([settings, originals], axis=1).reshape(-1, settings.shape[1])
     return vehicles, np.arange(0, 2 * n, 2), np.arange(1, 2 * n, 2)
 
@@ -184,7 +185,7 @@ def evaluate_matrix(system: System, settings: FloatArray) -> Evaluations:
 
 def evaluate_points(system: System, settings: FloatArray) -> list[Evaluations]:
     """Evaluations of settings, shape (N, n), at every point, in the points' order. Traces are
-    dropped, as they would take gigabytes.
+    dropped, because the traces of all points would take gigabytes.
     """
     evaluations = {}
     for result in simulate_points(system, settings):
@@ -194,21 +195,21 @@ def evaluate_points(system: System, settings: FloatArray) -> list[Evaluations]:
 
 def settings_per_batch(system: System) -> int:
     """Number of settings in an efficient batch."""
-    # The results of a batch are journaled at its end: a long simulation is not to be lost.
+    # A journal gets the results of a batch at its end: an interruption loses what is not in it.
     if system.mover.takes_long:
         return 1
     if reason_against_scenes(system):
         return MAX_COPIES
-    # The original vehicle drives beside each; the points one after another.
+    # The original vehicle drives beside each setting; points are simulated one after another.
     if len(system.characteristics.scenario):
         return largest_batch(system) // 2
-    # Vehicles of a batch take each step together: fewer would cost as much.
+    # A step costs about as much for few vehicles as for many: smaller batches would save nothing.
     return max(largest_batch(system) // len(system.points), MAX_COPIES)
 
 
 def largest_batch(system: System) -> int:
-    """Largest number of vehicles in one batch, smaller for long runs and if each has its own
-    FMU.
+    """Largest number of vehicles in one batch. Long runs, and an ADS that is an FMU for each
+    vehicle, make it smaller.
     """
     longest = max(float(np.max(point.scenario.duration)) for point in system.points)
     in_memory = round(MAX_VEHICLES * min(LONG_RUN / longest, 1.0))
@@ -229,10 +230,10 @@ def batch_size(system: System) -> int:
 
 
 def drive_worst(system: System, settings: FloatArray) -> SimulationRuns:
-    """Run the scenario once for every setting, shape (N, n).
+    """Simulate every setting, shape (N, n), once.
 
-    In a matrix, all settings run at the worst point of the last one: others may stand before it,
-    such as the original. Raises the errors of `drive_all`.
+    In a matrix, all settings run at the worst point of the last setting, so that other settings,
+    such as the original, can be compared with it. Raises the errors of `drive_all`.
     """
     return drive_all(system.at(worst_point(system, settings[-1])), settings)
 
@@ -257,7 +258,8 @@ def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResul
     if not reason_against_scenes(system) and (not searched or [*searched] == [PHASE]):
         groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
     for points in groups:
-        # Settings that have no encounter of these points keep their rows, for the others' sake.
+        # Settings that do not meet these points get the original encounter of the points, so that
+        # row i stays setting i. Their results are replaced below.
         is_met = met_at(points[0], system, settings)
         vehicles = settings
         if not is_met.all():
@@ -282,10 +284,11 @@ def worst_point(system: System, setting: FloatArray) -> Point:
 
 
 def _group_points(system: System, size: int) -> Iterator[Points]:
-    """Yield groups of at most `size` points that may share a batch, sorted by duration: those whose
-    scenarios are tracks around equal vehicles; any other point is alone. Where one batch does not
-    hold all points, those of a batch have equally many bodies: others would carry bodies that they
-    do not have.
+    """Yield groups of at most `size` points that may share a batch, sorted by duration.
+
+    Points share a batch if their scenarios are tracks around vehicles of equal size; any other
+    point is alone. If one batch does not hold all points, the points of a batch have equally many
+    bodies: with fewer bodies than the others, a point would carry bodies that it does not have.
     """
     groups: dict[Hashable, list[Point]] = {}
     for point in system.points:

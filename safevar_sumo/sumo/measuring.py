@@ -46,8 +46,8 @@ CRITERION_KEY = "unsafe.criterion"
 
 
 class Measuring(NamedTuple):
-    """The measures that are computed, of runs before those of settings, by column; and the
-    scoring.
+    """The measures that a study computes, by the name of their column, and the scoring: the facts
+    of metrics and objectives.
     """
 
     measures: Mapping[str, Measure]
@@ -55,8 +55,8 @@ class Measuring(NamedTuple):
 
 
 def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
-    """Look up the metrics and objectives that a study names; `has_stops`: one of its scenarios
-    brakes fully.
+    """Look up the metrics and objectives that a study names. With `has_stops`, a scenario of the
+    study brakes fully, so that stopping distances are measured, too.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
         objectives.append(objective)
         texts.setdefault(objective.name, []).append(repr(text))
     if IMPACT_EXCESS.name in named.computed:
-        # Sentences state both.
+        # Sentences about the impact excess state the impact speed, too.
         named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)
     for names in texts.values():
         if len(names) > 1:
@@ -115,12 +115,12 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
 
 
 def own_criterion(study: Study) -> Unsafe:
-    """The study's own criterion; without one, a collision.
+    """The criterion for unsafe that a study states. By default, a collision is unsafe.
 
     Raises
     ------
     InputError
-        If it is no criterion.
+        If the study's text is no criterion.
     """
     try:
         return Unsafe.parse(study.unsafe.criterion or COLLISION)
@@ -131,12 +131,12 @@ def own_criterion(study: Study) -> Unsafe:
 
 
 class _Named:
-    """The measures that a study names, as they are looked up.
+    """Looks up the measures that a study names, and collects them.
 
     Attributes
     ----------
     computed
-        Those that are computed, by column.
+        The measures that have to be computed, by the name of their column.
     """
 
     def __init__(
@@ -148,8 +148,8 @@ class _Named:
         self._own = dict[str, Measure]()
 
     def look_up(self, name: str, key: str, shipped: Mapping[str, Measure]) -> Measure:
-        """A measure by the name of a shipped one, of a user's class, or of one that was looked up
-        before.
+        """The measure with a name: that of a shipped measure, of a user's class
+        (package.module:Name), or of a measure of a user's class that was looked up before.
         """
         member = self._lookup.find({**shipped, **self._own}, name, key)
         measure: Measure = member.target

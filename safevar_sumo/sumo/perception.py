@@ -31,22 +31,24 @@ OCCLUDED = {
     "obstacle_length": 0.0,
     "obstacle": 0.0,
 }
-"""What is observed of an occluded obstacle [m, m/s]."""
+"""Observed values of an obstacle that is occluded: it is at rest, infinitely far away [m, m/s]."""
 _UNSEEN = np.array([*OCCLUDED.values()])[:, None]
 
 
 class Observer(Protocol):
-    """Observes the obstacles of all vehicles."""
+    """The contract of observers, which return the scene of all vehicles at each sample."""
 
     def observe(self, motion: VehicleStates) -> Scene:
-        """The scene now; must be called at every sample."""
+        """The scene at the current sample. This method is called at every sample."""
 
     def encounter(self, trace: Trace) -> Encounter:
         """The geometry of the encounters, from which the metrics are computed."""
 
 
 class Perception:
-    """Observations, step by step, of K groups of `size` vehicles; group k is in weather k."""
+    """Turns scenes into observations, step by step, for K groups of `size` vehicles. Group k drives
+    in weather k, which delays what the vehicles recognise.
+    """
 
     def __init__(self, weathers: Sequence[Weather], step: float, size: int) -> None:
         self._visibility = per_vehicle(
@@ -55,7 +57,7 @@ class Perception:
 
         delays = per_vehicle([weather.recognition_delay for weather in weathers], size)
         self._lines: list[tuple[IntArray | slice, DelayLine]] = []
-        # One delay line for all, without indices, is faster than one for each number of steps.
+        # With equal delays, one delay line without indices for all vehicles is the fastest way.
         if np.ndim(delays) == 0:
             self._lines.append((slice(None), DelayLine.by(float(delays), step)))
             return
@@ -65,11 +67,12 @@ class Perception:
             self._lines.append((group, DelayLine(int(count), fractions[group])))
 
     def observe(self, time: float, speed: FloatArray, scene: Scene) -> Observation:
-        """The observation at this step; must be called in every step.
+        """The observation at this step: the scene as it was one recognition delay ago, and the
+        vehicles' speeds now. This method is called in every step.
 
         An occluded obstacle appears at rest, infinitely far away.
         """
-        # The speed is delayed, too: the closing speed is that of then.
+        # The closing speed needs the vehicle's speed of the same time as the obstacle's speed.
         values = np.empty((len(OCCLUDED) + 1, len(speed)))
         values[-1] = speed
         for row, quantity in enumerate(OCCLUDED):
@@ -92,7 +95,9 @@ class Perception:
 
 
 class SceneObserver:
-    """Observes the obstacle of a scenario in a world, once the vehicles are there."""
+    """Observes the obstacle of a scenario in a world. The scenario begins with the first
+    observation, because it needs vehicles that have entered the world.
+    """
 
     def __init__(self, scenario: WorldScenario, world: SceneWorld) -> None:
         self._scenario = scenario
@@ -114,8 +119,8 @@ class SceneObserver:
 
 
 def per_vehicle(values: Sequence[Quantity], size: int) -> Quantity:
-    """The values of K points, repeated for `size` vehicles each, shape (K * size,); a single value,
-    or that of the only point, if all are equal.
+    """The values of K points, each repeated for the `size` vehicles of the point, shape (K *
+    size,). If the values of all points are equal, the result is this value alone.
     """
     if len(values) == 1 or all(value == values[0] for value in values):
         return values[0]

@@ -1,4 +1,6 @@
-"""What a study of a simulator of the user's own has, and what it has not."""
+"""Checks of the tables of a study: a study with a user's simulator must not have tables that the
+simulator would not use, and another study must have them.
+"""
 
 from __future__ import annotations
 
@@ -13,22 +15,22 @@ from safevar_sumo.study.encounters import Parameters
 from safevar_sumo.vehicles import CharacteristicSet
 
 NOISE = re.compile("noise|noisy|dropout|jitter")
-"""Words of characteristics that are noise."""
+"""Words in the name or the meaning of a characteristic that is noise."""
 SEED = "seed"
-"""The parameter of a simulator that its noise is drawn from."""
+"""Name of the parameter of a simulator that is the seed of its noise."""
 IN_SIMULATOR = (
     "nothing: the simulator moves and drives the vehicle, in a weather of its own"
 )
 
 
 def check_tables(study: Study, mover: Mover) -> None:
-    """Refuse tables that a mover would not use, as it drives the vehicle itself, or those that are
-    missing beside any other.
+    """Refuse tables that a user's simulator would not use, because it moves and drives the vehicle
+    itself. Without such a simulator, refuse a study that lacks these tables.
 
     Raises
     ------
     InputError
-        With the first such key.
+        About the first key that is not used, or is missing.
     """
     entries: Parameters = {
         "vehicle.model": study.vehicle.model,
@@ -78,12 +80,12 @@ def check_tables(study: Study, mover: Mover) -> None:
 
 
 def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
-    """Refuse a matrix in which two kinds of movers would both move the vehicle.
+    """Refuse a matrix whose tests have another kind of mover than the study's own scenario.
 
     Raises
     ------
     InputError
-        With the first such test.
+        About the first such test.
     """
     for point in matrix:
         kind, study_kind = point.scenario.mover.kind, scenario.mover.kind
@@ -98,8 +100,8 @@ def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
 def noise_remarks(
     characteristics: CharacteristicSet, points: Sequence[Point]
 ) -> list[str]:
-    """A remark on characteristics that are noise, by their words, if all runs draw it from one
-    seed.
+    """A remark on characteristics whose name or meaning says that they are noise, if the noise of
+    all runs comes from the same seed.
     """
     noisy = [
         item.name

@@ -1,5 +1,5 @@
-"""The functions that a controller which was written for SUMO may call, its commands among them, and
-the acceleration that SUMO's vehicle would then choose.
+"""The TraCI functions that a controller written for SUMO may call; its commands are among them. And
+the acceleration that SUMO's vehicle would choose under these commands.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ COMMANDS: Names = {
     "setImperfection": ("imperfection",),
     **DRIVER_COMMANDS,
 }
-"""The commands that a controller may give, each with its numeric arguments."""
+"""The commands that a controller may give, with the names of their numeric arguments."""
 LISTS = ("getIDList", "getIDCount")
 POSITIONS = ("getPosition", "getPosition3D")
 MOTION = (
@@ -68,8 +68,8 @@ TYPE_PROPERTIES = (
     "getMass",
 )
 CONSTANT = ("getTypeID", *TYPE_PROPERTIES)
-"""Functions that return properties of actors that are visible at once or follow from the actor's
-type.
+"""Functions that return properties of actors that never change: they follow from the actor's type,
+so that they need no sensor.
 """
 OWN = (
     "getLeader",
@@ -86,7 +86,7 @@ OWN = (
     "getSecureGap",
     "getStopSpeed",
 )
-"""Functions that return values of the vehicle under test alone."""
+"""Functions that a controller may call for the vehicle under test, but for no other actor."""
 SUBSCRIPTIONS = ("subscribe", "getSubscriptionResults", "getAllSubscriptionResults")
 CALLS: Names = {
     "vehicle": (*LISTS, *SENSED["vehicle"], *CONSTANT, *OWN, *COMMANDS, *SUBSCRIPTIONS),
@@ -150,7 +150,7 @@ VARIABLES: Mapping[str, str] = {
     "VAR_TYPE": "getTypeID",
     "VAR_MAXSPEED": "getMaxSpeed",
 }
-"""TraCI's variables for subscriptions, each with the function that returns the same value."""
+"""TraCI's variables for subscriptions, by name, with the function that returns the same value."""
 DEFAULT_VARIABLES = ("VAR_ROAD_ID", "VAR_LANEPOSITION")
 SUMO_CONTROL = -1.0
 """Value of a speed or speed mode with which a command returns control to SUMO's own driver."""
@@ -159,18 +159,19 @@ LEGAL_NUMBERS = (
     " SUMO's driver"
 )
 OWN_LANE_CHANGES = 0b11111111
-"""Bits of a lane change mode with which SUMO's driver changes lanes of his own accord."""
+"""Bits of a lane change mode that let SUMO's driver change lanes of his own accord."""
 TICKS = 1000
 """SUMO counts time in thousandths of a second [1/s]."""
 
 
 class CommandedSpeed:
-    """A controller's commands, and the acceleration that results from them under SUMO's speed
-    modes.
+    """The current command of a controller, and the acceleration that results from it under SUMO's
+    speed modes.
 
-    A command holds until the next one (`MSVehicle::Influencer`): from `setSpeed` on the speed is
-    `_target`; with `setAcceleration` and `slowDown` it changes evenly, by `_rate`, until `_end`.
-    Then SUMO's own driver takes over.
+    A command holds until the next command (`MSVehicle::Influencer`). After `setSpeed` the speed
+    becomes `_target` [m/s] at once. After `setAcceleration` or `slowDown` the speed changes towards
+    `_target` evenly, by `_rate` [m/s^2], until the time `_end` [s]; then SUMO's own driver takes
+    over.
     """
 
     LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE = (
@@ -191,8 +192,8 @@ class CommandedSpeed:
     def command(
         self, name: str, time: float, speed: float, values: tuple[Any, ...]
     ) -> None:
-        """Process a command at a time [s] and speed [m/s]; raises `InputError` if an argument is no
-        legal number.
+        """Process a command that the controller gives at this time [s] and speed [m/s]. Raises an
+        InputError if an argument is no legal number.
         """
         for argument, number in zip(COMMANDS[name], values, strict=True):
             returns_control = number == SUMO_CONTROL and name in (
@@ -209,7 +210,7 @@ class CommandedSpeed:
                     f"traci.vehicle.{name}", f"{argument} = {number!r}", LEGAL_NUMBERS
                 )
 
-        # What would make results random, or leave the lane.
+        # Random results could not be repeated, and the vehicle models know only one lane.
         value, *durations = map(float, values)
         if name == "setImperfection" and value:
             raise InputError(
@@ -241,12 +242,12 @@ class CommandedSpeed:
     def acceleration(
         self, speed: float, time: float, sumo_speed: float, accel: float, decel: float
     ) -> float:
-        """The acceleration by the commands [m/s^2].
+        """The acceleration that the current command asks for [m/s^2].
 
-        SUMO's own driver would choose `sumo_speed` next [m/s]; `accel` and `decel` are its limits
-        [m/s^2].
+        `sumo_speed` is the speed that SUMO's own driver would choose for the next step [m/s];
+        `accel` and `decel` are the limits of this driver [m/s^2].
         """
-        # After its end a command leaves the speed to SUMO.
+        # After the end of the command SUMO's own driver chooses the speed.
         change = self._target - speed
         if time > self._end + 0.5 / TICKS:
             return (sumo_speed - speed) / self._step

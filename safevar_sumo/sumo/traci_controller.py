@@ -60,7 +60,9 @@ class TraciController(Ads):
         self._sensors: Sensors
 
     def in_world(self, world: VehicleWorld, sensors: Sensors) -> TraciController:
-        """The controller in SUMO's world, with the vehicles' sensors in their weather."""
+        """The same controller in a world of SUMO, with the vehicles' sensors as the weather limits
+        them.
+        """
         assert isinstance(world, SumoWorld)
         controller = copy.copy(self)
         controller._world = world
@@ -82,8 +84,8 @@ class TraciController(Ads):
 
     @staticmethod
     def known_types(nominal: Nominal, types: SumoType) -> SumoType:
-        """The types that controllers may know: those of the original vehicle, with the headways of
-        SUMO's drivers.
+        """The SUMO types whose values controllers may query: the values of the original vehicle for
+        all N vehicles, but each vehicle's own time headway tau of SUMO's driver.
         """
         columns = (np.full_like(types.mass, value) for value in nominal[:5])
         return SumoType._make((*columns, types.tau))
@@ -126,8 +128,8 @@ class TraciController(Ads):
 
 
 class _Memory(NamedTuple):
-    """The original vehicle, the sensed traffic, each vehicle's view and step function, and the
-    initial trim, which is None before the first step.
+    """What controllers keep between steps: the original vehicle, the sensed traffic, the view and
+    the step function of each vehicle, and the initial trim, which is None before the first step.
     """
 
     nominal: Nominal
@@ -137,13 +139,13 @@ class _Memory(NamedTuple):
 
 
 _active_view: TraciView | None = None
-"""The view of the vehicle whose controller runs at the moment."""
+"""The view of the vehicle whose controller runs at the moment; None while no controller runs."""
 
 
 @contextmanager
 def substitute_traci() -> Iterator[None]:
-    """Context in which `import traci` and `import libsumo` import the substitute for
-    controllers.
+    """Context in which `import traci` and `import libsumo` import the substitute that controllers
+    use.
     """
     real_traci()
     modules = dict.fromkeys(("traci", "libsumo"), traci_module())
@@ -158,8 +160,8 @@ def traci_module() -> ModuleType:
 
 
 class _Substitute(ModuleType):
-    """A substitute for traci, or for a domain of it: traci's constants and classes, and functions
-    that answer for the driven vehicle.
+    """A substitute for the module traci, or for one of its domains such as `traci.vehicle`. It has
+    traci's constants and classes; its functions call the view of the driven vehicle.
     """
 
     def __init__(self, real: Value, domain: str = "") -> None:

@@ -1,5 +1,5 @@
-"""TraCI as one controller sees it: one copy of the network, ids of the traffic file, other actors
-through sensors.
+"""TraCI as the controller of one vehicle sees it: only the vehicle's copy of the network, with the
+ids of the traffic file, and other actors as the vehicle's sensors report them.
 """
 
 from __future__ import annotations
@@ -37,11 +37,12 @@ Value = Any
 """An argument or a result of a function of TraCI."""
 Arguments = tuple[Value, ...]
 ActorValues = dict[str, Value]
-"""What TraCI's functions return of an actor, by function; its length, too."""
+"""Values of an actor by the TraCI function that returns them; its length is among them."""
 Actors = dict[str, dict[str, ActorValues]]
-"""Their values by domain and name."""
+"""Values of all actors, by domain ("vehicle" or "person") and by name in the traffic file."""
 Variables = dict[int, tuple[str, Arguments]]
-"""Requested variables, each with its function and that function's arguments after the actor's id.
+"""Requested variables by number: the TraCI function that returns the value of the variable, and
+the arguments of this function after the actor's id.
 """
 
 INVALID_NUMBER = -1073741824
@@ -54,14 +55,16 @@ BYPASS = "it would bypass the vehicle's model or its sensors"
 
 @cache
 def real_traci() -> Api:
-    """The original module traci, not its substitute for controllers; must be called before
-    controllers run.
+    """The original module traci, not the substitute that controllers import. Call this function
+    before controllers run: then only the substitute is importable.
     """
     return traci_api()
 
 
 def refused(domain: str, name: str, problem: str) -> InputError:
-    """The error for a controller's call of a function, of traci itself if `domain` is ""."""
+    """The error for a call that a controller must not make. `domain` is "" for a function of the
+    module traci itself.
+    """
     function = ".".join(filter(None, ("traci", domain, name)))
     if function == "traci.vehicle.setType":
         return InputError(
@@ -81,10 +84,11 @@ def refused(domain: str, name: str, problem: str) -> InputError:
 
 
 class Snapshot(NamedTuple):
-    """The traffic at one time.
+    """The traffic in one copy of the network at one time.
 
-    `vehicle` are the values of the vehicle under test, empty once it has left the road; `actors`
-    those of other actors, by domain and name; `leader` is the leader with its gap [m].
+    `vehicle` has the values of the vehicle under test, none once the vehicle has left the road;
+    `actors` has the values of all other actors. `leader` is the name of the vehicle ahead and the
+    gap to it [m], or None.
     """
 
     vehicle: ActorValues
@@ -93,11 +97,11 @@ class Snapshot(NamedTuple):
 
 
 class SensedTraffic:
-    """The traffic around N vehicles in their copies of the network, delayed and limited by the
-    vehicles' sensors.
+    """The traffic around N vehicles in their copies of the network, as the vehicles' sensors report
+    it: after a latency, within a range, and with a scale of distances.
 
-    `seen` is what the sensors of each vehicle report now: the first snapshot until the latency is
-    over.
+    `seen` has a snapshot for each vehicle: what its sensors report now. Until the latency is over,
+    sensors report the first snapshot.
     """
 
     def __init__(self, world: SumoWorld, sensors: Sensors, step: float) -> None:
@@ -111,7 +115,7 @@ class SensedTraffic:
         self.record_step()
 
     def record_step(self) -> None:
-        """Record the traffic of this step; must be called in every later step."""
+        """Record the traffic of this step. Call this method in every step after the first one."""
         names = defaultdict(list)
         for domain in SENSED:
             for id_ in getattr(self._world.api, domain).getIDList():
@@ -166,7 +170,7 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
     for domain, members in snapshot.actors.items():
         actors[domain] = {}
         for name, values in members.items():
-            # A position is that of the front; of a vehicle, the rear may be nearer.
+            # SUMO states the position of an actor's front; the rear of a vehicle may be nearer.
             length = values["getLength"] if domain == "vehicle" else 0.0
             heading = math.radians(values["getAngle"])
             front = values["getPosition"]
@@ -189,8 +193,8 @@ def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
 def _positions_in_scale(
     vehicle: ActorValues, values: ActorValues, scale: float
 ) -> ActorValues:
-    """The positions of an actor, with distances from the vehicle itself multiplied by the sensors'
-    scale.
+    """The positions of an actor, after the sensors' scale has multiplied the distances from the
+    vehicle under test; none if the scale is 1, because the true positions stay.
     """
     if scale == 1:
         return {}
@@ -202,7 +206,9 @@ def _positions_in_scale(
 
 
 class TraciView:
-    """TraCI's functions for one vehicle, with the ids of the traffic file."""
+    """TraCI's functions as the controller of one vehicle calls them: ids are those of the traffic
+    file, without the number of the vehicle's copy.
+    """
 
     def __init__(self, world: SumoWorld, copy: int, traffic: SensedTraffic) -> None:
         self._api = world.api
@@ -221,13 +227,13 @@ class TraciView:
         """The last error raised to the controller, even if the controller caught it."""
 
     def commanded_acceleration(self, speed: float) -> float:
-        """The acceleration by the commands and SUMO's driver at a speed [m/s] of the vehicle
-        [m/s^2].
+        """The acceleration [m/s^2] that the controller's commands and SUMO's driver ask for, at the
+        speed of the vehicle [m/s].
         """
         accel = self._api.vehicle.getAccel(self._vut)
         decel = self._api.vehicle.getDecel(self._vut)
-        # Between two actions the driver asks for the acceleration of the last step again, however
-        # little of it the vehicle's delays let through.
+        # Between two actions the driver asks for its last acceleration again, even if the vehicle's
+        # delays let through only a part of this acceleration.
         sumo_speed = speed + self._acceleration * self._step
         steps = round(self.time / self._step)
         is_action = steps % self._steps_of_action == 0
@@ -239,8 +245,8 @@ class TraciView:
         return self._acceleration
 
     def _speed_of_sumo(self, speed: float, accel: float, decel: float) -> float:
-        """Speed that SUMO's driver would choose next for the limits of road and vehicle and for the
-        leader [m/s].
+        """The speed [m/s] that SUMO's driver would choose for the next step, within the limits of
+        road and vehicle, and behind the leader that the sensors see.
         """
         vehicle = self._api.vehicle
         vut = self._vut
@@ -272,9 +278,9 @@ class TraciView:
         Raises
         ------
         InputError
-            If a controller must not call the function; kept in `last_error`.
+            If a controller must not call the function; the error is kept in `last_error`.
         TraCIException
-            If SUMO refuses the call; its message has the traffic file's ids.
+            If SUMO refuses the call; ids in the message are those of the traffic file.
         """
         try:
             if name not in CALLS.get(domain, ()):
@@ -314,8 +320,8 @@ class TraciView:
             self._sumo_value(domain, name, VUT, *values)
 
     def _query(self, domain: str, name: str, *arguments: Value) -> Value:
-        """The value of a function that only reads: of other actors what the sensors report, of all
-        else what SUMO knows.
+        """The value of a function that only reads: what the sensors report of another actor, and
+        what SUMO knows of everything else.
         """
         if name == "getIDList":
             return self._ids(domain)
@@ -332,8 +338,8 @@ class TraciView:
     def _sensed_value(
         self, domain: str, name: str, actor: str, *arguments: Value
     ) -> Value:
-        """Another actor's value as the sensors report it; of an actor that they do not see, as SUMO
-        reports one that is not on the road.
+        """A value of another actor, as the sensors report it. If the sensors do not see the actor,
+        the value is the one that SUMO returns for an actor that is not on the road.
         """
         if name not in SENSED[domain]:
             raise refused(
@@ -350,12 +356,12 @@ class TraciView:
             return ""
         if isinstance(value, tuple):
             return (float(INVALID_NUMBER),) * len(value)
-        # An int or a float, as SUMO has it.
+        # Controllers may compare types: an int stays an int.
         return type(value)(INVALID_NUMBER)
 
     def _ids(self, domain: str) -> tuple[str, ...]:
-        """The ids of the actors that the sensors see, the vehicle under test first, or of the
-        network's parts.
+        """The ids in a domain: the actors that the sensors see, after the vehicle under test, or
+        the parts of the network (such as its edges).
         """
         if domain not in SENSED:
             return tuple(
@@ -367,8 +373,8 @@ class TraciView:
         return (*ids, *self._traffic.seen[self._copy].actors[domain])
 
     def _leader(self, dist: float = 100.0) -> tuple[str, float] | None:
-        """The leader and the gap to it minus minGap, if at most `dist` [m]; 0 means the stopping
-        distance.
+        """The leader that the sensors see, and the gap to it minus SUMO's minGap [m]; None if this
+        gap is larger than `dist` [m]. A `dist` of 0 stands for the vehicle's stopping distance.
         """
         vehicle = self._api.vehicle
         vut = self._vut
@@ -391,7 +397,9 @@ class TraciView:
         end: float,
         parameters: Value,
     ) -> Value:
-        """Subscribe to variables of an actor, by their numbers, at all times."""
+        """Subscribe to variables of an actor, by their numbers in TraCI. The times `begin` and
+        `end` are ignored: a subscription is always valid.
+        """
         functions = {_constant(name): function for name, function in VARIABLES.items()}
         if requested is None:
             requested = map(_constant, DEFAULT_VARIABLES)
@@ -403,15 +411,15 @@ class TraciView:
                     "subscribe",
                     f"variable {number!r} is none of {', '.join(VARIABLES)}",
                 )
-            # TraCI's tuples begin with the type of what follows.
+            # In TraCI the first element of such a tuple states the type of the other elements.
             extras = (parameters or {}).get(number, ())
             extras = extras[1:] if isinstance(extras, tuple) else (extras,)
             variables[number] = functions[number], extras
         self._subscriptions[domain, actor] = variables
 
     def _subscribed_values(self, domain: str, actor: str | None = None) -> Value:
-        """The variables of an actor, by default of all actors, as the sensors report them; none of
-        one that they do not see.
+        """The values of the variables to which the controller subscribed, of one actor or, without
+        `actor`, by actor. An actor that the sensors do not see has no values.
         """
         values = {}
         ids = self._ids(domain)
@@ -427,8 +435,8 @@ class TraciView:
 
 
 def _copied_ids(copy: int, value: Value) -> Value:
-    """Arguments for a copy: every text is an id; default types of SUMO are the same in all
-    copies.
+    """Arguments of a TraCI function with the ids of a copy. Every text is an id. SUMO's default
+    types (DEFAULT_...) have the same ids in all copies.
     """
     if isinstance(value, str):
         return re.sub(r"^(?!DEFAULT_)([:!]?)(?=.)", rf"\g<1>{copy}.", value)
@@ -438,10 +446,10 @@ def _copied_ids(copy: int, value: Value) -> Value:
 
 
 def _original_ids(value: Value) -> Value:
-    """A result with the ids of the traffic file."""
+    """A result of a TraCI function, with the ids of the traffic file instead of those of a copy."""
     if isinstance(value, str):
         return re.sub(r"^([:!]?)\d+\.", r"\1", value)
-    # TraCI's own classes derive from tuple.
+    # TraCI's own classes derive from tuple, but have other constructors: they stay as they are.
     if type(value) in (list, tuple):
         return type(value)(map(_original_ids, value))
     return value

@@ -20,7 +20,9 @@ MOST_SPEED = 100.0
 UNIT_TOLERANCE = 1e-6
 """Largest difference of a direction's length from 1 [-]."""
 APART = 1.0
-"""Distance from where its speed takes it that a body may have, beside a third of its way [m]."""
+"""Smallest distance of a body from the place where its speed takes it that can be an error [m]. The
+distance is an error if it is more than this, and more than a third of the body's way.
+"""
 TRACKS_KEY = "scenario.model"
 """The key that errors name; the study stands before it."""
 
@@ -28,8 +30,8 @@ TRACKS_KEY = "scenario.model"
 def check_shapes(
     tracks: Sequence[Track], n_samples: int, n_encounters: int, step: float
 ) -> None:
-    """Refuse actors that share a name, and quantities that are neither numbers nor arrays of all
-    samples.
+    """Refuse actors that share a name, and quantities that are neither numbers nor arrays with a
+    value for each of the samples.
 
     Raises
     ------
@@ -47,7 +49,7 @@ def check_shapes(
 
     for track in tracks:
         for name, value in zip(Track._fields[2:], track[2:], strict=True):
-            # A number, and a row, are the same at all samples.
+            # A number or a single row has the same value at all samples.
             shape = (1, *np.shape(value))[-2:]
             if (
                 np.ndim(value) > 2
@@ -74,12 +76,14 @@ def check_shapes(
 
 
 def check_motion(track: Track, times: FloatArray, step: float) -> None:
-    """Refuse a body, whose quantities are columns, that is not at each of T `times`, shape (T, 1),
-    at one place, or jumps.
+    """Refuse a body that jumps, that moves otherwise than its speed says, or that has illegal
+    values (such as NaN, or a negative size) at one of T `times`, shape (T, 1).
+
+    The quantities of the `track` are columns, as in `Moving`.
 
     Raises
     ------
-    InputError
+    UserCodeError
         With the actor, the time [s] and what is expected.
     """
     refuse = partial(_refuse, track, step)
@@ -116,8 +120,8 @@ def check_motion(track: Track, times: FloatArray, step: float) -> None:
             f"at most {MOST_SPEED:g} m/s between two samples",
         )
 
-    # It goes along the road where its speed takes it, from each sample to the next one at which it
-    # is there. (Who changes lane may face along it.)
+    # Only the way along the road is compared, because a body may face along the road while it
+    # changes lane. A step counts if the body has a length at its beginning and its end.
     is_there, x, velocity, _ = np.broadcast_arrays(
         track.length > 0, track.x, speed * track.along, times
     )
@@ -143,7 +147,7 @@ def _refuse(
     problem: str,
     expected: str,
 ) -> None:
-    """Raise the error for the first sample at which something about a track is wrong, if any."""
+    """Raise an error about the first sample at which `wrong` is true, if there is any."""
     if wrong.any():
         sample, column = np.argwhere(wrong)[0].tolist()
         text = problem.format(float(values[sample, column]))
@@ -155,8 +159,8 @@ def _refuse(
 
 
 def check_start(tracks: Sequence[Track], vehicle: Body) -> None:
-    """Refuse bodies, whose quantities are columns, that are inside each other or inside the vehicle
-    under test at the start.
+    """Refuse bodies that are inside each other, or inside the vehicle under test, at the start. The
+    quantities of the `tracks` are columns, as in `Moving`.
 
     Raises
     ------
@@ -169,7 +173,7 @@ def check_start(tracks: Sequence[Track], vehicle: Body) -> None:
             bodies[f"actor {track.name!r}"] = _first(track)
     bodies["the vehicle under test"] = vehicle
     for (name, body), (obstacle_name, obstacle) in combinations(bodies.items(), 2):
-        # Without a size nobody is there.
+        # A body without a size is not there (yet): it can overlap nothing.
         is_there = body.length + body.width > 0
         has_obstacle = obstacle.length + obstacle.width > 0
         overlaps = find_overlaps(body, obstacle)
@@ -184,7 +188,7 @@ def check_start(tracks: Sequence[Track], vehicle: Body) -> None:
 
 
 def _first(track: Track) -> Body:
-    """A body at the start, of M encounters."""
+    """A body at the first sample of M encounters, in columns."""
     length, width, x, y, cosine, sine, speed = np.broadcast_arrays(
         *(column[0] for column in track[2:])
     )

@@ -1,8 +1,8 @@
-"""Bodies on tracks in SUMO: they are put where their tracks say, and the vehicles under test drive
-among them.
+"""A world in SUMO with bodies on tracks: this module puts each body where its track says, and the
+vehicles under test drive among these bodies.
 
-SUMO's own word on collisions is not taken: it misses contacts at the side between lanes, and calls
-others too early.
+Collisions follow from the geometry of the bodies, and not from SUMO: it misses contacts at the side
+between lanes, and reports other contacts too early.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from safevar_sumo.sumo.world import SPEED_MODE, Api, SumoWorld, function_of
 from safevar_sumo.vehicles import SumoType
 
 PLACE_TOLERANCE = 1e-6
-"""Largest distance in SUMO of an actor from its track, and of a vehicle from where it has driven to
-[m].
+"""Largest distance in SUMO of an actor from its track, and of a vehicle under test from its
+position on the lane [m].
 """
 ANY_PLACE, ANY_LANE = 1 + 2 + 4, -1
-"""Values of `moveToXY`: SUMO looks for the lane on the actor's own route, whoever may use it, and
-allows places beside every road. Elsewhere it would look at the lanes of all copies, which are in
-the same place.
+"""Arguments `keepRoute` and `laneIndex` of `moveToXY`: SUMO looks for the lane on the actor's own
+route only, ignores who may use this lane, and allows places beside every road. Without these values
+SUMO would look at the lanes of all copies, which are in the same place.
 """
 SHAPES = {
     "adult": "pedestrian",
@@ -42,10 +42,11 @@ SHAPES = {
     "cyclist": "bicycle",
     "motorcyclist": "motorcycle",
 }
-"""Shapes that sumo-gui draws, by kind; of all others the one whose corners SUMO does not cut off.
+"""Shapes that sumo-gui draws, by kind of actor. All other kinds have the shape of a vehicle whose
+corners SUMO does not cut off.
 """
 WAIT = 1e6
-"""How long persons wait to be put somewhere [s]."""
+"""Length of the waiting stage that keeps persons in the simulation [s]: longer than any run."""
 
 
 @lru_cache(maxsize=100)
@@ -60,9 +61,11 @@ def start_frame(network: NetworkFiles, step: float | None) -> Frame:
 
 
 class Placed(NamedTuple):
-    """An actor in SUMO: its ids in the copies, whether it is a person, and at every sample the
-    place of its front or, of a person, of its middle [m], and its angle [degrees clockwise from
-    north], in columns as `Moving` has them.
+    """An actor in all copies: its track, its ids, whether it is a person, and its position and
+    angle in SUMO at every sample.
+
+    `x` and `y` are the position of a vehicle's front or of a person's middle [m], `angle` is in
+    degrees clockwise from north; these are columns as in `Moving`.
     """
 
     track: Track
@@ -87,8 +90,8 @@ class Placed(NamedTuple):
 class TrafficWorld(SumoWorld):
     """N copies of a road in SUMO with bodies on tracks.
 
-    Vehicles are where they are on `lane`, in its coordinates, to the last bit: SUMO must have them
-    at the same places.
+    The motion of the vehicles under test is that of a `LaneWorld`, in its coordinates and to the
+    last bit. A SimulationError is raised if SUMO has a vehicle at another place.
     """
 
     def __init__(
@@ -106,7 +109,8 @@ class TrafficWorld(SumoWorld):
             if track.kind != SCREEN
         ]
 
-        # At every sample of every copy: their wrappers would take as long as they do.
+        # These functions run for every copy at every sample: their Python wrappers would double
+        # the time.
         self._move_person = function_of(api, "person", "moveToXY")
         self._move_vehicle = function_of(api, "vehicle", "moveToXY")
         self._set_previous_speed = function_of(api, "vehicle", "setPreviousSpeed")
@@ -143,18 +147,20 @@ class TrafficWorld(SumoWorld):
         return {}
 
     def film(self, tracks: Films, sample: int, length: int) -> None:
-        """Nobody is filmed without a size."""
+        """Write the motion of all actors; see `SumoWorld.film`. An actor without a size is not
+        there: its motion is NaN.
+        """
         super().film(tracks, sample, length)
         for actor in self._actors:
             size = self._at_copies(actor.track.length + actor.track.width)
             tracks[actor.track.name].motion[sample, size == 0] = np.nan
 
     def _add(self, actor: Placed) -> None:
-        """Add an actor to every copy, wherever it may be put."""
+        """Add an actor to every copy. `_put` then moves the actor to its place."""
         api = self.api
         types = api.vehicletype
         track = actor.track
-        # Who is not there yet has the size that it will have.
+        # An actor that appears later has no size yet: SUMO gets the size that the actor will have.
         lengths = self._of_copies(track.length.max(axis=0, keepdims=True))
         widths = self._of_copies(track.width.max(axis=0, keepdims=True))
         default_type = "DEFAULT_PEDTYPE" if actor.is_person else "DEFAULT_VEHTYPE"
@@ -175,7 +181,9 @@ class TrafficWorld(SumoWorld):
                 api.vehicle.setLaneChangeMode(id_, 0)
 
     def _put(self) -> None:
-        """Put all actors where they are at the sample that the coming step leads to."""
+        """Put all actors at their places of the current sample, at which the next step of SUMO
+        ends.
+        """
         for actor in self._actors:
             places = map(self._of_copies, (actor.x, actor.y, actor.angle))
             placed = zip(actor.ids, self._edges, *places, strict=True)
@@ -191,7 +199,7 @@ class TrafficWorld(SumoWorld):
                     self._set_previous_speed(id_, speed)
 
     def _of_copies(self, column: FloatArray) -> list[float]:
-        """A column at this sample, for every copy."""
+        """The values of a column at the current sample, a value for every copy."""
         values: list[float] = self._at_copies(column).tolist()
         return values
 
@@ -202,8 +210,8 @@ class TrafficWorld(SumoWorld):
         return np.repeat(values, self.n)
 
     def _checked(self, motion: VehicleStates) -> VehicleStates:
-        """The motion on the lane; refuses a simulation in which SUMO has a vehicle or an actor
-        elsewhere.
+        """Return the motion on the lane unchanged, after a check. Raises a SimulationError if SUMO
+        has a vehicle under test or an actor at another place.
         """
         front = np.stack(self._start.point(motion.fronts[:, 0], 0.0), axis=1)
         driving = [*self.driving.values()]

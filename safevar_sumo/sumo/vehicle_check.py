@@ -16,13 +16,15 @@ from safevar_sumo.vehicles import Vehicle
 from safevar_sumo.vehicles.base import Plausible
 
 MIN_HEADWAY = 0.5
-"""Smallest original headway of SUMO's driver [s]; a smaller `tau` is a vehicle's lag, which it was
-in older studies.
+"""Smallest original headway of SUMO's driver [s]. A smaller `tau` is an error: in older studies
+`tau` was the lag of a vehicle's actuators.
 """
 
 
 def check_units(study: Study, vehicle: Vehicle) -> None:
-    """Refuse characteristics that the vehicle does not have, in other units, or missing."""
+    """Refuse characteristics that the vehicle does not have, that have other units than the
+    vehicle's, or that are missing.
+    """
     table = study.vehicle.characteristics
     units = vehicle.UNITS
     if (
@@ -64,8 +66,8 @@ def check_units(study: Study, vehicle: Vehicle) -> None:
 
 
 def check_plausible(study: Study, vehicle: Vehicle) -> None:
-    """Refuse values of characteristics and parameters that the vehicle calls implausible, as in
-    another unit.
+    """Refuse values of characteristics and parameters outside the ranges that the vehicle states as
+    plausible: such values are probably in another unit.
     """
     try:
         ranges = msgspec.convert(vehicle.PLAUSIBLE, dict[str, Plausible])

@@ -1,5 +1,5 @@
-"""Driven speeds once more in SUMO: what was recorded must be what SUMO simulates, and pictures show
-all actors.
+"""Drives vehicles in SUMO once more, with the speeds of finished runs: to check that SUMO simulates
+what recorded scenes have shown, and to show all actors in pictures.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from safevar_sumo.sumo.traffic import OVERTIME
 from safevar_sumo.sumo.world import SumoWorld
 
 COMPARED = ("position", "gap", "lateral", "obstacle_speed")
-"""Quantities of a trace that SUMO must repeat [m, m/s]."""
+"""Quantities of a trace that must be the same in SUMO [m, m/s]."""
 
 
 @np.errstate(all="ignore")
@@ -91,18 +91,19 @@ def drive_again(
 
 
 def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str:
-    """Drive settings, shape (M, n), in recorded scenes, and with the same speeds in SUMO: at their
-    worst points, whose numbers are `worst`, shape (M,), and in a matrix each at one other. Returns
-    why SUMO could not simulate some of the settings, "" if it could.
+    """Drive settings, shape (M, n), in recorded scenes, and then in SUMO with the same speeds: each
+    setting at its worst point, whose number is in `worst`, shape (M,), and in a matrix at a second
+    point. Returns the reason why SUMO could not simulate some of the settings; "" if it simulated
+    all.
 
     Raises
     ------
     InputError
-        If a place or a collision is another one in SUMO, with the first such setting and both
-        values.
+        If a position or a collision differs in SUMO. The error names the first such setting and
+        both values.
     """
-    # The other point: each test has one, which the settings decide, and they take turns; where it
-    # is the worst point itself, the next one.
+    # One point of each test is a candidate for the second points: a digest of the settings chooses
+    # it. Settings take the candidates in turn; instead of its worst point a setting takes the next.
     points = system.points
     of_tests = dict[Any, list[int]]()
     for number, point in enumerate(points):
@@ -130,8 +131,8 @@ def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str
 
 
 def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) -> None:
-    """Verify runs at the only point; runs of similar length together, so that few copies wait for
-    the longest.
+    """Verify runs at the system's only point. Batches have runs of similar length, so that few
+    copies of the network wait for the longest run.
     """
     order = np.argsort(np.count_nonzero(runs.trace.active, axis=0))
     size = batch_size(replace(system, in_sumo=True))
@@ -149,8 +150,8 @@ def _compare(
     runs: SimulationRuns,
     in_sumo: dict[str, FloatArray],
 ) -> None:
-    """Compare the quantities of N recorded runs, shape (T, N), with those in SUMO; raises the first
-    difference.
+    """Compare the quantities of N runs in recorded scenes, shape (T, N), with the same quantities
+    in SUMO. Raises an InputError about the first difference.
     """
     trace = runs.trace
     collision = nans(trace.speed.shape)
@@ -164,7 +165,7 @@ def _compare(
         differs = trace.active & ~np.isclose(
             in_sumo[name], values, rtol=0, atol=ROUNDING, equal_nan=True
         )
-        # An invalid test has no collision.
+        # `collision_speed` is NaN in an invalid test, also if the vehicle has hit somebody.
         if name == "collision":
             differs &= runs.outcome != Outcome.INVALID_TEST
         if differs.any():

@@ -19,9 +19,11 @@ UNKNOWN_TO_DRIVER = (
 )
 """Remark on a controller written for TraCI."""
 DECEL = "decel"
-"""The characteristic that is the largest deceleration by the brakes [m/s^2]."""
+"""Name of the characteristic that is the largest deceleration by the brakes [m/s^2]."""
 NEARLY = 0.999
-"""Share of the end of its domain at which the deceleration is lower if nothing else limits it."""
+"""Share of the domain's upper end at which the largest deceleration is compared with that at the
+end: it is the same if the tyres limit it, and lower if only the brakes do.
+"""
 
 
 def without_effect(system: System) -> list[str]:
@@ -71,7 +73,7 @@ def _remarks_on_driver(system: System) -> list[str]:
         return [UNKNOWN_TO_DRIVER]
     if not _has_tau(system):
         return []
-    # A driver with a headway of its own takes the vehicle's tau.
+    # The vehicle's tau replaces the headway of an ADS that has such a parameter.
     name = system.ads.tau_parameter
     if not name:
         return [
@@ -88,7 +90,7 @@ def _remarks_on_grip(system: System) -> list[str]:
     if DECEL not in members.names:
         return []
 
-    # Where it still rises at the end of the domain, the brakes limit it and not the tyres.
+    # If the deceleration still rises at the end of the domain, the brakes limit it, not the tyres.
     upper = members.upper[members.names.index(DECEL)]
     friction = max(point.weather.road_friction for point in system.points)
     nearly, highest = (
@@ -111,8 +113,8 @@ def _has_limited_range(system: System) -> bool:
 
 
 def _prepared(system: System, friction: float = 1.0, **changes: FloatArray) -> Prepared:
-    """The constants of the original vehicle with changes, on a road with this factor on its
-    friction.
+    """The model's constants of the original vehicle with `changes` of characteristics. `friction`
+    is the factor of the weather on the tyres' friction.
     """
     members = system.characteristics.vehicle
     return system.vehicle.prepare(

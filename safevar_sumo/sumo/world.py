@@ -1,4 +1,4 @@
-"""N copies of a network in a running simulation."""
+"""The running simulation in SUMO of N copies of a network, each with a vehicle under test."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import SumoType
 
 INSERTION_DECELERATION = 9.0
-"""Least deceleration of a vehicle while it is inserted [m/s^2]: SUMO inserts only vehicles that
-could stop before every obstacle.
+"""Least deceleration that a vehicle gets while SUMO inserts it [m/s^2]: SUMO inserts only vehicles
+that could stop before every obstacle.
 """
 MAX_DEPARTURE_SPEED = 200.0
 """Highest speed at which a vehicle may depart while a scene is recorded [m/s]."""
@@ -30,8 +30,8 @@ SPEED_MODE = 32
 # TraCI "set lane change mode": the vehicle never changes lanes.
 LANE_CHANGE_MODE = 0
 CUT_SHAPE, FULL_SHAPE = "passenger", "evehicle"
-"""Shapes of vehicles that SUMO draws alike; of the first it cuts the front corners off, also where
-it looks for collisions.
+"""Shapes of vehicles that SUMO draws alike. SUMO cuts the front corners off vehicles of the first
+shape, also when it looks for collisions.
 """
 
 Api = Any
@@ -39,8 +39,8 @@ Api = Any
 
 
 class SumoWorld:
-    """N copies of a network in a running simulation, created by `open_world`. Arrays have shape
-    (N,) or (N, 2).
+    """A `SceneWorld` that SUMO simulates: N copies of a network, in each a vehicle under test.
+    `open_world` creates it. Arrays have the shape (N,) or (N, 2).
     """
 
     def __init__(self, api: Api, n: int) -> None:
@@ -53,19 +53,19 @@ class SumoWorld:
         self._get_person_position = function_of(api, "person", "getPosition")
         self._copy_of = {id_: copy for copy, id_ in enumerate(self.ids(VUT))}
         self.driving = dict(self._copy_of)
-        """Copies whose vehicle under test is on the road, by the vehicle's id."""
+        """Copies whose vehicle under test is still on the road, by the vehicle's id."""
         self._speeds = np.zeros(n)
         self._fronts = np.zeros((n, 2))
-        """Speeds and fronts of the vehicles under test; the last ones of those that have left the
-        road.
+        """Speeds [m/s] and front positions [m] of the vehicles under test. A vehicle that has left
+        the road keeps its last values.
         """
         self._persons: dict[str, FloatArray] = {}
-        """Places of persons by actor; beside vehicles that have left the road the last ones, if a
-        person has left, too.
+        """Positions of persons in all copies by actor, shape (N, 2) [m]. Once a person has left the
+        road in a copy, positions are the last ones in copies without a vehicle under test.
         """
         self._commanded_speeds = nans(n)
         self._struck_ids: dict[int, str] = {}
-        """Ids of the actors that the vehicles under test collided with last, by copy."""
+        """Ids of the actors that vehicles under test collided with in the last step, by copy."""
 
     def ids(self, name: str) -> list[str]:
         """The ids of an actor in its copies."""
@@ -74,8 +74,8 @@ class SumoWorld:
     def _set_decelerations(
         self, decel: FloatArray, emergency_decel: FloatArray
     ) -> None:
-        """Set the largest decelerations of the vehicles under test, usually and in emergencies
-        [m/s^2].
+        """Set the largest decelerations of the vehicles under test, shape (N,) [m/s^2]: in usual
+        braking and in emergencies.
         """
         self._set(self.api.vehicletype.setDecel, decel)
         self._set(self.api.vehicletype.setEmergencyDecel, emergency_decel)
@@ -117,14 +117,14 @@ class SumoWorld:
         self._depart()
         self._set_decelerations(decel, emergency_decel)
         if keeps_drivers:
-            # SUMO drew a factor for each vehicle.
+            # SUMO has drawn a random factor for each vehicle: that of its type replaces the factor.
             for id_ in ids:
                 self.api.vehicle.setSpeedFactor(id_, vehicletype.getSpeedFactor(id_))
         return self._motion(np.ones(self.n, bool))
 
     def _depart(self) -> None:
-        """Insert all actors, whose bodies are rectangles, and take control of the vehicles under
-        test.
+        """Let SUMO insert all actors, with rectangles as bodies, and take control of the vehicles
+        under test.
         """
         vehicletype = self.api.vehicletype
         for type_id in vehicletype.getIDList():
@@ -177,10 +177,11 @@ class SumoWorld:
         return VehicleStates(self._fronts, self._speeds, self._hits(is_open))
 
     def _hits(self, is_open: BoolArray) -> Hits:
-        """Speeds [m/s] of the vehicles under test of open runs that collide in this step, by copy.
+        """Speeds [m/s] of the vehicles under test that collide in this step, by copy. Vehicles
+        whose runs have ended (not `is_open`) are left out.
 
         On a junction SUMO's collider is the vehicle that must yield (`MSLane::detectCollisions`):
-        the vehicle under test may be either.
+        there the vehicle under test may be the collider or the victim.
         """
         self._struck_ids = {}
         speeds = {}
@@ -208,7 +209,7 @@ class SumoWorld:
         return self._pairs(pairs)
 
     def _pairs(self, pairs: Sequence[tuple[int, str]]) -> BodyPairs:
-        """Vehicles under test by their copy, each with an actor by its id."""
+        """Pairs of the bodies of a vehicle under test, by its copy, and of an actor, by its id."""
         ids = self.ids(VUT)
         copies = []
         vehicles = []
@@ -252,7 +253,7 @@ class SumoWorld:
         copies = [*self.driving.values()]
         try:
             positions = np.array(list(map(self._get_person_position, ids)))
-        # One of them has left the road.
+        # A person has left the road in a copy: ask SUMO only where a vehicle is still driving.
         except self.api.TraCIException:
             positions = self._persons.get(actor, np.zeros((self.n, 2))).copy()
             positions[copies] = [
@@ -262,8 +263,8 @@ class SumoWorld:
         return positions
 
     def actor_poses(self) -> dict[str, tuple[Coordinates, float]]:
-        """All actors on the road, by id: the place of the front, or of a person [m], and the
-        heading clockwise from north [degrees].
+        """Positions and headings of all actors on the road, by id: the position of a vehicle's
+        front or of a person [m], and the heading clockwise from north [degrees].
         """
         return {
             id_: (domain.getPosition(id_), domain.getAngle(id_))
@@ -272,7 +273,9 @@ class SumoWorld:
         }
 
     def film(self, tracks: Films, sample: int, length: int) -> None:
-        """Write the motion of all actors on the road, by name, at one of `length` samples."""
+        """Write the motion of all actors on the road into `tracks`, which has a film of `length`
+        samples for each name, at one of these samples.
+        """
         for id_, (place, angle) in self.actor_poses().items():
             copy, name = copy_and_name(id_)
             domain = self._domain_of(id_)
@@ -339,8 +342,8 @@ def direction_of(angle: float) -> FloatArray:
 
 
 def function_of(api: Api, domain: str, name: str) -> Callable[..., Any]:
-    """A function of traci, or one of libsumo without its Python wrapper, which takes as long as the
-    function itself.
+    """A function of traci or libsumo. libsumo's Python wrapper is left out, because it takes as
+    long as the function itself.
     """
     compiled = getattr(api, "_libsumo", None)
     function: Callable[..., Any] = getattr(getattr(api, domain), name)
