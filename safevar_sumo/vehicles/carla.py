@@ -43,10 +43,10 @@ if TYPE_CHECKING:
 _Share = Annotated[float, Meta(gt=0, le=1)]
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
-# Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) r/min, N m, stretched over
-# max_rpm.
+# Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) in r/min and N m. The
+# curve is stretched over max_rpm of the vehicle.
 TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = 400.0, 500.0, 400.0  # N m
-# Relative to the maximum engine speed; the falling line extends to 1.
+# Engine speeds of peak and end over the maximum engine speed. The falling line extends to 1.
 PEAK_SPEED, END_SPEED = 1890 / 5800, 5730 / 5800
 TORQUE_RISE = (TORQUE_PEAK - TORQUE_IDLE) / PEAK_SPEED
 TORQUE_FALL = (TORQUE_PEAK - TORQUE_END) / (END_SPEED - PEAK_SPEED)
@@ -65,10 +65,11 @@ NEWTON_STEPS = 8  # from 1 to a cube root near 1; the last steps change nothing
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run, SI; arrays of shape (N,).
+    """Constants of N vehicles in a run, in SI units; arrays have the shape (N,).
 
-    `rows` are the fields of `car`, shape (16, N). The slope pulls with `pull` [N]. `assumed_height`
-    is the camera's assumed height over its actual height [-].
+    `rows`, shape (16, N), are the fields of `car` as one array, for the compiled step. `pull` is
+    the force of a slope against the direction of travel [N]. `assumed_height` is the camera's
+    assumed height over its actual height [-].
     """
 
     substeps: int
@@ -162,7 +163,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         slope: Slope = LEVEL,
         water: FloatOrArray = 0.0,
     ) -> _Prepared:
-        # Numba takes longer to load than a simulation: studies of other vehicles do without.
+        # Numba takes longer to load than a simulation: studies of other vehicles do not load it.
         from safevar_sumo.vehicles.carla_step import TYRE_STEPS, Car
 
         c = characteristics
@@ -196,7 +197,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             standstill=np.zeros_like(radius),
         )
 
-        # The speed at which a slope moves the wheels counts as standstill; `car` has it, too.
+        # The speed at which a slope moves the wheels counts as standstill. `car` shares the memory
+        # of `rows`, so that it gets this speed, too.
         rows = np.array(constants)
         car = Car(*rows)
         pull = c["mass"] * slope.back
@@ -215,7 +217,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         )
 
     def _law(self, substep: float, tyre_step: float) -> Law:
-        """Constants of all vehicles, for substeps and tyre steps so long [s]."""
+        """The constants of all vehicles for these lengths of a substep and of a tyre step [s]."""
         from safevar_sumo.vehicles.carla_step import Law
 
         return Law(
@@ -260,8 +262,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """The steady state, with the pedals that hold the speed: in every equation of `roll` the
         rate of change is 0.
 
-        The gearbox has shifted up to the gear for this speed. Where it would now shift down, its
-        last shift has just ended, so that it must wait.
+        The gearbox has shifted up to the gear for this speed. If the engine is so slow in this gear
+        that the gearbox would shift down, its last shift has just ended, so that it must wait.
         """
         from safevar_sumo.vehicles.carla_step import CarlaState, full_torque
 
@@ -271,11 +273,11 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         resistance = p.wheel_damping * wheel_speed + p.radius * force
 
         def engine_in(ratio: FloatOrArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-            """Torque through the clutch and torque that remains for the brake [N m], and engine
-            speed [rad/s].
+            """The torque through the clutch, the torque that remains for the brake [N m], and the
+            engine speed [rad/s], in a gear of this overall ratio.
             """
-            # Downhill the engine brakes and the brake supplies the rest; then w_e = G w_w + m / k_c
-            # with the clutch torque m = -c_e w_e.
+            # Downhill the engine brakes, and the brake supplies the rest. Then the engine's speed
+            # is w_e = G w_w + m / k_c with the clutch torque m = -c_e w_e (symbols as in `roll`).
             engine_drag = (
                 -p.damping_engaged
                 * ratio
@@ -315,8 +317,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def hold_gear(
         self, prepared: _Prepared, state: CarlaState, holds: BoolArray
     ) -> CarlaState:
-        """Hold the gear where `holds`, shape (N,), is true, as a selector lever does. It may change
-        as soon as it is released.
+        """Hold the gear of the vehicles for which `holds`, shape (N,), is true, as a selector lever
+        does. The gearbox may shift as soon as the gear is released.
         """
         since_shift = np.where(
             state.since_shift < 0, self.shift_latency, state.since_shift
@@ -326,8 +328,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def _rim_at(
         self, p: Car, pull: FloatArray, speed: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Rim speed at which the tyre force balances air drag and slope [m/s], and that force
-        [N].
+        """The rim speed at which the tyre force balances air drag and the pull of a slope [m/s],
+        and this tyre force, at most the grip [N].
         """
         force = np.minimum(
             np.maximum(p.air_drag * speed * speed + pull, -p.grip), p.grip

@@ -1,9 +1,9 @@
 """One step of vehicle `carla`: the equations of one vehicle, compiled by Numba for many vehicles
 side by side.
 
-No operation is fused or reordered: a vehicle gets the bits that Python's own floats give, whatever
-unit computes it. Numba's cache notices changes in this file alone, so records are defined here and
-constants are arguments.
+No operation is fused or reordered: a vehicle gets the same bits as with Python's own floats,
+whichever unit of the processor computes it. Numba's cache notices changes of this file only: so
+this file defines the records, and constants are arguments.
 """
 
 from __future__ import annotations
@@ -22,15 +22,16 @@ processor's first cache.
 TYRE_STEPS = 3
 """Tyre steps in a substep, at every speed; PhysX's number below 5 m/s (setSubStepCount)."""
 NEUTRAL, FIRST_GEAR, TOP_GEAR = 0.0, 1.0, 4.0
-"""A number of one vehicle; in records outside the compiled step those of N, shape (N,)."""
+"""The lowest and the highest forward gear, and neutral."""
 
 
 class Car(NamedTuple):
-    """Constants of a vehicle, SI.
+    """Constants of one vehicle, in SI units. Outside the compiled step: of N vehicles, shape (N,).
 
-    Inertias are divided by the tyre step, in which the speed changes by `speed_by_force` per unit
-    of force, and by `speed_by_slope` on a slope. `grip` is the largest tyre force [N]. A shift ends
-    after `shift_end` [s]. Below the speed `standstill` the tyres hold a braked vehicle.
+    Inertias are divided by the tyre step. In a tyre step the speed changes by `speed_by_force` per
+    unit of force, and falls by `speed_by_slope` on a slope. `grip` is the largest tyre force [N]. A
+    shift ends after `shift_end` [s]. Below the speed `standstill` [m/s] the tyres hold a braked
+    vehicle.
     """
 
     radius: FloatOrArray
@@ -52,11 +53,12 @@ class Car(NamedTuple):
 
 
 class Law(NamedTuple):
-    """Constants of all vehicles: the substep [s], in which pedals rise and fall so much, engine and
-    gearbox, tyres.
+    """Constants that all vehicles share: of pedals, engine, gearbox and tyres, in SI units.
 
-    Torque at full throttle is the lower of two lines over the engine's share of its highest speed:
-    it rises from `torque_idle`, and it falls through `torque_peak` at `peak_share` [N m].
+    `throttle_rise` to `brake_fall` are the largest changes of a pedal in a substep [-]. The torque
+    at full throttle is the lower of two lines over the engine's speed as a share of its highest
+    speed: the first line rises from `torque_idle`, and the second line falls through `torque_peak`
+    at `peak_share` [N m].
     """
 
     substep: float
@@ -79,8 +81,9 @@ class Law(NamedTuple):
 
 
 class CarlaState(NamedTuple):
-    """A vehicle's speed [m/s], wheel and engine speeds [rad/s], gears [-], time since a shift began
-    [s], pedals [-].
+    """State of one vehicle: its speed [m/s], the speeds of wheels and engine [rad/s], gears [-],
+    the time since a shift began [s], and pedals [-]. Outside the compiled step: of N vehicles,
+    shape (N,).
 
     `gear` is neutral during a shift to `target_gear`. `since_shift` is minus infinity while the
     gear is held.
@@ -127,7 +130,9 @@ _full_torque = equation(full_torque)
 def pedal_position(
     command: FloatOrArray, pedal: FloatOrArray, fall: float, rise: float
 ) -> FloatOrArray:
-    """Position of a pedal that follows its command, with the largest fall and rise."""
+    """Position of a pedal after a substep: it follows its command, but by no more than the largest
+    fall and rise.
+    """
     return pedal + np.minimum(np.maximum(command - pedal, -fall), rise)
 
 
@@ -143,7 +148,7 @@ def ratio_of(law: Law, gear: FloatOrArray) -> FloatOrArray:
 
 @equation
 def shift(car: Car, law: Law, s: CarlaState, throttle: FloatOrArray) -> Gearbox:
-    """Automatic gearbox; in a shift the gear is neutral."""
+    """The gears after a substep of the automatic gearbox; during a shift the gear is neutral."""
     speed_share = s.engine_speed / car.engine_limit
     is_ready = s.since_shift >= law.shift_latency
     sets_off = (s.gear <= NEUTRAL) & (s.gear == s.target_gear) & (throttle > 0.0)
@@ -172,7 +177,7 @@ def tyre_force(
     """
     slip_speed = rim - speed
     denominator = np.maximum(rim, speed) + law.slip_offset
-    # 1 - K / 3 in the equation: 1 without slip, 0 where the tyre slides.
+    # `adhesion` is 1 - K / 3 in the equation: 1 without slip, 0 if the tyre slides.
     adhesion = (
         np.maximum(denominator - car.slip_stiffness * np.abs(slip_speed), 0.0)
         / denominator
@@ -203,7 +208,7 @@ def roll(
     clutch = car.clutch if gear > NEUTRAL else 0.0
     damping = car.damping_engaged if gear > NEUTRAL else car.damping_neutral
     clutch_by_ratio = ratio * clutch
-    # Inertias with everything that is implicit:
+    # Inertias with the terms of damping and clutch, which the step solves implicitly:
     engine = (
         law.engine_inertia + damping + (car.damping_full - damping) * throttle + clutch
     )
@@ -212,8 +217,8 @@ def roll(
         + car.wheel_damping
         + clutch_by_ratio * ratio * (1.0 - clutch / engine)
     )
-    # Coefficients of a tyre step: x_by_y is the change of x for a unit of y; the rim's speed stands
-    # for the wheel's.
+    # Coefficients of a tyre step: x_by_y is the change of x for a unit of y. The speed of the rim
+    # [m/s] takes the place of the wheel's speed [rad/s].
     engine_share = law.engine_inertia / engine
     engine_gain = throttle * _full_torque(car, law, s.engine_speed) / engine
     rim_by_torque = car.radius / wheel
@@ -289,11 +294,14 @@ def state_in(t: FloatArray, i: int) -> CarlaState:
 def advance(
     cars: FloatArray, law: Law, states: FloatArray, commands: FloatArray, substeps: int
 ) -> None:
-    """Move N vehicles: rows of `cars` are those of `Car`, shape (16, N), of `states`, which
-    changes, those of `CarlaState`, shape (8, N), of `commands` throttle and brake, shape (2, N).
+    """Move N vehicles by `substeps`; `states` changes in place.
+
+    The rows of `cars`, shape (16, N), are the fields of `Car`. The rows of `states`, shape (8, N),
+    are the fields of `CarlaState`. The rows of `commands`, shape (2, N), are throttle and brake.
     """
     n = states.shape[1]
-    # 16 rows of `Car`, 8 of `CarlaState`, 2 of commands; idle columns divide by 1.
+    # A block has 16 rows of `Car`, 8 of `CarlaState` and 2 of commands. Columns without a vehicle
+    # are 1, so that no equation divides by 0.
     t = np.ones((26, BLOCK))
     for start in range(0, n, BLOCK):
         count = min(BLOCK, n - start)
@@ -301,7 +309,7 @@ def advance(
         t[16:24, :count] = states[:, start : start + count]
         t[24:, :count] = commands[:, start : start + count]
         for _ in range(substeps):
-            # The whole block, whose last columns may hold no vehicle: a fixed number is faster.
+            # All columns are computed, even without a vehicle: a fixed number is faster.
             for i in range(BLOCK):
                 s = move(car_in(t, i), law, state_in(t, i), t[24, i], t[25, i])
                 t[16, i] = s.speed
@@ -313,7 +321,7 @@ def advance(
                 t[22, i] = s.throttle
                 t[23, i] = s.brake
 
-        # A braked vehicle that is slower than a slope could move it stands.
+        # A braked vehicle stands if it is slower than the speed at which a slope moves its wheels.
         for i in range(count):
             if t[23, i] > 0.0 and t[16, i] < t[15, i]:
                 t[16, i] = 0.0

@@ -1,5 +1,5 @@
-"""Vehicle characteristics, and parameters of the scenario that a study searches with them: their
-domains, the filter of small changes, and measures of change.
+"""The characteristics of a study: quantities of the vehicle, and the parameters of the scenario
+that the study searches. Their domains, the filter of small changes, and measures of change.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from safevar_sumo.study import (
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
 ROUNDING = 1e-6
-"""Share of a text's last digit by which a value may be off its rounded one, from rounding errors.
-"""
+"""Difference from a rounded value, in units of its last digit, that counts as a rounding error."""
 FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
-"""Pairs of the smallest width of a domain, and the share beta of the width above which the filter
-keeps changes (method section 2).
+"""Pairs of a width and a share beta. The first pair whose width a domain reaches gives its beta:
+the filter keeps changes that are larger than this share of the domain's width (method section 2).
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Characteristic:
     """One characteristic of the vehicle under test, or a searched parameter of the scenario
-    (`is_scenario`); all quantities are in `unit`.
+    (`is_scenario`). All values are in `unit`.
 
-    `meaning` describes the quantity, `counterpart` names the part of a real vehicle that determines
-    it, `measurement` says how a workshop measures it or, unless `workshop`, who else does,
-    `precision` how exactly, and `remedy` what to do beyond a limit; all of them may be empty.
-    `short_name` is its name in sentences: by default the meaning up to the first comma or bracket,
-    such as `engine drag`, or the name if the study gives no meaning.
+    These texts may be empty: `meaning` describes the quantity; `counterpart` names the part of a
+    real vehicle that determines it; `measurement` says how a workshop measures it (if `workshop` is
+    false, who else measures it); `remedy` says what to do with a vehicle beyond a limit.
+    `precision` says how exactly the quantity is measured (None: not stated). `short_name` is the
+    name in sentences: by default the meaning up to the first comma or bracket, such as `engine
+    drag`, or `name` if the study gives no meaning.
     """
 
     name: str
@@ -81,12 +81,13 @@ class Characteristic:
 
     @property
     def is_for_workshop(self) -> bool:
-        """Whether a workshop can measure it, and the study says how."""
+        """Whether a workshop can measure this characteristic, and the study says how."""
         return self.workshop and bool(self.measurement)
 
     def is_decidable(self, low: float, high: float) -> bool:
-        """Whether limits, other than ends of the domain, are farther from the original than the
-        precision of the measurement.
+        """Whether a measurement can decide that a value is within the limits `low` and `high`: the
+        original value, measured with the largest error, is still within them. True without a stated
+        precision, and if both limits are equal.
         """
         if self.precision is None or low == high:
             return True
@@ -95,21 +96,21 @@ class Characteristic:
 
     @property
     def error(self) -> float:
-        """How far a measured value may be from the true one; 0 where no precision is stated."""
+        """Largest difference of a measured value from the true value; 0 without a precision."""
         if self.precision is None:
             return 0.0
         return self.precision.value
 
     def measured(self, value: float) -> Interval:
-        """The least and greatest value of the domain that a measured one may really be."""
+        """The least and the greatest true value of a measured value, within the domain."""
         ends = np.round([value - self.error, value + self.error], 12)
         low, high = np.clip(ends, self.lower, self.upper).tolist()
         return low, high
 
     @property
     def threshold(self) -> float:
-        """Largest change that the filter removes: Th = beta (u - l) (method section 2); 0 for a
-        parameter of the scenario, of which any value is an encounter.
+        """Largest change that the filter removes: Th = beta (u - l) (method section 2). The
+        threshold of a scenario parameter is 0, because each of its values is another encounter.
         """
         if self.is_scenario:
             return 0.0
@@ -117,7 +118,9 @@ class Characteristic:
 
     @property
     def resolution(self) -> float:
-        """A change that matters little: beta (u - l) (method section 2)."""
+        """A change too small to matter: beta (u - l) (method section 2), also for a parameter of
+        the scenario.
+        """
         width = self.upper - self.lower
         shares = (
             share for smallest_width, share in FILTER_SHARES if width >= smallest_width
@@ -143,8 +146,8 @@ class Characteristic:
         return max(0, math.ceil(-math.log10(self.resolution / 4)))
 
     def rounded(self, value: float, *, upwards: bool) -> float:
-        """A limit rounded to the digits of `text`, upwards or downwards; never beyond the
-        original.
+        """A limit rounded to the digits of `text`, upwards or downwards. If rounding would carry
+        the limit past the original value, the original value is returned.
         """
         scaled = value * 10**self.digits
         original = self.original
@@ -157,7 +160,9 @@ class Characteristic:
         return original if is_beyond else rounded
 
     def rounded_inwards(self, interval: Interval) -> Interval:
-        """An interval around the original, rounded inwards; ends of the domain stay."""
+        """An interval around the original value, with both ends rounded towards this value. An end
+        of the domain stays as it is.
+        """
         low, high = interval
         if low > self.lower:
             low = self.rounded(low, upwards=True)
@@ -178,15 +183,15 @@ class Characteristic:
         otherwise: str = "",
         switch: str = "beyond=True",
     ) -> None:
-        """Refuse a value that is not a number or not legal (`is_legal`).
+        """Refuse a value that is no number, or is not legal (see `is_legal`).
 
-        `otherwise` describes further legal values; `switch` is the option that allows values beyond
-        the domain, empty if there is none.
+        `otherwise` describes further legal values for the message. `switch` is the option that
+        allows values beyond the domain; "" if there is no such option.
 
         Raises
         ------
         InputError
-            Naming the value and what is expected.
+            The error names the value and what is expected.
         """
         is_number = isinstance(value, Real)
         if is_number and self.is_legal(value, beyond=beyond):
@@ -199,7 +204,7 @@ class Characteristic:
             if self.lower > 0:
                 sign = " above 0"
             expected = f"a finite number{sign}, up to {self.largest_plausible:g}"
-        # A legal value outside the domain has a way to be accepted.
+        # The option `switch` would allow this value: the message says so.
         elif is_number and self.is_legal(value, beyond=True):
             problem += " is outside its domain"
             hint = ""
@@ -208,11 +213,12 @@ class Characteristic:
         raise InputError("", problem, f"{expected}{self.suffix}{otherwise}{hint}")
 
     def is_legal(self, values: Quantity, *, beyond: bool) -> Quantity:
-        """Whether values, a number or an array, are in the domain; with `beyond`, whether they are
+        """Whether values, a number or an array, are in the domain. With `beyond`, whether they are
         plausible.
 
-        A plausible value has at most 1000 times the largest magnitude in the domain; it is above 0
-        if the domain is, and never below 0 in the scenario.
+        The magnitude of a plausible value is at most 1000 times the largest magnitude in the
+        domain. A plausible value is above 0 if the whole domain is, and a plausible value of a
+        scenario parameter is never below 0.
         """
         if beyond:
             is_positive = (values > 0) | (self.lower <= 0) & (
@@ -224,8 +230,8 @@ class Characteristic:
 
 @dataclass(frozen=True)
 class CharacteristicSet:
-    """The n characteristics C_1..C_n of a study, those of the vehicle before the parameters of its
-    scenario; N settings are an array of shape (N, n).
+    """The n characteristics C_1..C_n of a study: first the characteristics of the vehicle, then the
+    searched parameters of the scenario. N settings are an array of shape (N, n).
     """
 
     members: tuple[Characteristic, ...]
@@ -248,7 +254,7 @@ class CharacteristicSet:
         return len(self.members)
 
     def options(self, setting: FloatArray) -> str:
-        """The options of `simulate` that give a setting, shape (n,)."""
+        """The options of the command `simulate` that state a setting, shape (n,)."""
         changes = self._changes_of(setting)
         words = [f"--set {name}={value!r}" for name, value in changes.items()]
         if ((setting < self.lower) | (setting > self.upper)).any():
@@ -274,23 +280,27 @@ class CharacteristicSet:
 
     @cached_property
     def of_vehicle(self) -> BoolArray:
-        """Which members are the vehicle's, shape (n,)."""
+        """Whether each member is a characteristic of the vehicle, shape (n,)."""
         return np.array([not member.is_scenario for member in self.members], bool)
 
     def of_others(
         self, characteristics: CharacteristicSet, settings: FloatArray
     ) -> FloatArray:
-        """Settings of other characteristics, shape (N, m), with those of this set alone, shape
-        (N, n).
+        """The columns of this set, shape (N, n), in settings of a larger set of `characteristics`,
+        shape (N, m).
         """
         return settings[:, list(map(characteristics.names.index, self.names))]
 
     def with_original_vehicle(self, settings: FloatArray) -> FloatArray:
-        """The original vehicle in the encounters of settings, shape (N, n)."""
+        """The settings of the original vehicle in the encounters of `settings`; both have the shape
+        (N, n).
+        """
         return np.where(self.of_vehicle, self.original, settings)
 
     def with_printed_encounters(self, settings: FloatArray) -> FloatArray:
-        """Settings, shape (N, n), whose encounters are rounded as they are printed."""
+        """Settings, shape (N, n), with scenario parameters rounded to the decimals that are
+        printed: then a printed encounter is the simulated one.
+        """
         rounded = settings.copy()
         for column in np.flatnonzero(~self.of_vehicle):
             item = self.members[column]
@@ -304,7 +314,7 @@ class CharacteristicSet:
 
     @property
     def original_settings(self) -> FloatArray:
-        """The original setting alone, shape (1, n)."""
+        """The original setting as an array of one setting, shape (1, n)."""
         return self.original[None]
 
     @cached_property
@@ -339,11 +349,11 @@ class CharacteristicSet:
         return ", ".join(f"{name} = {value:g}" for name, value in changes.items())
 
     def encounter_of(self, setting: FloatArray) -> NamedValues:
-        """The values of a setting's encounter, by name."""
+        """The values of the scenario parameters of a setting, shape (n,), by name."""
         return self.scenario.named(setting[~self.of_vehicle])
 
     def columns(self, settings: FloatArray) -> dict[str, FloatArray]:
-        """The values of N settings, shape (N, n), by name, each of shape (N,)."""
+        """The columns of N settings, shape (N, n), by characteristic; a column has shape (N,)."""
         return dict(zip(self.names, np.ascontiguousarray(settings.T), strict=True))
 
     def filter(self, settings: FloatArray) -> FloatArray:
@@ -355,7 +365,7 @@ class CharacteristicSet:
         )
 
     def changed(self, filtered: FloatArray) -> BoolArray:
-        """Which characteristics differ from the original; bool, shape (N, n)."""
+        """Whether each value of filtered settings differs from the original, shape (N, n)."""
         return np.asarray(filtered != self.original)
 
     def change_objectives(self, settings: FloatArray) -> dict[str, Any]:
@@ -367,9 +377,9 @@ class CharacteristicSet:
         }
 
     def largest_change(self, filtered: FloatArray) -> FloatArray:
-        """f_diff = max_i |v_i - v''_i| / |v_i|, shape (N,): original v, filtered v'' (method
-        section 3), of the vehicle's characteristics; the domain's width stands for an original
-        of 0.
+        """f_diff = max_i |v_i - v''_i| / |v_i| over the vehicle's characteristics, shape (N,), with
+        the original values v and the filtered values v'' (method section 3). If an original value
+        is 0, the width of the domain replaces |v_i|.
         """
         vehicle = self.vehicle
         scale = np.where(
@@ -381,7 +391,7 @@ class CharacteristicSet:
         return np.asarray(np.max(changes, axis=1))
 
     def number_changed(self, filtered: FloatArray) -> FloatArray:
-        """f_numDiff, the number of the vehicle's characteristics changed, shape (N,) (method
+        """f_numDiff, the number of changed characteristics of the vehicle, shape (N,) (method
         section 3).
         """
         return np.asarray(
@@ -392,13 +402,13 @@ class CharacteristicSet:
     def setting(
         self, values: Mapping[str, float], *, beyond: bool = False
     ) -> FloatArray:
-        """The original setting with some values replaced, shape (n,); with `beyond`, plausible
-        values outside the domain are legal.
+        """The original setting with some values replaced, shape (n,). With `beyond`, plausible
+        values outside the domain are legal, too.
 
         Raises
         ------
         InputError
-            If a name is unknown or a value is outside its domain.
+            If a name is unknown, or a value is outside its domain (with `beyond`, not plausible).
         """
         values = plain_values(values)
         if not isinstance(values, Mapping):
