@@ -1,4 +1,6 @@
-"""The records of measures and scorings, and functions that several metrics use."""
+"""Records of measures (columns of results) and scorings (the objectives of a search), and functions
+that several metrics use.
+"""
 
 from __future__ import annotations
 
@@ -27,17 +29,17 @@ if TYPE_CHECKING:
 TIME_TOLERANCE = 1e-6
 """Largest difference between two times that count as equal [s]."""
 OF_EVERY_TRACE = "speed", "separation"
-"""Quantities that every trace has."""
+"""Quantities that every trace of a run has."""
 
 
 def sampling_stride(step: float, interval: float | None) -> int:
-    """Number of simulation steps between two samples that are `interval` seconds apart; 1 without
-    an interval.
+    """The number of simulation steps between two samples that are `interval` seconds apart; 1 if
+    the interval is None.
 
     Raises
     ------
     InputError
-        If that number is not whole.
+        If the interval is no whole multiple of the step.
     """
     if interval is None:
         return 1
@@ -52,9 +54,10 @@ def sampling_stride(step: float, interval: float | None) -> int:
 
 
 def sum_in_order(samples: FloatArray) -> FloatArray:
-    """Sum over the first axis, in order.
+    """Sum over the first axis, in the order of its elements.
 
-    In numpy's own sum the order depends on the shape, so that a vehicle's result would depend on N.
+    numpy's own sum chooses an order that depends on the shape of the array. A vehicle's result
+    would then depend on the number of vehicles.
     """
     if not len(samples):
         return np.zeros(samples.shape[1:])
@@ -66,8 +69,8 @@ TitleText = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]{1,200}\Z")]
 
 
 class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A column of results: a metric of simulation runs, or a measure of change of settings. A
-    search may minimise it, or maximise it if larger values are more unsafe.
+    """A measure is a column of results: a metric of simulation runs, or a measure of change of
+    settings. A search may minimise it, or maximise it if larger values are more unsafe.
 
     Attributes
     ----------
@@ -80,17 +83,18 @@ class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     over_collisions
         Whether colliding solutions count.
     description
-        One sentence.
+        A description in one sentence.
     of
-        What it measures: `runs` or `settings`.
+        The arguments of the function: `runs` or `settings`.
     function
-        Takes N simulation runs and thresholds, or settings as simulated, shape (N, n), and the
-        characteristics; returns shape (N,), of runs NaN where it is undefined. Element i depends
-        only on run or setting i, bit for bit. None in results, and for columns that all results
-        have.
+        The function that computes the measure; None in results, and for columns that all results
+        have. A function of `runs` takes N simulation runs and thresholds. A function of `settings`
+        takes simulated settings, shape (N, n), and the characteristics. Both return values of shape
+        (N,), for undefined metrics NaN. Element i depends only on run or setting i, bit for bit.
     needs
-        Quantities that the function of runs reads, of `QUANTITIES`; without them `OF_EVERY_TRACE`.
-        It is not called with runs that lack one, where the metric is undefined. Not in results.
+        The quantities (of `QUANTITIES`) that a function of runs reads, by default `OF_EVERY_TRACE`.
+        The metric is undefined for runs that lack one of these quantities. Results do not store the
+        needs.
     """
 
     name: MeasureName
@@ -105,26 +109,28 @@ class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """The quantities that it needs, by default those of every trace."""
+        """The quantities that the function of runs reads, by default the quantities of every
+        trace.
+        """
         if self.needs is UNSET:
             return OF_EVERY_TRACE
         return self.needs
 
     @property
     def sign(self) -> float:
-        """Factor on the values after which a search minimises them."""
+        """The factor by which a search multiplies values, so that it can minimise them: -1 or 1."""
         if self.more_is_unsafe:
             return -1.0
         return 1.0
 
     @property
     def facts(self) -> Measure:
-        """The record without the function and its needs, for results."""
+        """The record without the function and its needs, as results store it."""
         return replace(self, function=None, needs=UNSET)
 
     def of_runs(self, runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
-        """The metric of N runs, shape (N,): what a run states itself, or else what the function
-        says; NaN where a run lacks what it needs.
+        """The metric of N runs, shape (N,). A value that a run states itself wins over the value of
+        the function. NaN if a run lacks a quantity that the function needs.
         """
         rows = np.flatnonzero(~runs.lacking(*self.quantities))
         values = nans(len(runs))
@@ -137,17 +143,19 @@ class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def mask_collisions(runs: SimulationRuns, values: FloatArray) -> FloatArray:
-    """A metric's values, shape (N,), undefined on a collision."""
+    """The values of a metric, shape (N,), with NaN for runs with a collision."""
     return np.where(np.isnan(runs.collision_speed), values, np.nan)
 
 
 def checked_measure(code: UserCode) -> Measure:
-    """A user's measure, whose values are checked.
+    """A user's measure, with a function that checks its own results.
 
     Raises
     ------
+    UserCodeError
+        If the object is no measure with a function.
     InputError
-        If it is not a valid record of a measure.
+        If a field of the measure has an illegal value.
     """
     expected = (
         "a safevar_sumo.metrics.Measure(name=..., title=..., unit=..., function=...)"
@@ -175,11 +183,12 @@ def checked_measure(code: UserCode) -> Measure:
 class Scoring(
     Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True
 ):
-    """The metrics of a study and the objectives of its searches; stored in results beside the
-    study.
+    """The metrics of a study, and the objectives of its searches. Results store the scoring beside
+    the study.
 
-    Where encounters are ranges, a setting is feasible if the original vehicle has at
-    least the safety degree `safe_original` in the same encounter [m].
+    `safe_original` is the safety degree [m] that the original vehicle must have at least in the
+    same encounter, if encounters are ranges; None otherwise. Settings in other encounters are
+    infeasible.
     """
 
     metrics: tuple[Measure, ...]
@@ -187,8 +196,9 @@ class Scoring(
     safe_original: float | None = None
 
     def violation(self, evaluations: Evaluations) -> FloatArray:
-        """By how much the original vehicle is not safe in each setting's encounter, shape (M,); 0
-        if it is, infinite if it could not be simulated.
+        """The part of `safe_original` that the original vehicle lacks in the encounter of each
+        setting, shape (M,). 0 if the original vehicle is safe, infinite if its safety degree is
+        undefined.
         """
         if self.safe_original is None:
             return np.zeros(len(evaluations))
@@ -196,15 +206,15 @@ class Scoring(
         return np.where(np.isnan(shortfall), np.inf, np.maximum(shortfall, 0.0))
 
     def feasible_rows(self, frame: pd.DataFrame) -> BoolArray:
-        """In which rows the original vehicle is safe in the same encounter: all, unless encounters
-        are ranges.
+        """In which rows of a data frame the original vehicle is safe in the same encounter. All
+        rows, unless encounters are ranges.
         """
         if self.safe_original is None or ORIGINAL_DEGREE not in frame:
             return np.ones(len(frame), bool)
         return np.asarray(frame[ORIGINAL_DEGREE] >= self.safe_original)
 
     def values(self, evaluations: Evaluations) -> FloatArray:
-        """Values of the objectives, smaller being better; shape (M, objectives)."""
+        """The values of the objectives, shape (M, objectives). Smaller values are better."""
         return np.stack(
             [
                 objective.sign * evaluations.column(objective.name)
@@ -214,8 +224,8 @@ class Scoring(
         )
 
     def valid(self, evaluations: Evaluations) -> BoolArray:
-        """Whether the simulation succeeded, every objective is defined and the setting is feasible;
-        shape (M,).
+        """Which settings are valid, shape (M,): the simulation succeeded, every objective is
+        defined, and the original vehicle is safe in the encounter.
         """
         is_defined = np.isfinite(self.values(evaluations)).all(axis=1)
         return np.asarray(
