@@ -1,5 +1,5 @@
-"""The baselines of the published study (method section 6): random search, and SafeFuzzer, a
-fuzzer.
+"""The baselines of the published study (method section 6): random search, and the fuzzer
+SafeFuzzer.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class RandomSearch(Algorithm, Table, frozen=True, kw_only=True):
 
 
 MAX_REDRAWS = 100
-"""Maximum number of draws to replace an infeasible setting."""
+"""Largest number of further draws after an infeasible setting."""
 PositiveCount = Annotated[int, Meta(ge=1, le=1_000_000)]
 
 
@@ -86,7 +86,7 @@ class SafeFuzzer(Algorithm, Table, frozen=True, kw_only=True):
             used += len(evaluated)
             generations.append(evaluated)
 
-            # A search whose lowest score has not fallen for long ends.
+            # The search ends when its lowest score has not fallen for some generations.
             scores.append(_scores(evaluated, problem.scoring, self.safety_weight))
             lowest_in_generation = np.nanmin(scores[-1], initial=np.inf)
             is_improved = lowest_in_generation < lowest_score or used <= self.warm_up
@@ -95,7 +95,7 @@ class SafeFuzzer(Algorithm, Table, frozen=True, kw_only=True):
                 unimproved = 0
             lowest_score = min(lowest_score, lowest_in_generation)
 
-            # Ranges narrow to the best settings of the last generations.
+            # The ranges follow the less safe settings of the generations since the last update.
             if (
                 used >= self.warm_up
                 and len(generations) % self.generations_between_updates == 0
@@ -108,7 +108,9 @@ class SafeFuzzer(Algorithm, Table, frozen=True, kw_only=True):
 
 
 class Ranges:
-    """Ranges from which values are drawn, and the largest number of characteristics changed."""
+    """The ranges from which SafeFuzzer draws values, and the largest number of characteristics that
+    it changes at once.
+    """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
@@ -120,16 +122,16 @@ class Ranges:
         self.max_changes = len(problem.characteristics.vehicle)
 
     def draw(self, number: int, rng: Generator) -> FloatArray:
-        """Filtered settings; each changes k characteristics, with k drawn uniformly from 1 to
-        `max_changes`, in an encounter drawn uniformly.
+        """Draw filtered settings, shape (number, n). Each setting changes k characteristics; k is
+        drawn uniformly from 1 to `max_changes`. The encounter is drawn uniformly from its ranges.
         """
         return self._characteristics.filter(
             np.stack([self._draw_feasible_setting(rng) for _ in range(number)])
         )
 
     def _draw_feasible_setting(self, rng: Generator) -> FloatArray:
-        """A feasible setting; after `MAX_REDRAWS` infeasible draws, the last one moved towards the
-        original until it is feasible.
+        """Draw a feasible setting. If `MAX_REDRAWS` further draws are infeasible, too, the last
+        setting is moved towards the original until it is feasible.
         """
         for _ in range(1 + MAX_REDRAWS):
             setting = self._draw_setting(rng)
@@ -149,11 +151,11 @@ class Ranges:
         return setting
 
     def _draw_value(self, i: int, rng: Generator) -> float:
-        """A value of characteristic `i`, drawn uniformly from the values in its range that the
+        """Draw a value of characteristic `i`, uniformly from the values of its range that the
         filter keeps.
 
-        The filter replaces values within a threshold of the original by the original, which is
-        drawn if no others are in the range.
+        The filter replaces values that differ from the original by less than a threshold. If the
+        range has no other values, the result is the original value.
         """
         original = self._characteristics.original[i]
         threshold = self._characteristics.threshold[i]
@@ -167,8 +169,8 @@ class Ranges:
         return float(self.upper[i] - (position - width_below))
 
     def narrow(self, window: Evaluations) -> None:
-        """End each range at the mean of the increased values and the mean of the decreased values,
-        over the settings of `window` that are less safe than the original.
+        """Set the ends of each range to the mean of the increased values and the mean of the
+        decreased values. Only settings of `window` count that are less safe than the original.
         """
         is_less_safe = self._scoring.values(window)[:, 0] < self._originals(window)
         less_safe = window.take(self._scoring.valid(window) & is_less_safe)
@@ -181,12 +183,13 @@ class Ranges:
                 self.upper[i] = np.mean(values[values > original])
             if np.any(values < original):
                 self.lower[i] = np.mean(values[values < original])
-        # Python's own rounding takes halves to even numbers, not upwards.
+        # Halves are rounded upwards. Python's `round` would round halves to even numbers.
         self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))
 
     def _originals(self, window: Evaluations) -> FloatArray:
-        """The first objective of the original vehicle; in its own encounter, if that is a safety
-        degree there.
+        """The first objective of the original vehicle, for each setting of `window`. If the
+        objective is a safety degree and encounters are ranges, the original vehicle drives in the
+        encounter of the setting.
         """
         if (
             self._scoring.safe_original is not None
@@ -199,13 +202,13 @@ class Ranges:
 def _scores(
     evaluations: Evaluations, scoring: Scoring, safety_weight: float
 ) -> FloatArray:
-    """The scores of a generation, less being better, by default (6 SD_norm + f_diff + num_norm) /
-    8; NaN if invalid.
+    """The scores of a generation. Less is better; NaN for settings that are not valid. By default
+    the score is (6 SD_norm + f_diff + num_norm) / 8.
 
-    SD_norm is the safety degree scaled to [0, 1] over the generation ("after each generation, the
-    value of each objective is normalised"); num_norm = (f_num_diff - 1) / (n - 1) for n
-    characteristics. In a study with other objectives, the first takes the place of the safety
-    degree, and further ones are scaled to [0, 1], too.
+    SD_norm is the safety degree, scaled to [0, 1] over the generation ("after each generation, the
+    value of each objective is normalised"). num_norm = (f_num_diff - 1) / (n - 1) for n
+    characteristics. In a study with other objectives, the first objective replaces the safety
+    degree. Further objectives are scaled to [0, 1], too.
     """
     values = np.where(
         scoring.valid(evaluations)[:, None], scoring.values(evaluations), np.nan
