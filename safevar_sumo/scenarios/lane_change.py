@@ -1,8 +1,8 @@
-"""A car from the next lane cuts in; a leader cuts out and reveals a standing car (UN R157, annex 4,
-appendix 3).
+"""Two scenarios of UN R157 (annex 4, appendix 3): a car cuts in from the next lane, and a leader
+cuts out and reveals a standing car.
 
-The lateral movement is as the regulation draws it: at a constant speed from one lane's middle to
-the other's, with bodies that stay parallel to the lanes.
+The car moves sideways as in the regulation's figures: at a constant speed, from the middle of a
+lane to the middle of the next lane. Bodies stay parallel to the lanes.
 """
 
 from __future__ import annotations
@@ -30,11 +30,15 @@ from safevar_sumo.scenarios.tracks import (
 from safevar_sumo.study import searched
 
 CAR = BodySize(BODIES["car"].length, 1.9)
-"""Size of the other cars [m]: as wide as the regulation's."""
+"""Size of the other cars [m]. Their width is the width in the regulation."""
 BEGINS_AT = 1.0
-"""Time at which the lateral movement begins [s]: until then a driver sees where the car drives."""
+"""Time at which the lateral movement begins [s]. Before this time, a driver can see in which lane
+the car drives.
+"""
 MotorwaySpeed = Annotated[float, Meta(gt=0, le=130), VEHICLE_SPEED]
-"""Speed of the vehicle under test [km/h], up to that of the regulation's 01 series."""
+"""Speed of the vehicle under test [km/h]. The largest speed is that of the regulation's 01
+series.
+"""
 Gap = Annotated[
     float,
     Meta(gt=0, le=500),
@@ -46,8 +50,8 @@ LateralSpeed = Annotated[
 
 
 class LaneChange(LaneTest, frozen=True, kw_only=True):
-    """Base of both scenarios: a car changes the lane, `side` of the vehicle's; for other parameters
-    see `LaneTest`.
+    """Base of both scenarios: a car changes from or to the next lane. `side` is the side of the
+    vehicle on which this lane is. For other parameters see `LaneTest`.
     """
 
     speed: MotorwaySpeed = 80.0
@@ -57,18 +61,18 @@ class LaneChange(LaneTest, frozen=True, kw_only=True):
     network: str = "two_lanes"
 
     def actors(self, roads: Roads) -> XmlChanges:
-        """The vehicle under test, with the next lane at the side where it is needed."""
+        """Set the vehicle's departure, and its lane: the next lane must be at the needed side."""
         changes = super().actors(roads)
         # The lane to the right has the number 0.
         departure = {**(changes[DEPARTURE] or {}), "departLane": f"{self.sign < 0:d}"}
         return {**changes, DEPARTURE: departure}
 
     def benign(self) -> NamedScenarios:
-        """A car stays in the next lane."""
+        """A car stays in the next lane in each benign scene."""
         return next_lane(self)
 
     def moved(self, times: FloatArray) -> Quantity:
-        """Distance that the car has moved sideways [m]."""
+        """The distance that the car has moved sideways [m]."""
         return np.minimum(
             self.lateral_speed * np.maximum(times - BEGINS_AT, 0.0), LANE_WIDTH
         )
@@ -132,7 +136,9 @@ class CutIn(LaneChange, frozen=True, kw_only=True):
         return self.target_speed * KMH
 
     def check(self) -> None:
-        """Refuse a car that is beside the vehicle before any of it is in the vehicle's lane."""
+        """Refuse a car that the vehicle passes before any part of the car is in the vehicle's
+        lane.
+        """
         enters_after = (LANE_WIDTH - CAR.width) / 2 / self.lateral_speed
         closed_gap = (self.start_speed - self.first_speed) * enters_after
         if self.gap - closed_gap <= 0:
@@ -144,7 +150,7 @@ class CutIn(LaneChange, frozen=True, kw_only=True):
             )
 
     def tracks(self, times: FloatArray) -> list[Track]:
-        """The car that cuts in."""
+        """The track of the car that cuts in."""
         arrives = BEGINS_AT + LANE_WIDTH / self.lateral_speed
         speed = np.maximum(
             self.first_speed
@@ -202,14 +208,14 @@ class CutOut(LaneChange, frozen=True, kw_only=True):
         )
 
     def tracks(self, times: FloatArray) -> list[Track]:
-        """The leader and the standing car.
+        """The tracks of the leader and of the standing car.
 
         Raises
         ------
         InputError
-            If the leader is too slow sideways to get past the standing car.
+            If the leader moves sideways too slowly to pass the standing car.
         """
-        # The leader has left the path when he reaches the standing car.
+        # When the leader reaches the standing car, he must have left its path.
         speed = self.start_speed
         lateral_way = self.gap / self.start_speed * self.lateral_speed
         if np.any(lateral_way < CAR.width):
