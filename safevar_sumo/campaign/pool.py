@@ -1,7 +1,7 @@
-"""A pool of workers: processes of this machine, or the workers of a Dask cluster. Each carries out
+"""A pool of workers: processes of this machine, or workers of a Dask cluster. A worker carries out
 one job at a time.
 
-A job is a plain function with its arguments, which are sent to the worker. `carry_out` in
+A job is a plain function with its arguments. Both are sent to the worker. `carry_out` in
 `campaign/evaluation.py` gives jobs to a pool.
 """
 
@@ -25,13 +25,15 @@ from safevar_sumo.plugins.process import MAX_DEATHS
 from safevar_sumo.records import Evaluations, JsonObject
 
 Look = Callable[[Sequence[int]], None]
-"""A function that is told the numbers of jobs that have just ended."""
+"""A function that gets the numbers of the jobs that have just ended."""
 SECONDS_BETWEEN_LOOKS = 0.5
-"""Longest time between two looks at the jobs under way [s]."""
+"""Longest time between two calls of a `Look` [s]."""
 
 
 class WorkerLostError(SafevarError):
-    """More than `MAX_DEATHS` workers died of a job; `job` is its number."""
+    """The error after the deaths of more than `MAX_DEATHS` workers in a job. `job` is the number of
+    the job.
+    """
 
     def __init__(self, job: int, cause: str) -> None:
         super().__init__(cause)
@@ -42,43 +44,48 @@ class Worker(Protocol):
     """An executor with one worker."""
 
     def submit(self, function: Work, *arguments: Any) -> Future[Any]:
-        """Begin a job."""
+        """Begin a job, and return its future result."""
 
     def cause_of_death(self, error: BaseException) -> str:
-        """Why the worker died, if this is what an error of its job says; "" if it did not die."""
+        """The reason why the worker died, if the error of its job shows that it died; ""
+        otherwise.
+        """
 
     def end(self) -> None:
-        """End the worker, or, in a cluster, its jobs."""
+        """End the worker. In a cluster, only its jobs end."""
 
 
 class Pool:
-    """Workers, which start when they are first needed.
+    """Workers, which start when they are needed for the first time.
 
     Attributes
     ----------
     workers
         Number of jobs that are carried out at the same time.
     opened
-        The names of the files that the user code of studies opens, by the names of the code, and
-        the study's name with the folders in which code is looked up.
+        The names of the files that user code opens. Keys are the names of the user code, and the
+        study's name with the folders in which code is looked up.
     inputs
-        The inputs of a study's results when it was new to the pool, a manifest, by packed study.
+        For each study (packed): the manifest of its inputs when the pool first met the study.
     verified
-        Number of settings whose results were verified, by packed study.
+        For each study (packed): the number of settings whose results were verified.
     compiled
-        Names of the vehicle models that workers find compiled.
+        Names of the vehicle models that are already compiled.
     simulated, failed
-        Number of settings that questions have had, of studies that skip those that fail.
-    checked, spare
-        Number of simulations of the last check of user code; the largest numbers of a check and of
-        repeats in a simulator of the user's own, None if they are not limited.
+        Numbers of simulated and of failed settings in questions about studies that skip failures.
+    checked
+        Number of simulations of the last check of user code.
+    spare
+        Largest numbers of simulations of a check and of repeats, in a simulator of the user's own;
+        None without a limit.
     shared
-        What the questions of a page have simulated: evaluations by setting, of each study and
-        selection; None if questions do not share it.
+        The evaluations that the questions of a page share, for each study with a selection, and for
+        each setting; None if questions share nothing.
     on_cluster
-        Carries out a function in each worker of a cluster; None for processes of this machine.
+        A function that carries out a job in each worker of a cluster; None for processes of this
+        machine.
     attempts
-        The folder in which workers note the settings that may be skipped while they simulate them.
+        The folder in which workers note the settings that they simulate, if failures are skipped.
     """
 
     def __init__(self, workers: int, start: Callable[[int], Worker]) -> None:
@@ -101,8 +108,8 @@ class Pool:
         jobs: Sequence[tuple[Any, ...]],
         look: Look = lambda ended: None,
     ) -> list[Any]:
-        """The results of a function for the arguments of each job, in their order; a job whose
-        worker dies is carried out once more.
+        """Call a function with the arguments of each job, and return the results in the order of
+        the jobs. A job whose worker dies is carried out once more.
 
         `look` is called with the numbers of the jobs that have just ended, and at least twice a
         second.
@@ -110,7 +117,7 @@ class Pool:
         Raises
         ------
         WorkerLostError
-            If another worker dies of the same job.
+            If another worker dies in the same job.
         """
         results = dict[int, Any]()
         deaths = Counter[int]()
@@ -134,7 +141,8 @@ class Pool:
             place, number = under_way.pop(future)
             idle.appendleft(place)
 
-            # The worker may have died by chance: its job waits again, a few times.
+            # The worker may have died by chance. Therefore its job is carried out again, up to a
+            # few times.
             error = future.exception()
             if error is None:
                 results[number] = future.result()
@@ -150,7 +158,7 @@ class Pool:
         return [results[number] for number in range(len(jobs))]
 
     def _skipped(self) -> int:
-        """Number of settings of which so many workers have died that they are skipped."""
+        """The number of settings that are skipped, because too many workers have died of them."""
         folders = (
             self.attempts.iterdir() if self.attempts and self.attempts.exists() else ()
         )
@@ -159,7 +167,7 @@ class Pool:
     def everywhere(
         self, function: Work, *arguments: Any, limit: int | None = None
     ) -> None:
-        """Carry out a function in each worker that has started and lives, or in so many of them."""
+        """Call a function in each living worker, or in `limit` of them."""
         places = list(self._started)[:limit]
         futures = [self._begin(place, function, arguments) for place in places]
         for future in futures:
@@ -172,7 +180,7 @@ class Pool:
 
     def _begin(self, place: int, function: Work, job: tuple[Any, ...]) -> Future[Any]:
         if place in self._started:
-            # Its process may have died between two jobs.
+            # The process of the worker may have died between two jobs.
             with suppress(BrokenExecutor):
                 return self._started[place].submit(function, *job)
             self._started.pop(place).end()
@@ -181,7 +189,7 @@ class Pool:
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
+    """The number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -189,8 +197,8 @@ def available_cores() -> int:
 
 @contextmanager
 def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[Pool]:
-    """A pool of `jobs` processes, by default one for each core, or of the workers of the Dask
-    scheduler at an address; they end with the context.
+    """Open a pool of `jobs` processes, by default one for each core, or of the workers of the Dask
+    scheduler at the address `cluster`. The workers end with the context.
 
     Raises
     ------
