@@ -1,9 +1,7 @@
-"""Euro NCAP's frontal crash avoidance tests (protocol CA-FC, v1.2, July 2026): what their scenarios
-share.
+"""Parts that the scenarios of Euro NCAP's frontal crash avoidance tests share (protocol CA-FC,
+v1.2, July 2026): the protocol's table, directions of targets, and speeds of targets over time.
 
-It is the protocol's table, the directions of targets and their speeds over time.
-
-Speeds are in km/h and impact locations in per cent of the vehicle's width, as in the protocol.
+As in the protocol, speeds are in km/h, and impact locations in per cent of the vehicle's width.
 """
 
 from __future__ import annotations
@@ -24,21 +22,23 @@ from safevar_sumo.shipped import shipped_table
 Metres = Annotated[float, Meta(ge=0, le=100)]
 Seconds = Annotated[float, Meta(gt=0, le=60)]
 ImpactLocation = Annotated[float, Meta(ge=-50, le=150)]
-"""Point on or beside the vehicle's front [% of its width]."""
+"""A point on or beside the vehicle's front [% of the vehicle's width]."""
 Heading = Annotated[float, Meta(ge=-30, le=30)]
 """Rotation of a target's path, counterclockwise seen from above [degrees]."""
 
 
 class Direction(NamedTuple):
-    """Direction of a target as a unit vector, along the vehicle's lane and to its left."""
+    """The direction of a target: a unit vector with its parts along the vehicle's lane and to the
+    left.
+    """
 
     along: float
     left: float
 
     def turned(self, heading: float) -> Direction:
-        """The direction turned counterclockwise by `heading` [degrees].
+        """Turn the direction counterclockwise by `heading` [degrees].
 
-        Sine and cosine are rounded, as their last bits differ between machines.
+        Sine and cosine are rounded, because their last bits differ between machines.
         """
         angle = math.radians(heading)
         cosine, sine = round(math.cos(angle), 12), round(math.sin(angle), 12)
@@ -48,7 +48,7 @@ class Direction(NamedTuple):
         )
 
     def extent(self, body: BodySize) -> BodySize:
-        """Size along the lane and across it of a body that faces in this direction [m]."""
+        """The size of a body that faces in this direction, along the lane and across it [m]."""
         cosine, sine = abs(self.along), abs(self.left)
         return BodySize(
             body.length * cosine + body.width * sine,
@@ -69,18 +69,27 @@ class TestRow(Struct, frozen=True, forbid_unknown_fields=True):
     Attributes
     ----------
     words
-        What happens in the test, for readers who do not know its name.
-    target, pre_crash
-        The target, and the pre-crash type of the encounter.
-    slowest, fastest, locations
-        Tested speeds of the vehicle [km/h] and impact locations [% of the width].
-    target_speed, acceleration_distance
-        Speed of the target [km/h] and distance within which it reaches that speed [m].
-    side, lateral_start, hidden
-        Of a crossing target: where it starts [m], and whether parked cars hide it. A target without
-        a `lateral_start` starts at its full speed.
+        A description of the test, for readers who do not know its name.
+    target
+        The kind of the target.
+    pre_crash
+        The pre-crash type of the encounter.
+    slowest, fastest
+        Range of the vehicle's tested speeds [km/h].
+    locations
+        Tested impact locations [% of the vehicle's width].
+    target_speed
+        Speed of the target [km/h].
+    acceleration_distance
+        Distance within which the target reaches its speed [m].
+    side
+        Side from which a crossing target comes.
+    lateral_start
+        Distance at which a crossing target starts [m]. None: the target starts at its full speed.
+    hidden
+        Whether parked cars hide a crossing target.
     headway
-        Of a car or motorcyclist ahead: time headway at the start [s].
+        Time headway at the start to a car or motorcyclist ahead [s].
     """
 
     words: str
@@ -98,12 +107,14 @@ class TestRow(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 TESTS = msgspec.convert(shipped_table("scenarios/euro_ncap.toml"), dict[str, TestRow])
-"""The rows of the protocol's table: euro_ncap.toml beside this module."""
+"""The rows of the protocol's table, by the names of the tests, from euro_ncap.toml beside this
+module.
+"""
 
 
 class TargetProfile(NamedTuple):
-    """Speed over time of a target that stands, sets off at `begin` [s], and accelerates evenly to
-    `speed` [m/s] within `run_up` [m]; or of N targets, in arrays.
+    """The speed over time of a target, or of N targets if the values are arrays. The target stands
+    until `begin` [s], and accelerates evenly to `speed` [m/s] within `run_up` [m].
     """
 
     begin: Quantity
@@ -114,9 +125,9 @@ class TargetProfile(NamedTuple):
     def with_arrival(
         cls, distance: Quantity, time: Quantity, speed: Quantity, run_up: float
     ) -> TargetProfile:
-        """The profile that covers `distance` [m] by `time` [s].
+        """The profile of a target that covers `distance` [m] up to `time` [s].
 
-        Past the run-up, distance = speed * (time - begin) - run_up.
+        After the run-up, distance = speed * (time - begin) - run_up.
         """
         if np.any(distance < run_up):
             raise InputError(
@@ -135,12 +146,12 @@ class TargetProfile(NamedTuple):
             )
         return cls(begin, speed, run_up)
 
-    # A target without a run-up divides by 0.
+    # `np.where` computes both cases: the case of a target without run-up divides by 0.
     @np.errstate(all="ignore")
     def travelled(self, time: Quantity) -> Quantity:
-        """Distance covered [m] at a time [s]."""
+        """The distance covered [m] at a time [s]."""
         elapsed = np.maximum(time - self.begin, 0.0)
-        # The run-up takes twice the time that it would take at full speed.
+        # At even acceleration, the mean speed of the run-up is half of the full speed.
         return np.where(
             elapsed >= 2 * self.run_up / self.speed,
             self.speed * elapsed - self.run_up,
@@ -149,7 +160,7 @@ class TargetProfile(NamedTuple):
 
     @np.errstate(all="ignore")
     def speed_at(self, time: Quantity) -> Quantity:
-        """Speed [m/s] at a time [s]."""
+        """The speed [m/s] at a time [s]."""
         elapsed = time - self.begin
         rising = self.speed * self.speed / (2 * np.float64(self.run_up)) * elapsed
         steady = np.where(elapsed >= 2 * self.run_up / self.speed, self.speed, rising)
@@ -157,9 +168,8 @@ class TargetProfile(NamedTuple):
 
 
 def lateral_offset(location: Quantity, width: float) -> Quantity:
-    """Distance of an impact location [% of `width`] from the middle of the front [m].
-
-    It is below 0 on the side from which `location` counts.
+    """The distance of an impact location [% of `width`] from the middle of the front [m]. The
+    distance is below 0 on the side from which `location` counts.
     """
     return (location / 100 - 0.5) * width
 
@@ -184,18 +194,20 @@ class ProtocolTest(LaneTest, frozen=True, kw_only=True):
 
     @property
     def pre_crash(self) -> PreCrash:
-        """NHTSA's pre-crash type."""
+        """The encounter's type in NHTSA's typology of pre-crash scenarios."""
         return TESTS[self.test].pre_crash
 
     def parameter(self, name: str) -> Any:
-        """A parameter as the study sets it, by default as the protocol does."""
+        """The value of a parameter: the study's value, or else the protocol's value."""
         value = getattr(self, name, None)
         if value is None:
             return getattr(TESTS[self.test], name)
         return value
 
     def remarks(self) -> list[str]:
-        """Remarks on parameters outside the protocol's ranges and on a road that is not level."""
+        """Remarks on parameters outside of the protocol's ranges, and on a road that is not
+        level.
+        """
         row = TESTS[self.test]
         remarks = []
         if not row.slowest <= self.speed <= row.fastest:
