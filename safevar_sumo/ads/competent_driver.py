@@ -39,14 +39,15 @@ class _Perceiving(NamedTuple):
     Attributes
     ----------
     reaction
-        What every reference driver remembers.
-    first_lateral, appeared_in_way
-        Lateral position at which the driver first saw the obstacle [m], infinite before; whether
-        this position is in the way, and nobody had strayed from his before.
+        The memory of every reference driver.
+    first_lateral
+        Lateral position at which the driver first saw the obstacle [m]; infinite before.
+    appeared_in_way
+        Whether this position was in the way, and no obstacle had strayed before.
     stray_time
-        Time since an obstacle first strayed from this position [s], negative before.
+        Time since an obstacle first strayed from its first position [s]; negative before.
     braking_time
-        Time since a leader began to brake harder than `leader_braking` [s], negative before.
+        Time since a leader began to brake harder than `leader_braking` [s]; negative before.
     was_in_way
         Whether the obstacle was in the way at the last call.
     """
@@ -124,7 +125,8 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         is_in_way = is_perceived & enters
         reaction = self.watch_leader(observation, memory.reaction, is_in_way)
 
-        # Since when has a leader braked so hard that it is a danger? It is seen a step later.
+        # The time since a leader began to brake so hard that the braking is a danger. The driver
+        # sees the braking one step later: the time begins with one step.
         brakes_now = (
             reaction.leader_deceleration > self.leader_braking + DECELERATION_ROUNDING
         )
@@ -134,11 +136,12 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         is_noticed = braking_time >= self.perception_time - TIME_ROUNDING
         brakes = is_noticed & ((observation.closing_speed > 0) | reaction.leader_brakes)
 
-        # Towards somebody who does not brake, the time to collision decides.
+        # If the obstacle does not brake, the time to collision decides.
         nearness = self.critical_ttc - time_to_reach(observation)
         is_danger = is_in_way & (brakes | ((nearness > 0) & ~reaction.leader_brakes))
 
-        # A new danger has lasted since its condition held, and not longer than it is perceived.
+        # A danger may have begun before this step. Its age is at most the time since the driver
+        # could perceive it.
         perceived_time = np.where(
             is_same & memory.was_in_way, step, memory.stray_time - self.perception_time
         )
@@ -163,10 +166,10 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
     def _perceive(
         self, observation: Observation, memory: _Perceiving, is_same: BoolArray
     ) -> tuple[BoolArray, _Perceiving]:
-        """Whether the driver perceives the obstacle: it first appeared in the way, or strayed from
-        its first position `perception_time` ago or earlier.
+        """Decide for which vehicles the driver perceives the obstacle: the obstacle first appeared
+        in the way, or strayed from its first position at least `perception_time` ago.
         """
-        # Where the obstacle was at first sight, and whether it was in the way then.
+        # The place of the obstacle at first sight, and whether this place is in the way.
         is_sighted = np.isfinite(observation.gap) & np.isfinite(observation.lateral)
         lateral = np.where(is_sighted, observation.lateral, 0.0)
         is_first_sight = is_sighted & ~(is_same & np.isfinite(memory.first_lateral))
@@ -179,7 +182,7 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
             is_first_sight, appears_in_way, memory.appeared_in_way
         )
 
-        # Since when it has strayed from there.
+        # The time since the obstacle has strayed from its first place.
         deviation = np.abs(
             lateral - np.where(np.isfinite(first_lateral), first_lateral, 0.0)
         )
@@ -205,8 +208,8 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
 
 
 def _cuts_in(observation: Observation) -> BoolArray:
-    """Whether somebody ahead moves towards the middle of the lane, and drives along it rather than
-    across it.
+    """Return whether somebody ahead moves towards the middle of the lane, and moves faster along
+    the lane than across it.
     """
     along = observation.obstacle_speed >= np.abs(observation.lateral_speed)
     return is_ahead(observation) & moves_inwards(observation) & along
