@@ -1,5 +1,5 @@
-"""The contract of a search algorithm, and checks of users' algorithms; independent of SUMO,
-processes and files.
+"""The contract of a search algorithm, and checks of users' algorithms. This module depends neither
+on SUMO nor on processes and files.
 """
 
 from __future__ import annotations
@@ -27,19 +27,30 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 Search = Generator[FloatArray, Evaluations, Evaluations]
-"""A generator that yields k filtered settings of n characteristics, shape (k, n), receives their
-evaluations, and so on; at its end it returns the run's result.
+"""A generator that yields k filtered settings of n characteristics, shape (k, n), and receives
+their evaluations. At its end, the generator returns the result of the run.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """The characteristics to vary, the original vehicle's evaluation and the budget of evaluations.
+    """The problem that a search solves.
 
-    `population` is the number of settings of a generation, for algorithms with generations;
-    `scoring` defines the objectives, and which evaluated settings are feasible. `region` is the
-    feasible region of a study with constraints: yielded settings must lie in this region after the
-    filter.
+    Attributes
+    ----------
+    characteristics
+        The characteristics that the search varies.
+    original
+        The evaluation of the original vehicle.
+    evaluations
+        Number of evaluations that the search may request.
+    population
+        Number of settings in a generation, for algorithms with generations.
+    scoring
+        The objectives, and the rule which evaluated settings are valid.
+    region
+        The feasible region of a study with constraints; None without constraints. Settings must be
+        in this region after the filter.
     """
 
     characteristics: CharacteristicSet
@@ -50,8 +61,8 @@ class Problem:
     region: FeasibleRegion | None = None
 
     def uniform(self, number: int, rng: np.random.Generator) -> FloatArray:
-        """Unfiltered settings, drawn uniformly in the domains and feasible after the filter; shape
-        (number, n).
+        """Draw unfiltered settings uniformly in the domains, shape (number, n). The settings are
+        feasible after the filter.
         """
         lower = self.characteristics.lower
         upper = self.characteristics.upper
@@ -64,8 +75,8 @@ class Problem:
         return self.region.draw_feasible(draw, number, filtered=True)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
-        """Which settings, shape (k, n), satisfy the study's constraints after the filter; shape
-        (k,).
+        """Return which settings, shape (k, n), satisfy the study's constraints after the filter,
+        shape (k,).
         """
         filtered = self.characteristics.filter(settings)
         if not self.region:
@@ -73,7 +84,7 @@ class Problem:
         return self.region.feasible(filtered)
 
     def repaired(self, settings: FloatArray) -> FloatArray:
-        """Settings moved towards the original until they are feasible after the filter; shape (k,
+        """Move settings towards the original until they are feasible after the filter, shape (k,
         n).
         """
         if not self.region:
@@ -81,7 +92,7 @@ class Problem:
         return self.region.repaired(settings)
 
     def nondominated(self, evaluations: Evaluations) -> Evaluations:
-        """The valid evaluations that no other one of them dominates."""
+        """The valid evaluations that no other valid evaluation dominates."""
         valid = evaluations.take(self.scoring.valid(evaluations))
         return valid.take(
             moocore.is_nondominated(self.scoring.values(valid), keep_weakly=True)
@@ -91,7 +102,7 @@ class Problem:
 def check_search(
     code: UserCode, method: str, search: Any, problem: Problem, rng: np.random.Generator
 ) -> Search:
-    """A user's search, whose settings and result are checked."""
+    """Wrap a user's search: the wrapped generator checks the settings and the result."""
     if not hasattr(search, "send"):
         raise code.wrong(
             method,
@@ -158,7 +169,9 @@ def _checked_settings(
 def _checked_result(
     code: UserCode, result: Any, yielded: set[bytes], problem: Problem
 ) -> Evaluations:
-    """The result, whose settings were yielded; not all need be valid."""
+    """Check that the result consists of settings that the search yielded. Not all of them need be
+    valid.
+    """
     if not yielded:
         raise code.wrong(
             "search",
@@ -177,12 +190,18 @@ def _checked_result(
 
 
 class Algorithm:
-    """A search algorithm. Its fields are the parameters that a study gives in a table such as
-    [search.nsga2].
+    """A search algorithm. The fields of its class are the parameters that a study states in a table
+    such as [search.nsga2].
 
-    `title` is its name in tables and legends, by default its name in the study. `stops_by_itself`
-    says that it may end before it has used its budget: of others that do, the study's end and
-    tables say so. `RETURNS` is what the method of a user's class must return.
+    Attributes
+    ----------
+    title
+        Name of the algorithm in tables and legends; "" for its name in the study.
+    stops_by_itself
+        Whether the algorithm may end before it has used its budget. If another algorithm does, the
+        end of the study and tables say so.
+    RETURNS
+        What the method of a user's class must return.
     """
 
     __slots__ = ()
@@ -192,13 +211,14 @@ class Algorithm:
 
     @abstractmethod
     def search(self, problem: Problem, rng: np.random.Generator) -> Search:
-        """One run, which requests at most `problem.evaluations` evaluations.
+        """Carry out one run, which requests at most `problem.evaluations` evaluations.
 
-        All randomness comes from `rng`, so that a run which is resumed, with the evaluations of its
-        journal, yields the same settings again. Yielded settings are in the domains and filtered.
-        The result consists of evaluations that the run received. Those that are not valid
-        (`problem.scoring.valid`) are no solutions, and the command `study` counts them.
+        All random numbers must come from `rng`. A resumed run gets the evaluations of its journal,
+        and then yields the same settings again. Yielded settings are in the domains, and filtered.
+
+        The result consists of evaluations that the run received. Evaluations that are not valid
+        (`problem.scoring.valid`) are no solutions; the command `study` counts them.
         """
 
     def try_out(self, problem: Problem) -> None:
-        """Refuse, by an `InputError`, parameters with which a search fails; by default none."""
+        """Refuse parameters with which a search would fail, by an `InputError`; by default none."""
