@@ -1,4 +1,4 @@
-"""How other road users moved, from a table beside the study."""
+"""A scenario in which other road users move as a table beside the study says."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COLUMNS = ["time", "name", "x", "y", "heading", "speed", "length", "width"]
-"""Columns of a table."""
+"""Columns that a table of tracks must have."""
 ABOVE_ZERO = ["name", "length", "width"]
-"""Columns that are not empty and not 0."""
+"""Columns whose values must not be empty or 0."""
 LONGEST_STEP = 2.0
-"""Longest time between two rows of a body, in usual steps of the table [-]."""
+"""Longest time between two rows of a body, as a multiple of the table's median step [-]."""
 SAME = 1e-6
-"""Difference up to which two times are one [s]."""
+"""Difference up to which two times count as equal [s]."""
 DIGITS = 9
-"""Decimals of places [m] and directions: the last bits of a sine differ between machines."""
+"""Decimals of places [m] and of directions. The last bits of a sine differ between machines."""
 
 
 class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True):
@@ -50,7 +50,7 @@ class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True)
     ego: str = "ego"
     speed: Annotated[Speed, VEHICLE_SPEED] = 40.0
     grade: Grade = 0.0
-    # After the last row nobody is there.
+    # After the last row of the table, no obstacle exists.
     goes_on = False
 
     @cached_property
@@ -59,7 +59,7 @@ class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True)
 
     @cached_property
     def _start(self) -> pd.Series:
-        """The first row of `ego`."""
+        """The first row of `ego` in the table."""
         if self.ego in self._bodies:
             return self._bodies[self.ego].iloc[0]
         raise InputError(
@@ -69,7 +69,7 @@ class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True)
         )
 
     def check(self) -> None:
-        """Refuse a file without anybody else."""
+        """Refuse a file in which nobody else moves after the start of `ego`."""
         if self.duration <= 0:
             raise InputError(
                 "",
@@ -79,7 +79,7 @@ class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True)
 
     @property
     def duration(self) -> float:
-        """The time from the start to the last row of the others [s]."""
+        """The time from the first row of `ego` to the last row of any other body [s]."""
         ends = [
             rows["time"].iloc[-1]
             for name, rows in self._bodies.items()
@@ -103,7 +103,9 @@ class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True)
         return float(self._start["width"])
 
     def tracks(self, times: FloatArray) -> list[Track]:
-        """All bodies but `ego`; before its first row and after its last one a body has no size."""
+        """The tracks of all bodies except `ego`. A body has no size before its first row and after
+        its last row: then it does not exist.
+        """
         start = self._start
         direction = np.exp(1j * start["heading"])
         front = start["x"] + 1j * start["y"] + start["length"] / 2 * direction
@@ -125,22 +127,23 @@ class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True)
 
 
 def key_of(file: str) -> str:
-    """The key of a file, as errors name it."""
+    """The key and the name of the file, as errors name them."""
     return f"scenario.parameters.file = {os.path.basename(file)!r}"
 
 
 def read_tracks(file: str) -> dict[str, pd.DataFrame]:
-    """The rows of each body by name, in the order of time, with headings that do not jump.
+    """Read the rows of each body, by its name, in the order of time. Headings do not jump by a full
+    turn.
 
     Raises
     ------
     InputError
-        If the file cannot be read, lacks a column or a value, or knows a body twice at one time or
-        not all the time.
+        If the file cannot be read, lacks a column or a value, or has a body twice at one time or
+        with a gap in time.
     """
     import pandas as pd
 
-    # Texts, so that errors show what stands in the file.
+    # All values are read as texts, so that errors can quote the file.
     try:
         table = pd.read_csv(
             BytesIO(read_file(Path(file))),
@@ -160,7 +163,7 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
                 f"the columns {', '.join(COLUMNS)}",
             )
 
-    # The length of a name stands for it, so that an empty one is no legal number.
+    # The length of a name replaces the name: an empty name then is an illegal number, like others.
     values = table[COLUMNS].assign(name=table["name"].str.len())
     values = values.apply(pd.to_numeric, errors="coerce").astype(float)
     legal = np.isfinite(values)
@@ -191,7 +194,7 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
 
 
 def _check_steps(body: str, times: FloatArray, longest: float) -> None:
-    """Refuse two rows at one time, and a step longer than the longest one."""
+    """Refuse two rows at the same time, and a step that is longer than `longest` [s]."""
     steps = np.diff(times)
     for row in np.flatnonzero(steps <= 0)[:1]:
         raise InputError(
