@@ -1,5 +1,5 @@
-"""The reading of a study: the ranges of its axes may leave out what the scenario's class declares,
-shipped or the user's own, or the weather.
+"""The reading of a study. Axes of a study may leave out their ranges: classes of scenarios and the
+weather declare ranges, which complete the study.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from safevar_sumo.study.encounters import Parameters, are_numbers
 
 
 def read_study(study: StudyLike, **changes: Any) -> Study:
-    """Read a study strictly, as `safevar_sumo.load_study` does, but for the parameters of its
-    shipped models.
+    """Read a study strictly. Unlike `safevar_sumo.load_study`, this function does not check the
+    parameters of shipped models.
     """
     raw = read_tables(study, **changes)
     with about(raw.source):
@@ -59,8 +59,8 @@ def read_study(study: StudyLike, **changes: Any) -> Study:
 
 
 def with_ranges(study: Study) -> Study:
-    """The study whose vehicles meet any encounter in the ranges of its axes; itself if none of them
-    has a range.
+    """The study whose vehicles meet any encounter in the ranges of its axes. The same study if no
+    axis has a range.
     """
     if study.encounters == RANGES:
         return study
@@ -76,14 +76,15 @@ def with_ranges(study: Study) -> Study:
 
 
 def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
-    """The tables of a study, with what the scenarios' classes and the weather declare of axes that
-    have a range: stated ones, and all that can be moved where encounters are ranges.
+    """Complete the axes of a study by the ranges that scenarios' classes and the weather declare.
+    Axes that state a part of a range are completed. If encounters are ranges, lists of numbers get
+    ranges, too.
     """
     scenario = tables.get("scenario")
     matrix = tables.get("matrix")
     if not isinstance(scenario, dict):
         return tables
-    # A matrix without tests drops those of a study that it extends.
+    # An empty list of tests is legal only here: it removes the matrix that a study inherits.
     if matrix is not None and not (
         isinstance(matrix, dict) and matrix.get("tests") == []
     ):
@@ -118,7 +119,7 @@ def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
 
 
 class _Declared:
-    """What classes declare of the axes of a study."""
+    """The ranges that classes of scenarios and the weather declare for the axes of a study."""
 
     def __init__(self, tables: Parameters, places: Sequence[str]) -> None:
         self._scenario: Parameters = tables["scenario"]
@@ -127,15 +128,16 @@ class _Declared:
             weather = convert_table(weather, Weather, "weather")
         self._weather = msgspec.structs.asdict(weather_of(weather))
         self._lookup = Lookup(places)
-        # A study without a search is refused when all of it is read.
+        # A study without a table [search] is refused later, with all other mistakes of the study.
         if "search" in tables:
             limit = convert_table(tables["search"], SearchTable, "search").time_limit
             self._lookup = Lookup(places, time_limit=limit)
 
     def completed(self, key: str, name: str, axis: Any, test: Parameters) -> Any:
-        """An axis with all keys of its range; as it is if it lists what cannot be moved.
+        """Complete an axis by all keys of its range. A list stays if its values cannot vary: a
+        single value, or values that are no numbers.
 
-        The original is by default the first value of a list, else the test's own value.
+        The original value is by default the first value of a list, or else the test's own value.
         """
         table = axis
         if is_list := isinstance(axis, list):
@@ -154,7 +156,7 @@ class _Declared:
                 "unit, original, lower and upper, or a list of values",
             )
 
-        # The values say more than the class, and the study more than both.
+        # Listed values win over the class's range, and keys that the study states win over both.
         declared = {
             "unit": parameter.unit,
             "lower": parameter.lower,
@@ -174,11 +176,13 @@ class _Declared:
     def _parameter(
         self, name: str, test: Parameters
     ) -> tuple[FreeParameter | None, Any]:
-        """What is declared of a parameter, and the value that a test has of it."""
+        """The declared range of a parameter (None if nobody declares one), and the test's value of
+        it.
+        """
         if name in WEATHER_PARAMETERS:
             return WEATHER_PARAMETERS[name], self._weather[name]
         model = test.get("model") or self._scenario.get("model")
-        # The check of the whole study refuses a scenario without a model.
+        # A scenario without a model is refused later, by the check of the whole study.
         if not isinstance(model, str):
             return None, None
         stated = test.get("parameters", {})
@@ -192,7 +196,7 @@ class _Declared:
 
 
 def _defaults(model: type) -> Parameters:
-    """The defaults of a class's fields."""
+    """The default values of a class's fields."""
     fields: Sequence[Any] = ()
     if issubclass(model, msgspec.Struct):
         fields = msgspec.structs.fields(model)
