@@ -40,9 +40,11 @@ if TYPE_CHECKING:
 
 COLUMNS = shipped_columns("validate")["agreement"]
 STAGE = "settings"
-"""The phase of progress."""
+"""The name of the phase of progress."""
 SHIPPED_AGREEMENT = Path(__file__).with_name("agreement.csv")
-"""Safety degrees of shipped studies and published files: what `validate STUDY FILE` answers."""
+"""The file with the answers of `validate` for safety degrees of shipped studies and published
+files.
+"""
 SIMULATION_KEYS = (
     "scenario",
     "vehicle",
@@ -52,7 +54,7 @@ SIMULATION_KEYS = (
     "step_length",
     "matrix",
 )
-"""Study keys that affect the metrics of a setting."""
+"""Keys of a study that change the metrics of a setting."""
 
 
 @question
@@ -114,7 +116,7 @@ def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
 def _draw(
     title: str, reference: ReferenceData, evaluations: Evaluations, answer: Answer
 ) -> Figure:
-    """The values here over those in the reference, metric by metric."""
+    """Draw the values here over the values in the reference, in a panel for each metric."""
     table = answer.tables["agreement"]
     figure, axes = new_panels(
         title, len(table), 4, (3.0, 2.6), min_width=12.0, title_height=0.6
@@ -125,7 +127,7 @@ def _draw(
         simulated = evaluations.metrics[name]
         label = f"{METRICS[name].title} [{as_formula(METRICS[name].unit)}]"
         axis.scatter(published, simulated, s=6, alpha=0.4, c=colours, linewidths=0)
-        # A point in the range of the values lets the axes keep theirs.
+        # The line needs a point within the range of the values. Otherwise it would extend the axes.
         defined, _ = defined_pairs(published, simulated)
         origin = float(next(iter(defined), 0.0))
         axis.axline(
@@ -140,7 +142,7 @@ def _draw(
 def agreement_counts(
     reference: ReferenceData, evaluations: Evaluations
 ) -> dict[str, int]:
-    """Numbers of rows, and of those that collide here, in the reference, and in both."""
+    """The numbers of rows, and of rows that collide here, in the reference, and in both."""
     return {
         "rows": len(evaluations),
         "collisions_here": int(evaluations.collided.sum()),
@@ -152,7 +154,7 @@ def agreement_counts(
 def measure_agreement(
     reference: ReferenceData, evaluations: Evaluations
 ) -> pd.DataFrame:
-    """The table of `COLUMNS`, a row for each metric; NaN where undefined."""
+    """The rows of the table `COLUMNS`, one for each metric. NaN means undefined."""
     rows = []
     for name, values in reference.metrics.items():
         published, simulated = defined_pairs(values, evaluations.metrics[name])
@@ -174,13 +176,15 @@ def measure_agreement(
 def defined_pairs(
     values: FloatArray, other_values: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Both values of the rows in which both are defined."""
+    """The values of both sides in the rows in which both are defined."""
     is_defined = ~np.isnan(values) & ~np.isnan(other_values)
     return values[is_defined], other_values[is_defined]
 
 
 def rank_correlation(values: FloatArray, other_values: FloatArray) -> float:
-    """Spearman's rho; NaN for fewer than two values or if all values of one side are equal."""
+    """Spearman's rank correlation. NaN for fewer than two values, or if all values of a side are
+    equal.
+    """
     pairs = rounded_to_rank(values), rounded_to_rank(other_values)
     if len(values) < 2 or np.ptp(pairs[0]) == 0 or np.ptp(pairs[1]) == 0:
         return np.nan
@@ -188,8 +192,8 @@ def rank_correlation(values: FloatArray, other_values: FloatArray) -> float:
 
 
 def shipped_agreement(study: Study) -> pd.DataFrame:
-    """The rows of `SHIPPED_AGREEMENT` that hold for a study: those of shipped studies with the same
-    `SIMULATION_KEYS`.
+    """The rows of `SHIPPED_AGREEMENT` that hold for a study: rows of shipped studies with the same
+    values of `SIMULATION_KEYS`.
     """
     frame = pd.read_csv(SHIPPED_AGREEMENT)
     own_keys = evaluation_keys(tables_of(study))
