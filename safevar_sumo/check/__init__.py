@@ -1,6 +1,6 @@
-"""The check of user code before the first batch of a study, and the command `check`: does a result
-depend on its setting alone, and does every call keep its contract? Nothing below `sumo` and
-`search` imports this package.
+"""The check of user code, which runs before the first batch of a study and as the command `check`.
+The check asks whether a result depends on its setting alone, and whether every call keeps its
+contract. No module below `sumo` or `search` imports this package.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.sumo.traci_controller import substitute_traci
 
 STUDY_OF_AN_ADS = "smoke"
-"""The study in which `check` lets an ADS drive that is given by its name."""
+"""The study in which `check` lets a driving system drive that the user gives by its name."""
 CHECKS: Mapping[str, str] = {
     "contract": (
         "return what the base class documents, leave arguments as they are, state what a metric"
@@ -71,11 +71,14 @@ CHECKS: Mapping[str, str] = {
         " code reads and commands; changes of a vehicle that is unsafe as it is explain nothing"
     ),
 }
-"""The checks, with advice on a failure. The first four also keep a study from starting."""
+"""The checks by name, with advice after a failure. Failures of the first four checks also prevent a
+study from starting.
+"""
 
 
 def study_to_check(name: str) -> Study:
-    """The study by name or path; or `STUDY_OF_AN_ADS` with an ADS by name.
+    """Read the study to check. `name` is the name or path of a study, or the name of an ADS, which
+    then drives in `STUDY_OF_AN_ADS`.
 
     Raises
     ------
@@ -85,14 +88,14 @@ def study_to_check(name: str) -> Study:
     is_ads = name in ADS or (":" in name and not name.endswith(".toml"))
     if not is_ads:
         return read_study(name)
-    # The study has data about an ADS of its own.
+    # The study has data about another ADS, which would be wrong for this ADS.
     no_data: Parameters = {key: {} for key in keys_with(WHOLE, Study)}
     return read_study(STUDY_OF_AN_ADS, ads={"model": name}, **no_data)
 
 
 def check_study(study: Study, **how: Any) -> list[Finding]:
-    """Check the user code of a study, in which no failure is skipped; for `how` see
-    `try_simulations`.
+    """Check the user code of a study. Failures of simulations are not skipped, even if the study
+    says so. For `how` see `try_simulations`.
     """
     study = without_skipping(study)
     findings = list(find_defects(study, **how))
@@ -132,7 +135,7 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
 
 
 def refuse_defects(study: Study, limit: int | None = None) -> None:
-    """Check the user code that a study names, with at most so many simulations.
+    """Check the user code of a study with at most `limit` simulations.
 
     Raises
     ------
@@ -152,8 +155,8 @@ def refuse_defects(study: Study, limit: int | None = None) -> None:
 
 
 def find_defects(study: Study, **how: Any) -> Findings:
-    """The first defect of what is simulated, all of it in one trial, and of each user algorithm;
-    for `how` see `try_simulations`.
+    """Find the first defect of all simulated user code, and the first defect of each user's
+    algorithm. For `how` see `try_simulations`.
     """
     unload_user_modules()
     names = user_code(study)
@@ -167,8 +170,8 @@ def find_defects(study: Study, **how: Any) -> Findings:
 def _first_defect(
     study: Study, names: Mapping[str, str], findings: Findings
 ) -> Findings:
-    """The first of the findings about user code, or the error that it raises; `names` are its names
-    by their keys.
+    """Yield the first of the findings with the place of the user code, or the error that the user
+    code raises. `names` has the names of the user code by their keys.
     """
     places = [_definition(study, key, name) for key, name in names.items()]
     where = " or ".join(places) or study.source
@@ -188,11 +191,11 @@ def _first_defect(
 
 
 def _definition(study: Study, key: str, name: str) -> str:
-    """File and line at which user code is defined; else its key and name."""
+    """The file and line at which user code is defined. Without a known line: its key and name."""
     if ":" not in name:
         return f"{key} = {name!r}"
     with substitute_traci() if study.ads.kind == "traci" else nullcontext():
         code = Lookup.of(study).find({}, name, key).code
-    # The code of a name with a colon is a user's.
+    # A name with a colon always is a name of user code.
     assert code is not None
     return code.definition() or code.name
