@@ -1,4 +1,4 @@
-"""A worker in a process of this machine."""
+"""A worker of a pool that is a process of this machine."""
 
 from __future__ import annotations
 
@@ -34,40 +34,40 @@ from safevar_sumo.plugins.time_limit import TIMEOUT_MARK
 from safevar_sumo.shipped import PACKAGE
 
 CLOSING_SIGNAL = getattr(signal, "SIGUSR1", None)
-"""The signal upon which a worker ends its simulator, and itself; None on Windows."""
+"""The signal after which a worker ends its simulator and then itself; None on Windows."""
 ATTEMPTS = "attempts"
-"""Name of the folder in which workers note what they simulate."""
+"""The name of the folder in which workers note the settings that they simulate."""
 CLOSING_TIME = 5.0
-"""Time that it has for this [s]; then it is killed."""
+"""The time that a worker has to end its simulator [s]. Then the worker is killed."""
 
 
 Work = Callable[..., Any]
-"""What a worker carries out."""
+"""A function that a worker carries out."""
 
 
 class ProcessWorker:
-    """A process that starts at once. It is spawned, because libsumo must not be forked, and ends
-    with this process.
+    """A worker process. It starts at once, and ends with this process. The process is spawned,
+    because libsumo must not be forked.
 
     Parameters
     ----------
     last_words
-        The file in which the process says where it was when it crashed or exceeded a time limit;
-        its name is the worker's number.
+        The file in which the process notes its place in the code when it crashes or exceeds a time
+        limit. The name of the file is the worker's number.
     """
 
     def __init__(self, last_words: Path) -> None:
         self._last_words = last_words
-        # Simulators of this process have the number of a worker, too.
+        # A simulator that this process has opened uses the number of a worker: it must end first.
         _close_simulators()
         context = multiprocessing.get_context("spawn")
-        # The worker's child processes have the mark, too.
+        # Child processes of the worker inherit the mark, by which they can be found and ended.
         self._mark = uuid4().hex
         arguments = (ImportPath.here(), last_words, self._mark)
         self._executor = ProcessPoolExecutor(1, context, _begin_work, arguments)
         variables = {MARK: self._mark, "PYTHONHASHSEED": "0"}
-        # A spawned process would run the main module again; scripts then need no `if __name__ ==
-        # "__main__"`.
+        # A spawned process would run the user's main module again. Without a main module, scripts
+        # need no `if __name__ == "__main__"`.
         hidden_main = {"__main__": ModuleType("__main__")}
         with (
             temporary_entries(sys.modules, hidden_main),
@@ -75,11 +75,11 @@ class ProcessWorker:
             _block_interrupts(),
             temporary_entries(os.environ, variables),
         ):
-            # The first job starts the process.
+            # The executor starts its process with the first job.
             self._executor.submit(os.getpid)
         (self._process,) = self._executor._processes.values()
-        # Otherwise the result of a process that dies while it sends it is waited for until the end
-        # of time.
+        # If a process dies while it sends a result, the reader waits for the rest until all writers
+        # are closed. This process holds a writer, too: without the call it would wait for ever.
         self._executor._result_queue._writer.close()  # type: ignore[attr-defined]
 
     def submit(self, function: Work, *arguments: Any) -> Future[Any]:
@@ -89,7 +89,7 @@ class ProcessWorker:
         if not isinstance(error, BrokenExecutor):
             return ""
 
-        # The last words of the worker name the line of user code.
+        # The last words of the worker may name the line of user code at which it died.
         self._process.join()
         words = ""
         if self._last_words.exists():
@@ -108,7 +108,8 @@ class ProcessWorker:
             return (
                 f"a batch took longer than the time limit, `search.time_limit`{place}"
             )
-        # The executor's thread may have waited for the process, and be about to note its code.
+        # The executor's own thread may just have noticed the end of the process, without having set
+        # its exit code yet.
         for _ in range(1000):
             if self._process.exitcode is not None:
                 break
@@ -117,7 +118,7 @@ class ProcessWorker:
 
     def end(self) -> None:
         if CLOSING_SIGNAL is not None and self._process.pid:
-            # It may have died.
+            # The process may have died already.
             with suppress(ProcessLookupError):
                 os.kill(self._process.pid, CLOSING_SIGNAL)
                 self._process.join(CLOSING_TIME)
@@ -132,7 +133,7 @@ def _begin_work(path: ImportPath, last_words: Path, mark: str) -> None:
         signal.signal(interrupt, signal.SIG_IGN)
     if CLOSING_SIGNAL is not None:
         signal.signal(CLOSING_SIGNAL, _end_in_order)
-    # This folder ends with the pool: a worker is killed, and removes nothing.
+    # The pool removes this folder at its end. A killed worker could not remove its own files.
     tempfile.tempdir = str(last_words.parent)
     file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115
     faulthandler.enable(file=file, all_threads=False)
@@ -144,7 +145,7 @@ def _begin_work(path: ImportPath, last_words: Path, mark: str) -> None:
 
 
 def _end_in_order(*_: object) -> None:
-    """End the simulator of this process, and the process."""
+    """End the simulator of this process, and then the process."""
     _close_simulators()
     os._exit(1)
 
@@ -155,8 +156,8 @@ def _close_simulators() -> None:
 
 
 def _end_with_caller() -> None:
-    """End this process with its caller. Otherwise a worker that hangs in a simulation would outlive
-    a killed caller.
+    """End this process when its caller ends. Otherwise a worker that hangs in a simulation would
+    outlive a killed caller.
     """
     caller = multiprocessing.parent_process()
     assert caller is not None
@@ -169,7 +170,9 @@ def _end_with_caller() -> None:
 
 @contextmanager
 def _show_package() -> Iterator[None]:
-    """Let a spawned process find this package, even if its folder is not on Python's path."""
+    """Within the block, processes that start can import this package, even if its folder is not on
+    Python's path.
+    """
     sys.path.append(str(PACKAGE.parent))
     try:
         yield
@@ -179,16 +182,17 @@ def _show_package() -> Iterator[None]:
 
 @contextmanager
 def _block_interrupts() -> Iterator[None]:
-    """Block Ctrl-C and the like in this thread: a process that it starts inherits that, and does
-    not end while modules load; the one that started it ends it.
+    """Block Ctrl-C and similar signals in this thread. A process that starts within the block
+    inherits the blocked signals: it does not end while its modules load. The process that started
+    it ends it.
     """
-    # Windows has no signal masks.
+    # Windows has no masks of signals.
     if sys.platform == "win32":
         yield
         return
     from multiprocessing import resource_tracker
 
-    # A later start would unblock interrupts.
+    # If the resource tracker started later, it would unblock the signals.
     resource_tracker.ensure_running()
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
     try:
