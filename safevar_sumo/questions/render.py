@@ -1,5 +1,5 @@
-"""The one renderer of answers: one screen, or all details, as text and HTML; other formats have
-everything.
+"""Renders every answer. As text and HTML, an answer is one screen, or all details. JSON has
+everything; CSV has one table.
 """
 
 from __future__ import annotations
@@ -38,32 +38,32 @@ if TYPE_CHECKING:
 
 Form = Literal["text", "json", "csv", "latex", "html"]
 MAX_SENTENCES = 5
-"""Number of sentences of the verdict that one screen has."""
+"""Largest number of sentences of the verdict on one screen."""
 CODE = re.compile("`([^`<>]+)`")
-"""What a text quotes as code."""
+"""A part of a text that is quoted as code."""
 MAX_ROWS = 200
-"""Number of rows up to which readers see a table; JSON and CSV have them all."""
+"""Largest number of rows of a table that readers see. JSON and CSV have longer tables, too."""
 MAX_LINES = 30
-"""Number of lines that one screen has."""
+"""Largest number of lines of one screen."""
 WIDTH = 100
-"""Width of text that is not printed to a terminal [characters]."""
+"""Width of a text that is not printed to a terminal [characters]."""
 
 
 class Screen(NamedTuple):
-    """What a reader sees of an answer, and the tables that stand behind it.
+    """The one screen of an answer, and the tables that this screen leaves out.
 
     Attributes
     ----------
     sentences
         The first sentences of the verdict.
     unsaid
-        Number of its further sentences.
+        Number of further sentences of the verdict.
     lead
-        The one table; empty if there is none.
+        The only table on the screen; empty if there is none.
     notes
-        What the answer is valid for, how it was tested, and remarks.
+        Sentences below the table: what the answer is valid for, how it was tested, and remarks.
     tables
-        Other tables by name.
+        All other tables by name.
     """
 
     sentences: list[str]
@@ -74,8 +74,9 @@ class Screen(NamedTuple):
 
 
 def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
-    """The one screen of an answer, whose table has at most so many rows, or is shown whole."""
-    # Sentences of the verdict by kind.
+    """The one screen of an answer. Its table has at most `max_rows` rows, or all rows if the table
+    may be shown completely (`shown_whole`).
+    """
     sentences_by_kind = Verdict.of(answer.verdict).sentences
     tested = Verdict.of(answer.tested).sentences
     sentences = [text for kind, text in sentences_by_kind if kind != "note"]
@@ -84,7 +85,6 @@ def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
         notes.insert(1, f"Tested: {tested[0].text}")
         notes += [text for kind, text in tested[1:] if kind == "note"]
 
-    # The lead, and what it does not show.
     lead = AnswerTable(pd.DataFrame())
     tables = dict(answer.tables.records)
     name = next(iter(tables), "") if answer.lead == "" else answer.lead or ""
@@ -101,7 +101,9 @@ def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
 
 
 def _more(answer: Answer, screen: Screen) -> str:
-    """The last line: what else there is, and the next question."""
+    """The last line of a screen: what the details hold, and the command that a user should call
+    next.
+    """
     names = [name for name, table in screen.tables.items() if len(table.frame)]
     contents = []
     if screen.unsaid:
@@ -116,14 +118,16 @@ def _more(answer: Answer, screen: Screen) -> str:
 
 
 def print_answer(answer: Answer, console: Console, *, details: bool) -> None:
-    """Print one screen, also of a table alone; with `details`, or of another answer that is whole,
-    all tables and numbers.
+    """Print one screen of an answer. With `details`, print all tables and how they were tested.
+
+    An answer that is always shown completely (`is_whole`) has no screen. If it has a single leading
+    table, as many rows are printed as fit on a screen; otherwise everything is printed.
     """
     if details or (answer.is_whole and answer.lead not in answer.tables):
         _print_whole(answer, MAX_ROWS, console)
         return
 
-    # As many rows of the table as there are lines for.
+    # Print drafts with fewer and fewer rows, until the whole text fits on a screen.
     show, size = _print_screen, MAX_LEAD_ROWS
     if answer.is_whole:
         show, size = _print_whole, MAX_LINES
@@ -187,7 +191,7 @@ def render(
     if form == "html":
         return printable(_html(answer))
 
-    # Text as on a terminal of fixed width.
+    # A text looks as on a terminal of fixed width.
     console = Console(width=WIDTH, no_color=True, force_terminal=False)
     with console.capture() as capture:
         print_answer(answer, console, details=details)
@@ -195,7 +199,9 @@ def render(
 
 
 def _html(answer: Answer) -> str:
-    """One screen, below which the rest is folded; all of an answer that is whole."""
+    """The answer as HTML: one screen, and below it the folded details. An answer that is always
+    shown completely (`is_whole`) has no fold.
+    """
     tables = map(html_table, _short_tables(answer).values())
     if answer.is_whole:
         return _html_of([answer.verdict], tables)
@@ -215,14 +221,16 @@ def _html(answer: Answer) -> str:
 
 
 def _html_of(texts: Iterable[str], parts: Iterable[str] = ()) -> str:
-    """Texts as paragraphs, and parts of HTML; what texts quote as code is marked."""
+    """HTML with texts as paragraphs, followed by parts that are HTML already. Quoted code becomes
+    `<code>`.
+    """
     paragraphs = [f"<p>{escape(text)}</p>" for text in texts]
     html = "\n".join(filter(None, [*paragraphs, *parts]))
     return CODE.sub(r"<code>\1</code>", html)
 
 
 def _latex(answer: Answer) -> str:
-    """All tables that are short, with remarks below them."""
+    """The answer as LaTeX: all short tables, with remarks below them."""
     parts = [LATEX_PREAMBLE]
     notes = []
     for name, table in _short_tables(answer).items():
@@ -240,7 +248,7 @@ def _tested_in_words(answer: Answer) -> str:
 
 
 def _details_in_words(answer: Answer) -> Iterator[str]:
-    """How an answer was tested, and the tables that readers do not see."""
+    """Yield how an answer was tested, and the names of tables that are too long or folded."""
     if answer.tested:
         yield _tested_in_words(answer)
     long = [
@@ -259,8 +267,8 @@ def _details_in_words(answer: Answer) -> Iterator[str]:
 
 
 def _shown_tables(answer: Answer) -> dict[str, AnswerTable]:
-    """The tables of all details, by name; without remarks on others, and without a table of no
-    remark.
+    """The tables that the details show, by name. Folded tables are left out, and so are the remarks
+    on them. A table of remarks without a row is left out, too.
     """
     tables = {**answer.tables.records}
     for name in answer.folded:
@@ -270,7 +278,7 @@ def _shown_tables(answer: Answer) -> dict[str, AnswerTable]:
         rows = remarks.frame
         if "table" in rows:
             rows = rows[~rows["table"].isin(answer.folded)]
-            # "all" would be read as a part of the remark.
+            # A remark on all tables names no table: a reader would take "all" for its first word.
             rows = rows.replace({"table": {"all": ""}})
         if not rows.empty:
             tables["remarks"] = remarks.with_rows(rows)
@@ -286,8 +294,8 @@ def _short_tables(answer: Answer) -> dict[str, AnswerTable]:
 
 
 def _label_of(answer: Answer, table: str) -> str:
-    """The label of a table in LaTeX, which tables of other studies, questions and commands do not
-    have.
+    """The label of a table in LaTeX. It differs from the labels of other studies, questions and
+    commands, so that a document can hold all of them.
     """
     study = getattr(answer.study, "name", "safevar")
     label = f"{study}-{answer.question.replace(':', '-')}-{table}"

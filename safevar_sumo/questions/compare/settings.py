@@ -1,5 +1,5 @@
-"""The settings with which two systems, A and B, are compared: the same changes of both original
-vehicles, in the same encounters.
+"""The settings with which two versions A and B of a study are compared. Both versions get the same
+changes of their original vehicles, in the same encounters.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ from safevar_sumo.study.characteristics import Domain, check_limits
 from safevar_sumo.study.encounters import Axes, AxisTable
 
 BOTH_STAGE = "simulate both versions"
-"""The phase of progress."""
+"""The phase of progress in which settings are simulated in both versions."""
 MAX_FACTOR = 512
-"""Largest number of settings that are drawn for each one that satisfies the constraints of both
-studies.
+"""Largest number of sampled settings for each setting that must satisfy the constraints of both
+studies. If hardly any settings satisfy them, fewer settings are returned.
 """
 SAMPLE = "sample"
-"""Source of the settings that are drawn."""
+"""Value of the column `source` of sampled settings."""
 RUN_COLUMNS = ["source", "algorithm", "run"]
 """Columns that identify a run."""
 LINE = "line"
-"""Column with the number of a drawn setting's line."""
+"""Name of the column with the number of the line on which a sampled setting lies."""
 ROUNDS = 4
-"""Number of settings on a line: at half of its changes, then each half as far from the last one as
-that from its own last one.
+"""Number of settings on a line. The first setting has half of the line's changes. Each further
+setting is half as far from the setting before it as that setting was from its predecessor.
 """
 
 
 class Pairs(NamedTuple):
-    """M settings in both systems.
+    """M pairs of settings: the same changes in A and in B.
 
     Attributes
     ----------
     frame
-        Where each comes from: `source`, `solution`, `algorithm` and `run` of solutions, `line` of
-        drawn settings.
+        Where each pair comes from. The columns are `source`, for solutions also `solution`,
+        `algorithm` and `run`, and for sampled settings `line`.
     settings
-        Their values in A and in B, shape (2, M, n).
+        The values in A and in B, shape (2, M, n).
     runs
-        Their evaluations in A and in B.
+        The evaluations in A and in B.
     """
 
     frame: pd.DataFrame
@@ -61,7 +61,7 @@ class Pairs(NamedTuple):
 
     @classmethod
     def joined(cls, groups: Sequence[Pairs]) -> Pairs:
-        """All pairs of some groups, in their order."""
+        """The pairs of all groups, one group after the other."""
         frames, settings, runs = zip(*groups, strict=True)
         frame = pd.concat(frames, ignore_index=True)
         joined = list(map(Evaluations.concatenate, zip(*runs, strict=True)))
@@ -69,16 +69,16 @@ class Pairs(NamedTuple):
 
     @property
     def are_valid(self) -> BoolArray:
-        """Which could be simulated in both systems, shape (M,)."""
+        """Which pairs have valid simulations in both versions, shape (M,)."""
         return self.runs[0].valid & self.runs[1].valid
 
     @property
     def number_infeasible(self) -> int:
-        """How many a constraint of either study rules out."""
+        """The number of pairs that violate a constraint of either study."""
         return int(np.count_nonzero(self.runs[0].infeasible | self.runs[1].infeasible))
 
     def take(self, rows: BoolArray) -> Pairs:
-        """Some of the pairs, in their order."""
+        """The pairs whose row is True in `rows`, shape (M,)."""
         frame = self.frame[rows].reset_index(drop=True)
         return Pairs(
             frame, self.settings[:, rows], [run.take(rows) for run in self.runs]
@@ -86,16 +86,16 @@ class Pairs(NamedTuple):
 
 
 class CommonDomain(NamedTuple):
-    """What two systems have in common.
+    """The settings that both versions can drive, within the user's limits.
 
     Attributes
     ----------
     evaluators
-        Of A and B, whose characteristics have the same order.
+        The evaluators of A and B, whose characteristics have the same order.
     shift
-        By how much B's original values are above A's, shape (n,); 0 for parameters of the scenario.
+        B's original values minus A's, shape (n,); 0 for parameters of the scenario.
     lower, upper
-        The ends in A and in B, within the limits, shape (2, n).
+        The ends of both domains within the limits, A's in row 0 and B's in row 1, shape (2, n).
     """
 
     evaluators: tuple[Evaluator, Evaluator]
@@ -107,7 +107,7 @@ class CommonDomain(NamedTuple):
     def of(
         cls, evaluators: tuple[Evaluator, Evaluator], limits: Mapping[str, Limit]
     ) -> CommonDomain:
-        """The common domain, within limits that both original vehicles keep.
+        """The common domain of two versions, within the user's limits.
 
         Raises
         ------
@@ -115,7 +115,6 @@ class CommonDomain(NamedTuple):
             If B's original vehicle does not keep a limit, or the domains of a searched parameter
             have nothing in common.
         """
-        # The same limits in both, moved by the difference of the original vehicles.
         a, b = (side.characteristics for side in evaluators)
         second = evaluators[1].study
         with about(second.source):
@@ -128,7 +127,6 @@ class CommonDomain(NamedTuple):
             ]
         )
 
-        # Where both domains overlap.
         common = cls(evaluators, shift, lower=ends[:, :, 0], upper=ends[:, :, 1])
         lower, upper = common.ends_in_a
         is_empty = lower > upper
@@ -143,40 +141,44 @@ class CommonDomain(NamedTuple):
 
     @property
     def ends_in_a(self) -> tuple[FloatArray, FloatArray]:
-        """The lower and upper ends of A's settings that both domains hold, shape (n,)."""
+        """The lower and the upper ends, shape (n,), of the settings of A that are in A's domain,
+        and whose counterparts are in B's domain.
+        """
         lower = np.maximum(self.lower[0], self.as_in_a(self.lower[1]))
         return lower, np.minimum(self.upper[0], self.as_in_a(self.upper[1]))
 
     def as_in_b(self, settings: FloatArray) -> FloatArray:
-        """A's settings as B's: the same changes of the other original vehicle."""
+        """The settings of B with the same changes as settings of A."""
         return settings + self.shift
 
     def as_in_a(self, settings: FloatArray) -> FloatArray:
-        """B's settings as A's."""
+        """The settings of A with the same changes as settings of B."""
         return settings - self.shift
 
     def holds(self, settings: FloatArray) -> BoolArray:
-        """Which settings, shape (2, M, n), are in both domains, shape (M,)."""
+        """Which of M pairs of settings, shape (2, M, n), lie in the domains of their versions,
+        shape (M,).
+        """
         values = settings.swapaxes(0, 1)
         return np.asarray(
             ((values >= self.lower) & (values <= self.upper)).all(axis=(1, 2))
         )
 
     def in_both(self, settings: FloatArray) -> FloatArray:
-        """A's settings, and the same in B; what rounding moves out of B's domain is put onto its
-        end.
+        """The settings of A and their counterparts in B, shape (2, M, n). A value that rounding
+        errors move out of B's domain is put onto the domain's end.
         """
         in_b = np.clip(self.as_in_b(settings), self.lower[1], self.upper[1])
         return np.stack([settings, in_b])
 
     def evaluate(self, settings: FloatArray) -> list[Evaluations]:
-        """Evaluate settings, shape (2, M, n), in both systems."""
+        """Evaluate pairs of settings, shape (2, M, n), each in its version."""
         pairs = zip(self.evaluators, settings, strict=True)
         return [side.evaluate(of_side, BOTH_STAGE) for side, of_side in pairs]
 
 
 def within(limits: Mapping[str, Limit], name: str, domain: Domain) -> Interval:
-    """The ends of a domain within the user's limits."""
+    """The ends of the domain of the characteristic `name` within the user's limits."""
     return (
         limits[name].interval(domain)
         if name in limits
@@ -195,11 +197,11 @@ def in_order_of(a: Study, b: Study) -> Study:
     place = {name: number for number, name in enumerate(a.ranges)}
 
     def in_order(axes: dict[str, AxisTable]) -> Axes:
-        """Axes that may have any value stand in the order of their names, the last."""
+        """The axes in A's order. Listed axes stand before axes with a range."""
         names = sorted(axes, key=lambda name: place.get(name, -1))
         return {name: axes[name] for name in names}
 
-    # The units of both must be the same.
+    # Both studies must have the same characteristics and units.
     units_a = {(name, row.unit) for name, row in a.domains.items()}
     units_b = {(name, row.unit) for name, row in b.domains.items()}
     if units_a == units_b:
@@ -224,14 +226,14 @@ def pairs_of(
     criteria: Sequence[Unsafe],
     samples: int,
 ) -> tuple[Pairs, int]:
-    """The solutions of both sides and the drawn settings, evaluated in both systems; and the number
-    of solutions that are not in both domains.
+    """The solutions of both sides and `samples` sampled settings, evaluated in both versions. The
+    second result is the number of solutions that are left out, because they are not in both
+    domains.
     """
     names = list(common.evaluators[0].characteristics.names)
     groups = []
     outside = 0
 
-    # Solutions of each side, as settings of both.
     for side, case in zip("ab", subjects, strict=True):
         if not isinstance(case, Case):
             continue
@@ -259,15 +261,15 @@ def pairs_of(
 def _draw_on_lines(
     common: CommonDomain, criteria: Sequence[Unsafe], samples: int
 ) -> Pairs:
-    """`samples` settings on lines from the original vehicles to Sobol points of the common domain,
-    in the encounters of these points: each nearer to where the systems begin to fail.
+    """Sample `samples` settings near the place where the vehicles begin to fail.
 
-    Nearly every vehicle with random changes of all characteristics fails in both systems, which
-    says nothing. So a line goes on with smaller changes after a failure in both, with larger ones
-    after none, and beside a difference. Which of both systems fails does not matter: without a
-    difference between them, a line favours none.
+    The settings lie on lines from the original vehicle to Sobol points of the common domain, in the
+    encounters of these points. Nearly every vehicle with random changes of all characteristics
+    fails in both versions, which shows no difference. Therefore a line goes on with smaller changes
+    after a failure in both versions, and with larger changes after no failure. After a failure in
+    one version, lines with odd numbers go on with smaller changes, and all others with larger
+    changes, whichever version failed. Hence the sample favours no version.
     """
-    # Lines from the original to sampled settings.
     members = common.evaluators[0].characteristics
     ends = _common_sample(common, math.ceil(samples / ROUNDS))
     starts = members.with_original_vehicle(ends)
@@ -276,7 +278,6 @@ def _draw_on_lines(
     rounds = list[Pairs]()
     budget = samples if len(ends) else 0
 
-    # On each line, halve the step towards where one of them begins to fail.
     while budget and len(rounds) < ROUNDS:
         lines = np.arange(min(len(ends), budget))
         budget -= len(lines)
@@ -297,8 +298,8 @@ def _draw_on_lines(
 
 
 def _common_sample(common: CommonDomain, number: int) -> FloatArray:
-    """`number` settings of A that cover the common domain evenly and satisfy the constraints of
-    both studies; fewer if hardly any settings do.
+    """`number` settings of A that cover the common domain evenly, and satisfy the constraints of
+    both studies. There are fewer settings if hardly any satisfy these constraints.
     """
     lower, upper = common.ends_in_a
     factor = 1

@@ -1,5 +1,6 @@
-"""Which failures are explained: those that matter among the solutions of results, or among settings
-drawn from a study's whole domain; and how each of them ends beside the original vehicle.
+"""Chooses the failures that `explain` explains: failures that matter among the solutions of
+results, or among settings that are sampled from a study's whole domain. Each chosen failure is
+compared with the original vehicle in the same encounter.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from safevar_sumo.sumo.system import System
 Reasons = dict[int, str]
 """The rows of the chosen failures, with the reasons for their choice."""
 TO_EXPLAIN = "simulate the vehicles"
-"""A stage of progress."""
+"""The phase of progress in which the vehicles are simulated from which failures are chosen."""
 REASONS = {
     "fewest": "fewest changes",
     "most_severe": "lowest safety degree",
@@ -49,35 +50,37 @@ REQUESTED = "requested"
 DISTINCT_CAUSE = "simplest failure with another cause"
 """The reason for choosing the simplest failure with a cause that no other chosen failure has."""
 SAMPLED_SETTINGS = 4096
-"""Number of settings drawn from the whole domain if there are no results."""
+"""Number of settings that are sampled from the whole domain if there are no results."""
 SAMPLED_SIMULATIONS, LEAST_SAMPLED_SETTINGS = 40_000, 1024
-"""Number of simulations up to which they are as many, at all points of a matrix, and the least
-number.
+"""A setting is simulated at all points of a matrix. If this takes more simulations than the first
+number, fewer settings are sampled, but at least the second number.
 """
 
 
 class Population(NamedTuple):
-    """Evaluated settings, safe ones too, and the failures among them.
+    """Evaluated settings, also safe ones, and the failures among them.
 
     Attributes
     ----------
     original
-        Evaluation of the original vehicle.
+        The evaluation of the original vehicle.
     evaluations
-        Equal solutions of several runs are one row.
+        The evaluations of the settings. Equal solutions of several runs are one row.
     names
-        The handle of each row; `drawn:N` if the setting is no solution.
+        For each row, the handle of the solution, or `drawn:N` for a sampled setting.
     unsafe
-        The criterion.
-    rows, is_named
-        The unsafe rows, or those that the user names.
+        The criterion of an unsafe vehicle.
+    rows
+        The rows of the failures: the unsafe rows or, if the user names solutions, these.
+    is_named
+        Whether the user names solutions.
     otherwise
-        Number of rows with another outcome than in the results.
+        Number of rows whose outcome differs from that in the results.
     omissions
-        Number of drawn settings in whose encounter the original vehicle does not keep its margin,
-        which are no rows.
+        Number of sampled settings that are left out, because they violate a constraint, or because
+        the original vehicle does not keep its margin in their encounter.
     over_sets
-        The unsafe shares of drawn settings over the parameter sets; None for solutions.
+        The unsafe shares of sampled settings over the parameter sets; None for solutions.
     """
 
     original: Evaluations
@@ -98,15 +101,21 @@ def gather_failures(
     criterion: Unsafe | None,
     fits: int,
 ) -> Population:
-    """Evaluate all solutions of results, or settings that vary as a study says, of which the
-    first ones, without the filter, are also simulated with the first `fits` parameter sets.
+    """Evaluate all solutions of results, or sampled settings of a study. For a study, sampled
+    vehicles are also simulated with the first `fits` parameter sets.
+
+    Parameters
+    ----------
+    solutions
+        Handles of the solutions that the user names, such as nsga2:3:0.
+    criterion
+        The criterion that the user states; None for the default.
 
     Raises
     ------
     InputError
         If the criterion or a handle cannot be read, or a handle is no solution of the results.
     """
-    # Settings of the study's domain, or solutions of the results.
     named = list(map(SolutionId.parse, solutions))
     original = evaluator.evaluate_original()
     if isinstance(subject, Study):
@@ -120,7 +129,7 @@ def gather_failures(
     else:
         settings, names, recorded = _solutions_of(subject, named)
 
-    # All are simulated here, and judged by one criterion.
+    # Solutions are simulated again, because other files or versions may give other outcomes.
     evaluations = evaluator.evaluate(settings, TO_EXPLAIN)
     unsafe = (
         evaluator.checked(criterion)
@@ -129,7 +138,6 @@ def gather_failures(
     )
     is_other = (evaluations.outcome != recorded) & (recorded != UNKNOWN)
 
-    # Settings without a valid encounter do not count.
     omissions = 0
     over_sets = None
     if isinstance(subject, Study):
@@ -142,7 +150,7 @@ def gather_failures(
         )
         over_sets = SharesOverSets.of(evaluator, unsafe, vehicles, fits=fits)
 
-    # Named settings are explained whatever they do.
+    # A solution that the user names is explained even if it is safe.
     rows = (
         list(range(len(set(named))))
         if named
@@ -153,16 +161,16 @@ def gather_failures(
 
 
 Candidates = tuple[FloatArray, list[str], TextArray]
-"""Settings, shape (M, n), that may be unsafe, their names, and the outcomes in the results, shape
-(M,).
+"""M settings among which failures are sought, shape (M, n), their names, and their outcomes in the
+results, shape (M,); `UNKNOWN` without results.
 """
 
 
 def _drawn_from(study: Study, evaluator: Evaluator) -> Candidates:
-    """Settings that vary as a study says, after the filter."""
+    """Sampled settings, which vary as the study says, and pass the study's filter."""
     affordable = SAMPLED_SIMULATIONS // len(evaluator.system.points)
     number = min(SAMPLED_SETTINGS, max(affordable, LEAST_SAMPLED_SETTINGS))
-    # Of few simulations most are for the causes of what fails here.
+    # With few simulations, an eighth finds failures: most are needed to find the causes.
     number = evaluator.at_most(number, 8)
     sampled_settings = VariationModel(study).draw(
         number, default_rng(study.search.seed), filtered=True
@@ -173,7 +181,7 @@ def _drawn_from(study: Study, evaluator: Evaluator) -> Candidates:
 
 
 def _solutions_of(case: Case, named: Sequence[SolutionId]) -> Candidates:
-    """The distinct solutions of results, the named ones first."""
+    """The different solutions of results. The solutions that the user names come first."""
     table = case.solutions
     characteristics = list(case.characteristics.names)
     distinct = np.flatnonzero(~table.duplicated(characteristics)).tolist()
@@ -189,8 +197,18 @@ def _solutions_of(case: Case, named: Sequence[SolutionId]) -> Candidates:
 
 
 class Chosen(NamedTuple):
-    """Why failures are chosen, by row; the rows of a sample of all failures; the minimal causes of
-    both, by row; and the number of changes up to which these are all, None without a bound.
+    """The failures that are explained, and their causes.
+
+    Attributes
+    ----------
+    reasons
+        The reasons for which failures are chosen, by row.
+    sample
+        The rows of a sample of all failures.
+    causes
+        The minimal causes of chosen and sampled failures, by row.
+    complete
+        The number of changes up to which all minimal causes were found; None if all were found.
     """
 
     reasons: Reasons
@@ -202,13 +220,14 @@ class Chosen(NamedTuple):
 def choose_failures(
     population: Population, evaluator: Evaluator, limit: int, top: int
 ) -> Chosen:
-    """At most `top` failures that matter, and a sample of all failures; of named rows these alone.
+    """Choose at most `top` failures that matter, and a sample of all failures, and find their
+    minimal causes. If the user names solutions, these are all chosen, and are the sample.
 
-    The sample are all failures, if that takes at most about `limit` simulations. What matters: a
-    failure for each of `REASONS`, and the simplest failure with each minimal cause that these do
-    not have.
+    The failures that matter are a failure for each of `REASONS`, and then, for each minimal cause
+    that these failures do not have, the simplest failure with this cause. The sample has all
+    failures if their causes take at most about `limit` simulations.
     """
-    # An evaluation simulates a setting at every point.
+    # A setting takes a simulation at every point: the limit becomes a number of settings.
     limit //= len(evaluator.system.points)
     runs = population.evaluations
     rows = population.rows
@@ -221,7 +240,6 @@ def choose_failures(
         reasons = dict(islice(_failures_that_matter(population).items(), top))
         limit *= 2
 
-    # Causes of the sample, and of failures that matter.
     analysed = sorted({*sample, *reasons})
     settings = runs.settings[analysed]
     groups = find_minimal_causes(evaluator, settings, population.unsafe, limit)
@@ -233,7 +251,6 @@ def choose_failures(
     if population.is_named:
         return chosen
 
-    # For each distinct cause that is missing, the simplest failure that has it.
     members = evaluator.characteristics
     kinds = {row: kinds_of(members, group) for row, group in causes.items()}
     of_sample = [causes[row] for row in sample]
@@ -248,7 +265,7 @@ def choose_failures(
 
 
 def _failures_that_matter(population: Population) -> Reasons:
-    """A failure for each of `REASONS`."""
+    """The most extreme failure for each of `REASONS`; a failure may have several reasons."""
     reasons = Reasons()
     failures = population.evaluations.take(population.rows)
     for choice, reason in REASONS.items() if population.rows else ():
@@ -260,23 +277,21 @@ def _failures_that_matter(population: Population) -> Reasons:
 
 
 PointComparison = tuple[str, tuple[str, ...]]
-"""How the runs of the original vehicle and of a failure end at the failure's worst point, in a
-sentence; and the names of the points of a test matrix at which it is unsafe, in the study's order.
+"""A sentence on how the runs of the original vehicle and of a failure end at the failure's worst
+point; and the names of the points of a matrix at which the failure is unsafe, in the study's order.
 """
 
 
 def compare_at_points(
     system: System, settings: FloatArray, unsafe: Unsafe
 ) -> list[PointComparison]:
-    """Compare M settings, shape (M, n), with the original vehicle, each in its own encounter."""
-    # Both vehicles at every point, and where it is unsafe.
+    """Compare M settings, shape (M, n), with the original vehicle in the setting's encounter."""
     originals = system.characteristics.with_original_vehicle(settings)
     results = simulate_all_points(system, np.concatenate([originals, settings]))
     at_points = [result.evaluations for result in results]
     is_unsafe = np.stack(list(map(unsafe.of, at_points)))
     worst = worst_points(system, at_points)
 
-    # In words, at the worst point.
     comparisons = []
     for original, vehicle in enumerate(range(len(settings), len(worst))):
         result = results[worst[vehicle]]
