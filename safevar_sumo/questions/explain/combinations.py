@@ -1,8 +1,8 @@
-"""The smallest changes that are unsafe, by enumeration: each characteristic is as in the original
-vehicle or at an end of its domain, and combinations are simulated by size, without those that
-contain a smaller cause.
+"""Finds the smallest unsafe changes by enumeration. A combination sets some characteristics to an
+end of their domains, and leaves all others as in the original vehicle. Combinations are simulated
+by size; combinations that contain a smaller cause are left out.
 
-Nothing is inferred from other combinations, as a further change may make a vehicle safe again.
+Nothing is inferred from other combinations, because a further change may make a vehicle safe again.
 """
 
 from __future__ import annotations
@@ -21,33 +21,39 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
 COMBINATIONS = "try combinations of changes"
-"""The stage of progress."""
+"""The phase of progress in which combinations are simulated."""
 SHARES = tuple(percent / 100 for percent in range(100, 0, -10))
-"""Shares of the way to the ends of the domain at which the fewest changes are sought."""
+"""Shares of the way from the original to the ends of the domain at which the fewest unsafe changes
+are searched.
+"""
 MAX_COMBINATIONS = 200_000
-"""Largest number of combinations of a size that is begun, as the likely ones come first."""
+"""A size with more combinations is left out: the combinations of a size must be put in order, so
+that those that are likely to be unsafe are simulated first.
+"""
 
 Change = tuple[int, float]
-"""A column, and its value."""
+"""A change of a characteristic: its column in a setting, and its new value."""
 Combination = frozenset[Change]
 
 
 class Enumeration(NamedTuple):
-    """The combinations of changes that are unsafe while all smaller ones within them are safe.
+    """The result of an enumeration: the causes, which are unsafe combinations of changes without a
+    smaller unsafe combination in them.
 
     Attributes
     ----------
     share
-        The share of the way to the end of the domain at which each change is.
+        The share of the way from the original to the end of the domain at which each change is.
     causes
-        The unsafe combinations, the smallest first.
-    simulated, existing
-        How many combinations of each size were simulated, and how many there are that contain no
-        smaller cause and violate no constraint.
+        The causes, the smallest first.
+    simulated
+        By size, the number of combinations that were simulated.
+    existing
+        By size, the number of combinations that contain no smaller cause and violate no constraint.
     containing
-        The combinations of each size that contain a smaller cause and violate no constraint.
+        By size, the combinations that contain a smaller cause and violate no constraint.
     is_cut
-        Whether a larger size was left out, or cut, because it is too large.
+        Whether combinations were left out because they are too many.
     """
 
     share: float
@@ -72,7 +78,7 @@ class Enumeration(NamedTuple):
 
     @property
     def size(self) -> int:
-        """The fewest changes that are unsafe; 0 if none was found."""
+        """The least number of changes in a cause; 0 if no cause was found."""
         return len(self.causes[0].changes) if self.causes else 0
 
     @property
@@ -89,20 +95,22 @@ def enumerate_causes(
     *,
     only_fewest: bool = False,
 ) -> Enumeration:
-    """All causes of changes at a `share` of the way to the ends of their domains, with at most
-    `limit` simulated settings. The last size may be begun only, with the combinations whose single
-    changes add up to the worst; with `only_fewest` the first size with a cause is the last, and a
-    size is simulated as a whole or not at all.
+    """Find all causes whose changes are at a `share` of the way to the ends of their domains, with
+    at most `limit` simulated settings.
 
-    Where encounters are ranges a combination is simulated in the original encounter and
-    in the critical ones, as `Evaluator.evaluate_over_encounters` says.
+    If the simulations do not suffice for the last size, the combinations are simulated first whose
+    single changes are worst in sum. With `only_fewest`, the first size with a cause is the last
+    size, and a size is simulated completely or not at all.
+
+    If encounters are ranges, a combination is simulated in the original encounter and in the
+    critical ones (`Evaluator.evaluate_over_encounters`).
     """
-    # The changes, and what one combination costs.
+    # `room` is the number of combinations that may still be simulated, in all their encounters.
     members = evaluator.characteristics
     changes = _changes(members, share)
     columns = {column for column, _ in changes}
     room = limit // (1 + len(evaluator.critical_encounters))
-    # What each change leaves by itself.
+    # The robustness of the vehicle with each single change. It orders larger combinations.
     effects = dict.fromkeys(changes, np.inf)
     causes = list[Cause]()
     simulated, existing = dict[int, int](), dict[int, int]()
@@ -111,7 +119,7 @@ def enumerate_causes(
     is_cut = False
 
     for size in range(1, len(columns) + 1):
-        # A size is begun while all its combinations can be put in order.
+        # Stop at a size with too many combinations to put in order.
         if only_fewest and causes:
             break
         is_cut = comb(len(columns), size) * 2**size > MAX_COMBINATIONS
@@ -130,7 +138,7 @@ def enumerate_causes(
         if is_cut and (only_fewest or not room):
             break
 
-        # Those whose single changes are worst come first.
+        # The combinations whose single changes are worst in sum come first.
         candidates.sort(
             key=lambda combination: sum(effects[change] for change in combination)
         )
@@ -154,8 +162,8 @@ def enumerate_causes(
 def count_cures(
     evaluator: Evaluator, unsafe: Unsafe, enumeration: Enumeration, limit: int
 ) -> dict[int, int]:
-    """How many of the combinations that contain a smaller cause are safe, by their size; only of
-    the sizes that are simulated as a whole with at most `limit` settings.
+    """By size, the number of combinations that contain a smaller cause, but are safe. Only sizes
+    are simulated that can be simulated completely, with at most `limit` settings altogether.
     """
     cures = dict[int, int]()
     room = limit // (1 + len(evaluator.critical_encounters))
@@ -174,9 +182,12 @@ def count_cures(
 def staircase(
     evaluator: Evaluator, unsafe: Unsafe, at_ends: Enumeration, limit: int
 ) -> list[Enumeration]:
-    """The fewest changes that are unsafe at each of `SHARES` of the way to their ends, with at most
-    `limit` simulated settings. At the ends more changes may be necessary than before, so fewer are
-    simulated at every share.
+    """Find the fewest unsafe changes at each of `SHARES` of the way to the ends, with at most
+    `limit` simulated settings. The first step is `at_ends`, the enumeration at the ends themselves.
+
+    Nearer to the original, more changes may be necessary. Each share leaves enough simulations for
+    all shares after it: at least as many as the sizes took at the ends that are smaller than a
+    cause.
     """
     steps = [at_ends]
     encounters = 1 + len(evaluator.critical_encounters)
@@ -200,7 +211,9 @@ def staircase(
 
 
 def _changes(members: CharacteristicSet, share: float) -> list[Change]:
-    """The changes of one characteristic."""
+    """All single changes: each characteristic at a `share` of the way to each end of its domain. An
+    end that is the original value is no change.
+    """
     changes = list[Change]()
     for column, item in enumerate(members.vehicle):
         for end in (item.lower, item.upper):
@@ -213,7 +226,7 @@ def _changes(members: CharacteristicSet, share: float) -> list[Change]:
 
 
 def _of_size(changes: list[Change], size: int) -> Iterator[Combination]:
-    """All combinations of changes of so many different characteristics."""
+    """All combinations of changes of `size` different characteristics."""
     sides: dict[int, list[Change]] = {}
     for change in changes:
         sides.setdefault(change[0], []).append(change)
@@ -222,7 +235,7 @@ def _of_size(changes: list[Change], size: int) -> Iterator[Combination]:
 
 
 def _settings(members: CharacteristicSet, chosen: list[Combination]) -> FloatArray:
-    """The original vehicle with each of M combinations, shape (M, n)."""
+    """The settings of the original vehicle with each of M combinations, shape (M, n)."""
     settings = np.tile(members.original, (len(chosen), 1))
     for setting, combination in zip(settings, chosen, strict=True):
         for column, value in combination:
@@ -233,8 +246,8 @@ def _settings(members: CharacteristicSet, chosen: list[Combination]) -> FloatArr
 def _robustness(
     evaluator: Evaluator, unsafe: Unsafe, chosen: list[Combination]
 ) -> tuple[FloatArray, list[Cause]]:
-    """What each of M combinations leaves to the limit, shape (M,), below 0 where it is unsafe; and
-    each as a cause, in its worst encounter.
+    """The robustness of each of M combinations (below 0: unsafe), shape (M,), infinite without a
+    valid simulation; and each combination as a cause, in its worst encounter.
     """
     members = evaluator.characteristics
     names = members.names
