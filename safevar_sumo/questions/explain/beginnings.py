@@ -1,4 +1,6 @@
-"""The share of the way to the ends of the domain at which changes begin to be a cause."""
+"""Finds where causes begin: the smallest share of the way from the original to the ends of the
+domain at which the changes are a cause.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,9 @@ from safevar_sumo.records import FloatArray, NamedValues
 from safevar_sumo.vehicles import CharacteristicSet
 
 PlacedCause = tuple[Cause, float]
-"""A cause, and its share of the way to the ends."""
+"""A cause, and the share of the way to the ends at which its values are."""
 STEPS, COARSE_STEPS = 100, 20
-"""Parts of the way to the ends, and where few simulations are allowed."""
+"""Number of equal parts of the way to the ends, usually and with few simulations."""
 
 
 class Beginning(NamedTuple):
@@ -40,9 +42,9 @@ class Beginning(NamedTuple):
         The smallest share of the way to the ends at which it was found to be a cause; NaN if the
         values are at the ends and others were not simulated.
     boundary
-        The values there.
+        The values of the changes at this share.
     safe_again
-        The smallest larger share at which these changes are safe; NaN if none was found.
+        The smallest share above it at which these changes are safe again; NaN if there is none.
     """
 
     cause: Cause
@@ -54,9 +56,11 @@ class Beginning(NamedTuple):
 def find_beginnings(
     evaluator: Evaluator, unsafe: Unsafe, steps: Sequence[Enumeration]
 ) -> list[Beginning]:
-    """Where the causes of enumerations at several shares of the way begin, the ends first; and so
-    for smaller ones that are found on the way. A cause that contains another one is left out,
-    unless both are minimal at the ends.
+    """Find where causes begin.
+
+    The causes are those of the enumerations `steps`, of which the first is at the ends of the
+    domain. Smaller causes that are found on the way are added. A cause that contains another cause
+    is left out, unless both are minimal at the ends.
     """
     members = evaluator.characteristics
     pending, *nearer_steps = (
@@ -78,7 +82,9 @@ def _smallest(
     references: Sequence[Cause],
     candidates: Sequence[PlacedCause],
 ) -> list[PlacedCause]:
-    """Those of other causes that contain no known one, nor a smaller one of them."""
+    """The candidates that contain neither a cause of `references` nor a smaller candidate. A cause
+    contains another cause if it has all its changes, in the same directions.
+    """
     kinds = [{*directions(members, cause.changes)} for cause in references]
     smallest = list[PlacedCause]()
     for placed in sorted(candidates, key=lambda placed: len(placed[0].changes)):
@@ -92,8 +98,9 @@ def _smallest(
 def _begin(
     evaluator: Evaluator, unsafe: Unsafe, placed: Sequence[PlacedCause]
 ) -> tuple[list[Beginning], list[PlacedCause]]:
-    """Where causes begin, and smaller causes that are unsafe there."""
-    # Of few simulations half are left for the neighbours and the other parameter sets.
+    """The beginnings of causes, and smaller causes that were found where a cause begins."""
+    # With few simulations, half of them are left to check the causes: with similar vehicles and in
+    # other parameter sets.
     is_free = evaluator.left is None
     steps = STEPS if is_free else COARSE_STEPS
     causes = [cause for cause, _ in placed]
@@ -106,7 +113,7 @@ def _begin(
     if not number:
         return beginnings, []
 
-    # Lines from the original to the ends of the domain, shape (K, steps, n).
+    # `settings` lie on lines from the original to the ends of the domain, shape (K, steps, n).
     members = evaluator.characteristics
     values = settings_of(members, causes[:number])
     starts = members.with_original_vehicle(values)
@@ -120,14 +127,15 @@ def _begin(
     is_safe = runs.valid.reshape(is_unsafe.shape) & ~is_unsafe
 
     def smaller_causes(settings: FloatArray) -> list[list[Cause]]:
-        """The causes with fewer changes of each of several unsafe settings."""
+        """For each unsafe setting, the causes that have fewer changes than the setting."""
         groups = find_minimal_causes(evaluator, settings, unsafe)
         sizes = members.number_changed(settings).tolist()
         for group, size in zip(groups, sizes, strict=True):
             group[:] = [cause for cause in group if len(cause.changes) < size]
         return groups
 
-    # Where each is unsafe first. If fewer of its changes are unsafe there, it is a cause later.
+    # If only some of a cause's changes are enough at its first unsafe share, the whole cause is not
+    # minimal there: it begins at a larger share.
     first_unsafe = is_unsafe.argmax(axis=1)
     groups = smaller_causes(settings[range(number), first_unsafe])
     smaller = list[PlacedCause]()
@@ -140,10 +148,9 @@ def _begin(
             subcauses = smaller_causes(settings[row, unsafe_at])
             at = unsafe_at[subcauses.index([])]
 
-        # The values there, and where it is safe again.
         cause = causes[row]
         named = members.named(settings[row, at])
-        # What is a rounding error of the share is none of the value.
+        # Twelve digits are enough: further digits are rounding errors of the share.
         boundary = {name: float(f"{named[name]:.12g}") for name in cause.changes}
         safe_shares = shares[at + 1 :][is_safe[row, at + 1 :]]
         beginnings[row] = Beginning(

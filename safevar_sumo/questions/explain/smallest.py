@@ -1,5 +1,6 @@
-"""The smallest changes that make a vehicle unsafe, as `explain` prints them: causes at the ends of
-the domain with where they begin and how sure they are, and the staircase.
+"""The smallest changes that make the vehicle of a study unsafe, as `explain` prints them. For each
+cause at the ends of the domain, the answer says where the cause begins, and how sure it is. The
+staircase is the least number of unsafe changes at each share of the way to the ends.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MAX_SETTINGS = 12_000
-"""Largest number of settings for the combinations at the ends, and again for the staircase."""
+"""Largest number of settings for the combinations at the ends of the domain; the staircase may take
+the same number again.
+"""
 CURES = 4
-"""Combinations that contain a cause are as many of these settings, divided by this number."""
+"""Combinations that contain a cause may take `MAX_SETTINGS` / `CURES` settings."""
 TITLE = "The smallest unsafe changes, each at an end of its domain"
 
 SMALLEST_NUMBERS = (
@@ -43,9 +46,18 @@ SMALLEST_NUMBERS = (
 
 
 class Smallest(NamedTuple):
-    """The smallest changes that are unsafe: at the ends of the domain, and nearer to the original;
-    how many combinations are safe although they contain a cause, by size; and a row of
-    `SMALLEST_COLUMNS` for each cause, the most robust first.
+    """The smallest unsafe changes of a study.
+
+    Attributes
+    ----------
+    at_ends
+        The causes at the ends of the domain.
+    steps
+        The causes at each share of the way to the ends; the first step is `at_ends`.
+    cures
+        By size, the number of combinations that are safe although they contain a cause.
+    table
+        A row of `SMALLEST_COLUMNS` for each cause, the most robust cause first.
     """
 
     at_ends: Enumeration
@@ -55,9 +67,10 @@ class Smallest(NamedTuple):
 
     @classmethod
     def of(cls, evaluator: Evaluator, unsafe: Unsafe, fits: int) -> Self:
-        """Enumerate them within what may be simulated, and see how sure they are."""
-        # Of few simulations half enumerate and a third of the others find the staircase, as what is
-        # not enumerated cannot be made smaller; the rest says how sure the causes are.
+        """Find the smallest unsafe changes, and check them in `fits` parameter sets."""
+        # With few simulations, half of them enumerate the combinations at the ends, because only
+        # causes that are found there can be made smaller. A third of the remaining simulations
+        # finds the staircase. The rest checks how sure the causes are.
         at_ends = enumerate_causes(
             evaluator, unsafe, evaluator.at_most(MAX_SETTINGS, 2)
         )
@@ -71,8 +84,8 @@ class Smallest(NamedTuple):
 
     @property
     def containing(self) -> tuple[int, int, int]:
-        """How many combinations contain a smaller cause, how many of these were simulated, and how
-        many are safe.
+        """The number of combinations that contain a smaller cause, the number of these that were
+        simulated, and the number of these that are safe.
         """
         numbers = {size: len(group) for size, group in self.at_ends.containing.items()}
         simulated = sum(numbers[size] for size in self.cures)
@@ -80,7 +93,7 @@ class Smallest(NamedTuple):
 
     @property
     def numbers(self) -> JsonObject:
-        """The numbers of the answer."""
+        """The numbers of the answer, by the names in `SMALLEST_NUMBERS`."""
         at_ends = self.at_ends
         largest = max(at_ends.simulated, default=0)
         enumerated = at_ends.tried, largest, at_ends.complete_up_to, len(self.table)
@@ -89,7 +102,9 @@ class Smallest(NamedTuple):
 
 
 def smallest_tables(smallest: Smallest | None) -> dict[str, AnswerTable]:
-    """The tables of causes and of the staircase; empty where the original itself is unsafe."""
+    """The tables of causes and of the staircase. Both are empty if `smallest` is None, because the
+    original vehicle itself is unsafe.
+    """
     rows = []
     for step in smallest.steps if smallest else ():
         causes_in_words = [", ".join(cause.changes) for cause in step.fewest]
@@ -109,7 +124,9 @@ def smallest_tables(smallest: Smallest | None) -> dict[str, AnswerTable]:
 
 
 def draw_staircase(answer: Answer) -> Figure:
-    """The fewest changes over the share of the way to the ends, with the names of the parts."""
+    """Draw the least number of unsafe changes over the share of the way to the ends. Each step has
+    the names of the changed characteristics.
+    """
     from safevar_sumo.questions.figures import (
         BLUE,
         FONT_SIZE,
@@ -117,7 +134,6 @@ def draw_staircase(answer: Answer) -> Figure:
         new_figure,
     )
 
-    # A step for each share, the original at the left.
     title = f"{answer.study.name}: how many changes are enough for an unsafe vehicle"
     figure, ((axis,),) = new_figure(title, 1, 1, (6.4, 3.6))
     rows = answer.tables["staircase"].iloc[::-1].to_dict("records")
@@ -147,7 +163,7 @@ def draw_staircase(answer: Answer) -> Figure:
             textcoords="offset points",
             fontsize=size,
         )
-    # With room for names at the right.
+    # The axis ends at 125 %, because the names at the last step need room at the right.
     axis.set_xlim(0, 125)
     axis.set_xticks(range(0, 101, 20))
     axis.grid(visible=False, axis="x")
@@ -161,7 +177,7 @@ def draw_staircase(answer: Answer) -> Figure:
 def _table(
     evaluator: Evaluator, unsafe: Unsafe, steps: Sequence[Enumeration], fits: int
 ) -> pd.DataFrame:
-    """A row of `SMALLEST_COLUMNS` for each cause, the most robust first."""
+    """The frame with a row of `SMALLEST_COLUMNS` for each cause, the most robust cause first."""
     beginnings = find_beginnings(evaluator, unsafe, steps)
     causes = [beginning.cause for beginning in beginnings]
     robust, holds, number_of_sets = sureness(evaluator, causes, unsafe, fits)

@@ -1,4 +1,6 @@
-"""The tables of `explain`: failures and their causes, what failures need, and who avoids them."""
+"""The tables of `explain`: failures, their causes, the characteristics that failures need, and the
+drivers that would have avoided them.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,7 @@ from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import FloatArray, NamedValues
 
 MAX_DISTINCT = 10
-"""Maximum number of distinct causes in their table."""
+"""Maximum number of rows of the table of distinct causes."""
 (
     CAUSE_COLUMNS,
     SOLUTION_COLUMNS,
@@ -52,26 +54,26 @@ MAX_DISTINCT = 10
     SMALLEST_COLUMNS,
     STAIRCASE_COLUMNS,
 ) = shipped_columns("explain").values()
-"""The interval of a characteristic is Clopper and Pearson's, 95 %, if only a sample of the failures
-was analysed, else the share itself.
+"""The columns of the tables. In the table of characteristics, the interval of a share is the 95 %
+interval by Clopper and Pearson if only a sample of the failures was analysed; else both ends are
+the share itself.
 """
 OF_ENCOUNTER = ("encounter", "elsewhere")
-"""Columns of a study whose encounters are ranges."""
+"""Columns that only a study has whose encounters are ranges."""
 
 
 def failures_frame(
     population: Population, evaluator: Evaluator, reasons: Reasons
 ) -> pd.DataFrame:
-    """A row of `SOLUTION_COLUMNS` for each chosen failure."""
+    """The frame with a row of `SOLUTION_COLUMNS` for each chosen failure. `reasons` has the rows of
+    the chosen failures, and why each was chosen.
+    """
     if not reasons:
         return pd.DataFrame(columns=[*SOLUTION_COLUMNS])
-
-    # The failures that were chosen.
     failures = population.evaluations.take(list(reasons))
     settings = failures.settings
     unsafe = population.unsafe
 
-    # How they end beside the original, and who would have avoided the collision.
     comparisons = compare_at_points(evaluator.system, settings, unsafe)
     is_assessed = failures.collided & has_reference_drivers(evaluator)
     assessed = iter(
@@ -102,17 +104,26 @@ def causes_table(
     causes_of: Sequence[Sequence[Cause]],
     distinct: pd.DataFrame,
 ) -> AnswerTable:
-    """A row of `CAUSE_COLUMNS` for each cause of each chosen failure: first the most frequent of
-    the robust ones, whose shares are in `distinct`, then the others, the most robust one first.
+    """The table with a row of `CAUSE_COLUMNS` for each cause of each chosen failure. Robust causes
+    come first, the most frequent of them first. All other causes follow, the most robust first.
+
+    Parameters
+    ----------
+    fits
+        Number of parameter sets in which causes are checked.
+    solutions
+        The frame of the chosen failures.
+    causes_of
+        The causes of each chosen failure, in the same order.
+    distinct
+        The distinct causes of the sample, and the share of failures with each of them.
     """
     study = evaluator.study
     unsafe = population.unsafe
 
-    # How robust each cause is, and with how many parameter sets it is one.
     causes = [cause for group in causes_of for cause in group]
     robust, holds, number_of_sets = sureness(evaluator, causes, unsafe, fits)
 
-    # How far it may be scaled back, and whether it is a cause in the original encounter.
     limits = find_cause_limits(evaluator, causes, unsafe)
     printed = printed_limits(Model(0, evaluator, unsafe), causes, limits)
     elsewhere = np.zeros(len(causes), dtype=bool)
@@ -123,7 +134,6 @@ def causes_table(
             evaluator.evaluate(settings, "causes in the original encounter")
         )
 
-    # How many failures have a cause with the same directions; robust causes come first.
     share_of = dict(zip(distinct["cause"], distinct["share"], strict=True))
     kinds = [directions(evaluator.characteristics, cause.changes) for cause in causes]
     default_share = 0.0 if share_of else np.nan  # without a sample, no share is known
@@ -160,14 +170,14 @@ def causes_table(
 def printed_limits(
     model: Model, causes: Sequence[Cause], limits: Sequence[Limits]
 ) -> list[dict[str, NamedValues]]:
-    """The columns encounter, boundary and single_boundary of causes as they are printed: rounded to
-    the unsafe side, with as many digits as the vehicle needs to be unsafe.
+    """The columns encounter, boundary and single_boundary of each cause, with values as they are
+    printed. Values are rounded to the unsafe side, with so many digits that the vehicle is unsafe.
     """
     pairs = list(zip(causes, limits, strict=True))
     exact = [limit.boundary | cause.encounter for cause, limit in pairs]
     printed = values_as_printed(model, exact)
 
-    # An encounter is rounded only where the whole changes are unsafe in it, too.
+    # The rounded encounter is used only if the whole, not scaled changes are unsafe in it, too.
     full_changes = [
         values | cause.changes for values, cause in zip(printed, causes, strict=True)
     ]
@@ -181,7 +191,8 @@ def printed_limits(
         for rounded, values, fails in zip(printed, exact, is_unsafe, strict=True)
     ]
 
-    # Each change alone at its boundary, with the others as they are, in the printed encounter.
+    # Round the boundary of each change alone: the other changes are whole, and the encounter is the
+    # printed one.
     alone = list[NamedValues]()
     names = list[str]()
     for values, (cause, limit) in zip(printed, pairs, strict=True):
@@ -205,8 +216,13 @@ def printed_limits(
 def sureness(
     evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe, sets: int
 ) -> tuple[FloatArray, list[int | None], int | None]:
-    """How sure causes are: the share of vehicles with nearly their values that are unsafe, in how
-    many of the first `sets` parameter sets each is one, and how many sets there are.
+    """How sure M causes are. The results are:
+
+    - the unsafe share of vehicles with nearly the values of each cause, shape (M,),
+    - for each cause, the number of the first `sets` parameter sets in which it is a cause,
+    - the number of these sets.
+
+    The second and third result are None if no other parameter set is checked.
     """
     robust = np.full(len(causes), np.nan)
     if causes:
@@ -232,13 +248,27 @@ def statistics_tables(
     collisions: int,
     distinct: pd.DataFrame,
 ) -> dict[str, AnswerTable]:
-    """The tables of characteristics, of drivers and of distinct causes."""
+    """The tables of characteristics, of drivers and of distinct causes, by name.
+
+    Parameters
+    ----------
+    necessity
+        How often each characteristic is changed and needed (`count_needed`).
+    failures
+        Number of analysed failures.
+    verdicts
+        For each examined collision, whether each driver avoids it.
+    collisions
+        Number of all collisions.
+    distinct
+        The distinct causes (`count_distinct_causes`).
+    """
     return {
         "characteristics": tabulate(
             "How often each characteristic is changed, and how often it is necessary, in"
             f" {number_of(failures, 'failure')}",
             CHARACTERISTIC_COLUMNS,
-            # Of one failure every share is 0 or 1.
+            # With a single failure every share is 0 or 1: the table would say nothing.
             necessity if failures > 1 else necessity.head(0),
         ),
         "drivers": tabulate(
