@@ -267,8 +267,8 @@ def _draw_on_lines(
     encounters of these points. Nearly every vehicle with random changes of all characteristics
     fails in both versions, which shows no difference. Therefore a line goes on with smaller changes
     after a failure in both versions, and with larger changes after no failure. After a failure in
-    one version, lines with odd numbers go on with smaller changes, and all others with larger
-    changes, whichever version failed. Hence the sample favours no version.
+    one version, lines with even numbers go on with smaller changes, and lines with odd numbers with
+    larger changes, whichever version failed. Hence the sample favours no version.
     """
     members = common.evaluators[0].characteristics
     ends = _common_sample(common, math.ceil(samples / ROUNDS))

@@ -1,10 +1,11 @@
-"""Which smallest change of the driving system keeps all vehicles safe within a required range of
-wear, and what does it cost?
+"""The question `repair`: which smallest change of the driving system keeps all vehicles safe within
+a promised range of wear, and what does this change cost?
 
-The first counterexamples are corners and Sobol points of the range in the listed encounters,
-without those that no driving system keeps safe. The smallest changes that survive them (`smallest`)
-are searched for counterexamples and proved with sampled vehicles (`survivors`); what breaks a
-change is a new counterexample. Today's driving system is the change of no parameter.
+The first counterexamples are corners and Sobol points of the promise in the listed encounters.
+Counterexamples that no driving system keeps safe are left out. The module `smallest` finds the
+smallest changes that keep all known counterexamples safe: they survive. The module `survivors`
+searches for counterexamples to these changes, and proves the changes with sampled vehicles. Each
+unsafe vehicle is a new counterexample. Today's driving system counts as the change of no parameter.
 """
 
 from __future__ import annotations
@@ -45,18 +46,18 @@ from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 from safevar_sumo.study import SCHEMA_LINE, Study, study_names, write_study
 
 ROUNDS_STAGE = "smallest change that survives"
-"""The phase of progress."""
+"""The phase of progress in which changes are searched and tested."""
 USUAL_ROUNDS = 8
 OF_ROUND = 2
-"""Its usual number of rounds; in a round, changes meet the cases of this number of searches for a
-counterexample, and of another one for each test.
+"""The usual number of rounds of this phase; and the number of searches for a counterexample whose
+cases a round usually simulates, in addition to one search for each test.
 """
 SOBOL_VEHICLES = 256
-"""Sobol points of the promise among the first counterexamples, and corners: the same points
-rounded.
+"""Number of Sobol points of the promise among the first counterexamples, and number of corners: the
+corners are the same points, rounded.
 """
 CAUSES_OF = 4
-"""Number of failures of full braking whose causes are told."""
+"""Number of failures of full braking whose causes the answer states."""
 
 
 @question
@@ -145,7 +146,8 @@ def repair(
         parameters=parameters,
         budget=evaluator.scaled(cases.USUAL_BUDGET),
     )
-    # Less than usual is no rough answer: a change that was not attacked is no repair.
+    # `repair` needs the usual number of simulations, and has no answer with fewer: a change without
+    # a search for counterexamples is no repair.
     searches = USUAL_ROUNDS * (OF_ROUND + problem.oracle.fits.count(0))
     rounds = searches * problem.budget / len(evaluator.system.points)
     usual = round(rounds + MOST_CHANGED * usual_test(problem, len(models.members)))
@@ -164,8 +166,9 @@ def repair(
 
 
 def _first_cases(problem: RepairProblem, subject: Subject) -> FloatArray:
-    """The new vehicle, corners and Sobol points of the promise, and failures of results in it, in
-    the listed encounters; these failures in their own ones, too.
+    """The first cases, which may be counterexamples. They are the new vehicle, corners and Sobol
+    points of the promise, and promised failures of results, each in all listed encounters that
+    count. The failures are also taken in their own encounters.
     """
     promise = problem.promise
     members = promise.region.characteristics
@@ -198,8 +201,9 @@ def _first_cases(problem: RepairProblem, subject: Subject) -> FloatArray:
 def _worst_first(
     problem: RepairProblem, cases: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Cases, those first that are least safe today, and which of them a driving system can survive:
-    the others need another part, not a parameter.
+    """The cases in another order: the case that is least safe today comes first. The second result
+    says which of them a driving system can keep safe. All other vehicles need a repaired part, not
+    a changed parameter.
     """
     robustness = problem.robustness_with(
         problem.today, cases, "the driving system of today"
@@ -213,8 +217,8 @@ def _worst_first(
 
 
 def _not_repairable(problem: RepairProblem, cases: FloatArray) -> list[NamedValues]:
-    """What no driving system can survive: the minimal causes of failures of full braking, shrunk to
-    the limit; for each characteristic of a cause the value from which on even full braking at once
+    """The wear that no driving system can keep safe, as minimal causes of failures of full braking.
+    A cause has, for each of its characteristics, the value from which on even full braking at once
     fails.
     """
     driver = problem.best_driver(problem.oracle.own)
@@ -234,15 +238,15 @@ def _not_repairable(problem: RepairProblem, cases: FloatArray) -> list[NamedValu
     for limits, cause in zip(
         find_cause_limits(driver, causes, unsafe), causes, strict=True
     ):
-        # Of equal causes in many encounters only the first counts.
+        # The same characteristics may be a cause in many encounters: only the first cause counts.
         kind = tuple(limits.boundary if cause.encounter else limits.boundary.items())
         parts.setdefault(kind, limits.boundary | cause.encounter)
     return list(parts.values())
 
 
 def _check_file(path: Path, study: Study) -> None:
-    """Refuse a file that is no study file, cannot be written, or is one of the study's own, before
-    the work begins.
+    """Refuse an output file before the work begins: it must end in .toml, must be writable, and
+    must not be a file of the study itself.
     """
     if path.suffix != ".toml" or (
         path.exists() and any(map(path.samefile, study.origin.files))

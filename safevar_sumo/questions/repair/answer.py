@@ -1,4 +1,4 @@
-"""The answer about repairs: their table, what they cost, and its sentences."""
+"""The answer of `repair`: the table of repairs, their prices and tests, and the sentences."""
 
 from __future__ import annotations
 
@@ -41,11 +41,16 @@ def answer_of(
     worst_today: Evaluations,
     not_repairable: list[NamedValues],
 ) -> Answer:
-    """The answer from the changes that survive, each with its proof: today's parameters alone if
-    they do.
+    """Make the answer from the changes that survive all searches. If today's parameters survive, no
+    repair is necessary.
 
-    `worst_today` is how the driving system of today ends with the worst vehicle of the promise that
-    was tried and that a driving system can keep safe.
+    Parameters
+    ----------
+    worst_today
+        The evaluation, with today's driving system, of the worst promised vehicle that was tried
+        and that a driving system can keep safe.
+    not_repairable
+        The causes of failures that no driving system can avoid: values by name.
     """
     unsafe = problem.unsafe
     worst = float(
@@ -105,14 +110,16 @@ def answer_of(
 
 
 def _safe_in_words(unsafe: Unsafe) -> str:
-    """What all vehicles do."""
+    """What all vehicles do with a repair, such as `stay safe`."""
     return f"keep {unsafe.keep:g} m of clearance" if unsafe.keep else "stay safe"
 
 
 def _repair(
     problem: RepairProblem, repairs: Sequence[JsonObject]
 ) -> Iterator[Sentence]:
-    """The first repair, which is the cheapest one, and its price on a new vehicle."""
+    """Yield sentences on the first repair, which is the cheapest one, and on its price for a new
+    vehicle.
+    """
     if not repairs:
         names = join_phrases(parameter.name for parameter in problem.parameters)
         yield words.NOTHING_FOUND(names=names)
@@ -139,7 +146,9 @@ def _repair(
 def _notes(
     problem: RepairProblem, not_repairable: Sequence[NamedValues]
 ) -> Iterator[Sentence]:
-    """The wear, what is unsafe, and what no driving system survives."""
+    """Yield notes on the promised wear, the criterion, and the wear that no driving system can keep
+    safe.
+    """
     yield words.WEAR(wear=problem.promise.in_words)
     if not problem.unsafe.keep:
         yield UNSAFE_MEANS(description=problem.unsafe.description)
@@ -155,7 +164,7 @@ def _notes(
 def _tested(
     models: Models, survivors: Survivors, proof: JsonObject
 ) -> Iterator[Sentence]:
-    """How a change was tested, and in how many parameter sets it holds."""
+    """Say how a change was tested, and in how many parameter sets it holds."""
     bound = bound_in_words(proof["at_most"])
     yield words.PROOF(
         samples=proof["proof_samples"],
@@ -178,7 +187,7 @@ def _tested(
 def _row(
     problem: RepairProblem, change: FloatArray, proof: Proof, fits: int
 ) -> JsonObject:
-    """A repair, its price and its proof, by the names of columns."""
+    """A row of `REPAIRS`: a repair, its price and its proof, by the names of columns."""
     values = problem.changed_values(change)
     texts = [
         words.CHANGE.format(
@@ -202,13 +211,13 @@ def _row(
 
 
 def _cost_of(repair: JsonObject) -> tuple[float, ...]:
-    """What makes a repair the cheaper one, and of equal ones the smaller one."""
+    """The key that orders repairs: by needless braking, then by earlier braking, then by size."""
     names = ("needless_braking", "metres_earlier", "largest_change")
     return tuple(repair[name] or 0.0 for name in names)
 
 
 def _columns_of(proof: Proof) -> JsonObject:
-    """A proof by the names of columns."""
+    """The results of a proof by the names of columns."""
     return {
         "proof_samples": proof.samples,
         "proof_failures": proof.failures,
@@ -217,8 +226,8 @@ def _columns_of(proof: Proof) -> JsonObject:
 
 
 def _limits_in_words(problem: RepairProblem, part: NamedValues) -> str:
-    """A part that no driving system survives, such as `sensorRange below 21.4 m`, and its
-    encounter.
+    """Wear that no driving system can keep safe, in words, such as `sensorRange below 21.4 m`, and
+    its encounter.
     """
     characteristics = problem.promise.region.characteristics
     limits = list[str]()

@@ -1,5 +1,6 @@
-"""Search, attack and prove in turns: the smallest changes that survive the search for
-counterexamples in all parameter sets of the vehicle model, and a bound on new wear.
+"""Finds the smallest changes that survive: no search finds a counterexample in any parameter set of
+the vehicle model, and sampled vehicles prove a bound on the unsafe share. The steps follow each
+other in rounds: find the smallest changes, search for counterexamples, prove.
 """
 
 from __future__ import annotations
@@ -18,23 +19,25 @@ from safevar_sumo.questions.tolerance.oracle import product_of
 from safevar_sumo.records import FloatArray, IntArray
 
 KNOWN = 256
-"""Number of known cases with which a search begins, and of unsafe ones that it hands over; with
-each other parameter set an eighth."""
+"""Number of known cases with which a search begins, and largest number of unsafe cases that it
+returns. With another parameter set a search begins with an eighth of these known cases.
+"""
 OWN_SEARCHES = 4
-"""Number of searches with the study's own parameter set; each other one has one of half the
-size."""
+"""Number of searches with the study's own parameter set. Each other set has a single search with
+half of the budget.
+"""
 MAX_UNSAFE_SHARE = 0.001
-"""Upper bound of the share of unsafe vehicles that fresh wear has to prove."""
+"""Upper bound of the unsafe share that newly sampled vehicles must prove, at the usual effort."""
 FIRST = 1024
-"""Number of the worst cases that are the first counterexamples."""
+"""Number of the worst first cases with which the search for changes begins."""
 MAX_ROUNDS = 30
-"""Largest number of rounds of attacks."""
+"""Largest number of rounds; after them, no change counts as surviving."""
 ATTACK_STAGE = "attack on the change"
 PROOF_STAGE = "proof on fresh wear"
 
 
 def usual_test(problem: RepairProblem, sets: int) -> float:
-    """How many settings test a change that holds in so many parameter sets."""
+    """The usual number of settings that test a change in `sets` parameter sets."""
     points = len(problem.evaluator.system.points)
     encounters = 1 + ENCOUNTERS if problem.study.ranges else points
     searched = problem.budget * (OWN_SEARCHES + (sets - 1) / 2)
@@ -43,7 +46,7 @@ def usual_test(problem: RepairProblem, sets: int) -> float:
 
 
 def unsafe_share(problem: RepairProblem) -> float:
-    """The upper bound to prove, by how much is searched."""
+    """The upper bound of the unsafe share that must be proved. More effort proves a lower bound."""
     return MAX_UNSAFE_SHARE / problem.evaluator.account.effort
 
 
@@ -54,17 +57,24 @@ def find_failures(
     cases: FloatArray,
     number: int,
 ) -> FloatArray:
-    """Search some parameter sets for cases that a change does not keep safe, from known `cases` on,
-    the worst first; none if it keeps all safe. `number` counts the attacks, for their random
-    numbers.
+    """Search the parameter sets `fits` for cases that a change does not keep safe. The result has
+    the worst case first, and is empty if no search finds such a case.
+
+    Parameters
+    ----------
+    cases
+        Known cases, with which the searches begin.
+    number
+        The number of this call, which seeds its random numbers.
     """
-    # These numbers are of no `Stream`: repairs depend on them.
+    # The generator is no `Stream`: other random numbers would find other repairs.
     rng = np.random.default_rng((problem.study.search.seed, number))
 
     def judge(cases: FloatArray) -> FloatArray:
         return problem.robustness(change, cases, ATTACK_STAGE)
 
-    # Few large generations of the other sets cost less than many small ones.
+    # Searches with other parameter sets have large generations: a few large ones cost less than
+    # many small ones.
     plan_of_study = SearchPlan(problem.budget)
     generation = 2 * plan_of_study.generation
     plan_of_set = SearchPlan(problem.budget // 2, generation=generation)
@@ -84,17 +94,26 @@ def prove_change(
     number: int,
     attempt: int,
 ) -> tuple[Proof, FloatArray]:
-    """Draw fresh wear for a change: its proof with the study's own set in the listed encounters,
-    and the unsafe cases; only without them the change is proved.
+    """Test a change with newly sampled promised vehicles in the listed encounters.
 
-    As many vehicles again each drive with one of the other sets, at random. `number` counts the
-    searches, for the random numbers, and `attempt` the proofs, from 1 on.
+    First, vehicles drive with the study's own parameter set, which gives the proof. Then, if all of
+    them are safe, as many further vehicles each drive with one of the other sets, at random. The
+    second result are the unsafe cases: the change is proved only without them.
+
+    Parameters
+    ----------
+    number
+        The number of the search before, which seeds the random numbers.
+    attempt
+        The number of this proof, from 1 on: the more attempts, the stricter a proof must be.
     """
     rng = Stream.REPAIRED_BOUND.generator(problem.study.search.seed, number)
     unsafe = list[FloatArray]()
 
     def drive(vehicles: FloatArray, sets: IntArray) -> FloatArray:
-        """What vehicles, each with a parameter set, leave in the listed encounters."""
+        """The robustness of M vehicles, each with its parameter set, in the E listed encounters,
+        shape (M, E). Unsafe cases are added to `unsafe`.
+        """
         cases = product_of(vehicles, problem.encounters)
         cases = problem.with_sets(cases, np.repeat(sets, len(problem.encounters)))
         robustness = problem.robustness(change, cases, PROOF_STAGE)
@@ -102,11 +121,11 @@ def prove_change(
         return robustness.reshape(len(vehicles), -1)
 
     def judge(vehicles: FloatArray) -> FloatArray:
-        """What vehicles leave with the study's own parameter set."""
+        """The robustness of M vehicles with the study's own parameter set, shape (M, E)."""
         return drive(vehicles, np.zeros(len(vehicles), dtype=np.intp))
 
     def draw(count: int) -> FloatArray:
-        """Promised vehicles."""
+        """Random promised vehicles, shape (count, n)."""
         return problem.promise.draw(count, rng)[:, : problem.size]
 
     proof = prove(draw, judge, unsafe_share(problem), attempt)
@@ -117,9 +136,16 @@ def prove_change(
 
 
 class Survivors(NamedTuple):
-    """The smallest changes that survive everything, each with its proof; none if no change does.
+    """The smallest changes that survive all searches and proofs.
 
-    They hold in `fits` parameter sets, and not in those with the numbers `broken`.
+    Attributes
+    ----------
+    changes
+        Each change, shape (P,), with its proof; empty if no change survives.
+    fits
+        The number of parameter sets in which the changes hold.
+    broken
+        The numbers of the parameter sets in which a change does not hold.
     """
 
     changes: list[tuple[FloatArray, Proof]]
@@ -130,8 +156,9 @@ class Survivors(NamedTuple):
 def find_survivors(
     problem: RepairProblem, fits: tuple[int, ...], cases: FloatArray
 ) -> Survivors:
-    """The smallest changes that survive in all parameter sets, from known cases on; where none
-    does, those of the study's own set, and the sets in which a search breaks one of them.
+    """Find the smallest changes that survive in all parameter sets. If there are none, find those
+    that survive in the study's own set, and the sets in which a search finds a counterexample to
+    one of them. `cases` are the first counterexamples, the worst first.
     """
     changes = _survivors_in(problem, fits, cases)
     if changes or len(fits) == 1:
@@ -151,8 +178,8 @@ def find_survivors(
 def _survivors_in(
     problem: RepairProblem, fits: tuple[int, ...], cases: FloatArray
 ) -> list[tuple[FloatArray, Proof]]:
-    """Search, attack and prove in turns until the smallest changes survive everything; none if no
-    change does.
+    """Find the smallest changes, search for counterexamples and prove in turns, until the smallest
+    changes survive. The result is empty if no change survives.
     """
     phases = problem.evaluator.phases
     search = Search(problem, cases[:FIRST])
@@ -172,7 +199,7 @@ def _survivors_in(
                 robustness = problem.robustness(change, cases, ATTACK_STAGE)
                 unsafe = cases[robustness < 0][:KNOWN]
             if not len(unsafe):
-                # Earlier nobody knows how many rounds follow.
+                # Only now is it likely that the round is the last one: expect its simulations.
                 phases.expect((len(unproved) - row) * usual_test(problem, len(fits)))
                 proof, unsafe = prove_change(
                     problem, fits, change, attacks, failed_proofs + 1
