@@ -1,5 +1,5 @@
-"""The price of a repair on a new vehicle: how much earlier it brakes, how hard, and how often
-needlessly.
+"""The price of a repair: how much earlier and how hard a new vehicle brakes with the repair, and
+how often it brakes needlessly.
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
 
 NEEDLESS_BRAKE = 0.1
-"""Brake command above which a vehicle counts as braking in a benign scene [-]; less regulates the
-speed.
+"""Brake command above which a vehicle counts as braking in a benign scene [-]. A smaller command
+only regulates the speed.
 """
 
 OF_BRAKING = ("metres_earlier", "metres_earlier_mean", "seconds_earlier", "most_at")
-"""How much earlier a vehicle brakes, and at which point most."""
+"""Columns that say how much earlier a vehicle brakes, and at which point the difference is largest.
+"""
 
 
 def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonObject:
-    """The price of other values of parameters against today's, by the names of the answer's
-    columns; None where the new vehicle brakes nowhere. `encounters` are new vehicles in K
-    encounters, shape (K, n).
+    """The price of new values of parameters in comparison with today's values, by the names of the
+    answer's columns. Values of `OF_BRAKING` are None if the new vehicle brakes nowhere.
+    `encounters` are the new vehicle in K encounters, shape (K, n).
     """
     today = assemble(study)
     changed = assemble(with_parameters(study, values))
@@ -59,8 +60,9 @@ def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonO
 
 
 def drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, float]:
-    """Where and when the new vehicle begins to brake at each of N points in each of K encounters,
-    shape (2, N K), NaN if it does not [m, s]; its largest deceleration [m/s^2].
+    """The positions [m] and times [s] at which the new vehicle begins to brake at each of N points
+    in each of K encounters, shape (2, N K), NaN if it does not brake; and its largest deceleration
+    [m/s^2].
     """
     onsets = list[Interval]()
     deceleration = 0.0
@@ -82,9 +84,10 @@ def drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, 
 
 
 def benign_scenes(study: Study, system: System) -> list[Point]:
-    """The benign scenes that a study names, else those that its scenarios know, in the original
-    encounter and with all searched parameters of the scenario at their lower or upper ends; there
-    may be none.
+    """The benign scenes of a study, in which nobody needs to brake: those that the study names, or
+    else those that its scenarios know. The scenarios' scenes are taken in three encounters: the
+    original one, and those with all searched parameters at their lower or at their upper ends. A
+    study may have no benign scene.
     """
     if study.repair.benign:
         return list(
@@ -109,8 +112,8 @@ def benign_scenes(study: Study, system: System) -> list[Point]:
 
 
 def needless_braking(system: System, benign: list[Point]) -> list[bool]:
-    """In which benign scenes the new vehicle brakes: the given ones, and for each speed a road
-    without anybody.
+    """Whether the new vehicle brakes in each scene: in each benign scene and, for each speed of
+    these scenes, on a road on which the vehicle sees nobody.
     """
     one_per_speed = {point.scenario.test_speed: point for point in benign}.values()
     vehicle = system.characteristics.vehicle

@@ -1,9 +1,11 @@
-"""The smallest changes of one and of two parameters that survive all known counterexamples.
+"""Finds the smallest changes of one and of two parameters that survive all known counterexamples
+(keep them safe).
 
-A change is a set of parameters; its size is the largest change of one of them. Changes on rings
-around the parameters of today, the smallest first, are tried with single cases. Only the smallest
-of those that survive is tried with all cases. Either it fails with a case, with which all changes
-are then tried, or it is the smallest change.
+A change is a set of values of the parameters, as positions in their ranges from 0 to 1. Its size is
+the largest difference of a parameter from today's value. Changes lie on rings around the parameters
+of today. They are first tried with a few hard cases, in order of their size. The smallest change
+that survives these is tried with all cases. If it fails with a case, all changes are tried with
+this case; otherwise it is the smallest change.
 """
 
 from __future__ import annotations
@@ -19,29 +21,32 @@ MOST_CHANGED = 2
 """Largest number of parameters that change together."""
 RINGS = 32
 SIDE = 12
-"""Number of sizes that are tried, and again between the size that survives and the one below; of
-places on a side of a ring. It is even, so that both parameters change everywhere.
+"""RINGS is the number of sizes that are tried. The same number is tried again between the size that
+survives and the size below it. SIDE is the number of changes on a side of a ring; it is even, so
+that no change on a ring of two parameters leaves one of them at today's value.
 """
 THINNING = 4
-"""Factor by which an ADS that needs an instance for each set of parameters has fewer rings and
-places on a side.
+"""Factor by which rings and changes on a side are fewer if the ADS needs an object for each change.
 """
 LEAST_GAIN = 0.006
-"""By how much a change of two parameters has to be smaller than that of one."""
+"""Least difference by which a change of two parameters must be smaller than a change of one."""
 CHUNK = 2048
 BATCH = 2048
-"""Number of changes that are tried at a time, the smallest first; of simulations in a batch."""
+"""Number of changes that are tried at a time, the smallest first; and number of simulations in a
+batch.
+"""
 FIRST_CASES = 512
-"""Number of the first cases with which a change is tried first; then with four times as many, and
-so on.
+"""Number of cases in the first batch with which a change is tried. Each further batch has four
+times as many cases.
 """
 
 
 class Search:
-    """Searches the smallest changes that survive cases, shape (L, n + 1 + k), worst first.
+    """Searches the smallest changes that survive the L known cases, shape (L, n + 1 + k), of which
+    the worst comes first.
 
-    Counterexamples only make the smallest change of a number of parameters larger. So `_least`, a
-    size at which there was none, is a lower bound for ever.
+    More counterexamples can only make the smallest change of a number of parameters larger. So
+    `_least`, a size up to which no change survived, stays a lower bound for ever.
     """
 
     def __init__(self, problem: RepairProblem, cases: FloatArray) -> None:
@@ -54,13 +59,14 @@ class Search:
         self._least = dict[int, float]()
 
     def add(self, cases: FloatArray) -> None:
-        """Add counterexamples, which are tried first."""
+        """Add counterexamples. New cases are tried before all others; each case is kept once."""
         rows = np.concatenate([cases, self.cases])
         self.cases = rows[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
 
     def smallest_changes(self) -> list[FloatArray]:
-        """The parameters of today if they survive all counterexamples; otherwise the smallest
-        change of one parameter and that of two, if it is smaller.
+        """The changes, shape (P,), that survive all counterexamples. If the parameters of today
+        survive, they are the only change. Otherwise: the smallest change of one parameter, and the
+        smallest change of two, if it is smaller.
         """
         today = self.problem.today
         if self._failure_of(today) is None:
@@ -75,7 +81,9 @@ class Search:
         return changes
 
     def _smallest_change(self, number: int, limit: float) -> FloatArray | None:
-        """The smallest change of a number of parameters, up to a limit."""
+        """The smallest surviving change of `number` parameters, up to the size `limit`; None if no
+        tried change survives.
+        """
         best = self._best.pop(number, None)
         if best is None or self._failure_of(best) is not None:
             best = None
@@ -99,8 +107,8 @@ class Search:
         return best
 
     def _rings(self, number: int, sizes: FloatArray) -> FloatArray:
-        """Changes of each subset of a number of parameters with these sizes; of equal ones first
-        that with the smallest sum.
+        """The changes, shape (M, P), of each subset of `number` parameters with the given sizes.
+        Changes of the same size are ordered by the sum of their differences from today.
         """
         today = self.problem.today
         ring = np.array(
@@ -119,8 +127,8 @@ class Search:
         return changes[((changes >= 0) & (changes <= 1)).all(axis=1)]
 
     def _failure_of(self, change: FloatArray) -> FloatArray | None:
-        """The worst of the first cases with which a change fails, shape (1, n + 1 + k); None if it
-        survives all.
+        """A case with which a change fails, shape (1, n + 1 + k); None if the change survives all
+        cases. The case is the worst of the first batch with a failure.
         """
         start = 0
         size = FIRST_CASES
@@ -139,7 +147,9 @@ class Search:
         return None
 
     def _first_survivor(self, changes: FloatArray) -> int | None:
-        """The row of the first change, shape (M, P), that survives all cases; None if none does."""
+        """The row of the first of M changes, shape (M, P), that survives all cases; None if no
+        change survives.
+        """
         for start in range(0, len(changes), CHUNK):
             rows = np.arange(start, min(start + CHUNK, len(changes)))
             rows = rows[self._survivors(changes[rows], self._hardest)]
@@ -152,7 +162,9 @@ class Search:
         return None
 
     def _survivors(self, changes: FloatArray, cases: FloatArray) -> IntArray:
-        """The rows of the changes that survive cases; few at a time."""
+        """The rows of the changes that survive `cases`. Each batch has about `BATCH`
+        simulations.
+        """
         alive = np.arange(len(changes))
         while cases.size and alive.size:
             count = max(1, BATCH // len(alive))

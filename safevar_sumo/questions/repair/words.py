@@ -1,6 +1,6 @@
-"""What `repair` can say.
+"""The sentences of `repair`.
 
-`{safe}` is what all vehicles do, and `{wear}` is the wear that they may have.
+The slot `{safe}` says what all vehicles do; `{wear}` is the wear that vehicles may have.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ NOT_NECESSARY = (
         " required wear that any driving system can keep safe {safe}."
     ),
 )
-"""If full braking keeps all vehicles safe, and if not."""
+"""The first sentence is for a promise in which full braking keeps all vehicles safe; the second
+sentence is for any other promise.
+"""
 WORST = evidence("The worst vehicle {ending}.")
 NOTHING_FOUND = answer(
     "No repair was found among the changes of one or two parameters. The parameters that may"
