@@ -1,7 +1,7 @@
-"""Cases: a vehicle, the number of the world in which it drives, and its place on the axes of that
-world's encounters; and the search for the case that leaves least to the limit.
+"""Searches for the worst case. A case is a vehicle, the number of the world in which it drives, and
+the place of its encounter on the axes of this world. The search is an evolutionary algorithm.
 
-Nothing here knows of studies: a judge says what cases leave.
+Nothing in this module knows of studies: a judge returns the robustness of cases.
 """
 
 from __future__ import annotations
@@ -15,34 +15,37 @@ from numpy.random import Generator
 from safevar_sumo.records import FloatArray
 
 CaseJudge = Callable[[FloatArray], FloatArray]
-"""What each of M cases leaves to the limit, shape (M,): below 0 it is unsafe; infinite where it
-does not count.
+"""Returns the robustness of M cases (their distance to the limit of the criterion), shape (M,). A
+case is unsafe below 0, and does not count at infinity.
 """
 LEAST_SIMULATIONS = 1000
-"""Fewest simulations that search for a counterexample before a value is printed as one that holds.
-"""
+"""Fewest simulations that must search for a counterexample before a value is printed as safe."""
 USUAL_BUDGET = 5000
-"""Simulations that search for a counterexample to a claim."""
+"""Usual number of simulations that search for a counterexample to a claim."""
 PARENTS = 32
-"""The worst cases so far, from which the next ones come."""
+"""Number of the worst cases so far from which the next generation comes."""
 STEP, PULL, DIFFERENCE = 0.1, 0.5, 0.7
-"""Step of a mutation, as a share of the way to a random value; share of the way to a worse parent;
-factor on the difference of two parents (F of differential evolution; Storn and Price 1997).
+"""STEP is the step of a mutation, as a share of the way to a random value. PULL is the share of the
+way from one parent to another. DIFFERENCE is the factor on the difference of two further parents (F
+of differential evolution; Storn and Price 1997).
 """
 OTHER_WORLD = 0.1
 """Share of children that drive in another world than their parents."""
 
 
 class Space(NamedTuple):
-    """All cases between two ends, each of shape (n + 1 + k,): n values of a vehicle, the number of
-    a world, and k places from 0 to 1.
+    """All cases between two ends. A case has n values of a vehicle, the number of a world, and k
+    places from 0 to 1.
 
     Attributes
     ----------
+    lower, upper
+        The ends, shape (n + 1 + k,).
     size
         The number n of a vehicle's values.
     center
-        The vehicle from which a case may differ in one value alone, shape (n,); None if in all.
+        A vehicle, shape (n,), from which a case may differ in only one value; None if a case may
+        differ in all values.
     """
 
     lower: FloatArray
@@ -52,7 +55,9 @@ class Space(NamedTuple):
 
     @property
     def width(self) -> FloatArray:
-        """The widths of the vehicle's values; infinite where there is only one."""
+        """The widths of the ranges of a vehicle's values, shape (n,); infinite for a value that
+        cannot change.
+        """
         width = (self.upper - self.lower)[: self.size]
         return np.where(width > 0, width, np.inf)
 
@@ -61,7 +66,9 @@ class Space(NamedTuple):
         lower: FloatArray,
         upper: FloatArray,
     ) -> Space:
-        """The cases of other vehicles in the same worlds and places."""
+        """The space with the same worlds and places, but with other ends of the vehicle's values,
+        shape (n,).
+        """
         return self._replace(
             lower=np.concatenate([lower, self.lower[self.size :]]),
             upper=np.concatenate([upper, self.upper[self.size :]]),
@@ -72,7 +79,9 @@ class Space(NamedTuple):
         number: int,
         rng: Generator,
     ) -> FloatArray:
-        """Random cases, with half of the vehicles' values at ends."""
+        """Random cases. Each value of a vehicle is at an end of its range with a probability of one
+        half.
+        """
         points = rng.random((number, len(self.lower)))
         at_ends = rng.random(points.shape) < 0.5
         at_ends[:, self.size :] = False
@@ -84,7 +93,9 @@ class Space(NamedTuple):
         cases: FloatArray,
         rng: Generator,
     ) -> FloatArray:
-        """Cases moved into the space."""
+        """Cases that are moved into the space. With a `center`, a single value of each vehicle
+        stays changed: it is chosen at random, and a larger change has a better chance.
+        """
         cases = np.clip(cases, self.lower, self.upper)
         if self.center is None:
             return cases
@@ -101,8 +112,9 @@ class Space(NamedTuple):
         number: int,
         rng: Generator,
     ) -> FloatArray:
-        """Half of them mix two parents, and change about one value; half move towards a worse
-        parent, and by a difference of two others. The worst parents come first.
+        """Make `number` new cases from parents. One half of the new cases mixes two parents, and
+        changes about one value. The other half moves from one parent towards another, and by a
+        difference of two further parents (differential evolution).
         """
         rows = rng.integers(len(parents), size=(4, number))
         mothers, fathers, plus, minus = parents[rows]
@@ -115,7 +127,8 @@ class Space(NamedTuple):
         is_odd = np.arange(number)[:, np.newaxis] % 2
         cases = np.where(is_odd, neighbours, mutants)
 
-        # A place has no meaning in another world.
+        # The number of a world must not be mixed: a child drives in the world of its first parent
+        # or, seldom, in a random world.
         column = self.size
         is_elsewhere = rng.random(number) < OTHER_WORLD
         worlds = np.where(is_elsewhere, random[:, column], mothers[:, column])
@@ -128,7 +141,9 @@ class Space(NamedTuple):
         random: FloatArray,
         rng: Generator,
     ) -> FloatArray:
-        """Cases of which about one value is random, a step towards that, or an end."""
+        """Mutated cases. On average a little more than one value changes: it becomes the random
+        value, makes a step towards the random value, or becomes an end of its range.
+        """
         ends = np.where(rng.random(cases.shape) < 0.5, self.lower, self.upper)
         number_open = max(int(np.count_nonzero(self.lower < self.upper)), 1)
         lot = rng.random(cases.shape) * number_open
@@ -139,8 +154,16 @@ class Space(NamedTuple):
 
 
 class SearchPlan(NamedTuple):
-    """How a search for counterexamples goes: the largest number of cases, those of a generation,
-    and the generations that follow the first with an unsafe case.
+    """The plan of a search for counterexamples.
+
+    Attributes
+    ----------
+    budget
+        Largest number of cases of the search.
+    generation
+        Number of cases of a generation.
+    sequel
+        Number of generations that follow the first generation with an unsafe case.
     """
 
     budget: int
@@ -149,8 +172,16 @@ class SearchPlan(NamedTuple):
 
 
 class Counterexamples(NamedTuple):
-    """What a search met: the worst cases, worst first, with all unsafe ones, shape (K, n + 1 + k);
-    what they leave, shape (K,); and the number of all.
+    """The result of a search for counterexamples.
+
+    Attributes
+    ----------
+    cases
+        The worst cases, and all unsafe cases, the worst first, shape (K, n + 1 + k).
+    robustness
+        Their robustness, shape (K,).
+    simulated
+        Number of all cases of the search.
     """
 
     cases: FloatArray
@@ -164,7 +195,7 @@ class Counterexamples(NamedTuple):
 
     @property
     def least(self) -> float:
-        """What the worst case leaves; infinite without one that counts."""
+        """The robustness of the worst case; infinite if no case counts."""
         return float(self.robustness.min(initial=np.inf))
 
     def after(
@@ -172,7 +203,7 @@ class Counterexamples(NamedTuple):
         cases: FloatArray,
         robustness: FloatArray,
     ) -> Counterexamples:
-        """With the worst of further cases."""
+        """The result after further cases with their robustness."""
         counts = np.isfinite(robustness)
         every_case = np.concatenate([self.cases, cases[counts]])
         values = np.concatenate([self.robustness, robustness[counts]])
@@ -184,9 +215,11 @@ class Counterexamples(NamedTuple):
 
 
 CaseSearch = Callable[[Space, FloatArray], Counterexamples]
-"""Searches a space for unsafe cases, from known ones on, shape (K, n + 1 + k)."""
+"""Searches a space for unsafe cases. The search begins with known cases, shape (K, n + 1 + k)."""
 Generations = Steps[FloatArray, FloatArray, Counterexamples]
-"""The generations of a search, which takes what the cases of each leave."""
+"""A search as a generator: it yields the cases of a generation, is sent their robustness, and
+returns the result.
+"""
 
 
 def search_cases(
@@ -196,8 +229,8 @@ def search_cases(
     plan: SearchPlan,
     rng: Generator,
 ) -> Counterexamples:
-    """Search a space for the cases that leave least, from known ones on, in generations; it ends
-    soon after a case is unsafe.
+    """Search a space for the cases with the least robustness, in generations. The search begins
+    with the known cases `start`, and ends `plan.sequel` generations after the first unsafe case.
     """
     return search_side_by_side(judge, [generations_of(space, start, plan, rng)])[0]
 
@@ -206,8 +239,8 @@ def search_side_by_side(
     judge: CaseJudge,
     searches: Sequence[Generations],
 ) -> list[Counterexamples]:
-    """Several searches: a generation of all meets the judge in one batch, as few large batches cost
-    less than many small ones.
+    """Run several searches at the same time. The judge gets a generation of each search in one
+    batch, because few large batches cost less than many small ones.
     """
     results = dict[int, Counterexamples]()
     judged: dict[int, Any] = dict.fromkeys(range(len(searches)))
@@ -233,7 +266,7 @@ def generations_of(
     plan: SearchPlan,
     rng: Generator,
 ) -> Generations:
-    """The generations of a search of a space."""
+    """The generations of a search of a space (`search_cases`)."""
     size = plan.generation
     generations = plan.sequel
     results = Counterexamples(start[:0], np.zeros(0))

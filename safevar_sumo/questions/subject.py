@@ -1,4 +1,4 @@
-"""Subjects of questions: a study, or results read from their directory."""
+"""Loads the subject of a question: a study, or the results in a directory."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case, Subject
 
 MAX_CHANGES_NAMED = 3
-"""Maximum number of changes that an error names."""
+"""Maximum number of changed inputs that an error names."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def study_or_case(
         `as_it_is_now` is set for a study.
     """
     if isinstance(source, str | Path):
-        # `os.path` accepts any text, unlike paths.
+        # A text that is no legal path must give an error of its own: `os.path` accepts any text.
         names = study_names()
         is_directory = os.path.isdir(source)
         is_study = str(source) in names
@@ -174,13 +174,13 @@ def study_or_case(
 def part_of(
     subject: Subject, ranges: bool, point: str | None, up_to: str | None
 ) -> Subject:
-    """A study in the ranges of its axes, at a test or point, and up to a value of an axis, as far
-    as these are given; results at a test or point alone.
+    """The part of a subject that a question is asked about: of a study, see `part_of_study`.
+    Results may only be cut to a test or point of the matrix.
 
     Raises
     ------
     InputError
-        If the study has no such part.
+        If the study has no such part, or if results are cut in another way.
     """
     from safevar_sumo.questions.part import part_of_study  # SUMO takes long to load
 
@@ -193,7 +193,7 @@ def part_of(
 
 
 def refuse_part_of_results(*, ranges: bool, up_to: str | None) -> None:
-    """Refuse options that results do not have."""
+    """Refuse options that cut encounters, if they are given for results."""
     if ranges or up_to is not None:
         option = "ranges" if ranges else "up_to"
         raise InputError(
@@ -209,7 +209,7 @@ def study_in(subject: Subject) -> Study:
 
 
 def with_own_set(subject: Subject) -> Any:
-    """A subject whose study has its own parameter set of the vehicle model alone."""
+    """The same subject, but its study has only its own parameter set of the vehicle model."""
     study = replace_in(study_in(subject), spread={})
     if isinstance(subject, Study):
         return study
@@ -217,13 +217,13 @@ def with_own_set(subject: Subject) -> Any:
 
 
 def case_at(case: Case, point: str) -> Case:
-    """Results at one point of the study's matrix: their solutions and the original vehicle,
-    simulated again there.
+    """Results at a test or point of the study's matrix alone: the solutions and the original
+    vehicle are simulated again there.
 
     Raises
     ------
     InputError
-        If the study has no such point.
+        If the study has no such test or point.
     """
     from safevar_sumo.questions.part import at_point
     from safevar_sumo.sumo.matrix import drive_and_score
@@ -238,8 +238,8 @@ def case_at(case: Case, point: str) -> Case:
 
 
 def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[str]:
-    """Changes of the inputs since the results were computed; empty for imported results, which
-    record no inputs.
+    """The inputs that have changed since the results were computed, each in a sentence. Imported
+    results record no inputs: then there are no changes.
 
     Raises
     ------
@@ -249,7 +249,6 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
     from safevar_sumo.campaign.inputs import manifest_now
     from safevar_sumo.sumo.system import assemble
 
-    # Inputs of the results that have changed since.
     manifest = read_manifest(directory)
     study = case.study
     if "imported" in manifest:
@@ -259,7 +258,6 @@ def changes_since(directory: Path, case: Case, *, as_it_is_now: bool) -> list[st
         text for _, text, matters in manifest_differences(manifest, present) if matters
     ]
 
-    # Without `as_it_is_now` they are refused.
     if changes and not as_it_is_now:
         names = "; ".join(changes[:MAX_CHANGES_NAMED])
         if len(changes) > MAX_CHANGES_NAMED:

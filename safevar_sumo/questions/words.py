@@ -1,4 +1,4 @@
-"""Words that commands, figures and reports share: outcomes, changes, numbers, commands."""
+"""Phrases that commands, figures and reports share: outcomes, changes, numbers and commands."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ OUTCOME_VERBS = {
     Outcome.INVALID_TEST: "drives an invalid test, which counts neither as failure nor as success",
     Outcome.INFEASIBLE: "violates a constraint of the study",
 }
-"""How a run ended, as the verb of a sentence; a collision is described with its speed instead."""
+"""How a run ended, as the verb of a sentence. A collision is described with its speed instead."""
 
 
 VALID_FOR = note("Valid for: {scope}.")
 UNSAFE_MEANS = note("Unsafe means: {description}.")
 EXACT = ".15g"
-"""How values are printed with which a vehicle was simulated: all their digits."""
+"""Format that prints a value with all its digits, so that a reader can simulate it again."""
 LOST_SHARE = 0.05
-"""A value is printed with all its digits where rounding would change more of it."""
+"""A value is printed with all its digits if rounding would change it by more than this share."""
 
 
 def ending_in_words(outcome: str, safety_degree: float, contact: float) -> str:
@@ -51,8 +51,9 @@ def ending_in_words(outcome: str, safety_degree: float, contact: float) -> str:
 
 
 def collision_in_words(closing_speed: float, own_speed: float, digits: int = 2) -> str:
-    """How a vehicle collides [m/s], such as `collides at 3.17 m/s`; with its own speed if that is
-    another one, as the struck body moves along the lane.
+    """How a vehicle collides, such as `collides at 3.17 m/s`. The vehicle's own speed is added if
+    it differs from the closing speed, because the struck body moves along the lane. Speeds are in
+    m/s.
     """
     closing, driven = (f"{speed:.{digits}f}" for speed in (closing_speed, own_speed))
     if closing == driven:
@@ -66,9 +67,9 @@ def change_texts(
     *,
     are_printed: bool = False,
 ) -> list[str]:
-    """The values that differ from the original values, in the order of the study, such as `mass
-    from 2404 to 2600 kg (+8.2 %)`, without a share of an original that is 0. Values that
-    `are_printed` have their digits already.
+    """The changed values of a vehicle, in the order of the study, such as `mass from 2404 to 2600
+    kg (+8.2 %)`. The percentage is left out if the original value is 0. With `are_printed` the
+    values are rounded already, and all their digits are printed.
     """
     texts = []
     for item in characteristics:
@@ -81,7 +82,8 @@ def change_texts(
                 else ""
             )
             rounded = item.text(value)
-            # Over many decades, or next to the original, its decimals would tell another value.
+            # A value that is close to 0 in a wide domain, or close to the original, would look like
+            # another value with the usual decimals.
             error = abs(float(rounded) - value)
             is_lost = float(rounded) == original or error > LOST_SHARE * abs(value)
             text = f"{value:{EXACT}}" if are_printed or is_lost else rounded
@@ -92,8 +94,8 @@ def change_texts(
 
 
 def undecidable_in_words(items: Sequence[Characteristic]) -> str:
-    """That a workshop cannot check limits of characteristics, which are too near to the original,
-    and what to do.
+    """Sentences that say that a workshop cannot check limits of characteristics, because they are
+    too near to the original values, and what to do.
     """
     sentences = [
         f"A workshop cannot check the limit of {item.short_name}: the allowed change is smaller"
@@ -109,8 +111,8 @@ def undecidable_in_words(items: Sequence[Characteristic]) -> str:
 
 
 def precise_in_words(items: Iterable[Characteristic]) -> str:
-    """The characteristics among some of which the study states how precisely they are measured; ""
-    for none.
+    """The characteristics for which the study states a measuring error, with this error, as a
+    phrase; "" if there are none.
     """
     phrases = [
         f"{item.short_name} (measured to within {item.error:g}{item.suffix})"
@@ -126,7 +128,7 @@ def place_in_words(
     *,
     are_printed: bool = False,
 ) -> str:
-    """The searched parameters of the scenario, such as `speed 59.5 km/h`; empty without any."""
+    """The searched parameters of the scenario, such as `speed 59.5 km/h`; "" without any."""
     phrases = []
     for item in characteristics.scenario:
         value = values[item.name]
@@ -141,7 +143,9 @@ def encounter_in_words(
     *,
     are_printed: bool = False,
 ) -> str:
-    """The place in a sentence, such as ` in an encounter with speed 59.5 km/h`."""
+    """The end of a sentence that states the encounter, such as ` in an encounter with speed 59.5
+    km/h`; "" without searched parameters.
+    """
     place = place_in_words(characteristics, values, are_printed=are_printed)
     return f" in an encounter with {place}" if place else ""
 
@@ -161,7 +165,7 @@ def join_phrases(phrases: Iterable[str], conjunction: str = "and") -> str:
 
 
 def count_in_words(count: float, total: int) -> str:
-    """How many of a number: `none of the 24`, `1 of the 24`, `all 24`."""
+    """A count with its total: `none of the 24`, `1 of the 24`, `all 24`."""
     if count == total > 1:
         return f"all {total:,}"
     number = f"{count:,.1f}".removesuffix(".0") if count else "none"
@@ -198,7 +202,9 @@ def points_in_words(
 
 
 def percentage(share: float) -> str:
-    """A share as a percentage with the digits that decide, without its sign: `37`, `0.043`."""
+    """A share as a percentage without the percent sign: `37`, `0.043`. It has two significant
+    digits, and no decimals from 10 on.
+    """
     value = 100 * share
     return f"{value:.0f}" if value >= 9.95 else f"{value:.2g}"
 
@@ -209,7 +215,7 @@ def interval_in_words(low: float, high: float) -> str:
 
 
 def bound_in_words(at_most: float) -> str:
-    """The upper bound of a share, which is one-sided."""
+    """The one-sided upper bound of a share, with its confidence, as a phrase."""
     return f"with {100 * CONFIDENCE:g} % confidence at most {100 * at_most:.3g} %"
 
 
@@ -217,13 +223,13 @@ def two_decimals(value: float | None) -> str:
     """A value with two decimals, never `-0.00`; `-` if undefined."""
     if value is None or math.isnan(value):
         return "-"
-    # -0.0 + 0.0 is 0.0.
+    # Adding 0.0 turns -0.0 into 0.0.
     return f"{round(value, 2) + 0.0:.2f}"
 
 
 def counted_in_words(study: Study, omissions: int | None = None) -> list[str]:
-    """What a vehicle of a study whose encounters are ranges meets, and how many encounters do not
-    count, in a sentence; empty for any other study.
+    """Sentences on a study whose encounters are ranges: which encounters vehicles meet, which
+    encounters count, and how many were left out. Any other study has none.
     """
     if not study.ranges:
         return []
@@ -238,7 +244,9 @@ def counted_in_words(study: Study, omissions: int | None = None) -> list[str]:
 
 
 def notes_on(unsafe: Unsafe, *texts: str) -> list[Sentence]:
-    """Notes, among them what is unsafe where that is not a collision alone."""
+    """Notes with the given texts and the criterion's remark. A last note says what unsafe means, if
+    that is not only a collision.
+    """
     notes = [note(text) for text in (*texts, unsafe.remark)]
     if not unsafe.is_collision:
         notes.append(UNSAFE_MEANS(description=unsafe.description))
@@ -246,8 +254,8 @@ def notes_on(unsafe: Unsafe, *texts: str) -> list[Sentence]:
 
 
 def demanded_in_words(study: Study) -> list[str]:
-    """What the original vehicle must keep in a searched encounter, in a sentence; empty for any
-    other study.
+    """A sentence on the clearance that the original vehicle must keep, so that an encounter counts;
+    empty if the study lists its encounters.
     """
     sentence = (
         "An encounter counts only if the original vehicle keeps at least"
@@ -257,7 +265,7 @@ def demanded_in_words(study: Study) -> list[str]:
 
 
 def constraints_in_words(study: Study) -> list[str]:
-    """The constraints that all settings satisfy, in a sentence; empty if the study has none."""
+    """A sentence on the constraints that all settings satisfy; empty without constraints."""
     characteristics = study.vehicle.characteristics
     conditions = "; ".join(
         f"{constraint.quantity} {constraint.bounds_in_words(characteristics)}"
