@@ -162,8 +162,7 @@ class Search:
         return None
 
     def _survivors(self, changes: FloatArray, cases: FloatArray) -> IntArray:
-        """The rows of the changes that survive `cases`. Each batch has about `BATCH` simulations.
-        """
+        """The rows of the changes that survive `cases`; a batch has about `BATCH` simulations."""
         alive = np.arange(len(changes))
         while cases.size and alive.size:
             count = max(1, BATCH // len(alive))
