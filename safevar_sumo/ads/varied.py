@@ -1,6 +1,4 @@
-"""An ADS whose parameters differ from vehicle to vehicle, and the parameters that a repair may
-change.
-"""
+"""An ADS with other parameters in each vehicle, and the parameters that a repair may change."""
 
 from __future__ import annotations
 
@@ -19,12 +17,13 @@ from safevar_sumo.study import FreeParameter
 CHANGEABLE = msgspec.convert(
     shipped_table("ads/changeable.toml"), dict[str, dict[str, FreeParameter]]
 )
-"""Parameters that a repair may change, by shipped ADS and name: changeable.toml beside this module.
+"""The parameters that a repair may change, by the name of the shipped ADS and of the parameter. The
+file changeable.toml beside this module has them.
 """
 
 
 class VariedAds(Ads):
-    """An ADS that has other values of some parameters in each vehicle.
+    """An ADS with other values of some parameters in each vehicle.
 
     Parameters
     ----------
@@ -33,14 +32,14 @@ class VariedAds(Ads):
     names
         Names of the parameters that vary.
     values
-        Their values, shape (m, number of names). N vehicles are N / m groups, and vehicle i of each
-        group has row i.
+        Values of these parameters, shape (m, number of names). N vehicles consist of N / m groups.
+        Vehicle i of each group has row i.
 
     Notes
     -----
-    A driving system that steps all vehicles at once gets an array of N values where its field
-    declares a number, so it computes with its parameters value by value. What it says of itself by
-    constants, such as `max_vehicles`, is not asked here.
+    A driving system that drives all vehicles at once gets an array of N values in each varied
+    field. It must compute with the field value by value. Constants of the driving system, such as
+    `max_vehicles`, are not read from this object.
     """
 
     def __init__(self, ads: Ads, names: tuple[str, ...], values: FloatArray) -> None:
@@ -58,7 +57,7 @@ class VariedAds(Ads):
                 for driver, value in zip(drivers, column.tolist(), strict=True):
                     setattr(driver, name, value)
             return varied, drivers
-        # Frozen ones get the values, too.
+        # Frozen records refuse new values of their fields, unless msgspec sets the values.
         set_field = (
             force_setattr if isinstance(varied, msgspec.Struct) else object.__setattr__
         )
@@ -78,7 +77,9 @@ class VariedAds(Ads):
 
 
 def with_tau(ads: Ads, tau: FloatArray | None) -> Ads:
-    """The ADS, with the headways `tau` of N vehicles [s] if it has a parameter for them."""
+    """The ADS with the headways `tau` of N vehicles [s]. An ADS without a parameter for the headway
+    stays.
+    """
     if tau is None or not ads.tau_parameter:
         return ads
     if not isinstance(ads, VariedAds):
