@@ -1,4 +1,4 @@
-"""Settings evaluated in one call: `sv.evaluate`."""
+"""Evaluates many settings in one call: `sv.evaluate`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SETTINGS_FORMAT = (
     " characteristic that is changed, or an array of numbers, shape (M, n)"
 )
 SETTINGS = "settings"
-"""The phase of progress."""
+"""The name of the phase of progress."""
 
 
 def evaluate(
@@ -100,7 +100,7 @@ def evaluate(
             loaded_study, simulated, pool, jobs, report_progress
         )
 
-    # The evaluations are of no algorithm and run.
+    # The frame has columns for an algorithm and its run, which these evaluations do not have.
     frame = evaluations_frame(characteristics.names, [(("", 0), evaluations)]).drop(
         columns=["algorithm", "run"]
     )
@@ -117,8 +117,8 @@ def evaluate_with_workers(
     jobs: int | None = None,
     progress: Progress = show_no_progress,
 ) -> Evaluations:
-    """Simulate settings, shape (M, n), in worker processes, including settings that violate the
-    study's constraints.
+    """Simulate settings, shape (M, n), in worker processes. Settings that violate the study's
+    constraints are simulated, too.
     """
     from safevar_sumo.questions.evaluator import open_evaluator
 
@@ -130,7 +130,7 @@ def evaluate_with_workers(
 def _read_settings(
     settings: Any, characteristics: CharacteristicSet, beyond: bool
 ) -> tuple[FloatArray, Any]:
-    """Convert a user's settings into an array of shape (M, n), and the index of its rows; refuses
+    """Convert a user's settings into an array of shape (M, n), and the index of its rows. Refuse
     illegal values.
     """
     import pandas as pd
@@ -143,7 +143,7 @@ def _read_settings(
     ):
         settings = pd.DataFrame(list(settings), index=range(len(settings)))
     try:
-        # A table may leave out characteristics; an array has all.
+        # A table may leave out characteristics. An array has a column for each characteristic.
         if isinstance(settings, pd.DataFrame):
             for name in settings.columns:
                 check_name(
@@ -181,7 +181,9 @@ def _read_settings(
 
 
 def _check_numbers(name: str, column: pd.Series) -> None:
-    """Refuse a value of a column that is neither a number nor missing, such as a list or a text."""
+    """Refuse a column with a value that is neither a number nor missing, such as a list or a
+    text.
+    """
     if column.dtype.kind in "fiu":
         return
     for row, value in enumerate(column):
