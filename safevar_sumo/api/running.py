@@ -1,4 +1,4 @@
-"""Run a study on this machine or on a cluster."""
+"""Runs a study on this machine or on a cluster: `sv.run`."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def run(
     if out == "":
         raise InputError("out", "''", "a directory")
 
-    # A pool that the user gave stays open.
+    # A pool of the caller stays open after the search.
     pool_context = open_pool(jobs, cluster) if pool is None else nullcontext(pool)
     with pool_context as workers, open_progress(progress) as show:
         run_campaign(
@@ -105,12 +105,12 @@ def run(
 
 
 def load_for_search(study: StudyLike) -> tuple[Study, System]:
-    """Load a study, assemble its system and check its algorithms.
+    """Load a study, assemble its system, and check its algorithms.
 
     Raises
     ------
     InputError
-        If one of its names or parameters cannot be used.
+        If a name or a parameter of the study cannot be used.
     """
     loaded_study, system = load_and_assemble(study)
     check_algorithms(loaded_study, system)
