@@ -1,4 +1,4 @@
-"""What `study` can say."""
+"""The sentences of the answers of `study`."""
 
 from __future__ import annotations
 
