@@ -30,16 +30,16 @@ CLUSTER = (
     " configuration: distributed.comm.tls.ca-file and .client.cert, .client.key"
 )
 CONNECT_TIMEOUT = 10.0
-"""Longest time for the scheduler to answer [s]."""
+"""Longest time in which the scheduler must answer [s]."""
 _locks = list[portalocker.Lock]()
-"""The locks of the numbers that this process has."""
+"""Locks that keep the numbers of this process from other processes."""
 _libsumo_lock = threading.Lock()
-"""A process has one libsumo."""
+"""A process has only one libsumo: one thread at a time may simulate."""
 
 
 @contextmanager
 def connect(address: str) -> Iterator[Any]:
-    """Dask's client of the scheduler at an address.
+    """Connect to the Dask scheduler at an address, and give its client.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def connect(address: str) -> Iterator[Any]:
         from distributed import Client
     except ImportError:
         raise missing_extra("cluster", "Dask is not installed", "cluster") from None
-    # This package reports errors itself.
+    # Dask would print errors that this package reports itself.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
@@ -66,11 +66,11 @@ def connect(address: str) -> Iterator[Any]:
 
 
 def everywhere(client: Any, function: Work, *arguments: Any) -> None:
-    """Carry out a function in each worker of a cluster; raises its error."""
+    """Call a function in each worker of a cluster. Errors of the function are raised here."""
     try:
         client.run(_carry_out, pickle.dumps((function, arguments)), "")
     except (AttributeError, ImportError, TypeError) as error:
-        # Another version knows no such function.
+        # A worker with another version of this package may lack the function.
         raise InputError(
             "cluster",
             f"a worker has another version of safevar_sumo: {describe_error(error)}",
@@ -79,8 +79,9 @@ def everywhere(client: Any, function: Work, *arguments: Any) -> None:
 
 
 class ClusterWorker:
-    """Any worker of a cluster. Dask itself gives the job of a dead worker to others, as often as
-    its configuration says (`distributed.scheduler.allowed-failures`).
+    """A worker that stands for any worker of a cluster. If a worker of the cluster dies, Dask
+    itself gives the job to another worker, as often as Dask's configuration says
+    (`distributed.scheduler.allowed-failures`).
     """
 
     def __init__(self, client: Any) -> None:
@@ -88,7 +89,7 @@ class ClusterWorker:
         self._command = client.id
 
     def submit(self, function: Work, *arguments: Any) -> Future[Any]:
-        # Dask's own serialization turns records into lists.
+        # Dask's own serialization would turn records into lists: the job is pickled instead.
         future: Future[Any] = self._executor.submit(
             _carry_out, pickle.dumps((function, arguments)), self._command
         )
@@ -104,12 +105,14 @@ class ClusterWorker:
         return ""
 
     def end(self) -> None:
-        # This cancels the jobs.
+        # The shutdown of the executor cancels its jobs.
         self._executor.shutdown(wait=False)
 
 
 def _carry_out(packed_job: bytes, command: str) -> Any:
-    """Carry out a job of a command, which a client has, in a worker of the cluster."""
+    """Carry out a job in a worker of the cluster. `command` is the id of the client that sent the
+    job.
+    """
     function, arguments = pickle.loads(packed_job)
     with _libsumo_lock:
         if this_process.last_words is None:
@@ -122,7 +125,9 @@ def _carry_out(packed_job: bytes, command: str) -> Any:
 
 
 def _own_number() -> int:
-    """The least number that no other worker on this machine has; this process keeps it."""
+    """The least number that no other worker on this machine has. A lock keeps the number for this
+    process.
+    """
     for number in range(MAX_JOBS):
         path = Path(gettempdir(), f"safevar-worker-{number}.lock")
         lock = portalocker.Lock(path, "a", timeout=0, fail_when_locked=True)
@@ -134,7 +139,7 @@ def _own_number() -> int:
 
 
 def has_caller() -> bool:
-    """Whether somebody waits for this job: false in a worker of a cluster if its command has
+    """Return whether somebody waits for this job. False in a worker of a cluster whose command has
     ended.
     """
     if "distributed" not in sys.modules:
@@ -144,6 +149,6 @@ def has_caller() -> bool:
     try:
         worker = get_worker()
     except ValueError:
-        # This process is no worker of a cluster.
+        # `get_worker` raises this error in a process that is no worker of a cluster.
         return True
     return bool(worker.state.tasks[worker.get_current_task()].state != "cancelled")
