@@ -1,4 +1,4 @@
-"""The inputs of results besides the study itself, such as versions and digests of files."""
+"""The inputs of results in addition to the study itself, such as versions and digests of files."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from safevar_sumo.sumo.network import open_network
 from safevar_sumo.sumo.system import System
 
 PLATFORM = {"system": platform.system(), "machine": platform.machine()}
-"""Properties of this machine that may affect the last bit of a result."""
+"""Properties of this machine that may change the last bit of a result."""
 
 
 def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> JsonObject:
-    """The manifest of a study with the inputs of its results as they are now: plain values that are
-    the same in every process.
+    """The manifest of a study with the present inputs of its results. The manifest has plain
+    values, which are the same in every process.
 
-    `used` are names of further files, which user code was seen to load; those that exist belong to
+    `used` are names of further files, which user code was seen to load. Files that exist belong to
     the inputs.
     """
     identity = {
@@ -55,7 +55,7 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
 
 
 def refuse_changed_inputs(study: Study, system: System, manifest: JsonObject) -> None:
-    """Raise an error if the inputs of a study's results are no longer those of a manifest."""
+    """Raise an error if the inputs of a study's results differ from the inputs in a manifest."""
     now = manifest_now(study, system, manifest["files"])
     for _, text, _ in manifest_differences(manifest, now):
         raise InputError(
@@ -66,8 +66,8 @@ def refuse_changed_inputs(study: Study, system: System, manifest: JsonObject) ->
 
 
 def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
-    """Digests, by name, of the files that a study's results depend on: of its networks, its user
-    code and FMUs, the data files that it names, and those of the names `used` that exist.
+    """The digests, by name, of the files on which a study's results depend: the files of its
+    networks, user code, FMUs and data files, and the files with the names `used` that exist.
     """
     places = study.origin.places
     networks = {point.scenario.network for point in system.points} - {""}
