@@ -1,5 +1,5 @@
-"""A share of a study's runs, which one worker carries out together: their searches wait for common
-batches.
+"""A share of a study's runs, which a worker carries out together. The searches of these runs wait
+for common batches.
 """
 
 from __future__ import annotations
@@ -42,24 +42,24 @@ from safevar_sumo.results import (
 from safevar_sumo.study import Study
 
 MAX_SKIPPED = 0.1
-"""Largest share of settings that a study skips because they fail."""
+"""Largest share of failed settings that a study may skip."""
 MAX_NAMES = 6
-"""Largest number of runs that the name of a share lists."""
+"""Largest number of runs that the text of a share names."""
 
 
 class Share(NamedTuple):
-    """Some of a study's runs.
+    """A part of a study's runs.
 
     Attributes
     ----------
     keys
-        The runs.
+        The names of the runs.
     directory
         The directory of the journals, which the worker must see.
     manifest
-        The inputs of the study's results, which the worker must share.
+        The inputs of the study's results, which must be the worker's inputs, too.
     original
-        The original vehicle's evaluation.
+        The evaluation of the original vehicle.
     retry_failed
         Whether settings are simulated again that failed before.
     """
@@ -79,7 +79,8 @@ class Share(NamedTuple):
 
 
 def carry_share(task: Task, share: Share) -> list[RunResult]:
-    """Carry out runs in rounds, each of which evaluates all settings that their searches wait for.
+    """Carry out the runs of a share in rounds. In each round, all settings are evaluated for which
+    the searches wait.
 
     Raises
     ------
@@ -94,7 +95,8 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
             f"a worker does not see {share.directory}",
             "a directory on a disk that all workers share",
         )
-    # Before: this worker may have other files. Afterwards: somebody may have edited them meanwhile.
+    # This worker may have other files than the caller. The second call at the end finds files that
+    # were edited during the runs.
     study = task.study
     refuse_changed_inputs(study, system_of(study), share.manifest)
     with about(study.source), ExitStack() as stack:
@@ -102,8 +104,8 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
         for key in share.keys:
             run = closing(_begin(task, share, key))
             runs.append(stack.enter_context(run))
-        # Each search goes on until it asks for settings that are in no journal; a run's settings
-        # are neighbours.
+        # Each search goes on until it asks for settings that are in no journal. The settings of a
+        # run follow each other, so that `groupby` finds them.
         while requests := [(run, setting) for run in runs for setting in run.look_up()]:
             batches = math.ceil(len(requests) / task.batch_size)
             for rows in np.array_split(np.arange(len(requests)), batches):
@@ -119,16 +121,18 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
         try:
             repeat_first_batch(study)
         except UserCodeError:
-            # What the journals hold is not repeatable, and is not continued.
+            # The journals hold results that cannot be repeated: nobody may continue from these
+            # journals.
             for key in share.keys:
                 journal_file(share.directory, str(key)).unlink(missing_ok=True)
             raise
-        # SUMO repeats the same settings whether a run was searched now or read from its journal.
+        # `finish` draws the sample for SUMO with new random numbers of the run. The sample is the
+        # same for a run that was searched now, and for a run that was read from its journal.
         return [run.finish(random_generator_of(study, run.key)) for run in runs]
 
 
 def _refuse_failures(study: Study, runs: Sequence[Run]) -> None:
-    """Refuse to skip more than `MAX_SKIPPED` of the settings of runs."""
+    """Refuse to skip more than `MAX_SKIPPED` of the settings of these runs."""
     number = sum(len(run.failures) for run in runs)
     total = len(runs) * study.search.evaluations
     if number > MAX_SKIPPED * total:
@@ -143,7 +147,7 @@ def _refuse_failures(study: Study, runs: Sequence[Run]) -> None:
 
 
 def _begin(task: Task, share: Share, key: RunKey) -> Run:
-    """Open the journal of a run and begin its search."""
+    """Open the journal of a run, and begin the run's search."""
     study = task.study
     system = system_of(task.study)
     path = journal_file(share.directory, str(key))
