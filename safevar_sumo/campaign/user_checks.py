@@ -1,4 +1,6 @@
-"""Whether user code keeps what results rest on: it is checked, and repeated elsewhere."""
+"""Checks of user code on which results rely: `check_code` before the first batch, and repetitions
+in other processes.
+"""
 
 from __future__ import annotations
 
@@ -35,18 +37,20 @@ if TYPE_CHECKING:
 
 
 SAME_ELSEWHERE = "the same, to the bit; or repeats = N in [scenario]"
-"""What is expected of a simulator in another process."""
+"""The expected behaviour of a simulator in another process, in the words of an error."""
 
 
 def check_code(study: Study, pool: Pool) -> list[str]:
-    """Check the user code of a study in a worker, unless it has passed before with the same files;
-    returns the names of the files that it opened there. Where the number of simulations is limited,
-    the check takes at most a tenth of them.
+    """Check the user code of a study in a worker, and return the names of the files that the code
+    opened there.
+
+    The check is skipped if the same code has passed before. If simulations are limited, the check
+    takes at most a tenth of them.
 
     Raises
     ------
     UserCodeError
-        With file, line and advice of the first finding that makes results wrong.
+        If user code makes results wrong; the error has the file, the line and advice.
     """
     if not user_code_names(study):
         return []
@@ -59,7 +63,7 @@ def check_code(study: Study, pool: Pool) -> list[str]:
     ((opened, pool.checked),) = carry_out(_refuse_defects, [job], pool)
     if pool.spare is not None:
         return opened
-    # Without the marker, the next process checks again.
+    # If the marker cannot be written, the next process checks the code again.
     with suppress(OSError):
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.write_bytes(msgspec.json.encode(opened))
@@ -67,7 +71,8 @@ def check_code(study: Study, pool: Pool) -> list[str]:
 
 
 def repeat_elsewhere(study: Study, pool: Pool) -> None:
-    """Simulate three settings in two processes, in one of them with the points in another order.
+    """Simulate three settings in two processes. In the second process the points are in another
+    order.
 
     Raises
     ------
@@ -80,7 +85,7 @@ def repeat_elsewhere(study: Study, pool: Pool) -> None:
     )
     backwards = Selection(points=tuple(range(len(system.points)))[::-1])
     jobs = [(Task(study=study), rows), (Task(study=study, selection=backwards), rows)]
-    # The worker of the second job must not have simulated anything.
+    # The second process must be new: what it has simulated before might change its results.
     if pool.workers > 1:
         evaluations, repeated = carry_out(evaluate_settings, jobs, pool)
     else:
@@ -110,8 +115,8 @@ def random_settings(study: Study) -> FloatArray:
 
 
 def find_in_new_process(study: Study) -> list[Finding]:
-    """What a simulator of the user's own returns otherwise in a new process, for the original and
-    for both ends of the domains; nothing if the study says that it is not deterministic.
+    """Find a result of a simulator of the user's own that differs in a new process, for the
+    original vehicle or both ends of the domains. Nothing is compared if the study states `repeats`.
     """
     study = without_skipping(study)
     system = system_of(study)
@@ -121,14 +126,14 @@ def find_in_new_process(study: Study) -> list[Finding]:
     settings = system.region.repaired(
         np.stack([members.original, members.lower, members.upper])
     )
-    # The new process comes first, as a simulator may end its process.
+    # The new process simulates first, because a simulator may end the present process.
     with open_pool(1) as pool:
         (repeated,) = carry_out(
             evaluate_settings, [(Task(study=study), settings)], pool
         )
     evaluations = drive_and_score(replace(system, points=system.points[::-1]), settings)
     for row, difference in differences(evaluations.results, repeated.results):
-        # It is slow to import, and rarely needed.
+        # This import is slow, and rarely needed.
         from safevar_sumo.check.trials import Finding
 
         words = f"{difference} in a new process"
@@ -138,10 +143,10 @@ def find_in_new_process(study: Study) -> list[Finding]:
 
 
 def _refuse_defects(task: Task, limit: int | None = None) -> tuple[list[str], int]:
-    """The names of the files that user code opens in its check, and the number of simulations in a
-    simulator.
+    """Check user code in this process. Return the names of the files that user code opened, and the
+    number of simulations in a simulator.
     """
-    # It is slow to import, and rarely needed.
+    # This import is slow, and rarely needed.
     from safevar_sumo.check import refuse_defects
 
     unload_user_modules()
