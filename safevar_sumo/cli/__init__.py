@@ -1,5 +1,3 @@
-"""The command line: names and groups of the commands, and a command for any function of the
-library.
-"""
+"""The command line: names and groups of commands, and commands that are made of functions."""
 
 from safevar_sumo.cli.program import run_command_line as run_command_line
