@@ -1,4 +1,4 @@
-"""Errors that a user can fix: one or two lines, never a traceback."""
+"""Errors that a user can fix. A user sees one or two lines, never a traceback."""
 
 from __future__ import annotations
 
@@ -16,35 +16,36 @@ from typing import Any
 MAX_JOBS = 1024
 """Largest number of worker processes."""
 INTERRUPT_EXIT_CODE = 130
-"""Exit code after Ctrl-C, as in shells: 128 plus the signal's number."""
+"""Exit code after Ctrl-C: 128 plus the number of the signal, as in shells."""
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
-"""Signals that end the program as Ctrl-C does."""
+"""Signals that end the program like Ctrl-C."""
 CONTROLS = re.compile(
     r"[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )
-"""Characters that steer a terminal or hide text, and halves of characters."""
+"""Characters that control a terminal or hide text, and lone halves of characters."""
 
 
 def printable(text: str) -> str:
-    """A text of users and their code as every output has it: a question mark for each control
-    character but a tab and the end of a line.
+    """Make a text from users or their code printable: each control character becomes a question
+    mark, except tabs and ends of lines.
     """
     return CONTROLS.sub("?", text)
 
 
 _subject: ContextVar[str] = ContextVar("subject", default="study")
-"""What the code that runs now is about: a study, a file or a command's argument, as errors name it.
+"""The name of what the running code is about, for errors: a study, a file, or an argument of a
+command.
 """
 
 
 def subject() -> str:
-    """The study, file or argument that the code that runs now is about."""
+    """The study, the file or the argument that the running code is about."""
     return _subject.get()
 
 
 @contextmanager
 def about(source: object) -> Iterator[None]:
-    """Within the block, errors without a source of their own are about this one."""
+    """Within the block, errors that do not state a source are about this source."""
     token = _subject.set(str(source))
     try:
         yield
@@ -53,7 +54,9 @@ def about(source: object) -> Iterator[None]:
 
 
 class SafevarError(Exception):
-    """A failure that is no bug of this package; a command that raises it ends with `exit_code`."""
+    """A failure that is no bug of this package. A command with this failure ends with
+    `exit_code`.
+    """
 
     exit_code = 1
 
@@ -64,8 +67,8 @@ class InputError(SafevarError):
     Parameters
     ----------
     source
-        Where the value comes from: a file, a flag or a command's argument; "" for what the code
-        that runs now is about.
+        Where the value comes from: a file, a flag or an argument of a command. "" means
+        `subject()`.
     problem
         The key and the value, and what is wrong with them.
     legal
@@ -76,7 +79,7 @@ class InputError(SafevarError):
 
     def __init__(self, source: object, problem: str, legal: str = "") -> None:
         self.source = source or subject()
-        # A user's text may have lone surrogates.
+        # A lone half of a character could not be printed.
         self.problem = problem.encode(errors="backslashreplace").decode()
         self.legal = legal
         super().__init__(self.source, self.problem, legal)
@@ -89,13 +92,13 @@ class InputError(SafevarError):
 
 
 def missing_extra(source: object, problem: str, extra: str) -> InputError:
-    """The error that an extra of this package is not installed."""
+    """The error that a library is missing, because an extra of this package is not installed."""
     return InputError(source, problem, f"in the checkout: pip install '.[{extra}]'")
 
 
 class UserCodeError(InputError):
-    """User code that a study names failed or returned an illegal value; `place` is its file and
-    line, "" if they are unknown.
+    """User code that a study names failed, or returned an illegal value. `place` is the file and
+    line of the user code; "" if they are unknown.
     """
 
     def __init__(
@@ -110,13 +113,13 @@ class SimulationError(SafevarError):
 
 
 class EnvironmentFault(SafevarError):
-    """A simulation failed for a reason outside its setting: a disk, memory, netconvert, SUMO's
-    start.
+    """A simulation failed for a reason other than its setting: a disk, memory, netconvert, or the
+    start of SUMO.
     """
 
 
 def warn(message: str) -> None:
-    """Warn, and name the line of user code that called this package."""
+    """Show a warning that names the line of user code that called this package."""
     frame = inspect.currentframe()
     level = 1
     while (
@@ -130,12 +133,12 @@ def warn(message: str) -> None:
 
 
 MAX_MESSAGE_LENGTH = 500
-"""Length at which an error cuts a message that it quotes [characters]."""
+"""Length at which an error cuts off a message that it quotes [characters]."""
 
 
 def describe_error(error: BaseException) -> str:
-    """Describe an error by its class and its message, cut at `MAX_MESSAGE_LENGTH`, even if
-    `str(error)` fails.
+    """Describe an error by its class and its message. The message is cut off at
+    `MAX_MESSAGE_LENGTH`, and left out if `str(error)` fails.
     """
     try:
         message = " ".join(str(error).split())
@@ -178,7 +181,9 @@ def unknown_name(
 
 
 def check_text(argument: str, value: Any) -> Any:
-    """The value of an argument, which has to be a text or a path; raises an InputError."""
+    """Return the value of an argument that must be a text or a path; raise an InputError
+    otherwise.
+    """
     if not isinstance(value, str | PathLike):
         raise InputError(argument, repr(value), "a text or a path")
     return value
@@ -191,14 +196,14 @@ def check_name(
     names: Collection[str],
     otherwise: str = "",
 ) -> None:
-    """Refuse a name that is not known; raises the error of `unknown_name`."""
+    """Refuse an unknown name, with the error of `unknown_name`."""
     if name not in names:
         raise unknown_name(source, problem, name, names, otherwise)
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
-    """The text `; did you mean 'rain'?` with the name nearest in spelling, ignoring case; empty if
-    no name is similar.
+    """The text `; did you mean 'rain'?` with the name of the most similar spelling. "" if no name
+    is similar. Upper and lower case do not matter.
     """
     names_in_lower_case = {known_name.lower(): known_name for known_name in names}
     matches = get_close_matches(str(name).lower(), names_in_lower_case, n=1)
@@ -208,7 +213,7 @@ def did_you_mean(name: object, names: Iterable[str]) -> str:
 
 
 def one_of(names: Iterable[str]) -> str:
-    """The text `one of`, with all legal names, for an error message; `none` without any."""
+    """The text `one of` with all legal names, for an error; `none` if no name is legal."""
     listed = ", ".join(sorted(names))
     if listed:
         return f"one of {listed}"
