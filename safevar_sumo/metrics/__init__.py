@@ -1,4 +1,4 @@
-"""Measures by name: the safety metrics of method section 4, measures of change."""
+"""Measures by name: the safety metrics (method section 4), and the measures of change."""
 
 from safevar_sumo.metrics.base import (
     F_DIFF as F_DIFF,
@@ -47,11 +47,11 @@ OPTIONAL_METRICS = {
         REACTION_TIME,
     )
 }
-"""Metrics that only the studies have that name them."""
+"""Metrics that only studies have which name them."""
 OBJECTIVES = {
     objective.name: objective for objective in (F_SAFE, F_DIFF, F_NUM_DIFF)
 } | {SAFETY_DEGREE_METRIC.name: F_SAFE}
-"""What the objectives of a search may name besides metrics."""
+"""Measures that the objectives of a search may name, in addition to metrics."""
 PUBLISHED_SCORING = Scoring(
     metrics=tuple(metric.facts for metric in METRICS.values()),
     objectives=(F_SAFE, F_DIFF, F_NUM_DIFF),
