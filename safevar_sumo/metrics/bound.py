@@ -1,4 +1,4 @@
-"""A limit that a measure must not pass."""
+"""A bound: a limit that a measure must not pass."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ COMPARISONS: Mapping[str, Callable[[Quantity, float], Quantity]] = {
 
 
 class MetricBound(NamedTuple):
-    """A measure, one of `COMPARISONS`, and a number: `drac > 6`."""
+    """A measure, a comparison (a key of `COMPARISONS`), and a limit. A vehicle is unsafe if the
+    comparison is true: `drac > 6`.
+    """
 
     measure: str
     comparison: str
@@ -32,5 +34,5 @@ class MetricBound(NamedTuple):
 
     @property
     def sign(self) -> int:
-        """1 where small values are unsafe, -1 where large ones are."""
+        """1 if small values are unsafe, -1 if large values are unsafe."""
         return 1 - 2 * self.worst_is_largest
