@@ -1,4 +1,6 @@
-"""Words for what makes a vehicle unsafe: safety degrees, impacts, values near a limit, repeats."""
+"""Words for unsafe vehicles: safety degrees, impacts, values near a limit, and numbers of unsafe
+runs.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +9,14 @@ import numpy as np
 from safevar_sumo.records import KMH_PER_MS, BoolArray
 
 ALLOWED_ROUNDING = 0.01
-"""Allowed speed of an impact below which none is allowed [km/h]."""
+"""An impact is not allowed at all if its allowed speed is below this number [km/h]."""
 
 
 def runs_in_words(fails: BoolArray) -> str:
-    """In how many runs of a setting it is unsafe, shape (R,), with the exact interval (Clopper and
-    Pearson) of their share; "" if there is a single run.
+    """The number of unsafe runs of a setting, in words, with the exact interval of their share
+    (Clopper and Pearson). `fails` says which runs are unsafe, shape (R,). "" for a single run.
     """
-    # This module takes a second to load.
+    # The import takes a second.
     import scipy
 
     if len(fails) < 2:
@@ -26,7 +28,9 @@ def runs_in_words(fails: BoolArray) -> str:
 
 
 def impact_in_words(speed: float, excess: float) -> str:
-    """An impact [m/s] and its excess, such as `impact at 12 km/h where 15 is allowed`."""
+    """The speed of an impact, and the allowed speed, such as `impact at 12 km/h where 15 is
+    allowed`. The excess is the speed minus the allowed speed [m/s].
+    """
     allowed_speed = KMH_PER_MS * (speed - excess)
     words = "none"
     if allowed_speed >= ALLOWED_ROUNDING:
@@ -35,7 +39,7 @@ def impact_in_words(speed: float, excess: float) -> str:
 
 
 def unit_of_degree(degree: float) -> str:
-    """The unit of a safety degree, which is minus a speed on a collision."""
+    """The unit of a safety degree. After a collision, a safety degree is minus a speed."""
     if degree >= 0:
         return "m"
     return "m/s"
@@ -47,7 +51,9 @@ def degree_in_words(degree: float) -> str:
 
 
 def value_on_side(value: float, limit: float, kind: str, digits: int) -> str:
-    """A value with so many digits, or as few more as keep it on its side of a limit."""
+    """A value with this number of digits, or with as few more digits as keep the text on the
+    value's side of the limit. Otherwise a text could read "0.30 m, less than 0.3 m".
+    """
     side = np.sign(value - limit)
     for number in range(digits, 17):
         text = f"{value:.{number}{kind}}"
