@@ -1,5 +1,5 @@
-"""Files that users name: regular input files; output files, written as a whole or not at all; and
-files beside a study. Temporary files and folders, also those of killed processes.
+"""Files that users name: input files, output files (which are written as a whole or not at all),
+and files beside a study. Also temporary files and folders, which are removed even after a kill.
 """
 
 from __future__ import annotations
@@ -22,24 +22,25 @@ from safevar_sumo.errors import InputError
 
 ALONE = portalocker.LOCK_EX | portalocker.LOCK_NB
 SETTLING_TIME = 0.1
-"""Time within which a process locks a temporary file that it has made [s]."""
+"""Time within which a process locks a temporary file that it has created [s]."""
 PREFIX, LOCK = "safevar-", "lock"
-"""Beginning of the names of temporary folders, and the file in them that their process has locked.
+"""The prefix of the names of temporary folders, and the name of the file in such a folder that its
+process locks.
 """
 MAX_INPUT = 100_000_000
 """Largest size of an input file [bytes]."""
 MAX_UNPACKED = 1_000_000_000
 """Largest size of all files of an archive together, unpacked [bytes]."""
 WRITABLE = "a file in a directory that can be written, with space for it"
-"""What an error about an output file expects."""
+"""The expected value in an error about an output file."""
 
 
 def read_file(path: Path, largest: int = MAX_INPUT) -> bytes:
-    """The content of an input file; raises OSError for a pipe or device, which may never end, and
-    for a file that is too large.
+    """Read an input file. Raise an OSError for a file that is too large, and for a pipe or device,
+    which may never end.
     """
     about = path.stat()
-    # A folder ends, but cannot be read, which says more.
+    # A folder is no regular file, either, but reading it raises an error that says more.
     is_endless = not (stat.S_ISREG(about.st_mode) or path.is_dir())
     if is_endless or about.st_size > largest:
         problem = f"it is no regular file of at most {largest / 1e6:,.0f} MB"
@@ -49,17 +50,18 @@ def read_file(path: Path, largest: int = MAX_INPUT) -> bytes:
 
 @contextmanager
 def whole_file(path: Path, option: str = "") -> Iterator[Path]:
-    """Give the path of a temporary file to write, which then replaces `path`; after an error `path`
-    is as it was.
+    """Give the path of a temporary file. After the block, this file replaces `path`. After an
+    error, `path` is unchanged.
 
-    The temporary file lies beside `path` and has the same ending. Those that killed processes have
-    left there are removed. A stream such as `/dev/stdout` is given itself. An OSError becomes an
-    InputError that names `option`, if it is given.
+    The temporary file is beside `path`, and has the same ending. Temporary files that killed
+    processes have left there are removed. If `path` is a stream such as `/dev/stdout`, the block
+    gets the stream itself. An OSError becomes an InputError that names `option`, if an option is
+    given.
     """
-    # A link stays a link.
+    # If `path` is a link, its target is replaced, and the link stays.
     target = Path(os.path.realpath(path))
     is_stream = target.exists() and not target.is_file()
-    # File systems limit the length of names.
+    # File systems limit the length of names: a long name would not leave space for the suffix.
     short_stem = target.stem[:100]
     file = path
     if not is_stream:
@@ -84,8 +86,8 @@ def whole_file(path: Path, option: str = "") -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
-    """Give a temporary folder, which ends with the block; those that killed processes have left are
-    removed.
+    """Give a temporary folder, which is removed after the block. Folders that killed processes have
+    left are removed, too.
     """
     with tempfile.TemporaryDirectory(
         prefix=PREFIX, dir=parent, ignore_cleanup_errors=True
@@ -97,24 +99,24 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
 
 @contextmanager
 def _owned(file: Path, neighbours: Iterable[Path]) -> Iterator[None]:
-    """Make a temporary file and lock it within the block; remove those of its neighbours that
-    nobody has locked.
+    """Create a temporary file, and lock it within the block. Remove the neighbours that no process
+    has locked: their processes were killed.
     """
     with open(file, "xb") as stream:
-        # On Windows a lock would keep out this process, too.
+        # On Windows, a lock would also prevent this process from writing.
         if os.name != "nt":
             for neighbour in neighbours:
                 if neighbour != file:
                     _remove_left_behind(neighbour)
-            # A disk may have no locks.
+            # Some file systems have no locks: the file is then used without a lock.
             with suppress(portalocker.LockException):
                 portalocker.lock(stream, ALONE)
         yield
 
 
 def _remove_left_behind(file: Path) -> None:
-    """Remove a temporary file, of a `LOCK` its folder, that no process has locked, unless it is so
-    new that one may be about to.
+    """Remove a temporary file that no process has locked, or, for the file `LOCK`, its folder. A
+    new file stays, because its process may not have locked it yet.
     """
     with suppress(OSError, portalocker.LockException), open(file, "rb+") as stream:
         portalocker.lock(stream, ALONE)
@@ -125,8 +127,8 @@ def _remove_left_behind(file: Path) -> None:
 def check_writable(
     path: Path, option: str, endings: Sequence[str] = (), but: str = ""
 ) -> None:
-    """Refuse an output file that cannot be written, before the work begins, whose name has another
-    ending, or that exists and is named `but`; raises InputError.
+    """Refuse an output file, by an InputError, before the work begins. The file must be writable,
+    and end in one of `endings`. An existing file with the name `but` must not be overwritten.
     """
     if endings and path.suffix.lower() not in endings:
         raise InputError(option, str(path), f"a file that ends in {', '.join(endings)}")
@@ -144,7 +146,7 @@ def check_writable(
 
 
 def unwritable(path: Path, option: str, error: Exception) -> InputError:
-    """The error for an output file that cannot be written."""
+    """The error that an output file cannot be written."""
     return InputError(
         option,
         f"cannot write {path}: {getattr(error, 'strerror', None) or error}",
@@ -153,8 +155,8 @@ def unwritable(path: Path, option: str, error: Exception) -> InputError:
 
 
 def file_beside(text: str, folders: Sequence[str]) -> str:
-    """The file that a text names, relative to the folder of the study's file or of a file that it
-    extends; "" if there is none.
+    """The path of the file that a text names, relative to one of the `folders`; "" if no such file
+    exists.
     """
     try:
         return next(
@@ -166,5 +168,5 @@ def file_beside(text: str, folders: Sequence[str]) -> str:
             "",
         )
     except (OSError, ValueError):
-        # The text is no path.
+        # A text that is no legal path names no file.
         return ""
