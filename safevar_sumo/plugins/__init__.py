@@ -1,4 +1,4 @@
-"""User code: looked up by its name, checked against a contract; the room `check` tries it."""
+"""User code: its lookup by name, its contracts, and the files that it opens."""
 
 from safevar_sumo.plugins.contract import (
     FINITE as FINITE,
