@@ -1,5 +1,5 @@
-"""The user's files on which results depend, by names that are the same on every machine: code, and
-the data files that a study names.
+"""The user's files on which results depend: code, and the data files that a study names. A file has
+a name that is the same on every machine.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from safevar_sumo.output import file_beside
 from safevar_sumo.shipped import NETWORKS, PACKAGE
 
 DIGEST_LENGTH = 16
-"""Length of a file's digest."""
+"""Length of the digest of a file [characters]."""
 Files = dict[str, str]
-"""Digests of files by the names that `digests` gives them."""
+"""Digests of files, by the names that `digests` gives to the files."""
 CACHE = "__pycache__"
-"""Name of Python's cache folders."""
+"""The name of Python's folders for compiled files."""
 HIDDEN = re.compile(rf"(^|/)(\.|{CACHE}(/|\Z))")
-"""A hidden file or folder, or a cache, in a path."""
+"""Matches the path of a hidden file or folder, or of a folder with compiled files."""
 LIBRARY_FOLDERS = ("site-packages", "dist-packages")
-"""Names of folders of installed libraries; such folders may be anywhere."""
+"""Names of folders with installed libraries. Such folders may be anywhere."""
 KNOWN_FOLDERS = tuple(
     f"{folder}{os.sep}"
     for folder in (
@@ -34,12 +34,12 @@ KNOWN_FOLDERS = tuple(
         Path(sys.base_prefix, "DLLs"),
     )
 )
-"""The folders of this package and of the interpreter."""
+"""The folders of this package and of Python itself."""
 
 
 def is_user_file(path: str) -> bool:
-    """Whether a file belongs neither to the interpreter, nor to an installed library, nor to this
-    package.
+    """Return whether a file belongs to the user: neither to Python, nor to an installed library,
+    nor to this package.
     """
     is_in_library = any(name in Path(path).parts for name in LIBRARY_FOLDERS)
     return (
@@ -48,10 +48,10 @@ def is_user_file(path: str) -> bool:
 
 
 def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
-    """The files of user code: of the `modules`, wherever they are, and of all that they import in
-    the study's folders.
+    """Find the files of user code: the files of the `modules`, wherever they are, and of all
+    modules in the study's folders that they import.
 
-    A module is a file; of a package every file counts.
+    A module has one file. Of a package, all files count.
     """
     own_folders = (*folders, os.getcwd())
     paths = set()
@@ -74,8 +74,8 @@ def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
 
 
 def _files_of_module(path: Path) -> set[Path]:
-    """The file of a module, or every file of a package, whose path has no ending; empty if there is
-    none.
+    """The file of a module, or all files of a package. `path` is the path without the ending; the
+    set is empty if no such module exists.
     """
     if path.with_suffix(".py").is_file():
         return {path.with_suffix(".py")}
@@ -93,7 +93,9 @@ def _imported_modules(path: Path) -> Iterator[str]:
 
 
 def files_in(path: Path) -> list[Path]:
-    """A file itself, or every file in a folder, without Python's cache and hidden files."""
+    """All files in a folder, except hidden files and compiled files. If `path` is a file, this
+    file.
+    """
     if path.is_file():
         return [path]
     files = []
@@ -104,12 +106,12 @@ def files_in(path: Path) -> list[Path]:
 
 
 def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
-    """Digests of files by name.
+    """The digests of files, by their names.
 
     Parameters
     ----------
     folders
-        The folders of the study's file and of the files that it extends.
+        The folders of the study's file and of the files that the study extends.
     """
     files = Files()
     for path in paths:
@@ -119,13 +121,15 @@ def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
 
 
 def digests_by_name(names: Iterable[str], folders: Sequence[str]) -> Files:
-    """Digests of the files with these names, as far as they exist."""
+    """The digests of the files with these names. Files that do not exist are left out."""
     paths = (file_by_name(name, folders) for name in names)
     return digests(map(Path, filter(None, paths)), folders)
 
 
 def name_of_file(path: Path, folders: Sequence[str]) -> str:
-    """A file's path relative to the first folder that contains it; its whole path if none does."""
+    """The path of a file relative to the first folder that contains the file; the whole path if no
+    folder does.
+    """
     candidates = filter(path.is_relative_to, _naming_folders(folders))
     folder = next(candidates, path.anchor)
     if folder != path.anchor:
@@ -134,12 +138,12 @@ def name_of_file(path: Path, folders: Sequence[str]) -> str:
 
 
 def file_by_name(name: str, folders: Sequence[str]) -> str:
-    """The path of the file that `digests` calls `name`; "" if there is no such file."""
+    """The path of the file to which `digests` gives this name; "" if no such file exists."""
     return file_beside(name, _naming_folders(folders))
 
 
 def is_of_shipped_network(name: str) -> bool:
-    """Whether `digests` calls a file of a shipped network by this name."""
+    """Return whether `digests` gives this name to a file of a shipped network."""
     return (NETWORKS / name).is_file()
 
 
