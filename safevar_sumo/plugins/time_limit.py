@@ -1,8 +1,8 @@
-"""The time limit of a simulation, and of the import and `__init__` of user code: what takes longer
-counts as hung.
+"""The time limit of a simulation, and of the import and the `__init__` of user code. Code that
+takes longer counts as hung.
 
-It ends a worker, whose pool reports where it was; in any other process, where the system has
-timers, it is an error.
+A worker that exceeds the limit ends, and its pool reports the line at which it was. In any other
+process, the limit raises an error, if the system has timers.
 """
 
 from __future__ import annotations
@@ -20,25 +20,27 @@ from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.plugins.process import Interrupt, this_process
 
 TIMEOUT_MARK = "Timeout ("
-"""What the interpreter writes first when a process exceeds its time limit."""
+"""The beginning of the text that Python writes when a process exceeds its time limit."""
 
 
 class _TimeIsUp(Interrupt):
-    """Passes user code as Ctrl-C does; its argument is the error for the user."""
+    """The exception at the end of the time. Like Ctrl-C, it passes through user code. Its argument
+    is the error for the user.
+    """
 
 
 @contextmanager
 def end_if_longer(time_limit: float, name: str = "a simulation") -> Iterator[None]:
-    """End this process, if it is a worker, when the context takes longer than a time limit [s];
-    raise an error, with the context's name, in the main thread of any other process. Within such a
-    context another one has no effect.
+    """Limit the time of a block [s]. After the limit, a worker ends. In the main thread of any
+    other process, an error is raised, with the `name` of the block. A limit within the block has no
+    effect.
 
     Raises
     ------
     UserCodeError
-        With the line of user code that took too long.
+        If user code took too long; the error has the line.
     SimulationError
-        If no user code did.
+        If other code took too long.
     """
     has_timer = (
         hasattr(signal, "setitimer")
