@@ -1,5 +1,5 @@
-"""Records that pass between packages: observations and commands of an ADS, traces of runs,
-evaluations.
+"""Records that packages pass to each other: observations and commands of an ADS, traces of runs,
+and evaluations.
 """
 
 from safevar_sumo.records.driving import (
