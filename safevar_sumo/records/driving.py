@@ -1,4 +1,6 @@
-"""Quantities, and what a vehicle sees and does."""
+"""Types of quantities, constants, and records of what a vehicle's driving system observes and
+commands.
+"""
 
 from __future__ import annotations
 
@@ -14,69 +16,85 @@ IntArray = npt.NDArray[np.int_]
 TextArray = npt.NDArray[np.str_]
 FloatOrArray = float | FloatArray
 Quantity = Any
-"""A number, or an array of numbers that broadcasts to those of N vehicles or of T samples of N
-encounters.
+"""A number, or an array of numbers. Its shape broadcasts to that of N vehicles, or of T samples of
+N encounters.
 """
 NamedValues = dict[str, float]
-"""Values by name, such as those of characteristics."""
+"""Numbers by name, such as the values of characteristics."""
 JsonObject = dict[str, Any]
-"""An object of JSON, or a table of TOML: plain values by key."""
+"""An object of JSON, or a table of TOML: plain values by their keys."""
 
 STANDSTILL = 1e-3
 """Speed below which a vehicle counts as standing [m/s] (method section 4)."""
 KMH_PER_MS = 3.6
-"""km/h per m/s."""
+"""Number of km/h in 1 m/s."""
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
 TIME_ROUNDING = 1e-9
 """Difference below which two sums of time steps count as the same time [s]."""
 TOUCH_OVERLAP = 2e-3
-"""Overlap up to which bodies count as touching, not colliding: SUMO ignores an overlap of a
-millimetre [m].
-"""
+"""Largest overlap of bodies that only touch [m]. SUMO ignores an overlap of a millimetre."""
 LEAST_CLOSING_SPEED = 1e-3
-"""Least closing speed that a collision counts with [m/s]: also one with a faster body is worse than
-any distance.
+"""Least closing speed of a collision [m/s]. The safety degree of a collision is minus its closing
+speed, and must be below 0 even if the struck body is faster than the vehicle.
 """
 LENGTH_DECIMALS = 9
-"""Decimals to which differences of distances are rounded: 4.7 m, not 4.699999999999996 m."""
+"""Decimals to which differences of distances are rounded, so that 4.7 m is not 4.699999999999996
+m.
+"""
 TIME_DECIMALS = 9
-"""Decimals to which sums of time steps are rounded: 0.15 s, not 0.15000000000000002 s."""
+"""Decimals to which sums of time steps are rounded, so that 0.15 s is not 0.15000000000000002 s."""
 ZERO: FloatArray = np.zeros(())
-"""Scalar zero, broadcast to all N vehicles."""
+"""The scalar zero, which broadcasts to all N vehicles."""
 ALL_TRUE: BoolArray = np.ones((), bool)
-"""Scalar True, broadcast to all N vehicles."""
+"""The scalar True, which broadcasts to all N vehicles."""
 UNDEFINED: FloatArray = np.array(np.nan)
-"""Scalar NaN, broadcast to all N vehicles."""
+"""The scalar NaN, which broadcasts to all N vehicles."""
 for _constant in (ZERO, ALL_TRUE, UNDEFINED):
     _constant.flags.writeable = False
 
 
 def nans(shape: int | tuple[int, ...]) -> FloatArray:
-    """An array of undefined values."""
+    """An array of NaN, which stands for undefined values."""
     return np.full(shape, np.nan)
 
 
 def finite_or_none(value: float) -> float | None:
-    """Make a number fit for JSON, which has neither NaN nor infinities: such a number becomes
-    None.
-    """
+    """Convert a number for JSON. JSON has neither NaN nor infinities: these become None."""
     if not np.isfinite(value):
         return None
     return float(value)
 
 
 class Observation(NamedTuple):
-    """Sensor values of N vehicles; every array has shape (N,).
+    """What the sensors of N vehicles observe. Every array has shape (N,), or broadcasts to it.
 
-    `gap` is the distance along the vehicle's path from its front bumper to the obstacle, infinite
-    while the obstacle is not detected [m]; `lateral` is the obstacle's offset from the middle of
-    the vehicle's lane, negative on the side that the obstacle comes from, infinite while it is out
-    of sight [m]. `closing_speed` is the rate at which the gap shrinks, `obstacle_speed` the
-    obstacle's own speed along the vehicle's path [m/s], `obstacle_width` its extent across the lane
-    [m], `obstacle_length` its extent along the lane [m], both 0 where the scenario does not state
-    them; `obstacle` is the number of the body that it is, of several; `throttle` and `brake` are
-    the pedals' positions [-].
+    Attributes
+    ----------
+    time
+        Time since the start of the run [s].
+    speed
+        The vehicle's own speed [m/s].
+    gap
+        Distance along the vehicle's path from the front bumper to the obstacle [m]; infinite while
+        no obstacle is detected.
+    closing_speed
+        Speed at which the gap shrinks [m/s].
+    lateral
+        Distance of the obstacle from the middle of the vehicle's lane [m], negative on the side
+        from which the obstacle comes; infinite while the obstacle is out of sight.
+    lateral_speed
+        Speed at which `lateral` changes [m/s].
+    visibility
+        Factor on the range of the sensors [-].
+    obstacle_speed
+        The obstacle's own speed along the vehicle's path [m/s].
+    throttle, brake
+        Positions of the pedals [-].
+    obstacle_width, obstacle_length
+        The obstacle's extent across and along the lane [m]; 0 if the scenario does not state it.
+    obstacle
+        The number of the body that is the obstacle, if the scenario has several bodies.
     """
 
     time: float
@@ -95,18 +113,18 @@ class Observation(NamedTuple):
 
 
 class Command(NamedTuple):
-    """Pedals that the ADS of N vehicles commands, each in [0, 1], shape (N,)."""
+    """The pedals that the ADS of N vehicles commands, each in [0, 1], shape (N,)."""
 
     throttle: FloatArray
     brake: FloatArray
 
 
 class PedalTables(NamedTuple):
-    """The effect of the original vehicle's pedals on a dry road, at `speeds` [m/s].
+    """The effect of the original vehicle's pedals on a dry road, at certain `speeds` [m/s].
 
-    `full_throttle` is the acceleration at full throttle, `coasting` the deceleration without pedals
-    [m/s^2]; `braking` is the deceleration that the brake adds per unit of pedal, far from the limit
-    of the tyres [m/s^2].
+    `full_throttle` is the acceleration at full throttle, and `coasting` the deceleration without
+    pedals [m/s^2]. `braking` is the deceleration that the brake adds for each unit of pedal
+    [m/s^2], if tyres do not limit the brake force.
     """
 
     speeds: FloatArray
@@ -116,12 +134,13 @@ class PedalTables(NamedTuple):
 
 
 class Nominal(NamedTuple):
-    """The original vehicle on a dry road: all that an ADS knows of the vehicle.
+    """The original vehicle on a dry road. An ADS knows nothing else of the vehicle.
 
-    `mass` [kg], `accel`, `decel` [m/s^2] and `max_speed` [m/s] are values of its SUMO type;
-    `actuator_lag` [s] is the time constant with which its wheels follow the pedals. `tables` drives
-    the vehicle on its first call, and returns `speeds`, `full_throttle`, `coasting` and `braking`.
-    `length` and `width` [m] are those of its body in the scenario; 0 outside a run.
+    `mass` [kg], `accel`, `decel` [m/s^2] and `max_speed` [m/s] are values of the vehicle's SUMO
+    type. `actuator_lag` [s] is the time constant with which the wheels follow the pedals. The first
+    call of `tables` drives the vehicle; `tables` returns `speeds`, `full_throttle`, `coasting` and
+    `braking`. `length` and `width` [m] are those of the vehicle's body in the scenario; 0 outside
+    of a run.
     """
 
     mass: float
