@@ -1,5 +1,5 @@
-"""Scenarios and weathers by name, and their words; the weathers are in weather.toml beside this
-module.
+"""Scenarios and weathers by name, and words for both. The file weather.toml beside this module has
+the weathers.
 """
 
 from collections.abc import Iterable, Mapping
@@ -37,7 +37,7 @@ from safevar_sumo.shipped import shipped_table
 from safevar_sumo.study import PHASE, FreeParameter, Weather, free_parameters
 
 SCENARIO_BASES: tuple[type, ...] = (Simulator, TrackScenario, WorldScenario)
-"""The contracts of a user's scenario."""
+"""The contracts of which a user's scenario must fulfil one."""
 SCENARIOS: Mapping[str, type[Scenario]] = {
     "pedestrian_crossing": PedestrianCrossing,
     "along": Along,
@@ -54,11 +54,11 @@ WEATHERS = {
     name: msgspec.convert({"name": name, **table}, Weather)
     for name, table in shipped_table("scenarios/weather.toml").items()
 }
-"""Weathers by name."""
+"""The shipped weathers by name."""
 
 
 WEATHER_PARAMETERS = free_parameters(Weather)
-"""Parameters of a weather that a study may search, by name."""
+"""The parameters of a weather that a study may search, by name."""
 PHASES = {
     PHASE: FreeParameter(
         lower=0.0,
@@ -67,12 +67,12 @@ PHASES = {
         meaning="phase, by which the encounter begins later, in steps",
     )
 }
-"""The phase, where an encounter has one."""
+"""The phase as a parameter that a study may search, for encounters that have a phase."""
 
 
 def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
-    """Parameters of a scenario and its weather that a study may search; none without an
-    encounter.
+    """The parameters of a scenario and its weather that a study may search. A scenario without an
+    encounter has none.
     """
     if scenario.brakes_fully:
         return {}
@@ -85,11 +85,12 @@ def searchable_in(scenario: Scenario) -> Mapping[str, FreeParameter]:
 
 
 def unit_of(scenario: Scenario, name: str) -> str:
-    """The unit of a parameter that a matrix varies; "" if it is unknown."""
+    """The unit of a parameter that a matrix varies; "" if the unit is unknown."""
     searchable = searchable_in(scenario)
     if name in searchable:
         return searchable[name].unit
-    # A scenario whose speed cannot move declares no unit, but has it in m/s, too.
+    # A scenario that does not declare its speed as searchable states no unit. If the number equals
+    # the test speed in km/h, the unit is km/h.
     speed = KMH_PER_MS * (scenario.test_speed or 0.0)
     if name == SPEED_DIMENSION and isclose(getattr(scenario, name), speed):
         return "km/h"
@@ -106,7 +107,7 @@ def weather_of(choice: str | Weather) -> Weather:
     """
     if isinstance(choice, Weather):
         return choice
-    # A simulator of the user's own has no weather.
+    # A study with a simulator of the user's own names no weather: "" counts as clear weather.
     choice = choice or "clear"
     check_name(
         "",
@@ -119,7 +120,7 @@ def weather_of(choice: str | Weather) -> Weather:
 
 
 def equals_clear(weather: Weather) -> bool:
-    """Whether a weather has the effects of clear weather under another name."""
+    """Return whether a weather with another name has the same effects as clear weather."""
     clear = WEATHERS["clear"]
     return (
         weather.name != clear.name
@@ -129,12 +130,12 @@ def equals_clear(weather: Weather) -> bool:
 
 
 FROM_CENTRES = " from centre to centre"
-"""How a safety degree is measured where bodies touch at one above 0."""
+"""The words after a safety degree that is measured between the centres of bodies."""
 
 
 def distance_in_words(safety_degree: float, contact: float, digits: int = 2) -> str:
-    """A safety degree above 0 as text, with the gap where bodies touch at a safety degree of
-    `contact` above 0 [m].
+    """A safety degree above 0 as text. If bodies touch at a safety degree of `contact` above 0 [m],
+    the text also has the gap.
     """
     text = f"{safety_degree:.{digits}f} m"
     if not contact:
@@ -144,8 +145,8 @@ def distance_in_words(safety_degree: float, contact: float, digits: int = 2) -> 
 
 
 def pre_crash_sentence(points: Iterable[Point]) -> str:
-    """A sentence that lists the pre-crash types and the light of test points; "" if no scenario has
-    a type.
+    """A sentence that lists the pre-crash types and the light of points; "" if no scenario has a
+    type.
     """
     points = tuple(points)
     types = dict.fromkeys(filter(None, (point.scenario.pre_crash for point in points)))
