@@ -136,9 +136,7 @@ class CutIn(LaneChange, frozen=True, kw_only=True):
         return self.target_speed * KMH
 
     def check(self) -> None:
-        """Refuse a car that the vehicle passes before any part of the car is in the vehicle's
-        lane.
-        """
+        """Refuse a car that is beside the vehicle before any part of the car is in its lane."""
         enters_after = (LANE_WIDTH - CAR.width) / 2 / self.lateral_speed
         closed_gap = (self.start_speed - self.first_speed) * enters_after
         if self.gap - closed_gap <= 0:
