@@ -1,4 +1,4 @@
-"""A point: a scenario in a weather, and the ranges of its parameters."""
+"""A point: a scenario in a weather, with the ranges of the scenario's parameters."""
 
 from __future__ import annotations
 
@@ -9,15 +9,27 @@ from safevar_sumo.scenarios.base import Quantities, Scenario
 from safevar_sumo.study import Constraint, Domains, Weather
 
 SPEED_DIMENSION = "speed"
-"""The parameter by which `permit` asks, and that a scope names first."""
+"""The parameter by which `permit` asks by default, and that the scope of an answer names first."""
 
 
 class Point(NamedTuple):
-    """A scenario in a weather; `name` is its name in the study, `parameters` distinguish it from
-    the study's others. An impact is allowed up to the relative speed `allowed_impact_speed` [m/s].
-    All of it begins `phase` steps later, a number or of shape (N,). `ranges` are those of its
-    parameters of which settings have values, by name; None if it takes all of them. Its encounters
-    satisfy the `constraints`.
+    """A scenario in a weather.
+
+    Attributes
+    ----------
+    name
+        Name of the point in the study.
+    parameters
+        Parameters that distinguish the point from other points of the study.
+    allowed_impact_speed
+        Relative speed up to which an impact is allowed [m/s].
+    phase
+        Number of steps by which the whole encounter begins later, a number or shape (N,).
+    ranges
+        The parameters of the point of which settings have values, with their ranges; None if the
+        point uses all values of a setting.
+    constraints
+        Constraints that the encounters of the point satisfy.
     """
 
     scenario: Scenario
@@ -30,14 +42,14 @@ class Point(NamedTuple):
     constraints: tuple[Constraint, ...] = ()
 
     def own(self, values: Quantities) -> dict[str, Quantity]:
-        """Those of the values that are of parameters of this point."""
+        """The values that belong to parameters of this point."""
         if self.ranges is None:
             return dict(values)
         return {name: value for name, value in values.items() if name in self.ranges}
 
     def meets(self, values: Quantities) -> Quantity:
-        """Whether the encounters with these values are some of this point's, of shape (N,), or one
-        truth for all.
+        """Return whether encounters with these values belong to this point: an array of shape (N,),
+        or a single truth value for all encounters.
         """
         holds = True
         for name, domain in (self.ranges or {}).items():
@@ -49,4 +61,4 @@ class Point(NamedTuple):
 
 
 Points = tuple[Point, ...]
-"""The points of a matrix, or the only one of a study without a matrix."""
+"""The points of a matrix. A study without a matrix has a single point."""
