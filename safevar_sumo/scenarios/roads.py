@@ -1,4 +1,4 @@
-"""What a scenario knows of its network: straight lanes, coordinates along them, and the world that
+"""The network, as a scenario sees it: straight lanes, coordinates along them, and the world that
 moves the actors.
 """
 
@@ -15,19 +15,15 @@ from safevar_sumo.records import FloatArray, FloatOrArray, Quantity
 
 NETWORK_KEY = "scenario.parameters.network"
 MAX_BEND = 0.05
-"""Largest deviation of a lane's centre line from a straight line for which the lane counts as
-straight [m].
-"""
+"""Largest deviation of a straight lane's centre line from a straight line [m]."""
 Coordinates = tuple[float, float]
 MAX_SKEW = 0.05
-"""Largest offset along the road between the two ends of a crossing at which it still counts as at
-right angles [m].
-"""
+"""Largest distance along the road between the two ends of a crossing at right angles [m]."""
 
 
 class Lane(NamedTuple):
-    """First and last point of a lane's centre line [m]; `flaw` says why the lane is not straight,
-    "" if it is.
+    """The first and the last point of a lane's centre line [m]. `flaw` says why the lane is not
+    straight; "" for a straight lane.
     """
 
     start: Coordinates
@@ -36,14 +32,15 @@ class Lane(NamedTuple):
 
 
 def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
-    """The lane `name`, whose centre line goes through these points [m]."""
+    """Make the lane `name` from the points of its centre line [m]."""
     x, y = points[0]
     to_x, to_y = points[-1]
     length = math.hypot(to_x - x, to_y - y)
     bend = 0.0
     for at_x, at_y in points:
         deviation = math.hypot(at_x - x, at_y - y)
-        # A lane that ends where it begins has no line through both.
+        # A lane that ends at its beginning has no line through both points: the distance counts
+        # instead.
         if length:
             deviation = abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length
         bend = max(bend, deviation)
@@ -54,8 +51,8 @@ def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
 
 
 class Frame(NamedTuple):
-    """The coordinates of a straight lane: their origin [m], and the lane's direction, a unit
-    vector.
+    """Coordinates along and across a straight lane: the origin [m], and the lane's direction as a
+    unit vector.
     """
 
     origin: Coordinates
@@ -63,7 +60,7 @@ class Frame(NamedTuple):
 
     @classmethod
     def of(cls, lane: Lane) -> Frame:
-        """The frame of a lane, from its first point to its last.
+        """The frame of a lane, in the direction from its first point to its last point.
 
         Raises
         ------
@@ -79,37 +76,39 @@ class Frame(NamedTuple):
 
     @classmethod
     def through_origin(cls, lane: Lane) -> Frame:
-        """A frame with the lane's direction and the network's origin: a lane that leads east has
+        """The frame with the lane's direction, and the network's origin. A lane that leads east has
         exactly the network's coordinates.
         """
         return cls((0.0, 0.0), cls.of(lane).direction)
 
     def along(self, positions: FloatArray) -> FloatArray:
-        """Distances of positions, shape (N, 2), along the lane [m]; shape (N,)."""
+        """The distances of positions along the lane [m], shape (N,). The positions have shape (N,
+        2).
+        """
         x, y = self.origin
         dir_x, dir_y = self.direction
         return (positions[:, 0] - x) * dir_x + (positions[:, 1] - y) * dir_y
 
     def left(self, positions: FloatArray) -> FloatArray:
-        """Distances of positions, shape (N, 2), to the left of the lane's middle [m]; shape
-        (N,).
+        """The distances of positions to the left of the lane's middle [m], shape (N,). The
+        positions have shape (N, 2).
         """
         x, y = self.origin
         dir_x, dir_y = self.direction
         return (positions[:, 1] - y) * dir_x - (positions[:, 0] - x) * dir_y
 
     def lane_coordinates(self, point: Coordinates) -> Coordinates:
-        """Distances of one point along the lane and to its left [m]."""
+        """The distances of a single point along the lane and to its left [m]."""
         positions = np.array([point])
         return self.along(positions).item(), self.left(positions).item()
 
     def crossing_position(self, roads: Roads | World, lane: str) -> float:
-        """Position along this lane of another lane, which crosses it [m].
+        """The position along this lane at which another lane crosses it [m].
 
         Raises
         ------
         InputError
-            If the other lane does not cross it at right angles.
+            If the other lane does not cross this lane at right angles.
         """
         crossing = roads.lane(lane)
         start = self.lane_coordinates(crossing.start)[0]
@@ -123,7 +122,7 @@ class Frame(NamedTuple):
         return start
 
     def point(self, along: Quantity, sideways: Quantity) -> Coordinates:
-        """The point, or the points, at these distances along the lane and to its left [m]."""
+        """The point at these distances along the lane and to its left [m], or several points."""
         x, y = self.origin
         dir_x, dir_y = self.direction
         return (
@@ -133,42 +132,42 @@ class Frame(NamedTuple):
 
 
 class Roads(Protocol):
-    """A network without traffic."""
+    """A network without traffic, as a scenario sees it before a run."""
 
     def lane(self, lane: str) -> Lane:
-        """A lane by its id."""
+        """The lane with this id."""
 
 
 class World(Protocol):
-    """N copies of a simulated network, for scenarios."""
+    """N copies of a simulated network, as a scenario sees them during a run."""
 
     def vehicle_positions(self, actor: str) -> FloatArray:
-        """Front bumpers of a vehicle in its N copies; shape (N, 2) [m]."""
+        """Positions of the front bumper of a vehicle in the N copies [m], shape (N, 2)."""
 
     def person_positions(self, actor: str) -> FloatArray:
-        """Positions of a person in its N copies; shape (N, 2) [m]."""
+        """Positions of a person in the N copies [m], shape (N, 2)."""
 
     def speeds(self) -> FloatArray:
-        """Speeds of the vehicles under test; shape (N,) [m/s]."""
+        """Speeds of the vehicles under test [m/s], shape (N,)."""
 
     def vehicle_length(self, actor: str) -> float:
         """Length of a vehicle [m]."""
 
     def lane(self, lane: str) -> Lane:
-        """A lane by its id, the same in all copies; take its `start` and `end` by name, as it has a
-        third field.
+        """The lane with this id, which is the same in all copies. Take its `start` and `end` by
+        name: a lane has a third field.
         """
 
     def lane_of(self, vehicle: str) -> Lane:
-        """The lane that a vehicle is on, the same in all copies."""
+        """The lane on which a vehicle is, the same in all copies."""
 
     def person_width(self, actor: str) -> float:
         """Width of a person [m]."""
 
     def walk(self, person: str, speed: FloatOrArray) -> None:
-        """Make a person continue at a walking speed [m/s], one for all copies or one for each."""
+        """Make a person continue at a walking speed [m/s], a number for all copies or an array."""
 
     def turn_back(self, person: str, copies: Sequence[int] | None = None) -> None:
-        """Make a person turn round and walk back to its first edge at an unchanged speed, by
-        default in all copies.
+        """Make a person turn round, and walk back to its first edge at the same speed. By default
+        the person turns in all copies.
         """
