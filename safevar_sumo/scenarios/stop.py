@@ -42,18 +42,20 @@ class Stop(WorldScenario, Table, frozen=True, kw_only=True):
         return self.speed * KMH
 
     def actors(self, roads: Roads) -> XmlChanges:
-        """The vehicle under test alone, at its speed."""
+        """Set the departure speed of the vehicle under test, the only vehicle."""
         return {"vehicle[@id='vut']": {"departSpeed": repr(self.test_speed)}}
 
     def begin(self, world: World) -> Frame:
         return Frame.of(world.lane_of(VUT))
 
     def observe(self, world: World, step: float, memory: Frame) -> tuple[Scene, Frame]:
-        """Nobody, infinitely far away; it is over once the vehicle stands."""
+        """The scene without an obstacle: the gap is infinite. The encounter is over when the
+        vehicle stands.
+        """
         speeds = world.speeds()
         zeros = np.zeros_like(speeds)
         return Scene(zeros + np.inf, zeros, zeros, speeds <= STANDSTILL), memory
 
     def encounter(self, trace: Trace) -> Encounter:
-        """No encounter: metrics of one are undefined."""
+        """The geometry without an encounter: metrics of encounters are undefined."""
         return Encounter(trace.gap, trace.gap, trace.speed, np.zeros_like(trace.active))
