@@ -30,4 +30,4 @@ DESCRIPTIONS = {
     },
     "pymoo:NAME": f"An algorithm of pymoo (extra `pymoo`): {_PYMOO_NAMES}.",
 }
-"""What a study may name, for readers."""
+"""The names of algorithms that a study may state, with a description for users."""
