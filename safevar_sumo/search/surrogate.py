@@ -1,10 +1,10 @@
-"""NSGA-II on the prediction of models, which learn from all simulations so far.
+"""NSGA-II on the predictions of models. The models learn from all simulations so far.
 
-After the global search of SAMOTA (Haq, Shin and Briand, "Efficient online testing for DNN-enabled
-systems using surrogate-assisted and many-objective optimization", ICSE 2022), which simulates those
-settings that are best and those whose prediction is the most uncertain. The models here are bagged
-ridge regressions (Breiman, "Bagging predictors", Machine Learning 24, 1996). Only metrics are
-predicted; the measures of change are computed from the setting.
+The search follows the global search of SAMOTA (Haq, Shin and Briand, "Efficient online testing for
+DNN-enabled systems using surrogate-assisted and many-objective optimization", ICSE 2022). It
+simulates the settings with the best predictions, and the settings with the most uncertain
+predictions. The models here are bagged ridge regressions (Breiman, "Bagging predictors", Machine
+Learning 24, 1996). Only metrics are predicted, because measures of change follow from the setting.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
             except StopIteration as stop:
                 front = stop.value
 
-            # The best settings are simulated first, then those with the most uncertain prediction.
+            # The best settings come first, then the settings with the most uncertain predictions.
             new = {bytes(setting): row for row, setting in enumerate(front.settings)}
             for setting in archive.settings:
                 new.pop(bytes(setting), None)
@@ -67,7 +67,8 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
                 rows[promising:], key=front.column("certainty").__getitem__
             )
 
-            # Random settings if they are too few; a smaller budget begins as a larger one does.
+            # If the predictions give too few new settings, random settings are added. A search with
+            # a smaller budget simulates the same first settings as a search with a larger budget.
             candidates = np.concatenate([front.settings[rows], draw(number, rng)])
             batch = yield candidates[: min(number, budget)]
             archive = Evaluations.concatenate([archive, batch])
@@ -77,17 +78,20 @@ class Surrogate(Nsga2, frozen=True, kw_only=True):
 def _learn(
     archive: Evaluations, problem: Problem, seed: int
 ) -> Callable[[FloatArray], Evaluations]:
-    """Fit models of all metrics; the result predicts the evaluations of settings, shape (k, n).
+    """Fit models of all metrics. The returned function predicts the evaluations of settings, shape
+    (k, n).
 
-    Its metric `certainty` says how little the predictions of the safety degree differ. The models
-    are linear: unlike trees, they predict settings that are less safe than all known ones. An
-    undefined value counts as that of the original vehicle.
+    The predictions have a further metric, `certainty`: minus the standard deviation of the
+    predicted safety degrees. The models are linear: unlike trees, they can predict settings that
+    are less safe than all simulated settings. For an undefined metric, the models learn the
+    original vehicle's value.
     """
-    # These modules take a second to load.
+    # The import of these modules takes a second.
     from sklearn.ensemble import BaggingRegressor
     from sklearn.linear_model import Ridge
 
-    # Each model predicts all metrics, and the first one twice: one column has another shape.
+    # Each model predicts all metrics, and the first metric twice. With a single column, the
+    # predictions would have another shape.
     targets = [
         np.where(np.isnan(values), np.nan_to_num(problem.original.column(name)), values)
         for name, values in archive.metrics.items()
@@ -97,7 +101,8 @@ def _learn(
         archive.settings, columns
     )
 
-    # Further decimals differ between libraries of linear algebra, and so would searches.
+    # The last decimals differ between libraries of linear algebra. Without rounding, a search would
+    # take another way on another machine.
     def predict(settings: FloatArray) -> Evaluations:
         values = np.array(
             [model.predict(settings).T for model in bag.estimators_]
