@@ -1,4 +1,4 @@
-"""A study: data only, read strictly from a TOML file."""
+"""A study consists of data only, which are read strictly from a TOML file."""
 
 from safevar_sumo.study.characteristics import (
     CharacteristicTable as CharacteristicTable,
