@@ -1,5 +1,5 @@
-"""The JSON schema of study files, for editors. `python -m safevar_sumo.study.file_schema` renews
-the shipped file.
+"""The JSON schema of study files, for editors. `python -m safevar_sumo.study.file_schema` writes
+the shipped file again.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ EXTENDS = {
 
 
 def schema_text() -> str:
-    """The content of the shipped file: the records' schema, in which a file that extends a study
-    may leave out any key; the tables of algorithms and of a repair's parameters have names of their
-    own.
+    """The content of the shipped schema: the schema of the records with some changes. No key is
+    required, because a file may extend a study. Tables of algorithms, and tables of a repair's
+    parameters, may have any name.
     """
     schema = msgspec.json.schema(Study)
     tables = schema["$defs"]
