@@ -1,5 +1,5 @@
-"""Marks on the fields of a study's records: what the key of a field affects, and what a study that
-`extends` another one inherits.
+"""Marks on the fields of a study's records. A mark says what the key of a field affects, or whether
+a study inherits the key from the study that it `extends`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from msgspec import Meta, Struct
 
 
 class Table(Struct, frozen=True, forbid_unknown_fields=True):
-    """A table of a study file, or the parameters of a model in it; a key that is unknown is a
-    mistake.
+    """Base of the tables of a study file, and of the parameters of models. Unknown keys are
+    refused.
     """
 
 
@@ -23,29 +23,35 @@ def _mark(name: str) -> Meta:
 
 
 WITHOUT_EFFECT = _mark("without effect")
-"""No evaluation depends on it."""
+"""The key changes no evaluation."""
 ORDERED = _mark("ordered")
-"""The order of its keys has an effect, too: settings and points are arrays in this order."""
+"""The order of the keys in this table changes results, because arrays of settings and points are in
+this order.
+"""
 PART_OF_SYSTEM = _mark("part of system")
-"""It names a part of the system that is studied: a model and its network, a weather, a matrix."""
+"""The key names a part of the simulated system: a model and its network, a weather, or a matrix."""
 OF_SYSTEM = _mark("of system")
-"""It describes one system: a study in which a part of it differs does not inherit it."""
+"""The key describes one system. A study with another part of the system does not inherit the
+key.
+"""
 OF_VEHICLE_AND_ADS = _mark("of vehicle and ADS")
-"""It is about parameters of both: a study in which one of them differs does not inherit it."""
+"""The key is about parameters of the vehicle and of the ADS. A study with another vehicle or
+another ADS does not inherit the key.
+"""
 OF_SCENARIO = _mark("of scenario")
-"""It is about one scenario: a study that names another one does not inherit it."""
+"""The key is about one scenario. A study that names another scenario does not inherit the key."""
 OF_STUDY = _mark("of study")
-"""It is about one study: no other one inherits it."""
+"""The key is about one study. No other study inherits the key."""
 WHOLE = _mark("whole")
-"""A study inherits it as a whole or not at all."""
+"""A study inherits the whole table or nothing: single keys of the table cannot be overridden."""
 
 
 fields_of = cache(msgspec.structs.fields)
-"""The fields of a record, whose annotations msgspec evaluates anew each time."""
+"""The fields of a record. Without the cache, msgspec would evaluate the annotations each time."""
 
 
 def keys_with(mark: Meta, record: type[Table]) -> tuple[str, ...]:
-    """The keys of a record's fields that have a mark."""
+    """The keys of a record's fields that have this mark."""
     return tuple(
         field.name
         for field in fields_of(record)
@@ -54,8 +60,8 @@ def keys_with(mark: Meta, record: type[Table]) -> tuple[str, ...]:
 
 
 def with_effect(value: Any, kind: Any) -> Any:
-    """A value of a type, as plain tables, without the keys on which no evaluation depends, and with
-    the order of the keys of tables whose order has an effect.
+    """A value as plain tables, without the keys that change no evaluation. If the order of a
+    table's keys changes results, the order is added. `kind` is the type of the value.
     """
     inner_kinds = get_args(kind)
     if get_origin(kind) is Annotated:
