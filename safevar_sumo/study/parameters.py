@@ -1,4 +1,6 @@
-"""Parameters of a scenario or a weather that a study may search, as their fields declare them."""
+"""Parameters of a scenario or a weather that a study may search. Fields of their classes declare
+them.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +15,18 @@ from msgspec import Meta
 from safevar_sumo.study.marks import Table
 
 PHASE = "phase"
-"""The parameter of an encounter by which all of it begins later, as a share of the time between two
+"""The parameter by which the whole encounter begins later. Its unit is the time between two
 decisions of the driving system.
 """
 PHASE_DECIMALS = 4
-"""Decimals of a phase that is simulated and printed: unsafe windows of 0.1 % of a step occur."""
+"""Decimals to which phases are rounded. A range of unsafe phases may be as narrow as 0.1 % of a
+step.
+"""
 
 _hints_of = lru_cache(get_type_hints)
-"""The types of a class's fields, which Python compiles anew each time."""
+"""The types of a class's fields. Without the cache, Python would evaluate the annotations each
+time.
+"""
 
 
 class FreeParameter(Table, frozen=True, kw_only=True):
@@ -39,8 +45,8 @@ class FreeParameter(Table, frozen=True, kw_only=True):
 
 
 def searched(lower: float, upper: float, unit: str, meaning: str) -> Meta:
-    """The mark of a field that a study may search, with the widest domain, unit and meaning:
-    `speed: Annotated[float, searched(10, 80, "km/h", "speed of the vehicle")] = 40.0`.
+    """The mark of a field that a study may search. The mark states the widest domain, the unit and
+    the meaning: `speed: Annotated[float, searched(10, 80, "km/h", "speed of the vehicle")] = 40.0`.
     """
     return Meta(
         description=meaning,
@@ -51,8 +57,9 @@ def searched(lower: float, upper: float, unit: str, meaning: str) -> Meta:
 
 
 def free_parameters(model: type) -> dict[str, FreeParameter]:
-    """The fields of a `msgspec.Struct` or dataclass that are marked by `searched`, or by a `Meta`
-    with the bounds `ge` and `le`, a `description` and `extra={"unit": ...}`.
+    """The fields of a class that a study may search. The class is a `msgspec.Struct` or a
+    dataclass. A field is marked by `searched`, or by a `Meta` with the bounds `ge` and `le`, a
+    `description` and `extra={"unit": ...}`.
     """
     if not (issubclass(model, msgspec.Struct) or dataclasses.is_dataclass(model)):
         return {}
@@ -73,7 +80,7 @@ def free_parameters(model: type) -> dict[str, FreeParameter]:
 
 
 def _metas_in(kind: Any) -> Iterator[Meta]:
-    """The marks of a field's type, also within a union."""
+    """Yield the marks of a field's type, also the marks of members of a union."""
     for mark in getattr(kind, "__metadata__", ()):
         if isinstance(mark, Meta):
             yield mark
