@@ -1,4 +1,4 @@
-"""The user code, FMUs and data files that a study names."""
+"""The user code, the FMUs and the data files that a study names."""
 
 from __future__ import annotations
 
@@ -13,31 +13,33 @@ from safevar_sumo.study.schema import PYMOO, Study
 
 
 def user_code_names(study: Study) -> list[str]:
-    """The keys of a study that name user code, such as `ads.model = 'my_ads:Careful'`."""
+    """The keys of a study with user code and their values, such as `ads.model =
+    'my_ads:Careful'`.
+    """
     return [f"{key} = {name!r}" for key, name in (*user_code(study), *fmus_of(study))]
 
 
 def without_skipping(study: Study) -> Study:
-    """A study that stops where its simulator fails."""
+    """The study, but the first failure of its simulator stops it."""
     return msgspec.structs.replace(
         study, search=msgspec.structs.replace(study.search, failed="stop")
     )
 
 
 def fmus_of(study: Study) -> list[tuple[str, str]]:
-    """Key and path of a study's FMU."""
+    """The key and the path of a study's FMU, as a list; an empty list without an FMU."""
     if study.ads.kind == "fmu":
         return [("ads.model", study.ads.model)]
     return []
 
 
 def user_modules(study: Study) -> list[str]:
-    """The modules of a study's user code."""
+    """The names of the modules with a study's user code."""
     return sorted({name.partition(":")[0] for _, name in user_code(study)})
 
 
 def user_code(study: Study) -> list[tuple[str, str]]:
-    """Keys and names of a study's user code."""
+    """The keys and the names of a study's user code."""
     tests = [test.model for test in study.tests]
     names_by_key = {
         "vehicle.model": [study.vehicle.model],
@@ -58,13 +60,13 @@ def user_code(study: Study) -> list[tuple[str, str]]:
 
 
 def data_files(study: Study) -> dict[str, str]:
-    """The paths of the data files and folders that a study names, by their names: in `files`, or as
-    the parameter `file` of a shipped scenario.
+    """The paths of the data files and folders that a study names. A study names files under
+    `files`, or as the parameter `file` of a shipped scenario.
 
     Raises
     ------
     InputError
-        If one of them does not exist.
+        If a file does not exist.
     """
     places = study.origin.places or (os.getcwd(),)
     paths = {}
@@ -88,7 +90,7 @@ def data_files(study: Study) -> dict[str, str]:
 
 
 def _scenario_files(study: Study) -> list[str]:
-    """The values of the parameter `file` of shipped scenarios, in all tests."""
+    """The values of the parameter `file` of shipped scenarios, in all tests of the study."""
     texts = []
     for test in study.tests or [MatrixTest(name="it")]:
         if ":" not in (test.model or study.scenario.model):
