@@ -1,6 +1,6 @@
-"""Text on the terminal: users' text without markup and control characters; tables in which nothing
-is cut off; and the progress of long work, as a bar or elsewhere a line every half minute, with the
-time left.
+"""Output on the terminal: text without markup and control characters, tables in which nothing is
+cut off, and the progress of long work. Progress is a bar, or without a terminal a line every half
+minute, with the time left.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from rich.text import Text
 from safevar_sumo.errors import printable
 
 Progress = Callable[[str, int, int], None]
-"""A function that shows progress, called with the phase, and with the number of simulations that
-are done and their total, both of the whole command; the total is an estimate while it is not known
-how many rounds follow, and 0 where nothing is known.
+"""A function that shows progress. Its arguments are the phase, the number of simulations that are
+done, and the total number of simulations of the command. The total is an estimate while the number
+of rounds is unknown, and 0 if nothing is known.
 """
 SECONDS_BETWEEN_LINES = 30.0
-"""Interval of the lines that show progress without a terminal [s]."""
+"""Time between two lines that show progress without a terminal [s]."""
 MEASURED_SHARE = 0.25
-"""The share of the time so far, at its end, over which the speed is measured: a phase that the
-cache answered, or that is cheap, is soon forgotten.
+"""The speed is measured over this last share of the time so far. Therefore a phase that was fast,
+because the cache answered, is soon forgotten.
 """
 STALLED_SHARE = 0.25
-"""The least time left as a share of the time since the last sign of progress: what takes longer
-than expected does not end at once.
+"""The time left is at least this share of the time since the last sign of progress: work that takes
+longer than expected does not end at once.
 """
 UNLIMITED_WIDTH = 1_000_000
-"""Width in which no line is broken [characters]."""
+"""A width at which no line is broken [characters]."""
 
 
 class WholeTable(Table):
-    """A table of plain text that cuts nothing off.
+    """A table of plain text in which nothing is cut off.
 
-    In a narrow terminal it breaks lines between words; then it goes without padding; only then it
-    breaks words. Each column has a head, whether it holds numbers, and its cells.
+    In a narrow terminal, the table first breaks lines between words, then omits the padding, and
+    last breaks words. A column has a head, a truth value (whether it holds numbers), and its cells.
     """
 
     def __init__(
@@ -63,11 +63,11 @@ class WholeTable(Table):
     def __rich_console__(
         self, console: Console, options: ConsoleOptions
     ) -> RenderResult:
-        # Rich would break a title where its table ends.
+        # Rich would break a title at the width of its table.
         if self._title_line:
             yield self._title_line
 
-        # Widths that columns need for their longest word and for all text.
+        # For each column: the width of its longest word, and the width of its longest text.
         sizes = []
         count = len(self.columns)
         for column in self.columns:
@@ -79,7 +79,7 @@ class WholeTable(Table):
             sizes.append(tuple(map(max, zip(*measures, strict=True))))
             column.overflow = "fold"
 
-        # If not all fits, the space beside the lines is shared.
+        # If the table is too wide, columns share the space that the longest words leave.
         words, texts = map(sum, zip(*sizes, strict=True))
         space = options.max_width - count - 1
         if texts + 2 * count > space:
@@ -97,7 +97,7 @@ class WholeTable(Table):
 
 
 def printable_text(text: object, style: str = "") -> Text:
-    """Make text printable by rich: white space becomes a space, any other unprintable character a
+    """Convert text for rich. White space becomes a space, and any other unprintable character a
     question mark.
     """
     return Text("".join(map(_printable_letter, str(text))), style)
@@ -112,33 +112,38 @@ def _printable_letter(letter: str) -> str:
 
 
 def print_text(console: Console, text: str) -> None:
-    """Print a line of text without wrapping and markup."""
+    """Print a line of text without wrapping, and without interpreting markup."""
     console.print(printable(text), soft_wrap=True, markup=False, highlight=False)
 
 
 def show_no_progress(phase: str, number: int, total: int) -> None:
-    """Show no progress."""
+    """Ignore progress."""
 
 
 class Parts:
-    """The progress of parts of a command that come one after another, such as its questions: each
-    with the number of simulations that take as long as it is `expected` to take at least.
+    """The progress of parts of a command that follow each other, such as its questions.
+
+    `expected` has a number for each part: the part takes at least as long as this number of
+    simulations.
     """
 
     def __init__(self, show: Progress, expected: Iterable[int] = ()) -> None:
         self._show = show
         self._expected = list(expected)
         self._before = self._whole = 0
-        """Number of simulations of the parts before this one, and of this one."""
+        """Numbers of simulations of all parts before this part, and of this part."""
 
     def begin(self, name: str = "") -> Progress:
-        """The progress of the next part, whose name, if it has one, stands before its phases."""
+        """Begin the next part, and return the function that shows its progress. A `name` of the
+        part stands before its phases.
+        """
         self._before += self._whole
         expected = self._whole = self._expected.pop(0) if self._expected else 0
         later = sum(self._expected)
 
         def show_part(phase: str, number: int, total: int) -> None:
-            # What costs more than its simulations, such as workers that start, is spread over them.
+            # A part may take longer than its simulations, for example to start workers. Its
+            # expected number is spread over its simulations.
             self._whole = max(total, expected)
             number = self._whole * number // max(total, 1)
             if name:
@@ -149,16 +154,18 @@ class Parts:
 
 
 class Pace:
-    """The time left of a command, from when which share of its work was done."""
+    """Estimates the time left of a command, from the times at which parts of its work were done."""
 
     def __init__(self) -> None:
         self._marks = deque[tuple[float, int]]()
-        """Times [s] and what was done, from the beginning of the measurement of the speed on."""
+        """The times [s] and the work done at these times, since the beginning of the measurement of
+        the speed.
+        """
         self._begin = 0.0
         self._left = 0
 
     def update(self, number: int, total: int) -> None:
-        """Note what is done now, and how much there is in all."""
+        """Note how much work is done now, and how much work the command has."""
         now = time.monotonic()
         if not self._marks or number < self._marks[-1][1]:
             self._marks.clear()
@@ -171,7 +178,7 @@ class Pace:
             self._marks.popleft()
 
     def seconds_left(self) -> float | None:
-        """The time left [s]; None before anything is done."""
+        """The estimated time left [s]; None before any work is done."""
         if not self._marks:
             return None
         start, number_at_start = self._marks[0]
@@ -199,8 +206,8 @@ class _TimeLeft(ProgressColumn):
 def open_progress(
     progress: bool | Progress, console: Console | None = None
 ) -> Iterator[Progress]:
-    """Yield the function to call: `progress` itself, or one that moves a bar or prints lines (True)
-    or does nothing.
+    """Yield the function that shows progress: `progress` itself if it is a function. If it is True,
+    a function that moves a bar or prints lines. If it is False, a function that does nothing.
     """
     if progress is not True:
         yield progress or show_no_progress
