@@ -1,4 +1,4 @@
-"""`python -m safevar_sumo`, and the command `safevar-sumo`."""
+"""Starts the program: `python -m safevar_sumo`, and the command `safevar-sumo`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import threading
 import time
 
 ENDING_TIME = 5.0
-"""Time that threads and exit functions of user code have when a command has ended [s]."""
+"""Time that threads and exit functions of user code get after the end of a command [s]."""
 
 
 def main() -> None:
-    """Run the program; it is imported here and not above, because every worker process loads this
-    module too.
+    """Run the program. The import is in this function, because every worker process loads this
+    module, too, and does not need the program.
     """
     _put_installed_modules_first()
     from safevar_sumo import cli
@@ -26,7 +26,7 @@ def main() -> None:
 
 
 def _end_at_last(code: object) -> None:
-    """End this process, and simulators, if threads or exit functions keep it from ending."""
+    """End this process and its simulators, if threads or exit functions of user code do not end."""
     time.sleep(ENDING_TIME)
     if simulators := sys.modules.get("safevar_sumo.sumo.kept"):
         simulators.close_simulator()
@@ -34,8 +34,8 @@ def _end_at_last(code: object) -> None:
 
 
 def _put_installed_modules_first() -> None:
-    """Move the working directory, which `python -m` puts first, to the end of the path: a
-    `numpy.py` there must not replace numpy.
+    """Move the working directory from the beginning of Python's path to its end. `python -m` puts
+    the working directory first, and a `numpy.py` there would replace numpy.
     """
     if sys.path[0] in ("", os.getcwd()):
         sys.path.append(sys.path.pop(0))
