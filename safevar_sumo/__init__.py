@@ -13,7 +13,8 @@ _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        # Here, as it imports modules that a file of the working directory could replace.
+        # `importlib.metadata` imports modules that a file in the working directory could replace.
+        # Therefore it is imported only when it is needed.
         from importlib.metadata import version
 
         return version(__name__)
