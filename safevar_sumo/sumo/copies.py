@@ -1,5 +1,5 @@
-"""N copies of the XML of a network and its traffic, in which each id starts with the number of its
-copy; and the user's cache folder, which keeps such files.
+"""Writes N copies of a network and its traffic as XML: each id begins with the number of its copy.
+And the user's cache folder, which keeps such files.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ ROAD_IDS: IdAttributes = {
 }
 """Elements of a built network, with their attributes that contain ids."""
 SHARED_ELEMENTS = ("location", "type", "prohibition")
-"""Elements of a built network that all copies share; SUMO ignores prohibitions, as junctions
-contain them.
+"""Elements of a built network that all copies share. SUMO does not read prohibitions from a built
+network, because junctions state them, too.
 """
 DEMAND_IDS: IdAttributes = {
     "vType": ("id",),
@@ -60,7 +60,9 @@ _COPY_PLACEHOLDER = "\x01"
 
 
 def copied_id(copy: int | str, name: str) -> str:
-    """The id of `name` in a copy; internal edges keep their leading colon."""
+    """The id of the element `name` in a copy, such as "3.car"; the ids of internal edges keep their
+    leading colon (":3.junction").
+    """
     if name.startswith(":"):
         return f":{copy}.{name[1:]}"
     return f"{copy}.{name}"
@@ -70,8 +72,8 @@ _marked_id = partial(copied_id, _COPY_PLACEHOLDER)
 
 
 def copy_and_name(copied: str) -> tuple[int, str]:
-    """The copy to which an id belongs, and the name in the original network: the inverse of
-    `copied_id`.
+    """The number of the copy to which an id belongs, and the name in the original network: the
+    inverse of `copied_id`.
     """
     colon = ":" if copied.startswith(":") else ""
     copy, _, name = copied.removeprefix(":").partition(".")
@@ -93,8 +95,8 @@ def parse_xml(source: Path) -> ElementTree.Element:
 
 
 def write_roads(root: ElementTree.Element, n: int, file: Path) -> None:
-    """Write N copies of a built network, tag by tag: SUMO requires edges before junctions, and
-    junctions before connections.
+    """Write `n` copies of a built network. Copies are interleaved tag by tag, because SUMO requires
+    all edges before junctions, and junctions before connections.
 
     Raises
     ------
@@ -114,8 +116,8 @@ def write_roads(root: ElementTree.Element, n: int, file: Path) -> None:
 
 
 def write_demand(roots: Sequence[ElementTree.Element], n: int, file: Path) -> None:
-    """Write N copies of traffic in the order of departure: SUMO drops actors that come too late in
-    the file. There is one traffic for all copies, or one for each.
+    """Write `n` copies of traffic in the order of departure, because SUMO drops actors that come
+    too late in the file. `roots` has one traffic for all copies, or one for each.
 
     Raises
     ------
@@ -132,8 +134,8 @@ def write_demand(roots: Sequence[ElementTree.Element], n: int, file: Path) -> No
 
 
 def _departures(root: ElementTree.Element) -> Iterable[tuple[float, str]]:
-    """Yield the departure times [s] of children, and their XML with a placeholder in every id;
-    types and routes get -1, so that they come first.
+    """Yield the departure time [s] of each child of a traffic file, and its XML with a placeholder
+    in every id. Types and routes get the time -1, so that they come first.
     """
     time = 0.0
     for child in root:
@@ -145,13 +147,13 @@ def _departures(root: ElementTree.Element) -> Iterable[tuple[float, str]]:
 
 
 def parse_seconds(text: str) -> float | None:
-    """Convert a time in SUMO's format, seconds or [days:]hours:minutes:seconds, into seconds; None
-    if the text is no time.
+    """Convert a time in SUMO's format, seconds or [days:]hours:minutes:seconds, into seconds.
+    Returns None if the text is no time.
     """
     try:
         total = 0.0
         fields = text.split(":")
-        # The last field is that of seconds, however many stand before it.
+        # The last field has seconds, the field before it minutes, and so on.
         units = (86400, 3600, 60, 1)[-len(fields) :]
         for seconds, field in zip(units, fields, strict=True):
             total += seconds * float(field)
@@ -163,7 +165,7 @@ def parse_seconds(text: str) -> float | None:
 
 
 def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:
-    """An element as XML with a placeholder in every id; changes the element."""
+    """The XML of an element, with a placeholder in every id. The element itself is changed."""
     for part in element.iter():
         if part.tag not in ids:
             raise InputError(
@@ -178,8 +180,8 @@ def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:
 
 
 def _write(root: ElementTree.Element, blocks: Iterable[str], file: Path) -> None:
-    """Write a file with the root's tag and attributes, without those of a namespace, and `blocks`
-    of XML in it.
+    """Write a file with `blocks` of XML inside the tag of the root. Attributes of the root stay,
+    except attributes of a namespace.
     """
     attributes = {
         name: value for name, value in root.attrib.items() if not name.startswith("{")
@@ -197,7 +199,7 @@ def _write(root: ElementTree.Element, blocks: Iterable[str], file: Path) -> None
 
 
 def ensure_cached(folder: str, name: str, build: Callable[[Path], None]) -> Path:
-    """The path of a file in a folder of the cache, which is built if it does not exist.
+    """The path of a file in a folder of the cache; `build` writes the file if it does not exist.
 
     Parameters
     ----------
@@ -215,14 +217,14 @@ def ensure_cached(folder: str, name: str, build: Callable[[Path], None]) -> Path
     if (target / name).is_file():
         return target / name
 
-    # Another process must never see a part of it: it is moved to its place as a whole.
+    # Another process must never see a part of the folder, so that it is renamed when complete.
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(target.parent) as temporary:
             new = Path(temporary, "new")
             new.mkdir()
             build(new)
-            # Not even a power failure may leave a part of it at its place.
+            # Without this, a power failure after the renaming could leave an empty file.
             with (new / name).open("rb+") as file:
                 os.fsync(file.fileno())
             new.rename(target)

@@ -1,5 +1,5 @@
-"""The robot that holds the speed of a test until the system under test acts, as in Euro NCAP's
-tests.
+"""The robot that holds the speed of a test until the system under test acts, as in tests by Euro
+NCAP.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ MAX_ERROR, MIN_ERROR = 1.0 * KMH, -0.5 * KMH
 test protocols, "test execution").
 """
 PROPORTIONAL_GAIN, INTEGRAL_GAIN = 1.0, 1.0
-"""Gains of the robot [pedal per m/s, pedal per m], chosen so that `carla` is within 0.1 km/h 3 s
-after a pedal error of 0.15.
+"""Gains of the robot [pedal per m/s, pedal per m]. With these gains the vehicle `carla` is within
+0.1 km/h of its test speed 3 s after a pedal error of 0.15.
 """
 ACTION_THRESHOLD = 0.03
-"""Change of the pedal towards braking from which on the system acts [-]: about 0.3 m/s^2, the onset
-of an AEB by Euro NCAP.
+"""Change of the pedal towards braking by which the system acts [-]: it changes the acceleration by
+about 0.3 m/s^2, at which Euro NCAP sees the onset of an AEB.
 """
 
 
@@ -63,12 +63,12 @@ class DrivingRobot:
         size = n // len(points)
         speeds = []
         for point in points:
-            # Without a test the speed is None, which becomes NaN.
+            # A scenario that is no test has the speed None, which becomes NaN.
             speed = np.asarray(point.scenario.test_speed, float)
             speeds.append(np.broadcast_to(speed, size))
         self._test_speed = np.concatenate(speeds)
         self.has_test_speed = ~np.isnan(self._test_speed)
-        """Which vehicles are in a scenario with a `test_speed`."""
+        """Whether the scenario of each vehicle has a `test_speed`, shape (N,)."""
         self._is_driving = self.has_test_speed.copy()
         self._is_needed = bool(self.has_test_speed.any())
 
@@ -81,24 +81,24 @@ class DrivingRobot:
         self._has_braked = ~self.has_test_speed
         self._max_system_pedal = np.full(n, -np.inf)
         self.error = np.where(self.has_test_speed, 0.0, np.nan)
-        """Deviation from the test speed [m/s] that was largest relative to the tolerance while the
-        robot drove; NaN without a test.
+        """Deviation from the test speed while the robot drove [m/s], shape (N,): the deviation that
+        was largest relative to its tolerance; NaN without a test.
         """
-        # The error divided by the tolerance in its direction, which differs from the other's [-].
+        # The error over its tolerance [-]: the tolerances of higher and lower speeds differ.
         self._error_share = np.zeros(n)
 
     def drive(
         self, command: Command, state: State, is_open: BoolArray
     ) -> tuple[Command, State]:
-        """The command of the robot while it drives, otherwise of the system; and the state, with
-        the gear held while the robot drives.
+        """The robot's command while it drives a vehicle, and the system's command afterwards; and
+        the state, with the gear held while the robot drives.
 
-        `is_open` marks the runs that are not over; the speeds of other runs are not compared with
+        `is_open` is true for runs that have not ended; speeds of other runs are not compared with
         the tolerance.
         """
         if not self._is_needed:
             return command, state
-        # Once all have braked, this is the last call that it is needed for.
+        # Once all systems have braked, later calls have nothing to do.
         self._is_needed = not self._has_braked.all()
 
         error = np.where(self._is_driving, state.speed - self._test_speed, 0.0)
@@ -107,7 +107,7 @@ class DrivingRobot:
         np.copyto(self.error, error, where=is_larger)
         np.copyto(self._error_share, error_share, where=is_larger)
 
-        # Some systems ease off before they brake: that, too, is their action.
+        # Some systems release the accelerator before they brake: this counts as acting, too.
         self._has_braked |= command.brake > self._brake_threshold
         system_pedal = command.throttle - command.brake
         self._max_system_pedal = np.maximum(self._max_system_pedal, system_pedal)
@@ -144,5 +144,7 @@ class DrivingRobot:
 
     @property
     def invalid(self) -> BoolArray:
-        """Which vehicles left the tolerance before the system acted, shape (N,)."""
+        """Whether each vehicle left the tolerance of its test speed before the system acted, shape
+        (N,).
+        """
         return self._error_share > 1

@@ -48,20 +48,20 @@ OWN_OPTIONS = {
     "save-state.times": "",
     "save-state.period": "-1",
 }
-"""Options with which SUMO starts, whatever options a network's file has: how far a vehicle comes at
-its speeds, and what a collision is, depends on no user's file, and nobody who collides or waits
-leaves his place.
+"""Options with which SUMO starts, whatever options a network's file states. So no user's file
+decides how far a vehicle moves at its speeds and what a collision is, and SUMO never removes or
+teleports an actor that collides or waits.
 """
 OUTPUT, NO_FILE = (
     re.compile(r"(.+[.-])?output|netstate-dump|((error|message)-)?log"),
     "NUL",
 )
-"""SUMO's options that name a file to write, which would grow beside the user's network; and its
-name of no file.
+"""SUMO's options that name a file to write: such files would grow beside the user's network. And
+the name with which SUMO writes no file.
 """
 STEP_LENGTH = 0.05
-"""Time step where neither a study nor its network's file names one [s]: SUMO's own, 1 s, is no time
-to brake in.
+"""Time step if neither the study nor its network's file states one [s]. SUMO's default, 1 s, is too
+long for braking.
 """
 
 
@@ -73,8 +73,10 @@ def open_in_process(options: Sequence[str]) -> Iterator[Api]:
     ------
     SimulationError
         With SUMO's message, if SUMO cannot simulate a step.
+    EnvironmentFault
+        If SUMO does not start.
     """
-    # libsumo warns of a pyarrow of another version.
+    # libsumo prints a warning if pyarrow has another version: results belong to stdout alone.
     with redirect_stdout(sys.stderr):
         import libsumo
     with _open(libsumo, "SUMO"):
@@ -119,9 +121,9 @@ def open_window(options: Sequence[str]) -> Iterator[Api]:
 
 
 Create = Callable[[Api, int], SumoWorld]
-"""A function that returns the world of a simulation, with so many copies of the vehicle."""
+"""A function that returns the world of a simulation, from SUMO's API and the number of copies."""
 Start = Callable[[Sequence[str]], AbstractContextManager[Api]]
-"""What starts SUMO with options: `open_in_process` or `open_window`."""
+"""A function that starts SUMO with options: `open_in_process` or `open_window`."""
 
 
 @contextmanager
@@ -132,9 +134,9 @@ def open_world(
     create: Create = SumoWorld,
     start: Start = open_in_process,
 ) -> Iterator[SumoWorld]:
-    """Start SUMO on `n` copies of a network and its traffic, with a time step of `step` [s], by
-    default that of the network; close SUMO at the end, also after an error. `create` makes the
-    world of SUMO's API and the number of copies. Raises the errors of `start`.
+    """Start SUMO on `n` copies of a network and its traffic; close SUMO at the end, also after an
+    error. `step` is the time step [s] (None: that of the network's options). `create` makes the
+    world. Raises the errors of `start`.
     """
     with start(sumo_options(files, step)) as api:
         yield create(api, n)
@@ -157,8 +159,8 @@ def open_varied_world(
 
 @contextmanager
 def _open(api: Api, program: str) -> Iterator[None]:
-    """Report the errors of SUMO, and close SUMO at the end, even if it never started or its window
-    was closed.
+    """Turn an error of SUMO into a SimulationError, and close SUMO at the end, even if SUMO never
+    started or its window was closed.
     """
     try:
         yield
@@ -179,7 +181,7 @@ def traci_api() -> Api:
 
 def sumo_options(files: CopiedNetwork, step: float | None = None) -> list[str]:
     """The options with which SUMO simulates copies of a network; see `open_world`."""
-    # What the simulation needs overrules what the user's options say.
+    # The command line overrules the user's options: what the simulation needs stands there.
     stated = options_in(files.options)
     if step is None:
         step = step_of(stated)
@@ -201,14 +203,14 @@ def sumo_options(files: CopiedNetwork, step: float | None = None) -> list[str]:
 
 
 def own_options(stated: Mapping[str, str]) -> dict[str, str]:
-    """The options with which SUMO starts whatever a network's file states: `OWN_OPTIONS`, and no
-    file to write.
+    """The options that overrule the options `stated` by a network's file: `OWN_OPTIONS`, and no
+    file for each option that names a file to write.
     """
     return OWN_OPTIONS | dict.fromkeys(filter(OUTPUT.fullmatch, stated), NO_FILE)
 
 
 def step_of(stated: Mapping[str, str]) -> float:
-    """The time step of a network by the options that its file states [s]."""
+    """The time step of a network [s], by the options `stated` by its file."""
     return float(stated.get("step-length", STEP_LENGTH))
 
 

@@ -1,5 +1,5 @@
-"""Creates what a study names: its vehicle, its driving system, its scenario, and the points of its
-matrix.
+"""Creates the objects that a study names: its vehicle, its driving system, its scenario, and the
+points of its matrix.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ CONTROLLER_FORMS = (
 
 
 def create_shipped_models(study: Study) -> None:
-    """Create the shipped models of a study, which refuse parameters that they do not have; raises
-    InputError.
+    """Create the shipped models of a study, only to find errors: models refuse parameters that they
+    do not have. Raises an InputError.
     """
     with about(study.source):
         lookup = Lookup.of(study)
@@ -103,11 +103,11 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
                 CONTROLLER_FORMS,
             ) from None
 
-        # Each vehicle gets a controller of its own.
+        # Each vehicle gets its own controller, because controllers keep values between steps.
         create: Callable[[], Controller]
         if is_class:
             create = partial(instance_of, member, parameters, name, "ads.parameters")
-            # Wrong parameters raise their errors here.
+            # Create one controller now, so that wrong parameters are found before a simulation.
             create()
         else:
             create = partial(partial, controller, **parameters)
@@ -138,8 +138,8 @@ def matrix_points(study: Study, lookup: Lookup) -> Points:
 def _points_of(
     test: MatrixTest, study: Study, of_tests: Sequence[Constraint], lookup: Lookup
 ) -> Iterator[Point]:
-    """The points of a test of the study's matrix; `of_tests` are constraints that not every setting
-    has to satisfy.
+    """The points of a test of the study's matrix. `of_tests` are the constraints that hold only in
+    tests; all other constraints hold for every setting.
     """
     model = test.model or study.scenario.model
     shared = study.scenario.parameters if model == study.scenario.model else {}
@@ -151,7 +151,7 @@ def _points_of(
     )
     for number, alone in enumerate(study.points_of(test)):
         over = {name: alone.axes[name].at[0] for name in lists}
-        # All weathers of an encounter share a scenario.
+        # Neighbouring points are the weathers of one encounter: they share the scenario.
         if number % max(len(test.weathers), 1) == 0:
             table = ModelTable(
                 model=model, parameters={**shared, **test.parameters, **over}
@@ -178,7 +178,7 @@ def _points_of(
 
 
 def _check_listed(values: Mapping[str, Any], constraints: Sequence[Constraint]) -> None:
-    """Refuse a listed encounter that violates a constraint."""
+    """Refuse a listed encounter, given by values of parameters, that violates a constraint."""
     numbers = {
         name: value for name, value in values.items() if isinstance(value, int | float)
     }
@@ -193,11 +193,11 @@ def _check_listed(values: Mapping[str, Any], constraints: Sequence[Constraint]) 
 
 
 def _locate_network(scenario: Scenario, folders: Sequence[str]) -> Scenario:
-    """The scenario with the path of its network, if the network is not shipped but is a folder or
-    file beside the study.
+    """The scenario with the path of its network, if the network is a folder or a file in one of the
+    study's `folders`. A shipped network keeps its name.
 
-    A folder with sources has priority, because a results directory beside the study may have the
-    same name.
+    A folder with XML files has priority, because a results directory beside the study may have the
+    same name as the network.
     """
     paths = [
         path for folder in folders if is_network(path := Path(folder, scenario.network))
@@ -219,8 +219,8 @@ def _class_and_creator(
     lookup: Lookup,
     *bases: type,
 ) -> tuple[Member, Callable[[], Any]]:
-    """The class that the table `kind` names, and the function that creates an instance with the
-    table's parameters.
+    """The class that the `table` of a study names, and a function that creates an instance of it
+    with the table's parameters. `kind` is the name of the table, such as "vehicle".
     """
     traci = f'with ads.kind = "traci" {CONTROLLER_FORMS}' if kind == "ads" else ""
     member = lookup.class_of(
@@ -232,7 +232,7 @@ def _class_and_creator(
 
 
 def create_vehicle(table: VehicleTable, lookup: Lookup) -> Vehicle:
-    """A study's vehicle; raises an InputError."""
+    """The vehicle that a study names, with its parameters; raises an InputError."""
     member, create = _class_and_creator("vehicle", VEHICLES, table, lookup, Vehicle)
     vehicle: Vehicle = create()
     if member.code is not None and not isinstance(
@@ -259,7 +259,7 @@ def create_scenario(table: ModelTable, lookup: Lookup) -> Scenario:
 
 
 def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
-    """A study's driving system; raises an InputError."""
+    """The driving system that a study names, with its parameters; raises an InputError."""
     if table.kind == "traci":
         return _create_traci_controller(table, lookup)
 
@@ -289,8 +289,8 @@ def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
 def create_driven(
     study: Study, lookup: Lookup, scenario: Scenario
 ) -> tuple[Vehicle, Ads]:
-    """The vehicle of a study and its driving system; in a simulator of the user's own, only the
-    vehicle's characteristics. Raises an InputError.
+    """The vehicle and the driving system of a study. With a user's simulator, the vehicle has only
+    characteristics, and the driving system does nothing. Raises an InputError.
     """
     check_tables(study, scenario.mover)
     if scenario.mover.has("a driving system"):
@@ -304,5 +304,5 @@ def create_driven(
             "an object without UNITS",
             "UNITS: units of the vehicle's characteristics by name",
         )
-    # Neither moves nor drives anything.
+    # The simulator moves and drives the vehicle: these two objects only fill their places.
     return SimulatedVehicle(units, tuple(getattr(scenario, "OPTIONAL", ()))), Ads()  # type: ignore[abstract]

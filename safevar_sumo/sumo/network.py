@@ -1,10 +1,10 @@
-"""SUMO networks: their folders, and N copies of a network and its traffic, at the same coordinates
-and unconnected.
+"""SUMO networks: their folders, and N copies of a network and its traffic. The copies have the same
+coordinates, and no connection with each other.
 
-A folder has a recipe (`.netccfg`), by which netconvert builds the network, or a built network
-(`.net.xml`); its traffic, and SUMO's options. Shipped networks have both, and are used as built, so
-that only a user's recipe needs netconvert (extra `sumo`). The user's cache folder keeps the network
-that netconvert built and the copies, in folders named by the content of the sources.
+A folder has a network, its traffic, and SUMO's options. The network is built (`.net.xml`), or a
+recipe (`.netccfg`) from which netconvert builds it. Shipped networks have both, and are used as
+built, so that only a user's recipe needs netconvert (extra `sumo`). The user's cache folder keeps
+built networks and copies, in folders named by the content of the sources.
 """
 
 from __future__ import annotations
@@ -47,26 +47,29 @@ LEGAL_FOLDERS = (
     f"beside {TRAFFIC_FILE} and {OPTIONS_FILE}"
 )
 NETWORK_KEY = "scenario.parameters.network"
-"""Key of a study that names the network, the source of errors about a network that does not exist.
-"""
+"""Key of a study that names the network, as errors about a missing network state it."""
 SOURCE_OPTION = re.compile(
     r"sumo-net-file|(osm|opendrive|node|edge|connection|type|tllogic|polygon|additional)-files"
 )
-"""Options of netconvert, and of SUMO beside the network and its traffic, that name files to read.
+"""Options that name files to read: all such options of netconvert, and those of SUMO except the
+network and its traffic.
 """
 DIGEST_LENGTH, MESSAGE_LENGTH = 16, 500
-"""Numbers of characters of a digest, and of a program's message, that are used."""
+"""Numbers of characters to which a digest and a program's message are cut."""
 Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
-"""`XmlChanges` that can be hashed."""
+"""The same as `XmlChanges`, as tuples, which can be hashed: paths of elements, and their new
+attributes, or None for an element that is removed.
+"""
 
 
 class NetworkFiles(NamedTuple):
-    """A network as its files are now.
+    """A network, with the digests of its files when it was opened.
 
-    `roads_file` is the built network, or the recipe that netconvert builds it from; `digests` are
-    those of the recipe and its sources or, without a recipe, of the built network, and of traffic,
-    options and the files that they add, by file name. A scenario's parameters change its lanes once
-    it is built, and its traffic.
+    `roads_file` is the built network, or the recipe from which netconvert builds it. `digests` are
+    pairs of a file's name and its digest: of the recipe and its sources (without a recipe, of the
+    built network), of the traffic, of SUMO's options, and of files that these options name.
+    `lane_changes` and `traffic_changes` are changes by a scenario's parameters, of lanes of the
+    built network and of the traffic.
     """
 
     folder: Path
@@ -80,7 +83,7 @@ class NetworkFiles(NamedTuple):
 
     @property
     def is_built(self) -> bool:
-        """Whether the network is there as it was built; otherwise netconvert builds it."""
+        """Whether a file has the built network; otherwise netconvert builds it from a recipe."""
         return self.roads_file.endswith(NETWORK_ENDING)
 
 
@@ -130,7 +133,7 @@ def is_network(path: Path) -> bool:
     """Whether a path is a folder or a built network."""
     try:
         return path.is_dir() or (path.name.endswith(NETWORK_ENDING) and path.is_file())
-    # For example, a name is too long.
+    # The operating system refuses some names, such as a name that is too long.
     except OSError:
         return False
 
@@ -145,8 +148,8 @@ def options_in(file: Path) -> dict[str, str]:
 
 
 def _roads_in(folder: Path) -> str:
-    """The recipe in a folder or, without a recipe, its built network; of several the one that
-    SUMO's options name.
+    """The recipe in a folder or, without a recipe, its built network. If there are several, SUMO's
+    option `net-file` decides.
     """
     names = _names_in(folder, RECIPE_ENDING) or _names_in(folder, NETWORK_ENDING)
     if len(names) > 1 and (folder / OPTIONS_FILE).is_file():
@@ -167,7 +170,7 @@ def _names_in(folder: Path, ending: str) -> list[str]:
 
 
 def _sources_of(file: Path) -> list[str]:
-    """The files that a configuration names; none for a built network."""
+    """The names of the files that a configuration reads; none for a built network."""
     if file.name.endswith(NETWORK_ENDING):
         return []
     names = list[str]()
@@ -178,7 +181,9 @@ def _sources_of(file: Path) -> list[str]:
 
 
 class CopiedNetwork(NamedTuple):
-    """The files of N copies, and the file with SUMO's options."""
+    """The files of a simulation: the copies of the network, the copies of the traffic, and SUMO's
+    options.
+    """
 
     network: Path
     traffic: Path
@@ -186,7 +191,7 @@ class CopiedNetwork(NamedTuple):
 
 
 def copied_network(network: NetworkFiles, n: int) -> CopiedNetwork:
-    """At least `n` copies of a network, of which `n` have traffic.
+    """Make at least `n` copies of a network, and traffic for `n` of these copies.
 
     Raises
     ------
@@ -232,8 +237,8 @@ def copied_network(network: NetworkFiles, n: int) -> CopiedNetwork:
 
 @contextmanager
 def varied_network(networks: Sequence[NetworkFiles]) -> Iterator[CopiedNetwork]:
-    """A copy of one network for each of N traffics, whose file exists until the end; raises the
-    errors of `copied_network`.
+    """A copy of one network for each of N traffics: `networks` differ only in their traffic. The
+    file with the traffic exists until the context ends. Raises the errors of `copied_network`.
     """
     files = copied_network(networks[0], len(networks))
     traffic_file = networks[0].path(TRAFFIC_FILE)
@@ -248,8 +253,8 @@ def varied_network(networks: Sequence[NetworkFiles]) -> Iterator[CopiedNetwork]:
 
 
 def built_network(network: NetworkFiles) -> Path:
-    """The file of the network, which netconvert builds unless it is there, with its changes; raises
-    the errors of `copied_network`.
+    """The file of the built network with its changes of lanes. netconvert builds the network if
+    this has not been done yet. Raises the errors of `copied_network`.
     """
     if not network.lane_changes and network.is_built:
         return network.path(network.roads_file)
@@ -306,8 +311,8 @@ def program_of_sumo(name: str, source: object) -> str:
 
 
 def run_program(folder: Path, *command: str) -> tuple[int, str]:
-    """Run a program of SUMO in a folder; return its exit code, and its errors and warnings on one
-    line.
+    """Run a program of SUMO in a folder. Returns the exit code, and the program's errors and
+    warnings on one line.
     """
     process = subprocess.run(
         [*command, "--xml-validation", "never"],
@@ -337,7 +342,9 @@ def _code_digest() -> str:
 
 
 def road_digests(network: NetworkFiles) -> list[str]:
-    """Digests of a network's roads: of its sources, the file as it was built, and its changes."""
+    """Texts that identify a network's roads: digests of its sources and of the built network, and
+    the changes of lanes.
+    """
     digests = []
     for name, digest in network.digests:
         if name not in (TRAFFIC_FILE, OPTIONS_FILE):
@@ -368,7 +375,7 @@ def _run_netconvert(network: NetworkFiles, file: Path) -> None:
 
 
 def network_for(scenario: Scenario) -> NetworkFiles:
-    """The scenario's network, with lanes and traffic changed by the scenario's parameters.
+    """The network of a scenario, with the changes of lanes and traffic by its parameters.
 
     Raises
     ------
@@ -382,8 +389,8 @@ def network_for(scenario: Scenario) -> NetworkFiles:
 
 
 def networks_for(scenarios: Sequence[Scenario]) -> list[NetworkFiles]:
-    """The networks of several scenarios, whose files are read once per network; raises the errors
-    of `network_for`.
+    """The networks of several scenarios, as of `network_for`. The files of a network that several
+    scenarios share are read only once. Raises the errors of `network_for`.
     """
     opened = {}
     networks = []
@@ -399,7 +406,7 @@ def networks_for(scenarios: Sequence[Scenario]) -> list[NetworkFiles]:
 
 
 def _frozen(changes: XmlChanges) -> Changes:
-    """The changes with the attributes of elements as pairs, where they are not removed."""
+    """The changes as tuples, which can be hashed; see `Changes`."""
     items = {
         path: tuple(attributes.items())
         for path, attributes in changes.items()

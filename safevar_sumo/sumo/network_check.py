@@ -1,5 +1,5 @@
-"""Checks of a user's network: SUMO loads it, and further checks refuse what SUMO accepts but
-studies cannot use.
+"""Checks of a user's network: SUMO must load it. Further checks refuse networks and traffic that
+SUMO accepts, but that studies cannot use.
 """
 
 from __future__ import annotations
@@ -39,10 +39,9 @@ from safevar_sumo.sumo.network import (
 )
 
 SHORTEST_STEP, LONGEST_STEP = 0.001, 1.0
-"""SUMO's shortest time step, and the longest step in which a vehicle can still react in time [s].
-"""
+"""SUMO's shortest time step, and the longest step with which a vehicle can react in time [s]."""
 MAX_SLOPE = 0.005
-"""Largest difference in height on a road that counts as level, per length [-]."""
+"""Largest difference in height over the length of a lane that counts as level [-]."""
 N_STEPS = 600
 """Number of steps in which the traffic of two copies is compared."""
 WARNINGS_FILE = "warnings.txt"
@@ -60,7 +59,7 @@ DRIVER_ATTRIBUTES = re.compile(
     "carFollowModel|speedFactor|speedDev|sigma.*|desiredMaxSpeed|impatience|laneChangeModel|lc[A-Z].*|jm[A-Z].*"
     "|actionStepLength|startupDelay|delta|stepping|minGapLat|maxSpeedLat|latAlignment"
 )
-"""Attributes of SUMO's own driver."""
+"""Attributes of a vehicle or its type that only SUMO's own driver uses."""
 SETTING_ATTRIBUTES = (
     "mass",
     "accel",
@@ -70,7 +69,7 @@ SETTING_ATTRIBUTES = (
     "maxSpeed",
     "tau",
 )
-"""Attributes of the type of the vehicle under test that the vehicle model replaces by values of the
+"""Attributes of the type of the vehicle under test that the simulation replaces by values of a
 setting.
 """
 ACTING_ATTRIBUTES = (
@@ -85,24 +84,24 @@ ACTING_ATTRIBUTES = (
     ),
     *("actionStepLength", "delta", "stepping"),
 )
-"""Attributes with which SUMO's driver drives under a controller written for TraCI; he never dawdles
-(sigma).
+"""Attributes that act on SUMO's driver under a controller written for TraCI. `sigma` is none of
+them, because this driver never dawdles.
 """
 NO_EFFECT = {"sigma": "0", "speedDev": "0", "speedFactor": "1"}
-"""Values of attributes of SUMO's own driver that no remark mentions."""
+"""Values that attributes of SUMO's own driver would have anyway: no remark mentions them."""
 EXACT_MODELS = ("Krauss", "KraussOrig1", "IDM", "ACC", "CACC")
-"""Car-following models of which SUMO's driver under a controller drives as in SUMO."""
+"""Car-following models with which SUMO's driver under a controller drives exactly as in SUMO."""
 SIGMA_MODELS, DETERMINISTIC_MODELS = (
     ("Krauss", "KraussOrig1", "KraussPS"),
     ("IDM", "IDMM", "ACC", "CACC"),
 )
 """Car-following models that are random unless sigma is 0, and models that are never random."""
 DEFAULT_OPTIONS = {"step-method.ballistic": "false"}
-"""SUMO's default of an option that is overruled, and changes how everybody moves."""
+"""SUMO's default of an option that every study overrules, and that changes how all actors move."""
 SWITCHED_OFF = "-1"
-"""A waiting time that is never over, as all that are not above 0."""
+"""A value that switches a waiting time off; every value up to 0 does."""
 TRUE_VALUES = ("1", "yes", "true", "on", "x", "t")
-"""Words for true in SUMO's options."""
+"""Words that mean true in SUMO's options."""
 LEGAL_OPTIONS = (
     f"a step-length from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s], no remote-port, all traffic in"
     f" {TRAFFIC_FILE}: safevar_sumo starts SUMO itself"
@@ -123,7 +122,7 @@ def check_network(name: str) -> None:
     Raises
     ------
     InputError
-        Naming the file, the illegal value and the legal values.
+        The error names the file, the illegal value and the legal values.
     EnvironmentFault
         If netconvert fails for reasons outside the network.
     """
@@ -134,11 +133,11 @@ def check_network(name: str) -> None:
 
 
 def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
-    """Remarks on attributes of a user's traffic and on options that the simulation does not use,
-    and SUMO's warnings; none on shipped networks.
+    """Remarks on attributes of a user's traffic and on options that have no effect, and SUMO's
+    warnings; none on shipped networks.
 
-    `acting` are the attributes of SUMO's own driver that act, as with a controller written for
-    TraCI.
+    `acting` are the attributes of SUMO's own driver that have an effect, because this driver drives
+    under a controller written for TraCI.
     """
     if is_shipped(name):
         return []
@@ -163,7 +162,7 @@ def network_remarks(name: str, acting: Collection[str] = ()) -> list[str]:
         unused = f"{file}: no effect on vehicle {VUT!r}: {', '.join(unused_attributes)}"
         remarks.append(f"{unused}; the study's vehicle and ADS determine how it drives")
 
-    # SUMO's driver drives beside a controller.
+    # With a controller, SUMO's driver follows leaders by a car-following model.
     vtype = parse_xml(file).find(f"vType[@id='{VUT}']")
     model = "" if vtype is None else vtype.get("carFollowModel", "")
     if acting and model not in ("", *EXACT_MODELS):
@@ -212,7 +211,7 @@ def _is_same(stated: str, value: str) -> bool:
 
 @lru_cache(maxsize=100)
 def _check_files(network: NetworkFiles) -> None:
-    # With a remote-port SUMO would wait for a client.
+    # With the option remote-port SUMO would wait for a client for ever.
     options = {
         "step-length": str(STEP_LENGTH),
         "route-files": TRAFFIC_FILE,
@@ -233,7 +232,7 @@ def _check_files(network: NetworkFiles) -> None:
         )
         raise InputError(network.path(OPTIONS_FILE), stated, LEGAL_OPTIONS)
 
-    # The vehicle under test departs at once, alone of its type, as each setting changes its type.
+    # A setting changes the type of the vehicle under test: no other vehicle may have this type.
     file = network.path(TRAFFIC_FILE)
     traffic = parse_xml(file)
     vut = next(
@@ -275,7 +274,9 @@ def _check_files(network: NetworkFiles) -> None:
 def _check_lanes(
     file: Path, routes: Iterable[ElementTree.Element], roads: ElementTree.Element
 ) -> None:
-    """Refuse a sloping or slippery road of the vehicle under test."""
+    """Refuse a road on the routes of the vehicle under test that is not level, or has another
+    friction than 1.
+    """
     names = set()
     for route, name in product(routes, ("edges", "from", "via", "to")):
         names |= {*route.get(name, "").split()}
@@ -300,8 +301,8 @@ def _check_lanes(
 
 
 def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
-    """Refuse types whose drivers are random: two copies of traffic that reacts to the vehicle may
-    not show it yet.
+    """Refuse types whose drivers are random. Comparing two copies of the traffic does not suffice:
+    drivers who react to the vehicle under test may show their randomness only in later encounters.
     """
     actors = [actor for actor in traffic if actor.tag in ("vehicle", "trip", "flow")]
     names = {actor.get("type") for actor in actors} - {VUT}
@@ -328,8 +329,8 @@ def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
 
 
 def _warnings_file(network: NetworkFiles) -> Path:
-    """A file with SUMO's warnings about a network that SUMO has loaded; raises the errors of
-    `check_network`.
+    """The file in the cache with SUMO's warnings about a network. SUMO loads the network if there
+    is no such file yet. Raises the errors of `check_network`.
     """
     folder = cache_folder_name(network, 0, [digest for _, digest in network.digests])
     return ensure_cached(
@@ -338,8 +339,8 @@ def _warnings_file(network: NetworkFiles) -> Path:
 
 
 def _try_network(network: NetworkFiles, into: Path) -> None:
-    """Load a network in a SUMO process of its own, as some crash SUMO; then compare the traffic of
-    two copies.
+    """Load a network in a separate process, because some networks crash SUMO. Then compare the
+    traffic of two copies, and write SUMO's warnings into the folder `into`.
     """
     legal = "options and traffic that SUMO loads without an error"
     options = {
@@ -360,7 +361,7 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
             legal,
         )
 
-    # Traffic that is random moves otherwise in each copy.
+    # Random traffic moves in another way in each copy.
     try:
         actor, time = _first_difference(network)
     except (SimulationError, EnvironmentFault) as error:
@@ -379,10 +380,10 @@ def _try_network(network: NetworkFiles, into: Path) -> None:
 
 
 def _first_difference(network: NetworkFiles) -> tuple[str, float]:
-    """The first actor that moves differently in two copies, and the time [s]; "" and 0 if there is
-    none.
+    """The first actor whose motion differs between two copies of the traffic, and the time [s]; ""
+    and 0 if there is no such actor in `N_STEPS` steps.
 
-    The vehicle under test stays at its start.
+    In both copies the vehicle under test stays at its start.
     """
     with open_world(copied_network(network, 2), 2) as world:
         world.enter(None)

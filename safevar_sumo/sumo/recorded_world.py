@@ -1,6 +1,6 @@
-"""Vehicles that drive in a recorded scene, without SUMO.
+"""A world in which vehicles drive in a recorded scene, without SUMO.
 
-The vehicles move along the scene's lanes by SUMO's ballistic update, and collide where bodies
+The vehicles move along the scene's lanes by SUMO's ballistic update, and collide when bodies
 overlap. Their positions equal SUMO's to the last bit, because this module repeats the operations of
 `MSVehicle::updateState`, `MSLane::interpolateLanePosToGeometryPos` and
 `PositionVector::positionAtOffset` in the same order.
@@ -32,14 +32,14 @@ from safevar_sumo.vehicles import SumoType
 NUMERICAL_EPS = 0.001
 """SUMO's tolerance for positions on lanes [m] (utils/common/StdDefs.h)."""
 PARALLEL_COSINE = 1 - 1e-9
-"""Smallest absolute cosine of the angle between two parallel vehicles, which may drive in opposite
-directions.
+"""Smallest absolute cosine of the angle between two vehicles that count as parallel; they may drive
+in opposite directions.
 """
 
 
 class _Moment(NamedTuple):
-    """Fronts of the vehicles [m], their speeds [m/s], and whether SUMO looks for collisions with
-    persons there.
+    """The motion of N vehicles at one time: their fronts, shape (N, 2) [m], their speeds, shape
+    (N,) [m/s], and whether SUMO looks for collisions with persons on their lanes, shape (N,).
     """
 
     fronts: FloatArray
@@ -48,10 +48,10 @@ class _Moment(NamedTuple):
 
 
 class RecordedWorld:
-    """A recorded scene with `size` vehicles; a `VehicleWorld` in which others move as recorded.
+    """A `SceneWorld` with `size` vehicles in a recorded scene: all other actors move as recorded.
 
-    The scene may stand for K scenes with `size` vehicles in each: then its `start`, `speed` and
-    tracks are arrays with one value for each (`encounters.py`).
+    A recording may stand for K scenes with `size` vehicles in each. Then its `start`, `speed` and
+    tracks are arrays with a value for each scene (see `encounters.py`).
     """
 
     def __init__(self, recording: Recording, size: int) -> None:
@@ -77,8 +77,8 @@ class RecordedWorld:
             np.add.outer((recording.length, recording.width), np.hypot(*self._sizes.T))
             / 2
         )
-        """Largest distances of the middles of a vehicle and of each actor that touch, along the way
-        and across [m].
+        """Largest distances between the middles of a vehicle and an actor that touch, along and
+        across the way, shape (2, A) [m].
         """
         begins = (self._middles @ recording.along - self._reach[0]).reshape(
             n_samples, -1
@@ -86,8 +86,8 @@ class RecordedWorld:
         self._begins = (
             np.fmin.reduce(begins, axis=1, initial=np.inf) + recording.length / 2
         )
-        """The first position along the way, at every sample, of a front that may touch somebody
-        [m].
+        """Position along the way that a front must have reached to touch somebody, at every sample
+        [m]; infinite without actors.
         """
         self.n = size * n_scenes
         self.step_length = recording.step_length
@@ -98,17 +98,19 @@ class RecordedWorld:
         self._now = self._moment(np.repeat(recording.speed, size))
         self._before = self._now
         self._struck: dict[int, int] = {}
-        """The actors that vehicles strike in this step, by vehicle."""
+        """The numbers of the actors that vehicles hit in this step, by vehicle number."""
 
     def enter(
         self, types: SumoType | None, *, keeps_drivers: bool = False
     ) -> VehicleStates:
-        """All vehicles have departed, and their types do not limit the commanded speeds."""
+        """Return the first motion. The recording starts with vehicles that have departed, and types
+        do not limit the speeds that `step` gets.
+        """
         return self._moved(np.ones(self.n, bool))
 
     def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
-        """Simulate one step, in which the vehicles whose runs are open reach `speeds` [m/s] at a
-        constant acceleration.
+        """Simulate one step, in which vehicles with `is_open` (their runs have not ended) reach
+        `speeds` [m/s] at a constant acceleration.
 
         Raises
         ------
@@ -193,15 +195,15 @@ class RecordedWorld:
     turn_back = walk
 
     def _hits(self, is_open: BoolArray) -> Hits:
-        """Speeds [m/s] of the vehicles of open runs whose body overlaps another actor's, by vehicle
-        number.
+        """Speeds [m/s] of the vehicles whose body overlaps the body of an actor, by vehicle number.
+        Vehicles whose runs have ended (not `is_open`) are left out.
 
-        SUMO checks twice in a step: after persons have moved but before vehicles have, and after
-        vehicles have moved (`MSNet::simulationStep`: `STAGE_EVENTS`, `STAGE_MOVEMENTS`). Persons
-        who cross a junction are checked against vehicles whose front is on it
-        (`MSLane::detectCollisions`).
+        As in SUMO, overlaps count at two times of a step: after persons have moved but before
+        vehicles have, and after vehicles have moved (`MSNet::simulationStep`: `STAGE_EVENTS`,
+        `STAGE_MOVEMENTS`). Persons who cross a junction are only hit by vehicles whose front is on
+        this junction (`MSLane::detectCollisions`).
         """
-        # In most steps nobody is near: then no overlaps are computed.
+        # In most steps nobody is near any vehicle: this test saves the computation of overlaps.
         self._struck = {}
         if (self._now.fronts @ self._scene.along).max() < self._at_sample(self._begins):
             return {}
@@ -209,7 +211,7 @@ class RecordedWorld:
         if not len(vehicles):
             return {}
 
-        # Persons are struck before they move, vehicles after they have moved.
+        # `early` is before vehicles move, `late` is after; other vehicles are hit only late.
         persons = self._is_person[actors]
         early = self._overlaps(
             self._before,
@@ -231,7 +233,9 @@ class RecordedWorld:
         return dict(zip(struck.tolist(), speeds.tolist(), strict=True))
 
     def _is_near(self) -> BoolArray:
-        """Which of the A actors each vehicle may have touched since the last step, shape (N, A)."""
+        """Whether each vehicle may have touched each of the A actors since the last step, shape
+        (N, A).
+        """
         middles = self._now.fronts - self._scene.along * (self._scene.length / 2)
         offsets = (
             middles.reshape(-1, self._size, 1, 2)
@@ -253,8 +257,9 @@ class RecordedWorld:
         actors: IntArray,
         is_checked: BoolArray,
     ) -> BoolArray:
-        """Which vehicles overlap their actor among the pairs that are checked. Two parallel
-        vehicles must overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
+        """Whether vehicle and actor overlap in each pair of `vehicles` and `actors`; false for
+        pairs that are not `is_checked`. Two parallel vehicles must overlap by more than a
+        millimetre (SUMO, `MSLane::detectCollisionBetween`).
         """
         overlaps = np.zeros(len(vehicles), bool)
         (pairs,) = np.nonzero(is_checked)
@@ -289,12 +294,12 @@ class RecordedWorld:
         )
 
     def _at_sample(self, motion: FloatArray) -> FloatArray:
-        """The row of this sample; without actors there is only one."""
+        """The row of `motion` at the current sample; without actors there is only one row."""
         row: FloatArray = motion[min(self.sample, len(motion) - 1)]
         return row
 
     def _actors(self, vehicles: IntArray, actors: IntArray) -> Body:
-        """The bodies of actors now, as these vehicles meet them."""
+        """The bodies of actors at the current sample, each in the scene of its vehicle."""
         motion = self._at_sample(self._motion)[vehicles // self._size, actors]
         length, width = self._sizes[actors].T
         return Body.behind(motion[:, :2], motion[:, 2:4], length, width, motion[:, 4])

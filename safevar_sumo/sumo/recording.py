@@ -1,8 +1,8 @@
-"""Scenes that SUMO plays once, as all other actors move identically in every simulation if nobody
-reacts to the vehicle under test.
+"""Recorded scenes: SUMO plays a scene only once if nobody reacts to the vehicle under test, because
+then all other actors move in the same way in every simulation.
 
-While SUMO plays a scene, this vehicle stays at its start; `recorded_world.py` moves vehicles in the
-recorded scene.
+While SUMO plays a scene, the vehicle under test stays at its start. `recorded_world.py` moves
+vehicles in the recorded scene.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ SCENE_FILE = "scene.msgpack"
 POSITION_EPS = 0.1
 """Smallest length of a lane's shape (SUMO, utils/common/StdDefs.h) [m]."""
 STRAIGHTNESS = 1e-6
-"""Largest difference, on a straight line, between directions of lanes [-] or between an end and the
-next start [m].
+"""Largest difference between lanes that form a straight line: between components of their
+directions [-], or between the end of a lane and the start of the next lane [m].
 """
 NEXT_LANE, INTERNAL_LANE = 0, 4
-"""Positions in a link of `getLinks`: the lane that it leads to, and the lane on the junction, "" if
-there is none.
+"""Indices in a link that `getLinks` returns: of the lane to which the link leads, and of the lane
+on the junction between both lanes ("" if there is no such lane).
 """
 NOT_STRAIGHT = (
     "the vehicle under test does not depart in the middle of a lane and"
@@ -57,13 +57,14 @@ NOT_STRAIGHT = (
 
 
 class LaneSequence(NamedTuple):
-    """The L lanes of a straight line that the vehicle under test follows, in order; shape (L,) or
-    (L, 2) [m].
+    """The L lanes that the vehicle under test follows, in order; they form a straight line. Columns
+    have the shape (L,) or (L, 2) [m].
 
-    A lane's shape leads from `origin` along `vector`, over `shape_length`. SUMO counts positions on
-    the lane from 0 to `end`; `stretch` is `shape_length` / `end`. `meets_persons` is 1 where SUMO
-    looks for collisions with persons: on the lanes of junctions, which persons cross, or everywhere
-    if there is no junction; else 0.
+    A lane's shape leads from `origin` along `vector`, whose length is `shape_length`. SUMO counts
+    positions on the lane from 0 to `end`; `stretch` is `shape_length` / `end`, with at least
+    `POSITION_EPS` as length. `meets_persons` is 1 on lanes on which SUMO looks for collisions with
+    persons, else 0: on lanes of junctions, which persons cross, or on all lanes if there is no
+    junction.
     """
 
     origin: FloatArray
@@ -74,7 +75,9 @@ class LaneSequence(NamedTuple):
     meets_persons: FloatArray
 
     def at(self, lane: IntArray) -> LaneSequence:
-        """The current lanes of N vehicles, given by lane number; columns of length N."""
+        """The current lanes of N vehicles, from their lane numbers, shape (N,); the columns of the
+        result have the length N.
+        """
         return LaneSequence._make(column[lane] for column in self)
 
     def positions(self, lane_position: FloatArray) -> FloatArray:
@@ -89,9 +92,10 @@ class LaneSequence(NamedTuple):
 class Recording:
     """A recorded scene of T samples.
 
-    The vehicle under test departs at position `start` on the first lane of its `way` [m], at
-    `speed` [m/s]; `length` and `width` are its size [m], `along` is the direction of its way.
-    `lanes` are the shapes of all lanes, `first_lanes` each vehicle's first lane.
+    The vehicle under test departs at the position `start` on the first lane of its `way` [m], at
+    `speed` [m/s]. `length` and `width` are its size [m], `along` is the direction of its way, a
+    unit vector. `lanes` has the shape of each lane of the network, `first_lanes` the first lane of
+    each vehicle, and `tracks` the motion of all other actors.
     """
 
     step_length: float
@@ -111,8 +115,8 @@ class Recording:
 
 
 class Scenes:
-    """The scenes of a study, each recorded when it is first needed, with the study's time step [s]
-    (None: that of the network).
+    """The scenes of a study. Each scene is recorded when it is first needed, with the study's time
+    step [s] (None: the time step of the network).
     """
 
     def __init__(self, step_length: float | None = None) -> None:
@@ -127,10 +131,10 @@ class Scenes:
         )
 
     def of(self, scenario: WorldScenario) -> Recording | str:
-        """A scenario's scene, or the reason why SUMO must simulate it.
+        """The recorded scene of a scenario, or the reason why SUMO must simulate the scenario.
 
-        SUMO plays a scene once; scenes of shipped scenarios are also kept in the user's cache
-        folder.
+        SUMO plays a scene once. Scenes of shipped scenarios are also kept in the user's cache
+        folder, for later processes.
 
         Raises
         ------
@@ -145,8 +149,8 @@ class Scenes:
         return self._recorded[scenario]
 
     def reason_against_scenes(self, points: Sequence[Point]) -> str:
-        """Why SUMO must simulate one of the points, in a copy of the network for each vehicle; ""
-        if scenes suffice.
+        """The reason why SUMO must simulate one of the points, in a copy of the network for each
+        vehicle; "" if recorded scenes suffice for all points.
         """
         for point in points:
             if isinstance(point.scenario, WorldScenario):
@@ -157,10 +161,12 @@ class Scenes:
 
 
 def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
-    """A scene, read from the cache or played by SUMO with the study's time step [s]."""
+    """The scene of a scenario, from the cache or played by SUMO with this time step [s]; or the
+    reason why it cannot be recorded.
+    """
     if scenario.reactive_actors:
         return "an actor of the scenario may react to the vehicle under test"
-    # A shipped scenario knows only shipped networks; a user's scenario declares that nobody reacts.
+    # Shipped scenarios know that nobody reacts in shipped networks; a user's scenario declares it.
     if not scenario.is_user_code and not is_shipped(scenario.network):
         return (
             f"the traffic of the network {scenario.network!r} may react to the"
@@ -190,8 +196,8 @@ def _scene_of(scenario: WorldScenario, step: float | None) -> Recording | str:
 
 @cache
 def _code_bytes() -> bytes:
-    """SUMO's version and the code that plays scenes: a scene depends on them and on its
-    scenario.
+    """SUMO's version and the code that plays scenes, as bytes: a cached scene is valid only for the
+    same version and code.
     """
     files = sorted(
         [*(PACKAGE / "sumo").glob("*.*"), *(PACKAGE / "scenarios").glob("*.*")]
@@ -211,7 +217,7 @@ def _unpacked_array(_: Any, packed: Any) -> FloatArray:
 def _play(
     scenario: WorldScenario, network: NetworkFiles, step: float | None
 ) -> Recording | str:
-    """The scene, or the reason why it cannot be recorded."""
+    """Let SUMO play a scene. Returns the recording, or the reason why it cannot be recorded."""
     with open_world(copied_network(network, 1), 1, step) as world:
         world.enter(None)
         api = world.api
@@ -225,7 +231,7 @@ def _play(
             for id_ in vehicle.getIDList()
         }
 
-        # The tracks are last: they advance the world.
+        # `_tracks` must come last: it advances the world, and the other values are of the start.
         return Recording(
             step_length=world.step_length,
             start=float(vehicle.getLanePosition(vut)),
@@ -244,7 +250,7 @@ def _play(
 
 
 def _tracks(scenario: WorldScenario, world: SumoWorld) -> Films:
-    """How all actors except the vehicle under test move."""
+    """The motion of all actors except the vehicle under test, until the end of the scenario."""
     length = round(scenario.duration / world.step_length) + 1
 
     tracks = Films()
@@ -262,10 +268,10 @@ def _tracks(scenario: WorldScenario, world: SumoWorld) -> Films:
 
 
 def _way_of(api: Api, vut: str) -> LaneSequence | None:
-    """The lanes of a vehicle's route; None if the vehicle does not depart in the middle of a lane,
-    or the lanes do not form a straight line.
+    """The lanes that a vehicle follows on its route. None if the vehicle does not depart in the
+    middle of a lane, if a choice of lanes is open, or if the lanes form no straight line.
     """
-    # The way has the lanes of junctions, too, which a route leaves out.
+    # A route has no lanes of junctions: they follow from the links between lanes.
     lanes = [api.vehicle.getLaneID(vut)]
     for edge in api.vehicle.getRoute(vut)[api.vehicle.getRouteIndex(vut) + 1 :]:
         links = [

@@ -1,4 +1,4 @@
-"""Runs in a simulator of the user's own, which drives one vehicle after another."""
+"""Runs of a user's simulator, which simulates one setting after another."""
 
 from __future__ import annotations
 
@@ -64,16 +64,19 @@ SEVERITY = [
     Outcome.PASSED,
     Outcome.STOPPED,
 ]
-"""Outcomes of the rounds of a setting, the worst first."""
+"""Outcomes that rounds of a setting may have, from the worst to the best."""
 COLLISION = Unsafe()
-"""What a simulator states of a run."""
+"""The criterion for a single run if the study states none, or a share of unsafe runs: a collision.
+"""
 _steps = WeakKeyDictionary[type, dict[str, float]]()
-"""The time step of each class, as this process has loaded it, at each point [s]."""
+"""Time steps [s] of the runs in this process, by class of the simulator and by name of the point.
+A class that is loaded again is another class.
+"""
 
 
 def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
-    """Simulate N settings of n characteristics, shape (N, n), at the system's only point, one after
-    another, each within the time limit.
+    """Simulate N settings of n characteristics, shape (N, n), one after another, at the system's
+    only point. The time limit holds for each simulation.
     """
     (point,) = system.points
     vehicles, encounters = system.split(settings)
@@ -109,7 +112,7 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
 
 
 class _Setting(dict[str, float]):
-    """A setting that knows which of its values were read."""
+    """A setting that notes which of its values a simulator has read; `unread` has all others."""
 
     def __init__(self, values: NamedValues) -> None:
         super().__init__(values)
@@ -123,7 +126,7 @@ class _Setting(dict[str, float]):
         self.unread.discard(name)
         return super().get(name, default)
 
-    # Whoever copies a setting, by any of these, reads all of it.
+    # A simulator that iterates over a setting, or copies it, reads all values.
     def __iter__(self) -> Iterator[str]:
         self.unread.clear()
         return super().__iter__()
@@ -138,8 +141,8 @@ class _Setting(dict[str, float]):
 
 
 def unread_characteristics(system: System, settings: FloatArray) -> set[str]:
-    """The characteristics of the vehicle that a simulator of the user's own reads in none of N
-    settings, shape (N, n); none in another system.
+    """The characteristics of the vehicle that a user's simulator reads in none of N settings, shape
+    (N, n). The result is empty for systems without such a simulator.
     """
     if system.mover.is_exact:
         return set()
@@ -158,8 +161,8 @@ def unread_characteristics(system: System, settings: FloatArray) -> set[str]:
 
 
 def simulations_of_setting(system: System) -> int:
-    """How many simulations a setting takes: at each point, as often as it is repeated, and beside
-    the original vehicle where encounters count only if that is safe.
+    """The number of simulations that a setting takes: one for each point and repetition, and twice
+    as many if the original vehicle must be simulated in the same encounter, too.
     """
     has_pairs = system.measuring.scoring.safe_original is not None
     return len(system.points) * system.repeats * (1 + has_pairs)
@@ -167,17 +170,19 @@ def simulations_of_setting(system: System) -> int:
 
 @contextmanager
 def _attempt(command: str, system: System) -> Iterator[None]:
-    """Note that a setting is simulated, for a study that skips those that fail.
+    """Context that notes, for other processes, that this setting is being simulated. It does
+    nothing unless the study skips settings on which the simulator fails.
 
     Raises
     ------
     UserCodeError
-        If two workers have died of it.
+        If more than `MAX_DEATHS` workers have died while they simulated this setting.
     """
     if this_process.attempts is None or not system.skips_failed:
         yield
         return
-    # An attempt is a file that its process has locked, from the moment it is there.
+    # An attempt is a file that its process locks before it moves the file to its place: a file
+    # that nobody has locked is of a process that has died.
     attempts = this_process.attempts / sha256(command.encode()).hexdigest()
     attempts.mkdir(parents=True, exist_ok=True)
     if sum(map(_has_died, attempts.iterdir())) > MAX_DEATHS:
@@ -196,7 +201,9 @@ def _attempt(command: str, system: System) -> Iterator[None]:
 
 
 def _has_died(attempt: Path) -> bool:
-    """Whether the process of an attempt has died during it: nobody has locked its file."""
+    """Whether the process of an attempt has died during the attempt: its file still exists, and
+    nobody has locked it.
+    """
     with (
         suppress(FileNotFoundError, portalocker.LockException),
         attempt.open("r+") as file,
@@ -208,8 +215,8 @@ def _has_died(attempt: Path) -> bool:
 
 @contextmanager
 def _end_worker() -> Iterator[None]:
-    """Let a simulator that ends the program end this process, if it is a worker: a new one
-    simulates the setting again.
+    """Context in which a simulator that ends the program (SystemExit) ends this process, if the
+    process is a worker. A new worker then simulates the setting again.
     """
     try:
         yield
@@ -220,7 +227,9 @@ def _end_worker() -> Iterator[None]:
 
 
 def _check_step(simulator: Simulator, time: FloatArray, point: str) -> None:
-    """Refuse another time step than that of earlier runs of this process at a point."""
+    """Refuse a time step that differs from the time step of earlier runs at the same point in this
+    process.
+    """
     kind = type(simulator)
     step = round(float(time[1] - time[0]), 6)
     earlier_step = _steps.setdefault(kind, {}).setdefault(point, step)
@@ -233,8 +242,8 @@ def _check_step(simulator: Simulator, time: FloatArray, point: str) -> None:
 
 
 def _check_names(scenario: Simulator, result: StatedRun, system: System) -> None:
-    """Refuse metrics that nobody knows, and objectives that are missing, in a result without a
-    trace.
+    """Refuse a result without a trace that states unknown metrics, or lacks a metric that is an
+    objective of the study.
     """
     code = UserCode(f"scenario.model = {type(scenario).__name__}", type(scenario))
     measures = system.measuring.measures
@@ -265,8 +274,10 @@ def _check_names(scenario: Simulator, result: StatedRun, system: System) -> None
 def _runs_of(
     results: Sequence[StatedRun], system: System, allowed_impact_speed: float
 ) -> SimulationRuns:
-    """The runs of N results, each with its own number of samples; 0 without a trace."""
-    # A result with a trace states no metrics: they follow from the trace.
+    """The runs of N results. Each run has its own number of samples; 0 for a result without a
+    trace.
+    """
+    # Metrics of a result with a trace follow from the trace, those of other results are stated.
     traces, rigs = list[StatedRun](), list[StatedRun]()
     for result in results:
         has_trace = TIME in result
@@ -278,8 +289,8 @@ def _runs_of(
     samples = np.arange(lengths.max())
 
     def column(name: str) -> FloatArray:
-        """A quantity of all runs, shape (T, N), NaN where a run does not have it; after its end, a
-        run keeps its last value.
+        """A quantity of all runs, shape (T, N). It is NaN in a run that lacks this quantity; after
+        the end of a run its last value stays.
         """
         values = nans((len(samples), len(traces)))
         for row, trace in enumerate(traces):
@@ -288,7 +299,7 @@ def _runs_of(
         return values
 
     def number(name: str, of: Sequence[StatedRun] = results) -> FloatArray:
-        """What results state, shape (N,), NaN where they do not."""
+        """The number that each result states under a name, shape (N,); NaN without it."""
         return np.array([result.get(name, np.nan) for result in of], float)
 
     def is_missing(name: str) -> BoolArray:
@@ -337,10 +348,13 @@ def _runs_of(
 def joined(
     evaluations: Evaluations, repeats: int, criterion: Unsafe = COLLISION
 ) -> Evaluations:
-    """Of N settings that were simulated in several rounds, in their order, the worst outcome, the
-    safety degree and the collision speed of the worst run, the share of runs that are unsafe by the
-    study's own criterion, and the mean of each other metric over the runs that define it. Metrics
-    by which a run is unsafe are kept of each round, too.
+    """Join the evaluations of N settings that were simulated in `repeats` rounds, one round after
+    another, into one evaluation for each setting.
+
+    It has the worst outcome of all rounds; the safety degree and the collision speed of the run
+    with the least safety degree; the share of runs that are unsafe by `criterion`; and of each
+    other metric the mean over the runs that define it. The safety degree and metrics that not every
+    study has are also kept for each round (`NAME_1`, `NAME_2`, ...).
     """
     n = len(evaluations) // repeats
     columns = np.arange(n)

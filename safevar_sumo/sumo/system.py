@@ -1,5 +1,5 @@
-"""A study's parts, ready to simulate: models, points, measures and constraints, which fit each
-other.
+"""The parts of a study, ready to simulate: models, points, measures and constraints. `assemble`
+checks that the parts fit each other.
 """
 
 from __future__ import annotations
@@ -44,23 +44,27 @@ from safevar_sumo.vehicles import (
 )
 
 _ONE_AT_A_TIME = RLock()
-"""Held while a system is assembled, which unloads users' modules and may drive in SUMO."""
+"""Lock for assembling a system: it unloads users' modules and may start SUMO, so that two threads
+must not do it at the same time.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class System:
     """A study's models, points, metrics and constraints, ready to simulate.
 
-    - `source` is the study, as errors name it.
-    - `scenes` are the recorded scenes of all points, and of points that it is reduced to.
+    - `source` is the name of the study in errors.
+    - `scenes` has the recorded scenes of all points. A system that is reduced to fewer points
+      shares them.
     - `metrics_table` has the thresholds of the metrics in `measuring`.
-    - `aggregate` is that of the matrix: the least safety degree, or another measure, decides which
-      point is worst.
+    - `aggregate` decides which point of a matrix is the worst: the point with the least safety
+      degree, or with the worst value of another measure.
     - A simulation that takes longer than `time_limit` [s] counts as hung.
-    - Settings are simulated at `points`: those of the matrix, or the study's only scenario.
-    - A simulator of the user's own simulates each setting `repeats` times.
-    - `criterion` is the study's own.
-    - With `skips_failed`, settings on which a simulator of the user's own fails are infeasible.
+    - Settings are simulated at `points`: the points of the matrix, or the study's only scenario.
+    - A user's simulator simulates each setting `repeats` times.
+    - `criterion` is the criterion for unsafe that the study states (default: a collision).
+    - With `skips_failed`, a setting on which a user's simulator fails gets the outcome
+      `simulator-error`. Otherwise such a failure is an error.
     - `command` simulates the original vehicle of the study.
     - With `in_sumo` SUMO moves the vehicles, also where recorded scenes suffice.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
@@ -97,16 +101,16 @@ class System:
 
     @property
     def mover(self) -> Mover:
-        """Who moves the vehicles, of the same kind at all points."""
+        """The mover of the vehicles: SUMO, or a user's simulator. It is the same at all points."""
         return self.points[0].scenario.mover
 
     def require(self, part: Part, question: str) -> None:
-        """Refuse a question that needs a part that the mover lacks, with the reason.
+        """Refuse a question that needs a part, such as a driving system, that the mover lacks.
 
         Raises
         ------
         InputError
-            About the study.
+            The error states why the mover lacks this part.
         """
         if reason := self.mover.lacks.get(part):
             raise InputError(
@@ -122,15 +126,15 @@ class System:
 
     @property
     def step(self) -> float:
-        """Time step of the simulations [s]; 0 of a mover with one of its own."""
+        """Time step of the simulations [s]; 0 if the mover has its own time step."""
         if self.mover.has_own_step:
             return 0.0
         return self.scenes.step_of(self.points[0].scenario)
 
     @cached_property
     def contact(self) -> float:
-        """The safety degree at which bodies touch [m]: 0, or half of both lengths between
-        middles.
+        """The safety degree at which bodies touch [m]: 0 if it is a distance between bumpers, half
+        the sum of both lengths if it is a distance between middles.
         """
         scenario = self.points[0].scenario
         if not scenario.centre_to_centre:
@@ -150,22 +154,22 @@ class System:
             return (world.vehicle_length(VUT) + float(scene.obstacle_length)) / 2
 
     def with_contact(self, unsafe: Unsafe) -> Unsafe:
-        """A criterion with the safety degree at which bodies touch, if it is a clearance."""
+        """The criterion; if it is a clearance, with the safety degree at which bodies touch."""
         if unsafe.below is None:
             return unsafe
         return replace(unsafe, contact=self.contact)
 
     def split(self, settings: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Of N settings, shape (N, n), the vehicles, shape (N, k), and the encounters that they
-        meet: values of the n - k parameters that the study searches.
+        """Split N settings, shape (N, n), into the values of the vehicles, shape (N, k), and the
+        values of their encounters: the n - k scenario parameters that the study searches.
         """
         of_vehicle = self.characteristics.of_vehicle
         return settings[:, of_vehicle], settings[:, ~of_vehicle]
 
     def at_encounters(self, encounters: FloatArray) -> System:
-        """The system at encounters, shape (N, n - k): its only point, with arrays as the parameters
-        that the study searches, or several points if that is the phase alone; the system itself if
-        it has none.
+        """The system in N encounters, shape (N, n - k): its points have arrays as the parameters
+        that the study searches. There may be several points if the study searches only the phase.
+        A system of a study that searches no scenario parameters is returned as it is.
         """
         if not encounters.shape[1]:
             return self
@@ -183,8 +187,8 @@ class System:
 
 
 def simulate_command(study: Study) -> str:
-    """The command that simulates the original vehicle of a study, at the only point to which it was
-    reduced.
+    """The command that simulates the original vehicle of a study; if the study was reduced to a
+    point, at this point.
     """
     return f"{PROGRAM_COMMAND} simulate {study.words}"
 
@@ -195,15 +199,17 @@ def assemble(study: Study) -> System:
     Raises
     ------
     InputError
-        Naming the study, the key, the value and the legal values.
+        The error names the study, the key, the value and the legal values.
     """
     with user_errors(study.source), _ONE_AT_A_TIME:
         return _assemble(study)
 
 
 def _original_points(study: Study, lookup: Lookup, single: Point) -> Points:
-    """The points in the original encounter, where encounters are ranges; `single` is that without
-    a matrix. Ranges have to be possible, also where listed encounters alone are met.
+    """The points of a study whose encounters are ranges, each in its original encounter; () for
+    other studies. `single` is the only point of a study without a matrix.
+
+    Ranges that the study states are checked even if the study uses listed encounters.
     """
     in_ranges = with_ranges(study) if study.states_ranges else study
     points = matrix_points(in_ranges, lookup) or (single,) if in_ranges.ranges else ()
@@ -221,7 +227,7 @@ def _original_points(study: Study, lookup: Lookup, single: Point) -> Points:
 
 
 def _assemble(study: Study) -> System:
-    # The models: each system has the code as it is now, and no state of another one.
+    # User code is loaded anew: a system must not share state with another, nor have old code.
     unload_user_modules()
     lookup = Lookup.of(study)
     scenario = create_scenario(study.scenario, lookup)

@@ -1,5 +1,5 @@
-"""Vehicle models by name; and the calibration drive of the original vehicle, from which an ADS
-knows its pedals.
+"""Vehicle models by name; and the calibration drive of the original vehicle, which tells an ADS how
+the vehicle reacts to its pedals.
 """
 
 from collections.abc import Mapping
@@ -46,7 +46,9 @@ LIGHT_BRAKE = 0.1  # pedal position while braking, far from the limit of the tyr
 
 
 def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> Nominal:
-    """The original vehicle on a dry road; the drive is simulated when its tables are first used."""
+    """The original vehicle as an ADS knows it, on a dry road. The calibration drive is simulated
+    when its tables are first used.
+    """
     types = vehicle.sumo_type(_prepared_original(vehicle, characteristics))
     mass, accel, decel, max_speed, lag = (float(values[0]) for values in types[:5])
     return Nominal(
@@ -73,16 +75,16 @@ def _prepared_original(
 def _simulated_tables(
     vehicle: Vehicle, characteristics: CharacteristicSet
 ) -> PedalTables:
-    """Accelerate at full throttle to the highest speed of the tables; from there, coast in one
-    drive and brake lightly in another.
+    """Tables from three drives of the original vehicle: it accelerates at full throttle to the
+    highest speed of the tables; from there it coasts in one drive, and brakes lightly in another.
     """
     prepared = _prepared_original(vehicle, characteristics)
 
     def drive(
         state: VehicleState, throttle: float, brake: float
     ) -> tuple[list[float], VehicleState]:
-        """The speed after each step [m/s], until it leaves the range of the tables; and the last
-        state.
+        """Drive with constant pedals until the speed leaves the range of the tables, or for
+        `LONGEST_DRIVE`. Returns the speed after each step [m/s], and the last state.
         """
         speeds = [float(state.speed[0])]
         command = Command(np.full(1, throttle), np.full(1, brake))
@@ -108,17 +110,18 @@ def _simulated_tables(
         coasting=coasting,
         braking=float(np.median(braking - coasting)) / LIGHT_BRAKE,
     )
-    # Many ADSs read them.
+    # Many ADSs share these tables: none of them may change a table.
     for table in (tables.speeds, tables.full_throttle, tables.coasting):
         table.flags.writeable = False
     return tables
 
 
 def _accelerations(speeds: list[float]) -> FloatArray:
-    """Acceleration from each of `SPEEDS` to the next, in a drive that gains speed [m/s^2].
+    """The acceleration between each of `SPEEDS` and the next one [m/s^2], from the speeds of a
+    drive that gains speed.
 
-    Outside the speeds of the drive, the nearest acceleration holds. A drive at constant speed has
-    acceleration 0.
+    Outside the speeds of the drive, the nearest acceleration is used. The acceleration is 0 if the
+    drive reaches fewer than two of `SPEEDS`.
     """
     distinct_speeds, samples = np.unique(
         np.maximum.accumulate(np.array(speeds)), return_index=True

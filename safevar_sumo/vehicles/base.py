@@ -27,8 +27,9 @@ Positive = Annotated[float, Meta(gt=0, le=1e5)]
 
 
 class Plausible(NamedTuple):
-    """The plausible values of a characteristic, in its unit, or of a parameter, in `unit`: wide
-    enough for every road vehicle, too narrow for another unit.
+    """The range of plausible values of a characteristic (in the unit of the characteristic) or of a
+    parameter (in `unit`). The range is wide enough for every road vehicle, and so narrow that a
+    value in another unit is outside.
     """
 
     lowest: float
@@ -41,12 +42,12 @@ MASS = Plausible(50, 60_000, "kg")
 FRICTION = Plausible(0.05, 3, "-")
 """Friction coefficient of tyres."""
 SECONDS = Plausible(1e-12, 20, "s")
-"""Delays, time constants and headways: above 0."""
+"""Delays, time constants and headways; a plausible value is above 0."""
 
 
 class Slope(NamedTuple):
-    """Gravity on a road, scalar or shape (N,) [m/s^2]: `back` against the direction of travel,
-    negative downhill; `down` onto the road.
+    """The components of gravity on a road, numbers or shape (N,) [m/s^2]: `back` acts against the
+    direction of travel (negative downhill), `down` acts onto the road.
     """
 
     back: FloatOrArray
@@ -57,23 +58,23 @@ LEVEL = Slope(0.0, GRAVITY)
 
 
 def slope_of(grade: FloatArray) -> Slope:
-    """The slope of a grade, rise over run [%]: g sin and g cos of its angle."""
+    """The slope of a road with this grade (rise over run) [%]: g sin and g cos of its angle."""
     rise = grade / 100
     length = np.sqrt(1 + rise * rise)
     return Slope(GRAVITY * (rise / length), GRAVITY / length)
 
 
 Characteristics = Mapping[str, FloatArray]
-"""Values of N vehicles by characteristic, in the units of the model's table, each of shape (N,)."""
+"""Values of N vehicles by characteristic, each of shape (N,), in the units of `Vehicle.UNITS`."""
 
 
 class SumoType(NamedTuple):
-    """N vehicles as SUMO and driving systems see them; every column has shape (N,).
+    """N vehicles as SUMO and driving systems know them; every column has the shape (N,).
 
-    Mass [kg], largest acceleration and deceleration [m/s^2] and top speed [m/s] are those of a SUMO
-    vehicle type. `actuator_lag` is the time constant with which the wheels follow the pedals [s].
-    `tau` is the time headway that SUMO's driver of the vehicle keeps [s]; None if it is not among
-    the characteristics.
+    Mass [kg], largest acceleration and deceleration [m/s^2] and top speed [m/s] are attributes of a
+    SUMO vehicle type. `actuator_lag` is the time constant with which the wheels follow the pedals
+    [s]. `tau` is the time headway that SUMO's driver of the vehicle keeps [s]; None if `tau` is not
+    among the characteristics.
     """
 
     mass: FloatArray
@@ -85,11 +86,11 @@ class SumoType(NamedTuple):
 
 
 class Sensors(NamedTuple):
-    """Properties of the sensors of N vehicles, each of shape (N,): latency [s], range in clear
-    weather [m], factor on distances [-].
+    """Properties of the sensors of N vehicles, each of shape (N,): latency [s], `reach`, the range
+    in clear weather [m], and `scale`, the factor on distances [-].
 
-    A vehicle's method `sensors(prepared)` returns them; `Vehicle.sense` applies the same sensors to
-    an observation.
+    The method `Vehicle.sensors` returns these properties; `Vehicle.sense` applies the same sensors
+    to an observation.
     """
 
     latency: FloatArray
@@ -103,13 +104,17 @@ class Sensors(NamedTuple):
 
 
 Prepared = Any
-"""A vehicle's constants of a run, as its `prepare` returns them, of its own type."""
+"""Constants of N vehicles in a run, as the model's `prepare` returns them; each model has its own
+type of constants.
+"""
 State = Any
-"""The state of N vehicles, of the model's own type; see `VehicleState`."""
+"""The state of N vehicles. Each model has its own type of state, with the columns of
+`VehicleState`.
+"""
 
 
 HIGHEST_SPEED = 1000.0
-"""Highest speed of a vehicle [m/s]; beyond it a model has diverged."""
+"""Highest legal speed of a vehicle [m/s]: a model with a higher speed has diverged."""
 LEGAL_STATE = {
     "speed": Legal(0.0, HIGHEST_SPEED),
     "throttle": SHARE,
@@ -123,7 +128,7 @@ LEGAL_SENSORS = {
 }
 LEGAL_OBSERVATION = {
     **dict.fromkeys(Observation._fields, Legal(scalar=True)),
-    # While no obstacle is detected.
+    # Both are infinite while no obstacle is detected.
     **dict.fromkeys(("gap", "lateral"), Legal(infinite=True)),
 }
 
@@ -144,7 +149,7 @@ class VehicleState(Protocol):
 
 
 class Vehicle:
-    """A vehicle model. Its fields are the parameters of `vehicle.parameters`.
+    """A vehicle model. Its fields are the keys of `vehicle.parameters` in a study.
 
     Every method is a pure function over arrays of N vehicles: element i of a result depends only on
     element i of the arguments, bit for bit. So methods use only + - * / and square roots,
@@ -156,15 +161,15 @@ class Vehicle:
     UNITS
         Units of the characteristics by name.
     OPTIONAL
-        Characteristics that a study may leave out: then they have no effect. Their original value
-        may be 0.
+        Characteristics that a study may leave out: then they have no effect. The original value of
+        such a characteristic may be 0.
     PLAUSIBLE
-        Plausible values of characteristics and parameters by name; a study with others is refused.
-        A name may be missing.
+        Plausible values of characteristics and parameters by name. A study with other values is
+        refused; a name that is missing here may have any value.
     FITTED_UP_TO
-        Highest speed at which the parameters were identified [m/s].
+        Highest speed of the drives to which the model was fitted [m/s]; infinite if unknown.
     remarks
-        Remarks for the user.
+        Remarks for the user on the vehicle.
     RETURNS
         What the methods of a user's class must return.
     """
@@ -188,8 +193,8 @@ class Vehicle:
     remarks: Sequence[str] = ()
 
     def seeded(self, seed: int) -> Vehicle:
-        """The vehicle with the study's seed, for what is random in it, the same for all vehicles;
-        most need none.
+        """The vehicle with the study's seed, from which a model draws what is random in it, the
+        same for all vehicles. By default nothing is random, and the vehicle stays as it is.
         """
         return self
 
@@ -202,11 +207,11 @@ class Vehicle:
         slope: Slope = LEVEL,
         water: FloatOrArray = 0.0,
     ) -> Prepared:
-        """Constants of a run with a time step of `step` seconds.
+        """The constants of N vehicles in a run with a time step of `step` seconds.
 
-        `road_friction` is the weather's factor on the tyres' friction; the depth of the `water`
-        [mm] is for models that compute its effect, for which `road_friction` is that of the road
-        without it. `slope` and `water` are passed only on roads that have a slope or are wet.
+        `road_friction` is the weather's factor on the tyres' friction. `water` is the depth of
+        water on the road [mm], for models that compute its effect: then `road_friction` is the
+        factor without water. `slope` and `water` are passed only if a road has a slope or is wet.
         """
 
     @abstractmethod
@@ -218,7 +223,7 @@ class Vehicle:
         """The state at the start: standing, pedals released."""
 
     def at_speed(self, prepared: Prepared, speed: FloatArray) -> State:
-        """The steady state at a speed above 0 [m/s], shape (N,), with the pedals that hold it."""
+        """The steady state at a speed above 0, shape (N,) [m/s]; its pedals hold this speed."""
         raise InputError(
             type(self).__name__,
             "has no method at_speed(prepared, speed), and the simulation begins with it in motion",
@@ -226,34 +231,34 @@ class Vehicle:
         )
 
     def at_start(self, prepared: Prepared, speed: FloatArray) -> State:
-        """The initial state at a speed [m/s], shape (N,): at rest if the speed is 0, else the
-        steady state.
+        """The state in which a run begins, at a speed of shape (N,) [m/s]: vehicles with speed 0
+        are at rest, all others are in the steady state.
         """
         standing = self.at_rest(prepared)
         is_rolling = speed > 0
         if not is_rolling.any():
             return standing
-        # Those that stand get any speed above 0, and their state is not used.
+        # `at_speed` needs speeds above 0: vehicles at rest get 1 m/s, and this state is not used.
         steady = self.at_speed(prepared, np.where(is_rolling, speed, 1.0))
         if is_rolling.all():
             return steady
         return _select_state(is_rolling, steady, standing)
 
     def hold_gear(self, prepared: Prepared, state: State, holds: BoolArray) -> State:
-        """The state in which vehicles do not change gear where `holds`, shape (N,), is true; for
-        the robot of tests.
+        """The state in which vehicles keep their gear if `holds`, shape (N,), is true. The robot
+        that drives tests holds gears. By default the model has no gears to hold.
         """
         return state
 
     def sensors(self, prepared: Prepared) -> Sensors | None:
-        """Sensors of the vehicles, for a controller that reads SUMO instead of observations; None
-        if they see everything at once.
+        """The vehicles' sensors, for a controller that reads SUMO instead of observations; None if
+        the vehicles see everything without delay.
         """
         return None
 
     def compile(self, *, only_load: bool = False) -> bool:
-        """Compile what `advance` calls, or with `only_load` take it only from an earlier process;
-        returns whether it is ready.
+        """Compile the functions that `advance` calls. With `only_load`, only load functions that an
+        earlier process has compiled. Returns whether all functions are ready.
         """
         return True
 
@@ -261,7 +266,9 @@ class Vehicle:
     def sense(
         self, prepared: Prepared, state: State, observation: Observation
     ) -> tuple[Observation, State]:
-        """What the vehicles' sensors report of an observation, and the state after it."""
+        """The observation as the vehicles' sensors report it, and the state afterwards (which may
+        keep past observations).
+        """
 
     @abstractmethod
     def advance(self, prepared: Prepared, state: State, command: Command) -> State:
@@ -269,8 +276,8 @@ class Vehicle:
 
 
 class SimulatedVehicle(Vehicle):
-    """A vehicle that a simulator of the user's own moves and drives: here it has characteristics,
-    in their `units`; those that are `optional` may be missing, or be 0 in the original.
+    """A vehicle that a user's simulator moves and drives. This package knows only the `units` of
+    its characteristics. Characteristics that are `optional` may be missing, or 0 in the original.
     """
 
     def __init__(self, units: Mapping[str, str], optional: tuple[str, ...]) -> None:
@@ -283,15 +290,16 @@ class SimulatedVehicle(Vehicle):
         return characteristics
 
     def sumo_type(self, prepared: Characteristics) -> SumoType:
-        """Undefined: no vehicle of SUMO's stands for it."""
+        """NaN in every column: no SUMO type stands for a vehicle in a user's simulator."""
         undefined = nans(1)
         return SumoType(undefined, undefined, undefined, undefined, undefined)
 
 
 def _select_state(is_rolling: BoolArray, steady: State, standing: State) -> State:
-    """The state `steady` of the vehicles that roll, and `standing` of the others; a state may
-    consist of states, and a delayed signal, the only part with a method `where`, has a way of its
-    own.
+    """The state `steady` for the vehicles that roll, and the state `standing` for all others.
+
+    A state may be a tuple of states. A part with a method `where` (a delayed signal) selects for
+    itself. A part that is None in one of the two states is taken from `standing`.
     """
     if hasattr(standing, "where"):
         return steady.where(is_rolling, standing)

@@ -1,7 +1,7 @@
-"""Equations compiled by Numba: kept in its cache for later processes, where that can be written.
+"""Compilation of equations by Numba, whose cache keeps compiled functions for later processes.
 
-No operation is fused or reordered, so results have the bits of Python's own floats, whatever unit
-computes them.
+No operation is fused or reordered: results have the same bits as with Python's own floats,
+whichever unit of the processor computes them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class _NotCompiledError(Exception):
 
 
 class _Refuser(event.Listener):
-    """Ends calls that begin to compile."""
+    """Raises an error as soon as Numba begins to compile a function."""
 
     def on_start(self, event: event.Event) -> None:
         raise _NotCompiledError
@@ -29,16 +29,16 @@ class _Refuser(event.Listener):
 
 
 def equation(function: Function) -> Function:
-    """Make a function a part of the compiled functions that call it."""
+    """Make a function that Numba compiles into each compiled function that calls it."""
     part: Any = numba.njit(error_model="numpy", inline="always")(function)
     return part  # type: ignore[no-any-return]
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function when it is first called with arguments of new types, unless the cache has
-    it.
+    """Make a function that Numba compiles when it is first called with arguments of new types,
+    unless the cache has the compiled function.
     """
-    # Where no folder for a cache can be written, Numba refuses to use one.
+    # Numba raises an error for `cache=True` if no folder for its cache can be written.
     try:
         compiled_function: Any = numba.njit(error_model="numpy", cache=True)(function)
     except RuntimeError:
@@ -47,8 +47,8 @@ def compiled(function: Function) -> Function:
 
 
 def is_compiled(call: Callable[[], object]) -> bool:
-    """Call compiled functions, and say whether all were compiled before; the call ends where one
-    was not.
+    """Call compiled functions, and return whether all of them had been compiled before. The call
+    ends at the first function that would have to be compiled.
     """
     try:
         with event.install_listener("numba:compile", _Refuser()):

@@ -14,25 +14,27 @@ from safevar_sumo.study import Constraint, Study, unit_text
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
 SLACK = 1e-9
-"""Tolerated violation of a bound, as a share of the range of the quantity in the domains [-];
-covers rounding.
+"""Largest violation of bounds that counts as a rounding error, as a share of the range of the
+constraint's sum over the domains [-].
 """
 N_REPAIR_SHARES = 64
-"""Number of settings that a repair tries between an infeasible setting and the original."""
+"""Number of settings that a repair tries on the line from an infeasible setting to the original."""
 REJECTIONS = 1000
-"""Maximum number of settings drawn for each feasible setting."""
+"""Largest number of draws for each feasible setting that is wanted."""
 LARGEST_DRAW = 10_000
 """Largest number of settings that are drawn at once, unless more are missing."""
 N_PROBES, LEAST_SHARE = 10_000, 0.002
-"""Number of random settings of which at least this share has to be feasible, so that random
-settings can be drawn.
+"""Number of random settings that test a region, and the share of them that has to be feasible: a
+search draws its first settings at random.
 """
 
 
 class _Bounds(NamedTuple):
-    """A constraint as a computation: the `weights` of characteristics by their numbers, the size
-    `width` of the sum's range in the domains, its bounds, and the bounds and unit in words,
-    `condition` and `suffix`.
+    """A constraint of a study, ready to compute: a weighted sum of characteristics with bounds.
+
+    `weights` are pairs of a column of a setting and its weight. `width` is the range of the sum
+    over the domains. `minimum` and `maximum` bound the sum. `condition` states the bounds in words,
+    `suffix` the unit.
     """
 
     constraint: Constraint
@@ -65,8 +67,8 @@ class _Bounds(NamedTuple):
         )
 
     def quantity(self, settings: FloatArray) -> FloatArray:
-        """The weighted sum, shape (N,), added term by term so that it does not depend on the number
-        of settings.
+        """The weighted sum of each setting, shape (N,). It is added term by term, because the last
+        bits of a product of matrices depend on the number of settings.
         """
         total = np.zeros(len(settings))
         for column, weight in self.weights:
@@ -74,7 +76,9 @@ class _Bounds(NamedTuple):
         return total
 
     def excess(self, settings: FloatArray) -> FloatArray:
-        """By how much each setting violates the bounds, as a share of `width`, shape (N,)."""
+        """The violation of the bounds by each setting, as a share of `width`, shape (N,); 0 within
+        the bounds.
+        """
         values = self.quantity(settings)
         return (
             np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0)
@@ -99,8 +103,8 @@ class FeasibleRegion:
         return "; ".join(map(str, self.bounds))
 
     def violation(self, settings: FloatArray) -> FloatArray:
-        """Sum of a setting's violations, each as a share of the range of the constraint's quantity,
-        shape (N,); 0 if feasible.
+        """The sum of a setting's violations of all constraints, shape (N,); 0 if it is feasible. A
+        violation is a share of the range of the constraint's sum over the domains.
         """
         excess = np.zeros(len(settings))
         for bound in self.bounds:
@@ -108,7 +112,7 @@ class FeasibleRegion:
         return np.where(excess <= SLACK, 0.0, excess)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
-        """Which settings satisfy all constraints; shape (N,)."""
+        """Whether each setting satisfies all constraints, shape (N,)."""
         return np.asarray(self.violation(settings) == 0)
 
     def check(self, settings: FloatArray, *, otherwise: str = "") -> None:
@@ -117,10 +121,10 @@ class FeasibleRegion:
         Raises
         ------
         InputError
-            Naming the constraint that the first infeasible setting violates, and the values of that
-            setting.
+            The error names a constraint that the first infeasible setting violates, and the values
+            of this setting.
         """
-        # The first one, if any, stands for all.
+        # The error is about the first infeasible setting, if there is any.
         for setting in settings[~self.feasible(settings)][:1]:
             row = setting[None]
             bound = next(
@@ -140,8 +144,8 @@ class FeasibleRegion:
             )
 
     def repaired(self, settings: FloatArray) -> FloatArray:
-        """Settings moved towards the original until they are feasible after the filter, shape (N,
-        n).
+        """Settings, shape (N, n), moved towards the original setting until they are feasible after
+        the filter. Settings that are feasible stay as they are.
         """
         repaired = settings.copy()
         original = self.characteristics.original
@@ -158,15 +162,16 @@ class FeasibleRegion:
     def draw_feasible(
         self, draw: Callable[[int], FloatArray], number: int, *, filtered: bool = False
     ) -> FloatArray:
-        """The first `number` feasible settings that `draw` draws, shape (number, n); if `filtered`,
-        feasible after the filter. They are fewer if `REJECTIONS` draws for each do not suffice.
+        """The first `number` feasible settings that `draw` draws, shape (number, n); with
+        `filtered`, settings that are feasible after the filter. There are fewer settings if
+        `REJECTIONS` draws for each do not suffice. `draw(k)` draws k settings.
         """
         batches = [np.zeros((0, len(self.characteristics)))]
         draws = 0
         while (
             shortage := number - sum(map(len, batches))
         ) and draws < REJECTIONS * number:
-            # As many as all draws before, where few are feasible.
+            # If few settings are feasible, each batch doubles the number of draws.
             settings = draw(max(shortage, min(draws, LARGEST_DRAW)))
             draws += len(settings)
             batches.append(settings[self._are_accepted(settings, filtered)][:shortage])
@@ -184,7 +189,7 @@ def region_of(study: Study) -> FeasibleRegion:
     Raises
     ------
     InputError
-        If the original vehicle or nearly every other setting is infeasible.
+        If the original vehicle is infeasible, or nearly every other setting is.
     """
     characteristics = CharacteristicSet.of(study)
     bounds = tuple(
@@ -201,7 +206,7 @@ def region_of(study: Study) -> FeasibleRegion:
             otherwise="; the original vehicle must satisfy every constraint",
         )
 
-    # Searches start from random settings.
+    # Searches start from random settings: enough of these must be feasible.
     probes = np.random.default_rng(0).uniform(
         characteristics.lower, characteristics.upper, (N_PROBES, len(characteristics))
     )

@@ -1,6 +1,6 @@
-"""Vehicles with delayed sensors and brakes.
+"""Two vehicle models with delayed sensors and brakes.
 
-`SumoVehicle` has the parameters of a SUMO vType; `WornVehicle` is a car with worn tyres and brakes,
+`SumoVehicle` has the parameters of a SUMO vType. `WornVehicle` is a car with worn tyres and brakes,
 a payload and degraded sensors.
 """
 
@@ -29,18 +29,20 @@ from safevar_sumo.vehicles.sensors import DELAYED, SensingState, SensingVehicle
 from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_friction
 
 TANGENT_DECIMALS = 12
-"""Decimals to which a tangent is rounded: its last bits differ between machines."""
+"""Decimals to which a tangent is rounded, because the last bits of tangents differ between
+machines.
+"""
 UNLIMITED = 1e6
-"""Range of sensors that a study does not have [m]."""
+"""Range of the sensors of a study without the characteristic `sensorRange` [m]."""
 RELEASED_BRAKE = 1e-6
-"""Position of the brake of a SUMO vehicle up to which it is released [-]: the rest of a command
-that fades out between two steps must not hold the engine off.
+"""Largest position of a SUMO vehicle's brake pedal that counts as released [-]: while a delayed
+command fades out, a tiny remainder of it must not keep the engine from driving.
 """
 
 
 class _PreparedSumo(NamedTuple):
-    """Constants of a run, SI, shape (N,); see `SensingVehicle`. `grip` is the largest acceleration
-    by the tyres.
+    """Constants of N vehicles in a run, in SI units, shape (N,); see `SensingVehicle`. `grip` is
+    the largest acceleration that the tyres can transmit [m/s^2].
     """
 
     step: float
@@ -114,7 +116,7 @@ class SumoVehicle(
         slope: Slope = LEVEL,
         water: FloatOrArray = 0.0,
     ) -> _PreparedSumo:
-        # Brakes and drive are those of a vehicle of the reference mass.
+        # Forces stay the same at another mass, so that accelerations change with the mass.
         c = characteristics
         mass_ratio = self.reference_mass / c["mass"]
         decel = c["decel"] * mass_ratio
@@ -147,7 +149,9 @@ class SumoVehicle(
         throttle: FloatArray,
         brake: FloatArray,
     ) -> FloatArray:
-        """The wheels follow the pedals with the actuator lag T: da/dt = (target - a) / T."""
+        """The acceleration, which follows the pedals with the actuator lag T: da/dt = (target - a)
+        / T, by an implicit step.
+        """
         is_braking = brake > RELEASED_BRAKE
         commanded = np.where(
             is_braking, -brake * p.brake_gain * p.decel, throttle * p.drive
@@ -156,17 +160,17 @@ class SumoVehicle(
         acceleration = state.acceleration + (target - state.acceleration) * (
             p.step / (p.actuator_lag + p.step)
         )
-        # Braking ends a positive acceleration at once, without lag.
+        # The lag delays braking itself, but the engine stops driving at once.
         return np.where(is_braking, np.minimum(acceleration, 0.0), acceleration)
 
 
 class _PreparedWorn(NamedTuple):
-    """Constants of a run, SI, shape (N,); see `SensingVehicle`.
+    """Constants of N vehicles in a run, in SI units, shape (N,); see `SensingVehicle`.
 
-    `grip` is the friction coefficient at rest, `lift` its fall with speed (wet_road.py) [s^2/m^2];
-    `front_load` and `rear_load` are the axles' shares of the weight at rest [-]. `tangent` is that
-    of the sensors' angle, `dropout` the share of lost frames [-]; None if the study does not have
-    them.
+    `grip` is the friction coefficient at rest, `lift` says how fast it falls with speed (k in
+    wet_road.py) [s^2/m^2]. `front_load` and `rear_load` are the axles' shares of the weight at rest
+    [-]. `tangent` is the tangent of the sensors' angle, `dropout` the share of lost frames [-];
+    each is None if the study lacks the characteristic.
     """
 
     step: float
@@ -276,7 +280,7 @@ class WornVehicle(
     frame_seed: Annotated[int, Meta(ge=0)] = 0
 
     def seeded(self, seed: int) -> WornVehicle:
-        """The vehicle with a pattern of lost frames."""
+        """The vehicle whose pattern of lost frames follows from the seed."""
         return replace(self, frame_seed=seed)
 
     def prepare(
@@ -325,7 +329,7 @@ class WornVehicle(
     def sense(
         self, prepared: Prepared, state: SensingState, observation: Observation
     ) -> tuple[Observation, SensingState]:
-        """What sensors see that look aside and lose frames."""
+        """The observation of sensors that look aside and lose frames, and the state afterwards."""
         sensed, state = SensingVehicle.sense(self, prepared, state, observation)
 
         if prepared.tangent is not None:
@@ -366,7 +370,7 @@ class WornVehicle(
         throttle: FloatArray,
         brake: FloatArray,
     ) -> FloatArray:
-        # The speed in the middle of the step, as if the vehicle went on as in the last one.
+        # Friction depends on speed: that in the middle of the step, by the last acceleration.
         speed = state.speed + 0.5 * p.step * (state.acceleration - p.slope.back)
         grip = lifted_friction(p.grip, p.lift, speed)
         drive = np.minimum(throttle * p.drive, grip * p.slope.down)
@@ -375,8 +379,8 @@ class WornVehicle(
     def _deceleration(
         self, p: _PreparedWorn, pedal: FloatArray, grip: FloatArray
     ) -> FloatArray:
-        """Deceleration by the brakes of both axles together [m/s^2]; `grip` is the friction
-        coefficient now.
+        """Deceleration by the brakes of both axles together [m/s^2]. `grip` is the friction
+        coefficient at the current speed.
         """
         demand = pedal * p.brake
         grip_limit = grip * p.slope.down

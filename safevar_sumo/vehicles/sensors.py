@@ -1,6 +1,4 @@
-"""Sensors that report the past, brakes that follow late: delayed signals, and the base of vehicles
-that have them.
-"""
+"""Delayed signals, and the base class of vehicles with delayed sensors and brakes."""
 
 from __future__ import annotations
 
@@ -14,26 +12,26 @@ from safevar_sumo.records import BoolArray, Command, FloatArray, IntArray, Obser
 from safevar_sumo.vehicles.base import Prepared, Sensors, Vehicle
 
 LONGEST_DELAY = 3600.0
-"""Longest delay [s]."""
+"""Longest legal delay [s]: a longer delay is longer than any run."""
 
 
 SPARE = 32
-"""Number of further samples for which a history has room before it is copied."""
+"""Number of new samples for which a history has room before its samples are copied."""
 
 
 class DelayedSignal:
-    """A signal of N vehicles, each with its own delay, which ends between two samples: a newer and
-    an older one.
+    """The last samples of a signal of N vehicles, of which each has its own delay. The time of one
+    delay ago lies between two samples, a newer and an older sample.
 
     Attributes
     ----------
     samples
-        The last L samples, newest first, shape (L, ..., N).
+        The last L samples, the newest first, shape (L, ..., N).
     newer
-        For every value of a sample, its index in `samples.ravel()` where that is the newer sample,
-        shape (..., N).
+        For every value of a sample, the index of this value in `samples.ravel()` for the newer of
+        the two samples, shape (..., N).
     share
-        The older sample's share, shape (N,).
+        The weight of the older sample in the interpolation, 0 to 1, shape (N,).
     """
 
     __slots__ = ("_begin", "_room", "newer", "samples", "share")
@@ -55,12 +53,13 @@ class DelayedSignal:
 
     @classmethod
     def of(cls, sample: FloatArray, delay: FloatArray, step: float) -> DelayedSignal:
-        """A history for delays [s], shape (N,), filled with the first sample, shape (..., N).
+        """A history for delays of shape (N,) [s]. The first sample, shape (..., N), stands for all
+        earlier samples.
 
         Raises
         ------
         InputError
-            If a delay is longer than any run.
+            If a delay is longer than `LONGEST_DELAY`.
         """
         longest = float(np.max(delay))
         age = delay / step
@@ -77,8 +76,8 @@ class DelayedSignal:
         return cls(samples, newer, age - whole_steps)
 
     def where(self, chosen: BoolArray, history: DelayedSignal) -> DelayedSignal:
-        """This history of the `chosen` vehicles, shape (N,), and another one, of equal length, of
-        all others.
+        """A history that joins two of equal length: this history for the `chosen` vehicles, shape
+        (N,), and `history` for all other vehicles.
         """
         samples = np.where(chosen, self.samples, history.samples)
         newer = np.where(chosen, self.newer, history.newer)
@@ -87,8 +86,8 @@ class DelayedSignal:
         )
 
     def extended(self, sample: FloatArray) -> DelayedSignal:
-        """The history with a new sample at its front and the oldest one dropped."""
-        # Another history may go on from the same room, or the room may be full.
+        """The history with a new first sample and without its oldest sample."""
+        # Copy the samples if the room is full, or if another history has grown in this room.
         room = self._room
         if room.begin != self._begin or not room.begin:
             room = _Room(self.samples)
@@ -97,12 +96,13 @@ class DelayedSignal:
         return DelayedSignal(self.samples, self.newer, self.share, room)
 
     def delayed(self) -> FloatArray:
-        """The signal of each vehicle as it was one delay ago, interpolated linearly; shape (...,
-        N).
+        """The signal of each vehicle as it was one delay ago, interpolated linearly between two
+        samples, shape (..., N).
         """
         newer = self.samples.take(self.newer)
         older = self.samples[1:].take(self.newer)
-        # A signal is infinite while out of sight, finite a step later.
+        # A gap is infinite while nothing is in sight: 0 times infinity is NaN, so that the newer
+        # sample counts.
         with np.errstate(invalid="ignore"):
             signal = newer * (1 - self.share) + older * self.share
         np.copyto(signal, newer, where=np.isnan(signal))
@@ -110,7 +110,9 @@ class DelayedSignal:
 
 
 class _Room:
-    """Room for `SPARE` samples before those of a history, which grows towards the `begin`."""
+    """Memory for the samples of histories, with room for `SPARE` samples in front of them. `begin`
+    is the index of the newest sample, and falls as the history grows.
+    """
 
     __slots__ = ("begin", "samples")
 
@@ -130,7 +132,7 @@ DELAYED = (
     "obstacle_length",
     "obstacle",
 )
-"""What sensors report of an obstacle."""
+"""The fields of an observation that sensors report late: all that they report of an obstacle."""
 
 
 def sensed_observation(
@@ -140,8 +142,8 @@ def sensed_observation(
     reach: FloatArray,
     step: float,
 ) -> tuple[Observation, DelayedSignal]:
-    """The observation `latency` [s] ago, without obstacles beyond `reach` [m] times the visibility;
-    and the history for the next call.
+    """The observation as it was one `latency` [s] ago, without obstacles beyond `reach` [m] times
+    the visibility; and the history for the next call. `past` is None in the first call.
     """
     sample = np.empty((len(DELAYED), *observation.gap.shape))
     for row, name in enumerate(DELAYED):
@@ -158,13 +160,11 @@ def sensed_observation(
 
 
 class SensingState(NamedTuple):
-    """State of N vehicles: speed [m/s], positions of the actuators [-], and acceleration by the
+    """State of N vehicles: speed [m/s], positions of pedals and gear [-], and acceleration by the
     wheels [m/s^2].
 
-    `observations` and `brake_commands` are delayed signals; `observations` is None before the first
-    one.
-    `frame` is what the sensors last reported, in the order of `DELAYED`, in vehicles whose sensors
-    may lose frames.
+    `observations` is None before the first observation. `frame` is the last report of sensors that
+    may lose frames, in the order of `DELAYED`; None before the first one, and for other sensors.
     """
 
     speed: FloatArray
@@ -180,10 +180,9 @@ class SensingState(NamedTuple):
 class SensingVehicle(Vehicle):
     """A vehicle with delayed sensors of limited range and a delayed brake.
 
-    Its constants, which `prepare` returns, have a `step` [s], the vehicle's `mass` [kg], the
-    accelerations `drive` and `brake` by full pedals [m/s^2], the dead time `brake_delay` of the
-    brake [s], `max_speed` [m/s], the sensors' `latency` [s] and `sensor_range` [m], and the
-    `slope`.
+    The constants that `prepare` returns have these fields: `step` [s], `mass` [kg], `drive` and
+    `brake`, the accelerations by full pedals [m/s^2], `brake_delay`, the dead time of the brake
+    [s], `max_speed` [m/s], `latency` [s] and `sensor_range` [m] of the sensors, and `slope`.
     """
 
     __slots__ = ()
@@ -196,8 +195,8 @@ class SensingVehicle(Vehicle):
     def sense(
         self, prepared: Prepared, state: SensingState, observation: Observation
     ) -> tuple[Observation, SensingState]:
-        """Sensors report the scene as it was one latency ago, and nothing beyond their range times
-        the visibility.
+        """The observation as it was one latency ago, without an obstacle beyond the sensors' range
+        times the visibility; and the state with the observations so far.
         """
         sensed, past = sensed_observation(
             observation,
@@ -216,7 +215,7 @@ class SensingVehicle(Vehicle):
         )
 
     def at_speed(self, prepared: Prepared, speed: FloatArray) -> SensingState:
-        """The steady state: the pedals balance the slope, the only resistance."""
+        """The steady state at a speed. The slope is the only resistance: the pedals balance it."""
         standing = self.at_rest(prepared)
         back = prepared.slope.back
         throttle = np.minimum(np.maximum(back / prepared.drive, 0.0), 1.0)
@@ -238,7 +237,7 @@ class SensingVehicle(Vehicle):
         brake = commands.delayed()
         acceleration = self._acceleration(p, state, command.throttle, brake)
 
-        # Who is faster than the top speed is not slowed down to it.
+        # A vehicle that begins faster than its top speed must not lose speed at once.
         highest_speed = np.maximum(p.max_speed, state.speed)
         speed = state.speed + (acceleration - p.slope.back) * p.step
         speed = np.minimum(np.maximum(speed, 0.0), highest_speed)
@@ -254,4 +253,4 @@ class SensingVehicle(Vehicle):
     def _acceleration(
         self, p: Prepared, state: SensingState, throttle: FloatArray, brake: FloatArray
     ) -> FloatArray:
-        """Acceleration by the wheels with these positions of the pedals [m/s^2]."""
+        """Acceleration that the wheels give the vehicle at these pedal positions [m/s^2]."""
