@@ -1,5 +1,5 @@
-"""The identity of results: the inputs that they depend on, as a manifest states them, its digest,
-and the differences from other inputs.
+"""The identity of results: the inputs on which results depend, as their manifest states them. Its
+digest, and the differences between the inputs of two manifests.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ RESULTS = 13
 PACKAGES = ("safevar_sumo", "libsumo", "deap", "numpy")
 """Packages that every study uses."""
 LIBRARIES = {"ad_rss": "ad-rss", "highway_idm": "highway-env", "fmu": "fmpy"}
-"""Packages of extras by the driving system, or the kind of one, that needs them."""
+"""Optional packages, by the driving system, or the kind of driving system, that needs them."""
 PYMOO_PACKAGES = ("pymoo", "cma")
 """Packages on whose versions the searches of pymoo depend."""
 SEARCH_PACKAGES = ("safevar_sumo", "deap", "numpy", *PYMOO_PACKAGES)
-"""Packages on whose versions no single simulation depends."""
+"""Packages that only searches use: no single simulation depends on their versions."""
 IDENTITY = {
     "study": "the same study and options",
     "files": "the file as it was",
@@ -35,8 +35,8 @@ IDENTITY = {
     "versions": "those versions",
     "platform": "such a machine",
 }
-"""Inputs that results depend on, each with the remedy if it has changed; an error says "expected:
-another `out` ..., or REMEDY".
+"""Kinds of inputs on which results depend, and the remedy if such an input has changed. An error
+says "expected: another `out` ..., or REMEDY".
 """
 
 
@@ -46,9 +46,9 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
     Parameters
     ----------
     identity
-        Inputs of the results besides the study file, by `IDENTITY`; see
-        `safevar_sumo.campaign.inputs.manifest_now`. Its `versions` are those of a simulator of
-        the user's own.
+        Inputs of the results besides the study file, by the keys of `IDENTITY`; see
+        `safevar_sumo.campaign.inputs.manifest_now`. `versions` has the versions that a user's
+        simulator states.
     """
     versions = {name: version(name) for name in packages_of(study)}
     return {
@@ -60,8 +60,8 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
 
 
 def packages_of(study: Study) -> tuple[str, ...]:
-    """The packages that a study uses, and on whose versions its results depend; those of pymoo only
-    where it is installed, as no question about the study needs it.
+    """The packages that a study uses, and on whose versions its results depend. The packages of
+    pymoo are left out if pymoo is not installed: questions about results do not need pymoo.
     """
     has_pymoo = any(name.startswith(PYMOO) for name in study.search.algorithms)
     has_pymoo = has_pymoo and find_spec("pymoo") is not None
@@ -75,7 +75,9 @@ def packages_of(study: Study) -> tuple[str, ...]:
 
 
 def evaluation_keys(tables: Tables) -> JsonObject:
-    """Those of a study's tables that affect evaluations: of the axes only what is driven."""
+    """The keys of a study's tables that affect evaluations. If a study uses listed encounters, its
+    ranges affect nothing, and are left out.
+    """
     if tables.get("encounters") != RANGES:
         tables = _without_ranges(tables)
     keys: JsonObject = with_effect(tables, Study)
@@ -83,7 +85,9 @@ def evaluation_keys(tables: Tables) -> JsonObject:
 
 
 def _without_ranges(tables: Tables) -> JsonObject:
-    """A study's tables with listed encounters alone, without what is about others."""
+    """The tables of a study with listed encounters only: without ranges of axes, the margin, and
+    constraints of parameters that are no characteristics of the vehicle.
+    """
 
     def lists(table: JsonObject) -> JsonObject:
         listed = dict(table)
@@ -112,14 +116,14 @@ def _without_ranges(tables: Tables) -> JsonObject:
 
 
 def identity_in(manifest: JsonObject) -> JsonObject:
-    """The inputs of a manifest, by `IDENTITY`."""
+    """The inputs that a manifest states, by the keys of `IDENTITY`."""
     layers = {layer: manifest.get(layer, {}) for layer in IDENTITY}
     return {**layers, "study": evaluation_keys(manifest["study"])}
 
 
 def identity_digest(manifest: JsonObject) -> str:
-    """The digest that identifies a manifest's study in its journals, whether or not it has searches
-    of pymoo.
+    """The digest that identifies a manifest's study in its journals. Versions of pymoo's packages
+    are left out, so that the digest is the same with and without a search of pymoo.
     """
     layers = identity_in(manifest)
     versions = {
@@ -137,12 +141,12 @@ def manifest_differences(
 ) -> Iterator[tuple[str, str, bool]]:
     """The differences between the inputs of two manifests: of stored results, and of now.
 
-    Yields, for each, its layer of `IDENTITY`, a text, and whether it may change simulations. Other
-    search libraries, other machines, other versions of this package with the same `RESULTS`, and
-    new keys of a study do not.
+    Yields for each difference its kind (a key of `IDENTITY`), a sentence, and whether the
+    difference may change simulations. Other versions of search libraries, another machine, another
+    version of this package with the same `RESULTS`, and new keys of a study change no simulation.
     """
     inputs_before = identity_in(stored)
-    # A simulator may use libraries of searches, too.
+    # A search library that a user's simulator uses, too, may change simulations.
     searching = {*SEARCH_PACKAGES} - {*now.get("libraries", ())}
     for layer, inputs in identity_in(now).items():
         for key, old, new in changed_values(inputs_before[layer], inputs):
@@ -167,16 +171,16 @@ def manifest_differences(
 
 
 def search_extent_of(manifest: JsonObject) -> tuple[list[str], int, int]:
-    """Algorithms, runs and evaluations of a study: they decide which solutions the table of
-    solutions has.
+    """Algorithms, number of runs, and evaluations in a run of a study: they decide which solutions
+    the table of solutions has.
     """
     search = manifest["study"]["search"]
     return search["algorithms"], search["runs"], search["evaluations"]
 
 
 def changed_values(old: Any, new: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """The innermost keys at which two values differ, with the old and the new value; 2 and 2.0 are
-    different.
+    """Yield the innermost keys at which two nested values differ, such as "search.runs", with the
+    old and the new value; None without the key. 2 and 2.0 are different.
     """
     if isinstance(old, dict) and isinstance(new, dict):
         for name in sorted({*old, *new}):

@@ -1,12 +1,13 @@
-"""The journal of one run: a file of JSON lines, one for each evaluated batch, written before the
-search continues.
+"""The journal of one run: a file of JSON lines. A line has one evaluated batch, and is written
+before the search continues.
 
 The first line names the study, the run and the characteristics. A batch is a table: a list for each
 column of `solutions.csv`, the number of each evaluation in its run, the collision's speed and the
 reason of a failure; an undefined value is null. The last line of a finished run lists its
-solutions. Each line after the first ends with a checksum of the journal up to there. What follows
-the first line that cannot be read, or that the checksum contradicts, was lost with a process, a
-disk or a power supply, or was altered, and is simulated again.
+solutions. Each line after the first ends with a checksum of the journal up to this line. A line may
+be unreadable, or contradict its checksum, after a process, a disk or a power supply has failed, or
+because somebody has altered it. This line and all lines after it are dropped, and their evaluations
+are simulated again.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from safevar_sumo.results.manifest import disk_errors
 FORMAT = 7
 """Version number of the format of journals."""
 PATIENCE = 2.0
-"""Time within which the workers of a killed process end, which hold locks until then [s]."""
+"""Longest time to wait for a lock [s]: workers of a killed process hold locks until they end."""
 SECONDS_BETWEEN_ATTEMPTS = 0.05
 """Time between two attempts to lock a journal [s]."""
 POSITION, OUTCOME, REASON, POINT = "evaluation", "outcome", "reason", "point"
@@ -40,8 +41,8 @@ OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
 
 def journal_head(study: str, run: str, characteristics: Iterable[str]) -> JsonObject:
-    """The first line of a journal: what it belongs to, the digest of a study's identity and the
-    name of a run; and the characteristics.
+    """The first line of a journal, its head. `study` is the digest of the study's identity, `run`
+    the name of the run: together they are the owner of the journal.
     """
     return {
         "format": FORMAT,
@@ -61,11 +62,12 @@ class JournalContent(NamedTuple):
     evaluations
         The evaluations, in the order in which they were written.
     results
-        By budget, the positions of the run's solutions.
+        The positions of the run's solutions, by the budget (number of evaluations) of the search
+        that returned them.
     size
-        Size of the lines that were read [bytes].
+        Size of the valid lines [bytes].
     checksum
-        The CRC-32 of these lines without their checksums and ends.
+        The CRC-32 of these lines without their checksums and line ends.
     """
 
     positions: list[int]
@@ -83,7 +85,7 @@ class JournalContent(NamedTuple):
         """Positions and evaluations that a run with this budget requested, in the order of its
         requests.
 
-        A journal may hold more: those of a search with a larger budget.
+        A journal may have more evaluations, from a search with a larger budget.
         """
         positions = sorted(position for position in self.positions if position < budget)
         return positions, self.take_positions(positions)
@@ -95,12 +97,12 @@ class Journal:
     Parameters
     ----------
     path
-        The file, made if it does not exist.
+        The file; it is made if it does not exist.
     head
-        The owner of the journal, as `journal_head` names it. A journal without evaluations passes
-        to the owner.
+        The head, from `journal_head`. A file that has no line after its head gets this head.
     retry_failed
-        Whether to drop the first failed evaluation and all that came after it.
+        Whether to drop the first batch with a failed evaluation, and all batches after it, so that
+        their evaluations are simulated again.
 
     Attributes
     ----------
@@ -162,8 +164,8 @@ class Journal:
         self._add(line)
 
     def finish(self, positions: Sequence[int], budget: int) -> None:
-        """Add the result, the positions of the solutions and the allowed number of evaluations;
-        sync all.
+        """Add the result of a finished run: the positions of its solutions, and the budget. Then
+        flush the file to the disk.
         """
         self._add({SOLUTIONS: list(positions), "budget": budget})
         with disk_errors(self.path, "written"):
@@ -188,8 +190,8 @@ class Journal:
 def read_journal(
     path: Path, head: JsonObject, *, head_only: bool = False
 ) -> JournalContent:
-    """The contents of a journal that another process may be writing; arguments as of `Journal`.
-    With `head_only`, only its owner is checked.
+    """The contents of a journal that another process may be writing. `path` and `head` are those of
+    `Journal`. With `head_only`, only the owner is checked.
 
     Raises
     ------
@@ -198,7 +200,7 @@ def read_journal(
     """
     try:
         with path.open("rb") as file:
-            # One byte after the head says that it is not alone, so that its owner counts.
+            # One byte after the head suffices to see that lines follow: only then the owner counts.
             data = file.readline() + file.read(1)
             if not head_only:
                 data += file.read()
@@ -208,15 +210,17 @@ def read_journal(
 
 
 class _Progress(msgspec.Struct):
-    """What a line of a journal says about the progress of its run."""
+    """The progress of a run by one line of its journal: `evaluation` has positions of a batch,
+    `budget` is that of a finished run (0 in other lines).
+    """
 
     evaluation: list[int] = []
     budget: int = 0
 
 
 class JournalReader:
-    """Follows how many evaluations a run has asked for, in the journal that another process
-    writes.
+    """Reads the progress of a run from a journal that another process writes; `is_finished` says
+    whether the run has written its solutions.
     """
 
     def __init__(self, path: Path, budget: int) -> None:
@@ -226,7 +230,7 @@ class JournalReader:
         self.is_finished = False
 
     def asked(self) -> int:
-        """Number of evaluations that the run has asked for."""
+        """Number of evaluations that the run has requested so far, at most its budget."""
         with suppress(FileNotFoundError), open(self._path, "rb") as file:
             file.seek(self._end)
             for text in file:
@@ -246,14 +250,15 @@ class JournalReader:
 
     @property
     def left(self) -> int:
-        """Number of evaluations that the run may still ask for."""
+        """Number of evaluations that the run may still request."""
         if self.is_finished:
             return 0
         return self._budget - self._asked
 
 
 def open_and_lock(path: Path) -> IO[bytes]:
-    """A journal's file, made if it does not exist; the lock ends when it is closed.
+    """Open and lock the file of a journal, which is made if it does not exist. Closing the file
+    ends the lock.
 
     Raises
     ------
@@ -278,8 +283,8 @@ def open_and_lock(path: Path) -> IO[bytes]:
 def _read(
     data: bytes, path: Path, head: JsonObject, *, until_failure: bool = False
 ) -> JournalContent:
-    """The contents of a journal; with `until_failure`, without the first batch that failed and all
-    that came after it.
+    """The contents of a journal, from its bytes. With `until_failure`, the first batch with a
+    failed evaluation and all lines after it are left out.
     """
     positions = list[int]()
     batches = []
@@ -323,8 +328,9 @@ def _read(
 
 
 def _checked(text: bytes, checksum: int) -> tuple[JsonObject, int]:
-    """A line after the first, and the checksum of the journal up to it; empty if the line is torn,
-    damaged or altered. `checksum` is that of the lines before.
+    """Decode a line after the head, and return its content and the checksum of the journal up to
+    this line. The content is empty if the line is torn, damaged or altered. `checksum` is the
+    checksum of all lines before it.
     """
     content, _, stated = text.rpartition(CHECKSUM_MARK)
     checksum = zlib.crc32(content + b"}", checksum)
@@ -334,7 +340,7 @@ def _checked(text: bytes, checksum: int) -> tuple[JsonObject, int]:
 
 
 def _decoded(text: bytes) -> JsonObject:
-    """A line of a journal; empty if it is torn or damaged."""
+    """The content of a line of a journal; empty if the line is torn or damaged."""
     if not text.endswith(b"\n"):
         return {}
     try:
@@ -344,8 +350,8 @@ def _decoded(text: bytes) -> JsonObject:
 
 
 def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluations:
-    """The batch of evaluations in a line; raises an error if its columns are wrong or have
-    different lengths.
+    """The batch of evaluations in a line. Raises an error if a column is missing or wrong, or if
+    columns have different lengths.
     """
     if len(set(map(len, line.values()))) > 1:
         raise ValueError

@@ -1,5 +1,5 @@
-"""Reads results without SUMO, as tidy frames; and finds single solutions, by their handles or by a
-choice such as the most severe one.
+"""Reads results as tables, without SUMO; and finds single solutions, by their handles or by a
+choice such as `most_severe`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 
 def failure_lines(failures: Sequence[tuple[str, str]]) -> list[str]:
-    """A line for each distinct reason of `StoredResults.failures`: the first failure with this
-    reason, and the number of further failures.
+    """A line for each distinct reason in `failures` (see `StoredResults.failures`): the first
+    failure with this reason, and the number of further failures with the same reason.
     """
     firsts = {reason: place for place, reason in reversed(failures)}
     counts = Counter(reason for _, reason in failures)
@@ -61,8 +61,8 @@ class StoredResults(NamedTuple):
     finished
         Algorithm and number of every finished run.
     failures
-        The place of every setting that could not be simulated, with its position in the run from
-        0, and why.
+        For every setting that could not be simulated, the run with its position in the run (from
+        0), and the reason.
     """
 
     manifest: JsonObject
@@ -110,7 +110,7 @@ def load_runs(directory: str | Path) -> StoredResults:
                 (key, content.take_positions(content.results[budget]))
             )
 
-    # The rows of the frame are in the order of their runs, as the positions are.
+    # Both lists have the order of the runs, so that rows of the frame and positions match.
     frame = evaluations_frame(characteristics, evaluations_of_runs)
     frame.insert(2, "evaluation", all_positions)
     return StoredResults(
@@ -181,7 +181,7 @@ def row_of_handle(solutions: pd.DataFrame, handle: SolutionId) -> int:
     all_handles = handles_of(solutions)
     if handle in all_handles:
         return all_handles.index(handle)
-    # Of each run the last handle stays.
+    # The dictionary keeps the last handle of each run: it shows how many solutions the run has.
     last_handles = {solution[:2]: str(solution) for solution in all_handles}
     examples = ", ".join(list(last_handles.values())[:MAX_EXAMPLES])
     raise InputError(
@@ -196,12 +196,14 @@ CHOICES = {
     "fewest": ["f_num_diff", "f_safe", "f_diff"],
     "smallest": ["f_diff", "f_safe", "f_num_diff"],
 }
-"""Objectives that decide a choice, in order; smaller values first."""
+"""Objectives by which a choice ranks solutions, the most important first: the solution with the
+smallest values is chosen.
+"""
 
 
 def choose_handle(solutions: pd.DataFrame, unsafe: Unsafe, choice: str) -> SolutionId:
-    """The handle of the solution that a choice selects: `most_severe` among all solutions, any
-    other choice among the unsafe ones.
+    """The handle of the solution that a choice selects. `most_severe` selects among all solutions,
+    any other choice among the unsafe solutions.
 
     Parameters
     ----------

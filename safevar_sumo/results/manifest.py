@@ -1,4 +1,4 @@
-"""The files of a results directory: their names, and its manifest, written and read."""
+"""The files of a results directory: their names; and functions that write and read the manifest."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def journal_file(directory: Path, run: str) -> Path:
     Raises
     ------
     InputError
-        If something else is there, such as a folder, or a pipe, which would be waited for.
+        If something else has this name, such as a folder, or a pipe, on which a reader would wait.
     """
     path = directory / RUNS / f"{run}.jsonl"
     if path.exists() and not path.is_file():
@@ -73,7 +73,8 @@ def make_directory(path: Path) -> None:
     Raises
     ------
     InputError
-        If the directory cannot be written, or something else is in place of one of its files.
+        If the directory cannot be written, or a name of its files belongs to something else, such
+        as a folder.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -117,8 +118,8 @@ def write_whole(path: Path, text: str) -> None:
 
 @contextmanager
 def disk_errors(path: Path, action: str) -> Iterator[None]:
-    """Turn an error of the operating system into the error that `path` cannot be read, written,
-    opened or removed.
+    """Context that turns an error of the operating system into a SafevarError: `path` cannot be
+    read, written, opened or removed (`action`).
     """
     try:
         yield
@@ -140,8 +141,8 @@ OriginalRecord = dict[str, bool | float | str | None]
 
 
 class _Manifest(Struct):
-    """What a reader of a manifest relies on; imported results have neither `files` nor
-    `folders`.
+    """The keys on which readers of a manifest rely; reading checks their types. Imported results
+    have neither `files` nor `folders`.
     """
 
     study: Study
@@ -193,7 +194,7 @@ def read_manifest(directory: Path) -> JsonObject:
             legal,
         )
 
-    # Keys that ended without an effect are no reason to refuse results of another release.
+    # Older releases wrote keys that have no effect any more: they are no reason to refuse results.
     study = manifest.get("study")
     if isinstance(study, dict):
         for key in ("wider", "correlations"):
@@ -208,8 +209,8 @@ def read_manifest(directory: Path) -> JsonObject:
 
 
 def folders_of(directory: Path, manifest: JsonObject) -> tuple[str, ...]:
-    """Folders of the user code and files of a directory's study: those of the manifest that exist,
-    then the nearest two folders that contain the directory.
+    """The folders in which to look for the user code and files of a directory's study: the existing
+    folders that the manifest names, then the two nearest folders that contain the directory.
     """
     base = directory.resolve()
     folders = [os.path.abspath(base / folder) for folder in manifest.get("folders", ())]

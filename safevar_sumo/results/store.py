@@ -1,5 +1,5 @@
-"""Writes results directories, of a study or of imported solutions, and makes tables of evaluations
-and solutions. The same study and seed give the same bytes.
+"""Writes the results directory of a study, or of imported solutions, and makes tables of
+evaluations and solutions. The same study and seed give the same bytes.
 """
 
 from __future__ import annotations
@@ -47,11 +47,13 @@ if TYPE_CHECKING:
 RunName = tuple[str, int]
 """An algorithm, and the number of a run."""
 RunKeyT = TypeVar("RunKeyT", bound=RunName)
-"""The key of a run: its algorithm and number."""
+"""The type of the keys by which a caller names its runs: a `RunName`, or a subtype."""
 
 
 ROUNDING = 1e-6
-"""Largest difference of the original vehicle's results on another machine, relative or not."""
+"""Largest difference, relative or absolute, that another machine may cause in the results of the
+original vehicle.
+"""
 
 
 class ResultsDirectory:
@@ -60,9 +62,9 @@ class ResultsDirectory:
     Parameters
     ----------
     path
-        The directory, made if it does not exist.
+        The directory; it is made if it does not exist.
     study
-        The study as it is run.
+        The study, with the options with which it is run.
     manifest
         The study's manifest; see `safevar_sumo.campaign.inputs.manifest_now`.
     scoring
@@ -73,8 +75,9 @@ class ResultsDirectory:
     Raises
     ------
     SafevarError
-        If the directory cannot be written, it or a journal in it belongs to another study or
-        version, or another process works on such a run; then nothing in it was changed.
+        If the directory cannot be written; if it, or a journal in it, belongs to another study or
+        version; or if another process works on one of the runs. Nothing in the directory is changed
+        before such an error.
     """
 
     def __init__(
@@ -94,7 +97,7 @@ class ResultsDirectory:
         if scoring != PUBLISHED_SCORING:
             self.manifest["scoring"] = msgspec.to_builtins(scoring)
 
-        # Earlier results of another study are refused here, too.
+        # Raises an error if the directory has results of another study.
         make_directory(path)
         self._earlier_manifest()
 
@@ -105,10 +108,10 @@ class ResultsDirectory:
                 open_and_lock(journal).close()
 
     def begin(self, original: Evaluations) -> None:
-        """Write the manifest with the original vehicle's evaluation; remove a table of solutions
-        that covers other runs.
+        """Write the manifest, with the evaluation of the original vehicle. Remove a table of
+        solutions that belongs to other runs or another number of evaluations.
         """
-        # Another study may have begun meanwhile.
+        # Another process may have written results since the directory was opened.
         earlier_manifest = self._earlier_manifest()
         now = record(original, row=0)
         manifest = {**self.manifest, "original": now}
@@ -122,15 +125,17 @@ class ResultsDirectory:
                 (self.path / SOLUTIONS).unlink(missing_ok=True)
 
     def finish(self, solutions: Mapping[RunKeyT, Evaluations]) -> None:
-        """Write the solutions of every run, by (algorithm, run)."""
+        """Write the table of the solutions of all runs; `solutions` has those of each run by its
+        algorithm and number.
+        """
         frame = solutions_frame(self._study.domains, solutions.items())
         write_whole(
             self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n")
         )
 
     def extent_remarks(self, names: Collection[str]) -> list[str]:
-        """Remarks on earlier results: runs of another length, and runs that the study, with runs of
-        these names, no longer has.
+        """Remarks on earlier results in the directory: their runs had another number of
+        evaluations, or they have runs that are not among `names`, the runs of the study now.
         """
         earlier_manifest = self._earlier_manifest()
         remarks = []
@@ -153,8 +158,8 @@ class ResultsDirectory:
         return remarks
 
     def _earlier_manifest(self) -> JsonObject:
-        """The manifest of earlier results in the directory, empty without any; raises an error if
-        they are of another study.
+        """The manifest of earlier results in the directory; empty if there are none. Raises an
+        error if they belong to another study.
         """
         if not (self.path / MANIFEST).exists():
             return {}
@@ -174,8 +179,8 @@ class ResultsDirectory:
 def stored_journals(
     directory: Path, manifest: JsonObject
 ) -> Iterator[tuple[RunName, Path, JsonObject]]:
-    """The journals that exist of a manifest's study: the algorithm and number of each run, its
-    file, and the head that the file must have.
+    """Yield the existing journals of a manifest's study: the algorithm and number of the run, the
+    journal's file, and the head that the file must have.
     """
     study = manifest["study"]
     search = study["search"]
@@ -193,12 +198,14 @@ def solutions_frame(
     characteristics: Collection[str],
     solutions: Iterable[tuple[RunName, Evaluations]],
 ) -> pd.DataFrame:
-    """One row per solution of every run, in a fixed order; columns as in `evaluations_frame`."""
+    """A table with a row for each solution of each run, in a fixed order. It has the columns of
+    `evaluations_frame`.
+    """
     return in_order(evaluations_frame(characteristics, solutions), characteristics)
 
 
 def in_order(solutions: pd.DataFrame, characteristics: Collection[str]) -> pd.DataFrame:
-    """Rows of solutions in the order of `solutions.csv`."""
+    """The rows of a table of solutions, in the order of `solutions.csv`."""
     columns = ["algorithm", "run", "f_safe", "f_diff", "f_num_diff", *characteristics]
     return solutions.sort_values(columns, kind="stable", ignore_index=True)
 
@@ -207,7 +214,7 @@ def evaluations_frame(
     characteristics: Collection[str],
     runs: Iterable[tuple[RunName, Evaluations]],
 ) -> pd.DataFrame:
-    """One row per evaluation.
+    """A table with a row for each evaluation of each run.
 
     Columns: algorithm, run, the characteristics' filtered values in the units of the study, f_safe,
     f_diff [fraction], f_num_diff, safety_degree [m or -m/s], tet [s], tit [s^2], ave_dece [m/s^2],
@@ -240,7 +247,7 @@ def evaluations_frame(
 
 
 def record(evaluations: Evaluations, row: int) -> JsonObject:
-    """One evaluation as plain values; undefined values are None."""
+    """The evaluation in one row, as plain values by name; an undefined value is None."""
     numbers = {
         "collision_speed": evaluations.collision_speed[row],
         **{name: values[row] for name, values in evaluations.metrics.items()},
@@ -258,12 +265,13 @@ def record(evaluations: Evaluations, row: int) -> JsonObject:
 def refuse_other_original(
     directory: Path, stored: Mapping[str, Any], now: Mapping[str, Any]
 ) -> None:
-    """Refuse to mix results with those of a simulator that drives the original vehicle otherwise.
+    """Refuse to continue results if the simulator drives the original vehicle in another way now.
+    `stored` and `now` are results of the original vehicle, as of `record`.
 
     Raises
     ------
     InputError
-        With the first of its results that differs by more than rounding.
+        About the first result that differs by more than `ROUNDING`.
     """
     for name, old in stored.items():
         new = now.get(name, old)
@@ -294,7 +302,7 @@ def write_imported(
     original: Mapping[str, float | None],
     files: Mapping[str, str],
 ) -> None:
-    """Write a results directory of imported solutions, in place of an earlier import.
+    """Write a results directory of imported solutions; it replaces an earlier import.
 
     Parameters
     ----------
@@ -332,7 +340,7 @@ def write_imported(
 
 
 def read_imported(path: Path, characteristics: Collection[str]) -> pd.DataFrame:
-    """The imported solutions, without a run column.
+    """The table of imported solutions, which has no column `run`.
 
     Raises
     ------

@@ -25,8 +25,8 @@ from safevar_sumo.vehicles.base import (
     Vehicle,
 )
 
-# Constants used with arrays in every step are arrays themselves: numpy would convert a float each
-# time, which doubles the cost.
+# Constants that meet arrays in every step are arrays, too: numpy would convert a float each time,
+# which doubles the time of an operation.
 ZERO, ONE, TWO, HALF = map(np.array, (0.0, 1.0, 2.0, 0.5))
 RPM_PER_RAD_S = np.array(30 / math.pi)  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
@@ -35,29 +35,31 @@ GEAR_RATIOS = np.array([4.17, 3.14, 2.11, 1.67, 1.28, 1.0, 0.84, 0.67])  # Vehic
 FIRST_GEAR, LAST_GEAR = map(np.array, (1.0, len(GEAR_RATIOS)))
 FINAL_RATIO = np.array(2.56)  # VehicleSMI
 SHIFT_DELAY = np.array(0.7)  # s, minimum time between two shifts; VehicleSMI
-SHIFT_UP, SHIFT_DOWN = map(np.array, (0.33, 0.13))  # of maxRpm (assumption)
-# 1/s, the engine speed follows the wheels with a lag of 1/20 s; VehicleSMI.
+# Engine speeds above and below which the gearbox shifts, over maxRpm (assumption).
+SHIFT_UP, SHIFT_DOWN = map(np.array, (0.33, 0.13))
+# 1/s: the engine speed follows the wheels with a time constant of 1/20 s; VehicleSMI.
 RPM_RATE = 20.0
 # Share of maxMotorTorque that the traction control allows at the start; VehicleSMI.
 TRACTION_START = 1 - 0.675
 # N m/s, rate at which the allowed torque rises and falls; VehicleSMI, at 50 Hz.
 TRACTION_RATE = 6.75 / 0.02
 AIR_DRAG, DOWNFORCE = map(np.array, (1.0, 2.0))  # N s^2/m^2; VehicleSMI
-# Unity's WheelCollider: forward friction rises to its extremum and falls to its asymptote.
+# Forward friction of Unity's WheelCollider over slip: it rises to an extremum at PEAK_SLIP, and
+# falls to an asymptote, SLIDING_FRICTION of the extremum, at SLIDING_SLIP.
 PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = map(np.array, (0.4, 0.8, 0.5))
 SLIDING_RANGE, FRICTION_LOSS = map(
     np.array, (SLIDING_SLIP - PEAK_SLIP, 1 - SLIDING_FRICTION)
 )
 FRICTION = 1.0  # at the extremum
-# m/s, smallest denominator of a slip (assumption, as in PhysX).
+# m/s, smallest speed by which a slip speed is divided (assumption, as in PhysX).
 SLIP_FLOOR = np.array(4.0)
-# m/s, smallest rim speed that a slip limit is relative to.
+# m/s, smallest rim speed with which the slip limit of the traction control is multiplied.
 LEAST_RIM_SPEED = np.array(1e-3)
 # m/s, below which locked wheels hold the vehicle (assumption).
 HOLD_SPEED = np.array(0.05)
 WHEELBASE = np.array(2.85)  # m
-# Initial errors for the lane keeping to correct (assumption), so that the steering angle has an
-# effect.
+# Errors at the start that the lane keeping corrects (assumption): without them the steering angle
+# would have no effect.
 LATERAL_ERROR, HEADING_ERROR = 0.10, 0.01  # m, rad
 LATERAL_GAIN, HEADING_GAIN = map(np.array, (0.02, 0.35))  # rad/m, rad/rad
 TORQUE_IDLE, TORQUE_BEND = map(np.array, (0.4, 2.4))  # of maxMotorTorque (assumption)
@@ -68,9 +70,11 @@ _Share = Annotated[float, Meta(ge=0, le=1)]
 
 
 class _Prepared(NamedTuple):
-    """Constants of a run, SI except engine speeds in r/min; shape (N,) or ().
+    """Constants of N vehicles in a run, shape (N,) or (), in SI units; engine speeds are in r/min.
 
-    `body` is the mass of body and wheels, `steering` the full steering angle.
+    `body` is the mass that the tyres accelerate: the vehicle, with a share of the wheels' mass.
+    `steering` is the full steering angle [rad]. Below the speed `standstill` locked wheels hold the
+    vehicle.
     """
 
     step: FloatArray
@@ -197,7 +201,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             friction=np.asarray(FRICTION * road_friction),
         )
 
-        # The speed at which a slope moves the wheels counts as standstill.
+        # On a slope even locked wheels creep, with the slip whose tyre force balances the slope:
+        # this speed counts as standstill, too.
         creep_speed = _rim_at(
             prepared,
             np.zeros_like(prepared.mass),
@@ -240,9 +245,9 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         )
 
     def at_speed(self, prepared: _Prepared, speed: FloatArray) -> LgsvlState:
-        """The steady state at a speed: every equation with its rate of change set to zero.
+        """The steady state at a speed: in every equation the rate of change is 0.
 
-        The vehicle keeps its lane without error; the gearbox has shifted up to the gear for this
+        The vehicle keeps its lane without error. The gearbox has shifted up to the gear for this
         speed.
         """
         p = prepared
@@ -295,7 +300,7 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     ) -> LgsvlState:
         p = prepared
         lateral, heading, cornering_drag = self._steer(p, state)
-        # Of its error a pedal makes up this share in a step.
+        # Share of its distance from the command by which a pedal moves in a step.
         pedal_share = p.step / (p.step + self.pedal_lag)
         state = _shift(p, state)._replace(
             throttle=state.throttle + (command.throttle - state.throttle) * pedal_share,
@@ -312,11 +317,11 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def _steer(
         self, p: _Prepared, s: LgsvlState
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Lane keeping, a kinematic bicycle at small angles: lateral position, heading, and
-        cornering drag [N s/m].
+        """Lateral position [m], heading [rad] and cornering drag [N s/m] after a step of the lane
+        keeping; the vehicle is a kinematic bicycle at small angles.
 
-        The lane keeping commands a share of the full steering angle; the share suits the vehicle
-        for which it was designed.
+        The lane keeping commands a share of the full steering angle. Its gains were designed for a
+        vehicle with the full angle `steering_design_angle`.
         """
         share = -(LATERAL_GAIN * s.lateral + HEADING_GAIN * s.heading) / (
             self.steering_design_angle * RADIANS
@@ -325,13 +330,14 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         curvature = angle / WHEELBASE
         heading = s.heading + s.speed * curvature * p.step
         lateral = s.lateral + s.speed * p.step * HALF * (s.heading + heading)
-        # The lateral force m v^2 curvature, of which the share `angle` points back, over v.
+        # The lateral force is m v^2 curvature. Its share `angle` points back; divided by v, it is a
+        # drag coefficient.
         return lateral, heading, p.mass * np.abs(curvature * angle) * s.speed
 
 
 def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
-    """Automatic gearbox by engine speed. For shiftTime after a shift, the ratio moves linearly from
-    the old one to the new one.
+    """The state after the decision of the automatic gearbox, which depends on the engine speed. For
+    shiftTime after a shift, the ratio changes linearly from the old gear's to the new gear's.
     """
     rpm_share = s.engine_rpm / p.largest_rpm
     is_ready = s.since_shift >= SHIFT_DELAY
@@ -350,7 +356,7 @@ def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
 
 
 def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
-    """The gear ratio in use."""
+    """The current gear ratio [-]; see `_shift`."""
     return np.asarray(
         s.old_ratio
         + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, ONE)
@@ -408,7 +414,7 @@ def _roll(
     )
     speed = np.maximum((p.body * slope_speed + pull * wheel_speed) / damped_mass, ZERO)
 
-    # A braked vehicle that is slower than a slope could move it stands.
+    # A vehicle with locked wheels stands if it is slower than `standstill`.
     is_held = (wheel_speed <= ZERO) & (speed < p.standstill)
     if np.count_nonzero(is_held):
         speed[is_held] = ZERO
@@ -421,8 +427,8 @@ def _roll(
 
 
 def _torque_share(rpm_share: FloatArray) -> FloatArray:
-    """Engine torque as a share of the largest, at an engine speed as a share of maxRpm: a parabola
-    below 1, zero from 1 on (assumption).
+    """Engine torque over maxMotorTorque, from the engine speed over maxRpm: a parabola up to
+    maxRpm, and 0 from maxRpm on (assumption).
     """
     torque_share = TORQUE_IDLE + TORQUE_BEND * rpm_share * (ONE - rpm_share)
     is_overspeed = rpm_share >= ONE
@@ -432,8 +438,8 @@ def _torque_share(rpm_share: FloatArray) -> FloatArray:
 
 
 def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
-    """Rim speed [m/s] at which the tyre force is `force` [N]: the rising part of `_tyre_stiffness`
-    solved for the rim speed.
+    """Rim speed [m/s] at which the tyre force is `force` [N]: the solution of the rising part of
+    the curve in `_tyre_stiffness` for the rim speed.
     """
     grip_share = np.minimum(
         np.abs(force) / (p.friction * (p.weight + DOWNFORCE * speed * speed)), 1.0
@@ -449,8 +455,8 @@ def _rim_at(p: _Prepared, speed: FloatArray, force: FloatArray) -> FloatArray:
 def _tyre_stiffness(
     p: _Prepared, speed: FloatArray, rim: FloatArray, slip_speed: FloatArray
 ) -> FloatArray:
-    """Tyre force over slip speed [N s/m], by Unity's WheelCollider: a parabola to the extremum,
-    then a line to the asymptote.
+    """Secant stiffness of the tyre [N s/m]: tyre force over slip speed. The force over slip is that
+    of Unity's WheelCollider: a parabola to the extremum, then a line to the asymptote.
     """
     denominator = np.maximum(np.maximum(speed, rim), SLIP_FLOOR)
     slip = np.abs(slip_speed) / denominator
