@@ -1,4 +1,4 @@
-"""Animations of a comparison, seen from above, by Matplotlib: a gif, and an HTML page."""
+"""Animations of a comparison from above, drawn by Matplotlib: as a gif, or as an HTML page."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 WIDTH, PANEL_HEIGHT = 8.8, 0.62
 """Width of a frame, and height of the panel with texts above the road [inches]."""
 DPI, PAGE_DPI = 100, 75
-"""Resolution of an animation, and of one on a page with others [pixels per inch]."""
+"""Resolution of a single animation, and of an animation on a page of a report [pixels per inch]."""
 MAX_FRAMES, MAX_PAGE_FRAMES = 100, 40
-"""Largest number of frames of an animation, and of one on a page with others."""
+"""Largest number of frames of a single animation, and of an animation on a page of a report."""
 PALETTE = 32
-"""Number of colours of a frame on a page."""
+"""Number of colours to which the frames of a player are reduced."""
 GROUND_COLOUR, TEXT_COLOUR, PALE_TEXT_COLOUR = "#eef0ec", "#1d2329", "#5d666f"
 ACTOR_COLOUR, IMPACT_COLOUR = "#3f464d", "#ffd400"
 SEAM_WIDTH = 0.12
@@ -45,7 +45,9 @@ LAYERS = {
     "road": [(0.0, "#e8eaec"), (SEAM_WIDTH, "#9aa1a9")],
     "crossing": [(0.0, "white")],
 }
-"""How much narrower than a lane each line is that shows it [m], and its colour."""
+"""Lines that draw a lane, one upon the other, by kind of lane: the difference between the widths of
+lane and line [m], and the line's colour.
+"""
 KINDS = ("area", *LAYERS)
 """Kinds of lanes in the order in which they are drawn."""
 STRIPE_LENGTH = 0.5
@@ -62,9 +64,9 @@ MARGIN = 4.0
 MIN_HEIGHT = 11.0
 """Smallest height of a view [m]."""
 MAX_LENGTH = 60.0
-"""Largest length of road that is shown; in a longer scene the camera follows the vehicles [m]."""
+"""Largest length of road in a view [m]: in a longer scene a camera follows the vehicles."""
 CAMERA_LEAD = 0.45
-"""Part of this length behind the front bumpers of the vehicles under test [-]."""
+"""Share of the view's length behind the front bumpers of the vehicles under test [-]."""
 MAX_DISTANCE = 30.0
 """Distance to the vehicle under test beyond which actors are not shown [m]."""
 ENDINGS = (".gif", ".html")
@@ -72,7 +74,7 @@ ENDINGS = (".gif", ".html")
 SECONDS_PER_FRAME = 0.1
 """Least duration of a frame [s]; gifs resolve 0.01 s."""
 LAST_FRAME_DURATION = 2.0
-"""How long the last frame of a gif is kept [s]."""
+"""Time for which a gif shows its last frame [s]."""
 PLAYER_FOLDER = Path(__file__).parent / "web"
 HTML_CHANGES = {
     r"\\\n": "",
@@ -81,14 +83,15 @@ HTML_CHANGES = {
     r"this\.current_frame = 0;": "this.current_frame = frames.length - 1;",
     r'name="points"': 'aria-label="time"',
 }
-"""What is put in place of parts of the HTML that Matplotlib writes, by regular expressions: a page
-opens offline, shows how a drive ends, and names what one can press.
+"""Replacements in the HTML that Matplotlib writes, by regular expression. With them a page opens
+offline, shows first how a drive ends, and names its controls for screen readers.
 """
 
 
 class DrawnBody(NamedTuple):
-    """An actor of one simulation: front bumper or person's middle, x to the right and y up [m],
-    heading [rad from x]; shape (T,).
+    """An actor in one of the two simulations (`row`), at T samples: the position of a vehicle's
+    front bumper or of a person's middle, x to the right and y up, shape (T,) [m], and the heading
+    counter-clockwise from x, shape (T,) [rad].
     """
 
     row: int
@@ -138,8 +141,8 @@ def player_of(
     frames: int = MAX_PAGE_FRAMES,
     dpi: int = PAGE_DPI,
 ) -> Markup:
-    """HTML that plays a comparison, with all that this needs, under its number on a page; without
-    JavaScript it shows the end.
+    """HTML that plays a comparison, without other files. `number` makes its names unique on a page.
+    Without JavaScript it shows the last frame.
     """
     from matplotlib.animation import HTMLWriter
 
@@ -166,7 +169,7 @@ def player_of(
 
 
 def _with_palette(picture: re.Match[str]) -> str:
-    """The data of a picture with a palette, which are a quarter as long."""
+    """The data of a picture with a palette of colours, which are a quarter as long."""
     from PIL import Image
 
     data = BytesIO()
@@ -178,8 +181,8 @@ def _with_palette(picture: re.Match[str]) -> str:
 def film_of(
     comparison: Comparison, frames: int, pause: float = 0.0
 ) -> tuple[FuncAnimation, float]:
-    """At most about so many frames, of which the last one is kept for some time [s], and how many
-    there are in a second.
+    """An animation with about `frames` frames at most, and its number of frames per second. The
+    last frame stays for the time `pause` [s].
     """
     from matplotlib.animation import FuncAnimation
 
@@ -196,8 +199,8 @@ def film_of(
 
 
 def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Patch]]]:
-    """Draw a scene as a figure outside any window; also returns the function that shows a sample in
-    it.
+    """Draw the scene of a comparison as a figure outside any window. Returns the figure, and a
+    function that shows a sample in this figure.
     """
     from matplotlib.figure import Figure
     from matplotlib.transforms import Affine2D
@@ -249,20 +252,20 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
             texts[row].set_text(reading(comparison, row, sample))
             has_collided = not np.isnan(comparison.runs.closing_speed[row])
             impacts[row].set_visible(has_collided and sample >= moments.decided)
-        # Matplotlib draws the whole figure again.
+        # An empty list makes Matplotlib draw the whole figure again.
         return []
 
     return figure, show
 
 
 def _last_sample(comparison: Comparison) -> int:
-    """The last sample of all runs."""
+    """The last sample of the longer run."""
     return max(moments.end for moments in comparison.moments)
 
 
 def lay_out(comparison: Comparison) -> tuple[list[DrawnBody], Affine2D]:
-    """The actors that ever come near the vehicle under test, which starts at the origin towards the
-    right, and what turns the scene to that.
+    """The actors that ever come near the vehicle under test, and the transformation that turns the
+    scene: then this vehicle starts at the origin, and heads to the right.
     """
     from matplotlib.transforms import Affine2D
 
@@ -272,7 +275,7 @@ def lay_out(comparison: Comparison) -> tuple[list[DrawnBody], Affine2D]:
     bodies = []
     rows = enumerate(comparison.moments)
     for (name, track), (row, moments) in product(comparison.tracks.items(), rows):
-        # After the end of its run an actor stays in place.
+        # After the end of a run its actors stay in place, because their samples are meaningless.
         samples = np.minimum(np.arange(_last_sample(comparison) + 1), moments.end)
         place = track.motion[samples, row, :2]
         distance = np.linalg.norm(place - vut.motion[samples, row, :2], axis=1)
@@ -286,8 +289,8 @@ def lay_out(comparison: Comparison) -> tuple[list[DrawnBody], Affine2D]:
 
 
 def _choose_view(bodies: Sequence[DrawnBody]) -> tuple[FloatArray, float, float, float]:
-    """The left ends of the part of the road that is shown, shape (T,), its length, and its lower
-    and upper end [m].
+    """The view: its left end at each sample, shape (T,), its length, and its lower and its upper
+    end [m].
     """
     x, y = np.stack([(body.x, body.y) for body in bodies], axis=1)
     sizes = np.array([(body.length, body.width / 2) for body in bodies])
@@ -308,8 +311,8 @@ def _choose_view(bodies: Sequence[DrawnBody]) -> tuple[FloatArray, float, float,
 def _draw_road(
     axis: Axes, comparison: Comparison, turn: Affine2D, points: float
 ) -> None:
-    """Draw lanes, a metre as so many points, and a mark every ten metres from the start of the
-    front bumper.
+    """Draw the lanes, and a mark every ten metres from the front bumper's start. A metre has
+    `points` points of a line's width.
     """
     from matplotlib.patches import Polygon
     from matplotlib.ticker import MultipleLocator
@@ -337,13 +340,15 @@ def _draw_road(
 
 
 def _draw_body(body: DrawnBody, *, is_outline: bool) -> Patch:
-    """Draw an actor, heading along x; the front bumper, or a person's middle, is at the origin."""
+    """The shape of an actor that heads along x, with its front bumper, or a person's middle, at the
+    origin. An outline has no filling.
+    """
     from matplotlib.patches import Circle, Polygon
 
     colour = COLOURS[body.row] if body.is_vut else ACTOR_COLOUR
     style: Any = {"color": colour, "zorder": 3}
     if is_outline:
-        # It is not on the road with the other.
+        # The two vehicles are not on the road together: the original shines through the other.
         style |= {
             "fill": False,
             "linewidth": 2,
@@ -358,8 +363,8 @@ def _draw_body(body: DrawnBody, *, is_outline: bool) -> Patch:
 
 
 def reading(comparison: Comparison, row: int, sample: int) -> str:
-    """Speed and gap of a vehicle, whether it brakes and, from the nearest moment on, how its run
-    ends.
+    """A line of text on a vehicle at a sample: its speed, its gap, whether it brakes and, from the
+    nearest moment on, how its run ends.
     """
     trace = comparison.runs.trace
     moments = comparison.moments[row]
@@ -377,8 +382,8 @@ def reading(comparison: Comparison, row: int, sample: int) -> str:
 
 
 def template_environment(*folders: Path) -> Environment:
-    """The jinja2 environment for templates in these folders and for animations; it escapes all
-    values.
+    """The jinja2 environment for templates in these folders and in the folder of the player. It
+    escapes all values.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 

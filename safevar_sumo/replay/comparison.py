@@ -1,5 +1,5 @@
-"""A changed vehicle beside the original, seen from above: when each begins to brake, is nearest and
-ends.
+"""The runs of a changed vehicle and of the original vehicle, to be drawn side by side: the moments
+at which each begins to brake, is nearest to the obstacle, and ends, and the roads and actors.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from safevar_sumo.sumo.verification import drive_again
 
 
 class DrawnLane(NamedTuple):
-    """A lane of SUMO: its middle line of P points, shape (P, 2), and width [m]; or the outline of
-    an area, and 0.
+    """A lane of SUMO: the P points of its middle line, shape (P, 2), and its width [m]. Of an area,
+    the points of its outline, and width 0.
 
-    `kind` is road, path (only for persons), crossing or area (for persons, between paths).
+    `kind` is road, path (only for persons), crossing, or area (for persons, between paths).
     """
 
     kind: str
@@ -47,10 +47,10 @@ class DrawnLane(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """Indices of a run's samples; None where there is no such moment.
+    """The samples of a run's moments, as indices; None if the run has no such moment.
 
-    - `braking_start`: the vehicle begins to brake for the obstacle;
-    - `nearest`: the obstacle is nearest (on a collision, the impact);
+    - `braking_start`: the vehicle begins to brake for the obstacle.
+    - `nearest`: the obstacle is nearest (in a collision, the impact).
     - `end`: the last sample of the run.
     """
 
@@ -60,26 +60,30 @@ class Moments(NamedTuple):
 
     @property
     def decided(self) -> int:
-        """The sample from which on it is known how the run ends."""
+        """The sample from which on pictures say how the run ends: the nearest moment, or the end of
+        the run without such a moment.
+        """
         if self.nearest is None:
             return self.end
         return self.nearest
 
 
 ORIGINAL, CHANGED = 0, 1
-"""Rows of a comparison."""
+"""Rows of a comparison: of the original and of the changed vehicle."""
 COLOURS = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
-"""Okabe and Ito's blue and vermillion."""
+"""Colours of the vehicles by row: blue and vermillion of the palette by Okabe and Ito, which
+colour-blind people can tell apart.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Runs of the original vehicle (row 0) and of a changed one (row 1; missing if nothing is
-    changed).
+    """Runs of the original vehicle (row 0) and of a changed vehicle (row 1; this row is missing if
+    nothing is changed).
 
-    `title` is the study's title and the name of `point`, at which `system` drove; `evaluations` and
-    `runs` have one row for each vehicle. `objectives` are metrics that the study optimises besides
-    the paper's metrics.
+    `title` is the title of the study, with the name of the `point` of a matrix. `system` drove the
+    vehicles at this point. `evaluations` and `runs` have a row for each vehicle. `objectives` are
+    the metrics that the study optimises besides the metrics that every study has.
     """
 
     title: str
@@ -107,13 +111,11 @@ class Comparison:
 
     @property
     def has_position(self) -> bool:
-        """Whether positions of the vehicles are known: a simulator of the user's own may have
-        none.
-        """
+        """Whether the runs have the vehicles' positions: a user's simulator need not state them."""
         return not self.runs.lacking("position").any()
 
     def refuse_without_position(self) -> None:
-        """Refuse to draw runs without positions."""
+        """Raise an InputError if the runs have no positions: then there is nothing to draw."""
         if not self.has_position:
             self.system.require("a picture", "--plot or --animate")
 
@@ -124,17 +126,17 @@ class Comparison:
 
     @cached_property
     def road(self) -> tuple[DrawnLane, ...]:
-        """The lanes of the network; of a simulator of the user's own, a straight one."""
+        """The lanes of the network; for a user's simulator, a single straight lane."""
         if not self.system.mover.has("roads"):
             return (lane_below(self.runs.trace),)
         return read_road(self.network)
 
     @cached_property
     def tracks(self) -> dict[str, Film]:
-        """How all actors move in SUMO, by name in alphabetical order, at the samples of `runs`.
+        """The motion of all actors in SUMO at the samples of `runs`, by name in alphabetical order.
 
-        Samples after the end of a run are meaningless: SUMO continues with the other run. What a
-        simulator of the user's own moves is drawn along a straight line.
+        Samples after the end of a run are meaningless: SUMO continues with the other run. With a
+        user's simulator, vehicle and obstacle move along a straight line.
         """
         if not self.system.mover.has("roads"):
             return films_along(self.runs.trace)
@@ -156,9 +158,9 @@ class Comparison:
 
     @property
     def changes(self) -> list[str]:
-        """Every change in words, with its unit and share."""
+        """The changes of the changed vehicle in words, each with its unit and its share."""
         characteristics = self.system.characteristics
-        # The last row: the original vehicle is alone without a change.
+        # The last row is the changed vehicle or, if nothing is changed, the original.
         return change_texts(
             characteristics, characteristics.named(self.evaluations.settings[-1])
         )
@@ -187,13 +189,13 @@ class Comparison:
 
 
 BODY_LENGTH, BODY_WIDTH, LANE_WIDTH = 4.5, 1.8, 3.5
-"""What is drawn of a simulator of the user's own, which states no sizes [m]."""
+"""Sizes of bodies and lane in pictures of a user's simulator, which states no sizes [m]."""
 ROAD_BEHIND, ROAD_AHEAD = 20.0, 100.0
-"""How far the lane reaches that is drawn there [m]."""
+"""Lengths by which this lane extends behind and ahead of all positions of the vehicles [m]."""
 
 
 def films_along(trace: Trace) -> dict[str, Film]:
-    """The vehicle and who is ahead of it, along a straight line."""
+    """The motion of the vehicles and of the obstacles ahead of them, along a straight line."""
 
     def film(front: FloatArray, speed: FloatArray) -> Film:
         nothing = np.zeros(front.shape)
@@ -206,15 +208,15 @@ def films_along(trace: Trace) -> dict[str, Film]:
 
 
 def lane_below(trace: Trace) -> DrawnLane:
-    """The lane on which they are drawn."""
+    """The straight lane below the vehicles of `films_along`."""
     rear = trace.position.min() - ROAD_BEHIND
     front = trace.position.max() + ROAD_AHEAD
     return DrawnLane("road", np.array([[rear, 0.0], [front, 0.0]]), LANE_WIDTH)
 
 
 def comparison_of(simulation: Simulation) -> Comparison:
-    """What a simulation and that of the original vehicle beside it look like, at the same point of
-    a matrix.
+    """The comparison of a simulation with the simulation of the original vehicle, at the same point
+    of a matrix.
     """
     pair = simulation.pair
     scoring = simulation.scoring
@@ -223,7 +225,7 @@ def comparison_of(simulation: Simulation) -> Comparison:
         title += f" ({pair.point.name})"
     names = {objective.name for objective in scoring.objectives} - {*METRICS}
 
-    # At an impact a command has no effect any more: the pedals are those of the sample before.
+    # A command at the impact has no effect any more: pictures show the pedals of the sample before.
     trace = pair.runs.trace
     pedals = np.stack([trace.throttle, trace.brake])
     has_collided = ~np.isnan(pair.runs.collision_speed) & trace.active.any(axis=0)
@@ -263,8 +265,8 @@ def read_road(network: NetworkFiles) -> tuple[DrawnLane, ...]:
 
 
 def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:
-    """List where the replay of a solution differs from its row of solutions.csv, with both
-    values.
+    """Sentences on differences between the replay of a solution and its row of solutions.csv, with
+    the old and the new value.
     """
     differences = []
     if recorded["outcome"] not in (replayed.outcome[0], UNKNOWN):
@@ -279,7 +281,7 @@ def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:
 
 
 def why_different(*, is_imported: bool) -> str:
-    """Why replays of solutions may differ from the results."""
+    """The reason why replays of solutions may differ from the results."""
     if is_imported:
         return "the results are imported: another simulator made them"
     return "the driving system, another model or this program has changed since"

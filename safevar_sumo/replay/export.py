@@ -1,5 +1,5 @@
-"""A solution's simulation as files for other simulators: OpenSCENARIO XML and OpenDRIVE, or a
-script for CARLA.
+"""Exports the simulation of a solution for other simulators: as OpenSCENARIO XML with OpenDRIVE, or
+as a script for CARLA.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ CARLA_PHYSICS = {
     "mass": "mass",
     "dragCoeff": "drag_coefficient",
 }
-"""Attributes of CARLA's `VehiclePhysicsControl`, by the characteristic with the same meaning and
-unit.
+"""Attributes of CARLA's `VehiclePhysicsControl`, by the characteristic that has the same meaning
+and unit.
 """
 CARLA_WHEELS = {
     "tireFric": "tire_friction",
@@ -59,15 +59,15 @@ CARLA_WHEELS = {
     "radius": "radius",
     "maxBrakeTorque": "max_brake_torque",
 }
-"""Attributes of each `WheelPhysicsControl`, by characteristic; CARLA's radius is in cm, as the
-characteristic is.
+"""Attributes of each `WheelPhysicsControl` of CARLA, by the characteristic that has the same
+meaning and unit; the radius is in cm in both.
 """
 EGO = "Ego"
 """Name of the vehicle under test in OpenSCENARIO."""
 WHEELBASE = 0.58
-"""Assumed wheelbase over the vehicle's length, with equal overhangs [-]."""
+"""Assumed wheelbase over the length of a vehicle [-]; its two overhangs are equal."""
 HEIGHTS = {"pedestrian": 1.8, "bicycle": 1.7, "car": 1.5}
-"""Assumed heights [m]; SUMO has no third dimension."""
+"""Assumed heights by kind of actor [m], because SUMO has no third dimension."""
 BICYCLE_WIDTH = 1.0
 """Width below which a vehicle is a bicycle [m]."""
 DROPPED_ATTRIBUTES = {
@@ -75,14 +75,14 @@ DROPPED_ATTRIBUTES = {
     "cornerLocal": ("id",),
     "header": ("date",),
 }
-"""Attributes, by element, that netconvert writes into OpenDRIVE 1.4 although only later versions
-have them; and the time of the conversion.
+"""Attributes, by element, that are removed from netconvert's OpenDRIVE 1.4: only later versions of
+OpenDRIVE have them, or (`date`) they differ between two conversions.
 """
 
 
 class Poses(NamedTuple):
-    """Samples of an actor on the road, shape (T,): time [s], middle x and y [m], and heading
-    counter-clockwise from x [rad].
+    """An actor at the T samples at which it is on the road. Columns have the shape (T,): time [s],
+    x and y of its middle [m], and heading counter-clockwise from x [rad].
     """
 
     name: str
@@ -101,16 +101,16 @@ class Poses(NamedTuple):
 
     @property
     def to_axle(self) -> float:
-        """Distance of the rear axle behind the middle [m]; OpenSCENARIO places a vehicle by this
-        axle, a person by its middle.
+        """Distance from the middle back to the point by which OpenSCENARIO places an actor [m]: the
+        rear axle of a vehicle, the middle of a person (0).
         """
         if self.kind == "pedestrian":
             return 0.0
         return self.length * WHEELBASE / 2
 
     def places(self, distance: float = 0.0) -> list[list[float]]:
-        """Time [s], x, y [m] and heading [rad] of the point at this distance behind the middle
-        [m].
+        """For each sample the time [s], x, y [m] and heading [rad] of the point that is `distance`
+        behind the middle [m].
         """
         x = self.x - distance * np.cos(self.heading)
         y = self.y - distance * np.sin(self.heading)
@@ -121,8 +121,8 @@ class Poses(NamedTuple):
 
 
 def poses_of(comparison: Comparison) -> list[Poses]:
-    """All actors of the changed vehicle's run, or of the original's if nothing is changed, until
-    its end; the vehicle under test is the first.
+    """All actors in the run of the changed vehicle (of the original, if nothing is changed), until
+    the end of this run. The vehicle under test comes first.
     """
     row = comparison.rows[-1]
     actors = []
@@ -157,8 +157,9 @@ def poses_of(comparison: Comparison) -> list[Poses]:
 
 
 def _with_next_place(actor: Poses) -> Poses:
-    """An actor with a place one step after its end, where an even change of speed leads: between
-    the places beside it, a reader finds the speed at the end.
+    """The actor with a further place, one step after its last place, which continues the last
+    change of speed: a simulator that derives speeds from two places then finds the speed at the end
+    of the run.
     """
     lengths = np.hypot(*np.diff([actor.x[-3:], actor.y[-3:]]))
     if len(lengths) < 2 or not lengths[1]:
@@ -172,15 +173,14 @@ def _with_next_place(actor: Poses) -> Poses:
 
 
 def open_drive(network: NetworkFiles) -> str:
-    """The network as OpenDRIVE 1.4: of a shipped network the file beside it, of others by
-    netconvert.
+    """The network as OpenDRIVE 1.4: from the file beside a shipped network, or by netconvert.
 
     Raises
     ------
     EnvironmentFault
         If netconvert fails.
     InputError
-        If it is not installed.
+        If netconvert is not installed.
     """
     if network.folder.parent == NETWORKS and not network.lane_changes:
         return network.path(ROAD).read_text(encoding="utf-8")
@@ -188,8 +188,8 @@ def open_drive(network: NetworkFiles) -> str:
 
 
 def converted(network: NetworkFiles) -> str:
-    """The network as OpenDRIVE 1.4, by netconvert, without the time of the conversion; raises the
-    errors of `open_drive`.
+    """The network as OpenDRIVE 1.4 by netconvert, without `DROPPED_ATTRIBUTES`. Raises the errors
+    of `open_drive`.
     """
     netconvert = program_of_sumo("netconvert", f"an export of {network.folder}")
     with temporary_folder() as folder:
@@ -217,12 +217,13 @@ def converted(network: NetworkFiles) -> str:
 
 
 def carla_physics(setting: NamedValues) -> dict[str, NamedValues]:
-    """The values of CARLA's physics and of each wheel, by attribute.
+    """The values of a setting by CARLA's attributes of the vehicle ("physics") and of each of its
+    wheels ("wheels").
 
     Raises
     ------
     InputError
-        If a characteristic has no counterpart in CARLA, or one of CARLA's has no characteristic.
+        If a characteristic has no attribute in CARLA, or an attribute has no characteristic.
     """
     names = {**CARLA_PHYSICS, **CARLA_WHEELS}
 
@@ -247,8 +248,8 @@ def carla_physics(setting: NamedValues) -> dict[str, NamedValues]:
 def carla_scene(
     comparison: Comparison, physics: Mapping[str, NamedValues], handle: str
 ) -> JsonObject:
-    """The content of `vehicle.json`: physics, places in SUMO's frame (x east, y north, headings
-    counter-clockwise) and pedals.
+    """The content of `vehicle.json`: physics, pedals, and places in SUMO's coordinates (x east, y
+    north, headings counter-clockwise).
     """
     row = comparison.rows[-1]
     trace = comparison.runs.trace
@@ -342,8 +343,8 @@ def write_files(
     handle: str,
     physics: Mapping[str, NamedValues],
 ) -> None:
-    """Write the last run of a comparison into a new directory: for "carla", with its `physics`, or
-    "openscenario".
+    """Write the last run of a comparison into a new directory, as files for `to`: "carla" (with the
+    values `physics`) or "openscenario". `handle` names the solution in these files.
     """
     files = {ROAD: open_drive(comparison.network)}
     if to == "carla":

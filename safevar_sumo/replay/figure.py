@@ -1,6 +1,4 @@
-"""The original and a changed vehicle in one figure: speed, gap, pedals and time to collision over
-time.
-"""
+"""The figure of a comparison: speeds, gaps, pedals and times to collision of both vehicles."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ if TYPE_CHECKING:
 
 BRAKING_MARK, NEAREST_MARK, IMPACT_MARK = "v", "o", "X"
 LINES = ("-", "--")
-"""The lines of the original and of the changed vehicle."""
+"""Line styles of the original and of the changed vehicle."""
 MAX_TTC = 6.0
 """Largest time to collision that is drawn [s]."""
 MIN_DIVERGENCE = 0.1
@@ -99,8 +97,8 @@ def draw_comparison(comparison: Comparison) -> Figure:
 def _mark_moments(
     speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row: int
 ) -> None:
-    """Mark where a vehicle begins to brake, is nearest, and collides. The original's marks are
-    larger, to show behind the changed vehicle's.
+    """Mark the moments at which a vehicle begins to brake, is nearest to the obstacle, and
+    collides. The marks of the original are larger, so that they show behind those of the other.
     """
     trace = comparison.runs.trace
     start, nearest, end = comparison.moments[row]
@@ -163,7 +161,9 @@ def _mark_moments(
 
 
 def _end_time(comparison: Comparison) -> float:
-    """The later of the times at which the vehicles are nearest and at rest [s]."""
+    """The end of the time axis [s]: a sample after all vehicles are at rest (or their runs have
+    ended), and after both nearest moments.
+    """
     runs = comparison.runs
     last_moving = np.flatnonzero(
         (runs.trace.active & (runs.trace.speed > STANDSTILL)).any(axis=1)
@@ -203,8 +203,8 @@ def _draw_legend(
 
 
 def find_divergence(runs: SimulationRuns) -> float | None:
-    """The time from which on the speeds of the original and the changed vehicle have diverged [s];
-    None if they never do, or if nothing is changed.
+    """The first time at which the speeds of the original and the changed vehicle differ by more
+    than `MIN_DIVERGENCE` [s]; None if there is no such time, or if nothing is changed.
     """
     trace = runs.trace
     have_diverged = trace.active.all(axis=1) & (
@@ -216,8 +216,8 @@ def find_divergence(runs: SimulationRuns) -> float | None:
 
 
 def _heading(comparison: Comparison) -> str:
-    """The study's title and, below it, the changes; lines break only between changes."""
-    # No line breaks at "\0", which stands for the spaces of a change.
+    """The study's title and, below it, the changes. Lines break only between two changes."""
+    # The spaces of a change are replaced by "\0", at which no line breaks.
     changes = ", ".join(change.replace(" ", "\0") for change in comparison.changes)
     line = "the original vehicle"
     if changes:

@@ -1,5 +1,5 @@
-"""A comparison in sumo-gui: SUMO drives both vehicles again, each on its own copy of the road, one
-upon the other.
+"""A comparison in sumo-gui: SUMO drives both vehicles again. Each vehicle is on its own copy of the
+road, and both copies are in the same place of the picture.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from safevar_sumo.sumo.verification import drive_again
 from safevar_sumo.sumo.world import Api, SumoWorld
 
 PAUSE = 2.0
-"""Pause at the nearest moment and at the end [s]."""
+"""Length of the pauses at the nearest moments and at the end [s]."""
 AROUND = 12.0
-"""How far the view reaches around the vehicles [m]."""
+"""Distance between the vehicles and the edges of the view [m]."""
 VIEW_NAME = "View #0"
 VIEW_SETTINGS = """<viewsettings>
     <scheme name="safevar_sumo">
@@ -67,7 +67,7 @@ def show_in_gui(comparison: Comparison, pictures: Path | None = None) -> None:
     def watch(world: SumoWorld) -> None:
         nonlocal start
         sample = next(samples)
-        # The pace counts from the first step on: to open the window takes a while.
+        # The clock starts with the first step, because opening the window takes a while.
         if sample == 0:
             start = time.monotonic()
             for row in comparison.rows:
@@ -75,7 +75,7 @@ def show_in_gui(comparison: Comparison, pictures: Path | None = None) -> None:
                     copied_id(row, VUT), (*bytes.fromhex(COLOURS[row][1:]), 255)
                 )
         _look_at(world)
-        # Sumo-gui takes a picture at the end of its next step.
+        # sumo-gui takes a picture at the end of its next step, so that it is requested before.
         if pictures is not None and sample + 1 in pauses:
             world.api.gui.screenshot(VIEW_NAME, str(pictures / f"{sample + 1:04d}.png"))
 
@@ -98,7 +98,7 @@ def _look_at(world: SumoWorld) -> None:
 
 @contextmanager
 def _open_view(options: Sequence[str]) -> Iterator[Api]:
-    """Open a window on what SUMO simulates with options."""
+    """Start sumo-gui with SUMO's `options` and the settings of the view; yields TraCI."""
     with temporary_folder() as folder:
         settings_file = Path(folder) / "view.xml"
         settings_file.write_text(VIEW_SETTINGS, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The answer about one setting beside the original vehicle."""
+"""The answer of `simulate`: the simulations of one setting and of the original vehicle."""
 
 from __future__ import annotations
 
@@ -43,14 +43,16 @@ OUTCOME_NAMES = (
     "f_diff",
     "f_num_diff",
 )
-"""What every study says of a simulation besides its metrics."""
+"""Names of numbers that an answer has in every study, besides the metrics."""
 OF_SEARCH = ("gap", "f_safe", "f_diff", "f_num_diff")
-"""Results that say what others say, or that a search minimises."""
+"""Results that the first view leaves out: only a search needs them, or other results say the same.
+"""
 
 
 def _fails(system: System, result: PointResult) -> bool:
-    """Whether the first setting fails at a point: by the study's own criterion, or by a contact
-    that is faster than the point allows.
+    """Whether the first setting fails at a point. The study's criterion decides, unless it is a
+    collision, or its metric is missing: then a contact that is faster than the point allows is a
+    failure.
     """
     criterion = system.with_contact(system.criterion)
     bound = criterion.bound
@@ -66,8 +68,8 @@ def _fails(system: System, result: PointResult) -> bool:
 def answer_of_setting(
     system: System, simulation: Simulation, handle: SolutionId | None
 ) -> Answer:
-    """A setting beside the original: its values, outcome, metrics and objectives, and the points of
-    a matrix; of a solution its handle.
+    """The answer about a setting and the original vehicle: values, outcomes, metrics, objectives,
+    and the results at the points of a matrix. `handle` is that of a solution, else None.
     """
     study = simulation.study
     setting = simulation.evaluation.settings[0]
@@ -133,12 +135,12 @@ def answer_of_setting(
 
 
 def _points(system: System, setting: FloatArray) -> tuple[AnswerTable, list[str]]:
-    """The table of the points of a matrix, of which the worst ones lead, and the points at which a
-    setting fails.
+    """The table of the points of a matrix, in which the worst points come first; and the names of
+    the points at which a setting fails.
     """
     results = list(simulate_all_points(system, setting[None]))
     records = map(point_record, results)
-    # Side and place of a contact are columns of their own.
+    # A contact is a record in a record: its side and its place become columns.
     points = pd.DataFrame([{**row, **row.get("contact", {})} for row in records])
     worst = np.argsort(points[SAFETY_DEGREE], kind="stable").tolist()
     table = tabulate("Test cases, worst first", POINTS, points, lead_rows=worst)
@@ -148,7 +150,9 @@ def _points(system: System, setting: FloatArray) -> tuple[AnswerTable, list[str]
 def _without_repetition(
     columns: dict[str, Column], simulation: Simulation
 ) -> dict[str, Column]:
-    """Columns that show the values of the original vehicle once if nothing is changed."""
+    """The columns, without those of the simulated vehicle if nothing is changed: they would repeat
+    the values of the original vehicle.
+    """
     if simulation.row:
         return columns
     names = columns.keys() & {"simulated", "changed"}
@@ -168,8 +172,8 @@ def _characteristics(simulation: Simulation) -> AnswerTable:
 
 
 def _verdict(simulation: Simulation, point_count: int) -> list[Sentence]:
-    """How the simulated vehicle and, if it differs, the original end; of a matrix in the worst of
-    its test cases.
+    """Sentences on the ends of the simulations of the changed vehicle, if there is one, and of the
+    original vehicle. In a matrix they are about the worst test case.
     """
     is_changed = simulation.row > 0
     test = simulation.pair.point.name
@@ -190,7 +194,7 @@ def _verdict(simulation: Simulation, point_count: int) -> list[Sentence]:
     if is_changed:
         sentences.append(_safety_comparison(simulation))
 
-    # NaN is no safety degree that suffices.
+    # The comparison is negated, because an undefined safety degree, NaN, does not suffice.
     demand = simulation.scoring.safe_original
     if demand is not None and not simulation.original.metrics[SAFETY_DEGREE] >= demand:
         sentences.append(words.LEFT_OUT(demand=demand))

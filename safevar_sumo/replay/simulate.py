@@ -53,8 +53,11 @@ from safevar_sumo.sumo.system import System, assemble
 
 
 class Target(NamedTuple):
-    """What is simulated: a study, and its name in errors; of a solution also its handle and its row
-    of the results; where changes of it are undone, the row has the values alone.
+    """The target of `simulate`: a study, or a solution of results. `source` is its name in errors.
+
+    A solution has its handle, and its row of the table of solutions; both are None for a study. If
+    needless changes of a solution are undone (choice `fewest`), `row` has only the values of its
+    characteristics, without an outcome.
     """
 
     study: Study
@@ -63,7 +66,7 @@ class Target(NamedTuple):
     row: JsonObject | None = None
 
     def setting(self, system: System) -> FloatArray:
-        """The solution's setting, or the original."""
+        """The setting of the solution, shape (n,); for a study, the original setting."""
         if self.row is None:
             return system.characteristics.original
         values = system.characteristics.named(system.characteristics.original)
@@ -145,7 +148,7 @@ def show_simulation(
             values[PHASE] = round(values[PHASE], PHASE_DECIMALS)
         target_values = system.characteristics.named(target.setting(system))
         requested = np.array(list({**target_values, **values}.values()))
-        # What a study or results hold has been checked.
+        # Without changes the setting is that of a study or of results, which has been checked.
         if changes and not beyond:
             system.region.check(requested[None], otherwise=", or any with --beyond")
 
@@ -159,7 +162,7 @@ def show_simulation(
 
     system = _where_met(system, requested)
     simulation = simulate_with_original(study, system, requested, filtered=False)
-    # Results belong to the whole matrix.
+    # Stored results are those of the worst point of the matrix: at a chosen point they may differ.
     if target.row and "outcome" in target.row and not changes and point is None:
         _warn_of_differences(target, target.row, simulation)
     if trace is not None:
@@ -177,7 +180,9 @@ def show_simulation(
 
 
 def _where_met(system: System, setting: FloatArray) -> System:
-    """The system at the points that a setting, shape (n,), meets; a warning names other tests."""
+    """The system, reduced to the points whose ranges have the encounter of a setting, shape (n,). A
+    warning names the tests that are left out.
+    """
     reduced = where_met(system, setting)
     if names := sorted(_tests_of(system) - _tests_of(reduced)):
         warn(
@@ -199,8 +204,9 @@ def load_target(
     ranges: bool = False,
     up_to: str | None = None,
 ) -> Target:
-    """The study by name or path, or that of a results directory, at a point or as a whole, with the
-    solution that is named or chosen.
+    """Load a study, by its name, its path or a directory of its results, with the solution of these
+    results that a handle or a choice names. `point`, `ranges` and `up_to` select a part of the
+    study.
 
     Raises
     ------
@@ -234,7 +240,7 @@ def load_target(
 
 
 def _with_set(study: Study, fit: int) -> Study:
-    """The study with a parameter set of its vehicle, by its number."""
+    """The study with the parameter set `fit` of its vehicle model; 0 is the study's own set."""
     if not fit:
         return study
     with about("fit"):

@@ -1,4 +1,4 @@
-"""What `simulate` can say."""
+"""The sentences of the answer of `simulate`."""
 
 from __future__ import annotations
 
