@@ -1,5 +1,5 @@
-"""Make a page about the findings of studies. The package is callable:
-`safevar_sumo.report(...)`.
+"""Make a page about the results of studies. The package itself is callable, so that
+`safevar_sumo.report(...)` makes a page.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How a page divides the simulations that it may do over its questions."""
+"""Divides the simulations of a page (`--simulations`) over its questions and replays."""
 
 from __future__ import annotations
 
@@ -10,19 +10,25 @@ from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System
 
 REPLAYS, SPEED = "replays", "speed"
-"""The names of the parts of the replays, and of the question about the speed of a sheet."""
+"""Names of parts of the simulations: of the replays, and of the question about the greatest speed
+on the sheet.
+"""
 PART_OF_REPLAYS = 10
+"""Replays in a simulator that takes long get 1 / `PART_OF_REPLAYS` of all simulations."""
 ONE_SAMPLE = ("risk", "rules")
-"""Questions that simulate one sample, if their options are the same."""
+"""Questions that share one sample of simulated vehicles, if their options are the same."""
 BESIDES = 4, 6
-"""What a question that finds its sample simulates besides: the original vehicle so often, and so
-many repeats.
+"""Simulations of a question whose sample is simulated already: the number of settings (all of them
+the original vehicle), and the number of further simulations, which repeat runs.
 """
 
 
 def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str, int]:
-    """How many simulations each question about a study may do, by its text, and the replays: equal
-    parts of all; of questions that share a sample one has a part.
+    """The largest numbers of simulations of each question, by its text, and of the `REPLAYS`.
+
+    All questions have equal parts. A question that states its number itself has no part, but its
+    number is subtracted first. Questions about a sample that another question has simulated need
+    only few simulations of their part.
 
     Raises
     ------
@@ -38,12 +44,12 @@ def divided(texts: Sequence[str], simulations: int, system: System) -> dict[str,
     remaining_simulations = simulations - replays
     for text in dict.fromkeys(texts):
         name, *options = text.split()
-        # A question may state its number itself.
+        # The text of a question may state the number of its simulations.
         if SIMULATIONS.flag in options:
             remaining_simulations -= int(options[options.index(SIMULATIONS.flag) + 1])
             continue
         sample = tuple(options) if name in ONE_SAMPLE else (text,)
-        # A simulator that takes long keeps its samples, and has no repairs.
+        # A simulator that takes long keeps its samples for other questions, and has no repairs.
         if system.mover.takes_long and (sample in samples or name == "repair"):
             free.append(text)
         else:

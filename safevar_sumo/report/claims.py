@@ -1,4 +1,4 @@
-"""What a pack claims about a study, and how each claim is computed again."""
+"""The claims of an evidence pack about a study, and the functions that compute each claim again."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Parts, Progress
 
 STUDY, ANSWERS, PAGE, CODE = "study.toml", "answers.json", "report.html", "code"
-"""Files of a study in a pack beside manifest and solutions, and the folder of its user's files."""
+"""Files of a study in a pack, and the folder of the user's code and files."""
 FILES = {MANIFEST, SOLUTIONS, STUDY, ANSWERS, PAGE}
 LISTS, CARS = "lists", "cars"
-"""The folder of the lists of cars in a pack, and the option of a question that names one."""
+"""The folder of lists of cars in a pack, and the option of a question that names such a list."""
 SAME, DIFFERS, CANNOT, UNCHECKED = "same", "differs", "cannot be run", "unchecked"
 VERDICTS = SAME, DIFFERS, CANNOT, UNCHECKED
 MAX_ASKED = 1_000_000
-"""Largest sum of the numbers, such as of vehicles, that all questions of a study state."""
+"""Largest sum of all numbers, such as numbers of vehicles, that the questions of a study state."""
 MALFORMED = (
     LookupError,
     ValueError,
@@ -89,13 +89,13 @@ MALFORMED = (
     csv.Error,
     msgspec.MsgspecError,
 )
-"""What reading a damaged file raises."""
+"""The errors that reading a damaged file may raise."""
 SURPLUS = 10
-"""How many times the evaluations that its runs may have a study can claim to be compared; one with
-more is damaged.
+"""A pack that claims more than this multiple of the evaluations that its runs may have is damaged.
 """
 CONTEXT, SHOWN = 40, 200
-"""Characters of a long line that are shown before the first one that differs, and in all."""
+"""Numbers of characters that a row shows of a long line: before the first difference, and in all.
+"""
 
 
 WHOLE_NUMBER = re.compile(r"[+-]?\d[\d_]*")
@@ -103,8 +103,8 @@ CLAIMS = shipped_columns("verify")["claims"]
 
 
 class Claim(NamedTuple):
-    """What a pack claims under a name, and the function that computes it again; None if that was
-    not asked for.
+    """A claim of a pack: its name, the claimed content, and the function that computes the content
+    again; None if the user has not asked for this computation.
     """
 
     name: str
@@ -113,9 +113,9 @@ class Claim(NamedTuple):
 
 
 class Packed:
-    """A study of a pack: everything follows from its description, manifest, solutions and code.
+    """A study in a pack: all claims follow from its description, manifest, solutions and code.
 
-    The user's code is in the folders `places`, and runs from the first answer or simulation on.
+    The user's code, in the folders `places`, does not run before the first answer or simulation.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class Packed:
         self._answers: dict[str, Answer] = {}
 
     def _check_claims(self, study: Study) -> None:
-        """Refuse what no pack claims, before anything is computed."""
+        """Refuse claims that no intact pack has, before anything is computed."""
         outcomes = self.packed.outcomes
         runs = self.packed.runs
         if unknown := outcomes.keys() - set(Outcome):
@@ -176,7 +176,7 @@ class Packed:
                 f"{total:,} evaluations are far more than {number_of(len(runs), 'run')} may have"
             )
 
-        # No question writes a file, or takes for ever.
+        # Questions of a pack must not write files, nor take too long.
         words = split(" ".join(self.packed.questions).replace("=", " "))
         numbers = [int(word) for word in words if WHOLE_NUMBER.fullmatch(word.strip())]
         total = sum(map(abs, [*numbers, *self.packed.simulations.values()]))
@@ -200,12 +200,14 @@ class Packed:
             )
 
     def _check_solutions(self, study: Study, solutions: pd.DataFrame) -> None:
-        """Refuse a table of solutions with columns or rows that are missing, new or there twice."""
+        """Refuse a table of solutions with missing, unknown or repeated columns, or whose numbers
+        of rows contradict the description of the pack.
+        """
         expected = {"algorithm", "run", *study.domains, *self.manifest["original"]} - {
             "collision",
             "collision_speed",
         }
-        # Pandas calls a second column x "x.1".
+        # If two columns are called x, pandas calls the second one "x.1".
         if wrong := expected ^ {*solutions}:
             raise ValueError(
                 f"{SOLUTIONS}: the column {min(wrong)} is missing, new or there twice"
@@ -221,8 +223,8 @@ class Packed:
 
     @cached_property
     def judged_case(self) -> Case:
-        """The results by the criterion of the pack; raises InputError if it states a scoring that
-        its study does not have.
+        """The results by the criterion of the pack. Raises an InputError if the manifest states
+        another scoring than that of the study.
         """
         if self.case.scoring != assemble(self.case.study).measuring.scoring:
             raise InputError(MANIFEST, "scoring is not that of the study", PACK)
@@ -231,13 +233,15 @@ class Packed:
 
     @property
     def unsafe(self) -> Unsafe | None:
-        """The criterion of the pack."""
+        """The criterion for unsafe that the pack states; None if it states none."""
         return None if self.packed.unsafe is None else Unsafe.parse(self.packed.unsafe)
 
     def answer(
         self, text: str, parsed: tuple[Question, JsonObject] | None = None
     ) -> Answer:
-        """The answer to a question of the pack, or to another one under a name."""
+        """The answer to a question of the pack, given by its text. `parsed` is a question that no
+        text states; then `text` is only its name.
+        """
         if text in self._answers:
             return self._answers[text]
         add_import_folders(self._places)
@@ -269,7 +273,7 @@ class Packed:
         return self._answers[text]
 
     def simulations(self) -> dict[str, int]:
-        """The largest number of simulations of each question whose text does not state it."""
+        """The largest numbers of simulations of questions whose text does not state this number."""
         flag = f" {SIMULATIONS.flag} "
         return self.packed.simulations | {
             text: int(answer.command.rpartition(flag)[2])
@@ -281,7 +285,7 @@ class Packed:
         return json_bytes(packed_answer(self.answer(text)))
 
     def ask_speed(self) -> ReportedStudy:
-        """What the page is about, with the answer about the speed of its sheet."""
+        """The study with the answers of its page, such as that about the sheet's greatest speed."""
         study = ReportedStudy(
             directory=self._directory,
             case=self.judged_case,
@@ -294,7 +298,7 @@ class Packed:
         return make_page([self.ask_speed()], Parts(self._progress)).encode()
 
     def study_file(self) -> bytes:
-        """A study file with all that the study extends."""
+        """The content of a study file, in which the studies that the study extends are included."""
         with temporary_folder() as folder:
             path = Path(folder, f"{self.case.study.name}.toml")
             write_study(
@@ -302,12 +306,12 @@ class Packed:
                 self.case.study,
                 "The study as it was run, with all that it extends.",
             )
-            # Its first line has the path of the schema on this machine.
+            # The first line is left out, because it has the path of the schema on this machine.
             return path.read_bytes().partition(b"\n")[2]
 
     @cached_property
     def simulated(self) -> tuple[bytes, bytes]:
-        """The original vehicle's evaluation, and the table of solutions, all simulated again."""
+        """The evaluation of the original vehicle, and the table of solutions, simulated again."""
         names = self.case.characteristics.names
         solutions = self.case.solutions
         settings = self.case.settings
@@ -322,7 +326,7 @@ class Packed:
 
     @cached_property
     def searched(self) -> tuple[bytes, bytes]:
-        """The outcomes of all evaluations, and the table of solutions, of the same runs again."""
+        """Numbers of evaluations by outcome, and the table of solutions, of the same runs again."""
         with temporary_folder() as folder:
             study = self.case.study
             runs = self.packed.runs
@@ -337,15 +341,15 @@ class Packed:
 
     @property
     def versions(self) -> tuple[JsonObject, JsonObject]:
-        """Versions and platform with which the study was searched, and those here."""
+        """Versions and platform with which the search was run, and those of this machine."""
         manifest = self.manifest
         packed = {"versions": manifest["versions"], "platform": manifest["platform"]}
         versions = manifest_of(self.case.study, {})["versions"]
         return packed, {"versions": versions, "platform": PLATFORM}
 
     def claims(self, folder: Path, search: bool) -> Iterator[Claim]:
-        """What the pack claims, and the functions that compute it again; the manifest is in
-        `folder`.
+        """Yield the claims of the pack about this study. The search is repeated only if `search` is
+        true. The manifest is in `folder`.
         """
         solutions = self.files[SOLUTIONS]
         yield Claim(
@@ -379,11 +383,10 @@ class Packed:
 
     @property
     def code(self) -> list[str]:
-        """The user code that would run: files of the pack, and what the study and the questions
-        name.
+        """The names of user code that would run: files of the pack, and code that the study or its
+        questions name.
 
-        Networks count, since SUMO's options beside them may name files to write; tables of tracks
-        do not.
+        Networks count, because SUMO's options may name files to write. Files .csv do not count.
         """
         study = self.case.study
         prefix = f"{CODE}/"
@@ -401,7 +404,7 @@ class Packed:
 
 
 def list_in(text: str) -> str:
-    """The list of cars that a question names; empty without one."""
+    """The path of the list of cars that a question names; "" if it names none."""
     words = split(text)
     if flag_of(CARS) in words:
         return words[words.index(flag_of(CARS)) + 1]
@@ -409,15 +412,15 @@ def list_in(text: str) -> str:
 
 
 def with_list(text: str, path: str) -> str:
-    """A question that names a list of cars, about another list."""
+    """The text of a question about a list of cars, with `path` in place of the list's path."""
     words = split(text)
     words[words.index(flag_of(CARS)) + 1] = path
     return join(words)
 
 
 def read_table(content: bytes) -> pd.DataFrame:
-    """Read a table of solutions to the last bit; raises ValueError or KeyError if a cell is no
-    number.
+    """Read a table of solutions; numbers keep their last bit. Raises a ValueError or KeyError if a
+    cell is no number, or a column is missing.
     """
     frame = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)
     numbers = [name for name in frame if name not in ("algorithm", "outcome")]
@@ -428,7 +431,7 @@ def read_table(content: bytes) -> pd.DataFrame:
 
 
 def packed_answer(answer: Answer) -> JsonObject:
-    """An answer as a pack holds it: with its command."""
+    """The record of an answer in a pack: the values of the answer, and its command."""
     return {"command": answer.command, **answer.to_dict()}
 
 
@@ -451,8 +454,8 @@ def count_outcomes(case: Case) -> dict[str, int]:
 
 
 def count_solutions(solutions: pd.DataFrame, runs: Sequence[RunName]) -> list[int]:
-    """The numbers of solutions of each run, of all, and of different ones: a run may return a
-    setting twice.
+    """Numbers of solutions: of each run, of all runs, and of different solutions (a run may return
+    a setting twice).
     """
     counts = Counter(zip(solutions["algorithm"], solutions["run"], strict=True))
     return [
@@ -463,7 +466,9 @@ def count_solutions(solutions: pd.DataFrame, runs: Sequence[RunName]) -> list[in
 
 
 def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
-    """A row of `CLAIMS`: a claim, computed again; the lines shown are the first that differ."""
+    """Compute a claim again and compare it. Returns a row of `CLAIMS`, with the first line that
+    differs, as claimed and as computed.
+    """
     if claim.compute is None:
         return study, claim.name, UNCHECKED, "", "--search repeats the search"
     try:
@@ -473,7 +478,7 @@ def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
     if claim.packed == computed:
         return study, claim.name, SAME, "", ""
 
-    # Lines may be long: the text around the first character that differs is enough.
+    # Lines may be long: only the text around the first character that differs is shown.
     lines = claim.packed.decode().splitlines(keepends=True)
     pairs = zip_longest(
         lines, computed.decode().splitlines(keepends=True), fillvalue="nothing"
@@ -489,7 +494,7 @@ def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
 
 
 def _shown(line: str, counterpart: str) -> str:
-    """A line without spaces around it, unless its counterpart differs in them alone."""
+    """A line without spaces around it. If lines differ only in them, the quoted line."""
     if line.strip() in ("", counterpart.strip()):
         return repr(line)
     return line.strip()

@@ -169,7 +169,9 @@ def _pack_study(
     progress: Progress,
     simulations: int | None,
 ) -> tuple[PackedStudy, FileContents]:
-    """The description of a study in a pack, and its files."""
+    """Describe results as a study of a pack. Returns the description, and the contents of the
+    study's files by name.
+    """
     case = study_or_case(directory, results_only=True)
     assert isinstance(case, Case)
     if not case.has_runs:
@@ -179,7 +181,7 @@ def _pack_study(
             "results of `study`",
         )
     study = case.study
-    # `verify` compares or names what a pack has of the manifest.
+    # A pack keeps only keys of the manifest that `verify` compares or names.
     stored = {**read_manifest(directory), "study": tables_of(study)}
     manifest = {
         name: stored[name]
@@ -235,8 +237,8 @@ def _pack_study(
 
 
 def _with_lists(questions: Sequence[str]) -> tuple[list[str], FileContents]:
-    """Questions about the lists of cars as a pack holds them, and these lists by their names in the
-    pack.
+    """The questions, in which lists of cars have their names in the pack; and the contents of these
+    lists, without the names of cars.
     """
     packed = []
     lists = FileContents()
@@ -253,12 +255,12 @@ def _with_lists(questions: Sequence[str]) -> tuple[list[str], FileContents]:
 def _files_of_user(
     study: Study, named: Iterable[str], questions: Sequence[str]
 ) -> FileContents:
-    """The user's files that the results depend on, the files of the user's questions, and the views
-    of networks, without which SUMO does not start, by their names in a pack.
+    """The contents of the user's files by their names in a pack: files on which the results depend
+    (`named`), code of the user's questions, and views of networks.
     """
     places = study.origin.places
     names = [name for name in named if not is_of_shipped_network(name)]
-    # What a study names beside itself is there in a pack, too.
+    # Files are found by their places beside the study: a file elsewhere would be missing in a pack.
     outside = []
     for name in (*data_files(study), *dict(fmus_of(study)).values()):
         path_beside = os.path.abspath(Path(places[0], name))
@@ -349,7 +351,7 @@ def verify(
         if unknown:
             raise InputError(path, f"{min(unknown)} belongs to no study", PACK)
 
-        # Its code runs only if the user trusts it.
+        # Code of a pack runs only if the user trusts it.
         if not run_code and (
             code := [name for packed in studies.values() for name in packed.code]
         ):
@@ -403,8 +405,8 @@ def verify(
 
 
 def _not_compared(description: Description, studies: Iterable[Packed]) -> list[str]:
-    """What a pack says that `verify` does not compare: versions and machines, as their results are
-    compared.
+    """Phrases on values of a pack that `verify` does not compare, and that differ from this
+    machine: versions and platforms. `verify` compares the results, and need not compare these.
     """
     pairs = {
         DESCRIPTION: ({"versions": description.versions}, {"versions": versions_here()})
@@ -427,12 +429,12 @@ def _unpack(
     jobs: int | None,
     progress: Progress,
 ) -> Packed:
-    """One study of a pack; its manifest and the user's files are written to a folder.
+    """Read one study of a pack, and write its manifest and the user's files into `folder`.
 
     Raises
     ------
     InputError
-        If it is damaged.
+        If the study is damaged.
     """
     prefix = f"{described.folder}/"
     own_files = {
@@ -443,7 +445,7 @@ def _unpack(
     code = [name for name in own_files if name.startswith(f"{CODE}/")]
     lists = [name for name in own_files if name.startswith(f"{LISTS}/")]
 
-    # Anybody may have edited a pack: its files are checked before one of them is used.
+    # Anybody may have edited a pack: all files are checked before any of them is used.
     try:
         for name in sorted(FILES ^ (own_files.keys() - {*code, *lists})):
             problem = "belongs to no claim" if name in own_files else "is missing"

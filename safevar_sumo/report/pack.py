@@ -1,4 +1,6 @@
-"""A pack of evidence: a zip archive of plain files; reading one refuses what no pack holds."""
+"""An evidence pack: a zip archive of plain files. Reading refuses an archive that is no intact
+pack.
+"""
 
 from __future__ import annotations
 
@@ -28,24 +30,38 @@ from safevar_sumo.study import Study
 
 DESCRIPTION = "pack.json"
 FileContents = dict[str, bytes]
-"""What files hold, by their names."""
+"""Contents of files, by their names."""
 MAX_FILES = 10_000
 MAX_EVALUATIONS = 100_000_000
 MORE_IN_DIRECTORY, DIRECTORY_END = 16, 22
-"""By how much an entry of a zip archive's directory is larger than the header of its file, and the
-size of the directory's end [bytes].
+"""Sizes in the directory of a zip archive [bytes]: the difference between an entry and the header
+of its file, and the end of the directory.
 """
 UNIX_MODE_SHIFT = 16
-"""Bits of a zip entry's attributes below the mode of its file."""
+"""Number of bits below the file's mode in the attributes of a zip entry."""
 PACK = "a file that the command `evidence` has written, unchanged"
-"""What an error about a pack expects."""
+"""The expected input in errors about a pack."""
 
 
 class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
-    """One results directory in a pack: its folder there, the questions that its answers answer, as
-    typed, its finished runs, the number of their evaluations by outcome, the numbers of solutions
-    of each run, of all and of different ones, what is unsafe, if it was stated, and the largest
-    numbers of simulations of questions that followed from their time.
+    """The description of one results directory in a pack.
+
+    Attributes
+    ----------
+    folder
+        The folder of the study in the pack.
+    questions
+        The texts of the questions whose answers the pack has.
+    runs
+        The finished runs, by algorithm and number.
+    outcomes
+        The numbers of evaluations of these runs, by outcome.
+    solutions
+        Numbers of solutions; see `count_solutions`.
+    unsafe
+        The criterion for unsafe; None if the user stated none.
+    simulations
+        Largest numbers of simulations of questions whose text does not state them, by text.
     """
 
     folder: str
@@ -58,14 +74,14 @@ class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PackedPlatform(Struct, frozen=True, forbid_unknown_fields=True):
-    """System and processor with which results were computed."""
+    """The operating system and the processor with which results were computed."""
 
     system: str
     machine: str
 
 
 class PackedManifest(Struct, frozen=True, forbid_unknown_fields=True):
-    """The keys of a manifest that a pack holds: those that `verify` compares or names."""
+    """The keys of a manifest that a pack keeps: `verify` compares or names each of them."""
 
     format: int
     study: Study
@@ -78,7 +94,7 @@ class PackedManifest(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Description(Struct, frozen=True, forbid_unknown_fields=True):
-    """The file `pack.json`; `files` are the sha256 of all other files of the pack, by name."""
+    """The file `pack.json`. `files` has the sha256 of all other files of the pack, by name."""
 
     versions: dict[str, str]
     files: Files
@@ -93,7 +109,7 @@ def write_pack(path: Path, studies: list[PackedStudy], files: FileContents) -> N
     texts = {DESCRIPTION: msgspec.json.format(described, indent=1) + b"\n", **files}
     with whole_file(path, "out") as file, zipfile.ZipFile(file, "w") as archive:
         for name in sorted(texts):
-            # Its date is the same on every day, in 1980.
+            # Without a date an entry has the default, in 1980: equal contents give equal bytes.
             entry = zipfile.ZipInfo(name)
             entry.compress_type = zipfile.ZIP_DEFLATED
             entry.external_attr = 0o644 << UNIX_MODE_SHIFT
@@ -101,7 +117,9 @@ def write_pack(path: Path, studies: list[PackedStudy], files: FileContents) -> N
 
 
 def versions_here() -> dict[str, str]:
-    """Versions of Python and of the packages with which a pack's answers and page are computed."""
+    """The versions of Python and of packages that compute the answers and the page of a pack on
+    this machine.
+    """
     # Matplotlib and Pillow draw the pictures of the page.
     packages = (*PACKAGES, "matplotlib", "pillow")
     return {
@@ -111,8 +129,8 @@ def versions_here() -> dict[str, str]:
 
 
 def json_of(content: bytes) -> Any:
-    """The value of a JSON text; raises ValueError if it is none, has a key twice, or holds NaN or
-    an infinity.
+    """The value of a JSON text. Raises a ValueError if the text is no JSON, has a key twice, or
+    contains NaN or an infinity.
     """
 
     def once(pairs: list[tuple[str, Any]]) -> JsonObject:
@@ -122,7 +140,7 @@ def json_of(content: bytes) -> Any:
         return dict(pairs)
 
     value = json.loads(content.decode(), object_pairs_hook=once)
-    # 1e999 is an infinity, too.
+    # The text 1e999 becomes an infinity without an error: encoding the value finds it.
     json.dumps(value, allow_nan=False)
     return value
 
@@ -133,7 +151,7 @@ def digests_of(files: FileContents) -> dict[str, str]:
 
 
 def digest_of(path: Path) -> str:
-    """The sha256 of a pack, to quote it by."""
+    """The sha256 of the file of a pack, by which readers identify the pack."""
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()
 
@@ -180,7 +198,7 @@ def read_pack(path: Path) -> tuple[Description, FileContents]:
             problem = f"is not named in {DESCRIPTION}"
         _refuse(path, f"{name} {problem}")
 
-    # Results of other versions may differ.
+    # Other versions may compute other results: then differences would mean nothing.
     present = {"safevar_sumo": version("safevar_sumo"), "libsumo": version("libsumo")}
     changed = [
         f"{name} {described.versions.get(name)}"
@@ -197,8 +215,9 @@ def read_pack(path: Path) -> tuple[Description, FileContents]:
 
 
 def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
-    """Refuse entries before any of them is unpacked."""
-    # No entry may leave the folder, and none is a link.
+    """Refuse entries that leave the folder of the pack, are links, are there twice, or are too many
+    or too large. No entry has been unpacked before.
+    """
     names = [entry.filename for entry in entries]
     for entry in entries:
         name = entry.filename
@@ -208,7 +227,7 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
             and not path_of_entry.is_absolute()
             and ".." not in path_of_entry.parts
         )
-        # "a//b" is no path inside either: joined, it is "/b".
+        # `name` must be a normal path: "a//b" without its beginning "a/" would be the path "/b".
         if not is_inside or "\\" in name or ":" in name:
             _refuse(path, f"the path {name!r} leaves the pack")
         if stat.S_ISLNK(entry.external_attr >> UNIX_MODE_SHIFT):

@@ -1,5 +1,5 @@
-"""The page about results: for each study first what decides, a replay, and the sheet of a workshop,
-then all other answers.
+"""The page about results. Each study begins with its first answer, replays, and the sheet for a
+workshop; all other answers follow.
 """
 
 from __future__ import annotations
@@ -57,16 +57,19 @@ USUAL_QUESTIONS = (
     "risk --samples 4000",
     "rules --samples 4000",
 )
-"""Questions of a page, whose first verdict decides; samples are smaller than those of commands."""
+"""Questions that a page answers unless the user asks others. The first answer leads the page.
+Samples are smaller than the default of the commands.
+"""
 LEAST_COST = 40_000
 USUAL_COSTS = {"tolerance": 500_000, "repair": 500_000, "explain": 100_000}
 PAGE_COSTS = 25_000, 5_000
-"""Numbers of simulations that take as long as a question at least, with its start; and as the
-figures of a study, and its replays.
+"""Times of the parts of a page, in simulations that take as long: the least time of a question,
+with its start; the usual times of some questions; and the times of a study's figures and replays.
+Only the bar of progress needs them.
 """
 TEMPLATE_FOLDER = Path(__file__).parent / "web"
 LONG_DECIMALS = re.compile(r"(\d\.\d\d)\d+")
-"""Coordinates with more decimals than a screen can show."""
+"""A number with more than two decimals, more than a screen can show of a coordinate."""
 TAG = re.compile(r"<[^>]*>")
 SVG_STYLE = {
     "svg.fonttype": "none",
@@ -207,15 +210,15 @@ def report(
             ask_study = partial(next_answer, slice(number, number + 1))
             studies.append(with_answers(study, questions[number], ask_study))
         shared = list(map(partial(next_answer, slice(None)), joint))
-        # This process simulates the replays.
+        # Close the pool of workers: this process simulates the replays.
         stack.close()
         write_whole(out, make_page(studies, parts, shared))
     return out
 
 
 def _simulated(cases: Sequence[Case], point: str | None, *, quick: bool) -> list[Case]:
-    """Results as the page simulates them: at a point, and with the study's own parameter set alone
-    if it is quick.
+    """The results about which the page asks: at a `point` if there is one, and only with the
+    study's own parameter set if the page is `quick`.
     """
     if point is not None:
         cases = [case_at(case, point) for case in cases]
@@ -232,9 +235,11 @@ def _budgets(
     joint: Sequence[str],
     simulations: int | None,
 ) -> list[dict[str, int]]:
-    """The simulations of the questions about each of the results, which have equal parts; those of
-    joint questions are the first one's. Solutions that were simulated again count. Nothing is
-    divided without a number.
+    """The largest numbers of simulations of the questions about each of the results, by text; see
+    `divided`. Without `simulations` there are no limits.
+
+    All results have equal parts. Joint questions take a part from the first results. Simulations
+    that have already repeated solutions (at a point, or by a criterion) are subtracted.
     """
     if not simulations:
         return [{}] * len(cases)
@@ -258,8 +263,9 @@ def _pool_of(
     cluster: str | None,
     counts: bool,
 ) -> Pool | None:
-    """The pool that the questions of a page share, with what simulators have simulated, where they
-    take long; None if each opens its own.
+    """The pool of workers that the questions of a page share; None if each question opens its own.
+    If a simulator takes long, and simulations are limited (`counts`), the pool keeps its results,
+    so that questions share samples.
     """
     take_long = any(assemble(case.study).mover.takes_long for case in cases)
     if not (take_long or cluster or counts):
@@ -271,8 +277,8 @@ def _pool_of(
 
 
 def with_speed_part(questions: Sequence[str], case: Case) -> list[str]:
-    """The questions about results, with the name of that of the greatest speed if the sheet of
-    their page has it.
+    """The questions about results, and `SPEED` if the page has a sheet that states the greatest
+    speed.
     """
     has_sheet = any(text.startswith("tolerance") for text in questions)
     if has_sheet and speeds_of(case):
@@ -281,8 +287,8 @@ def with_speed_part(questions: Sequence[str], case: Case) -> list[str]:
 
 
 def _joint_questions(ask: Sequence[str], results: int) -> list[str]:
-    """The questions about all results together: of those asked, else of two results their
-    comparison.
+    """The questions about all results together: such questions among those that the user asks. If
+    the user asks nothing, `compare` for two results.
     """
     usual = []
     if results == 2:
@@ -293,7 +299,9 @@ def _joint_questions(ask: Sequence[str], results: int) -> list[str]:
 def _later_changes(
     paths: Sequence[Path], cases: Sequence[Case], *, as_it_is_now: bool
 ) -> list[list[str]]:
-    """The changes of files and versions since each of the results, of which the user is warned."""
+    """The changes of files and versions since each of the results were computed. The user is warned
+    of each change.
+    """
     later_changes = []
     for path, case in zip(paths, cases, strict=True):
         changes = changes_since(path, case, as_it_is_now=as_it_is_now)
@@ -304,7 +312,9 @@ def _later_changes(
 
 
 def usual_questions(case: Case) -> list[str]:
-    """The questions of a page about results; a simulator has no time for the smallest changes."""
+    """The questions of a page about results, unless the user asks others. The question about the
+    smallest changes is left out with a simulator that takes long.
+    """
     questions = list(USUAL_QUESTIONS)
     if assemble(case.study).mover.takes_long:
         questions.remove(SMALLEST)
@@ -316,7 +326,7 @@ def usual_questions(case: Case) -> list[str]:
 def make_page(
     studies: Sequence[ReportedStudy], parts: Parts, shared: Sequence[Answer] = ()
 ) -> str:
-    """The page about studies, with answers about all of them."""
+    """The HTML of the page about studies; `shared` are the answers about all studies together."""
     names = ", ".join(study.case.name for study in studies)
     commands = [*chain(*map(page_commands, studies))]
     for answer in shared:
@@ -331,12 +341,14 @@ def make_page(
         commands=commands,
         css=Markup((TEMPLATE_FOLDER / "report.css").read_text(encoding="utf-8")),
     )
-    # Units have powers, as in m/s^2.
+    # Units have powers, such as m/s^2: a page shows m/s².
     return printable(page).replace("^2", "²").replace("^3", "³") + "\n"
 
 
 def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
-    """One study for the template: what decides, which is the first answer, and all others."""
+    """The values of one study for the template. `front` is the first answer, which leads the page;
+    `sections` are all other answers.
+    """
     anchor = f"study-{number}"
     parts.begin()("figures", 0, 1)
     answers = study.answers
@@ -359,7 +371,9 @@ def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
 
 
 def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
-    """Answers for the template: the heading, the answer in HTML, and its figure if it has one."""
+    """Yield the values of answers for the template: the heading, the answer in HTML, and its figure
+    (None without a figure).
+    """
     for number, answer in enumerate(answers, 1):
         name = "smallest changes"
         if "staircase" not in answer.tables:
@@ -367,7 +381,7 @@ def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
         try:
             picture = _picture(answer.figure())
         except InputError:
-            # It has nothing to draw.
+            # The answer has nothing to draw.
             picture = None
         yield {
             "anchor": f"{anchor}-{number}-{re.sub('[^a-z]', '-', name.lower())}",
@@ -378,8 +392,8 @@ def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
 
 
 def _picture(figure: Figure) -> JsonObject:
-    """A figure for the page: Matplotlib's SVG in a link that holds it; equal figures give equal
-    bytes.
+    """A figure for the page: a text that describes it, and a link that contains Matplotlib's SVG.
+    Equal figures give equal bytes.
     """
     import matplotlib
 

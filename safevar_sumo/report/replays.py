@@ -1,4 +1,4 @@
-"""Replays of a page, and the commands that give its numbers."""
+"""The replays of a page, and the commands that compute its numbers again."""
 
 from __future__ import annotations
 
@@ -24,18 +24,20 @@ from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.terminal import Progress
 
 MAX_CAUSES = 6
-"""Maximum number of replays of settings that answers name by their changes."""
+"""Largest number of replays of settings that stand in tables of answers."""
 CHANGES, ENCOUNTER = "changes", "encounter"
-"""A table's column of settings to replay: values by characteristic, all others as in the original
-vehicle; and, where encounters are ranges, the column of their encounters.
+"""Columns of an answer's table that has settings to replay: the changed values by characteristic
+(all others are those of the original vehicle), and the values of the encounter, in a study whose
+encounters are ranges.
 """
 
 
 def replays(
     study: ReportedStudy, progress: Progress, start: int = 0
 ) -> Iterator[JsonObject]:
-    """Replays of chosen solutions, and of settings that answers name by their `CHANGES`: one for
-    each set of changed characteristics. Their players have numbers from `start` on.
+    """Yield the values of replays for the template: of the failure with the fewest changes, of
+    chosen solutions, and of settings in tables of answers (column `CHANGES`), one for each set of
+    changed characteristics. Their players have numbers from `start` on.
     """
     characteristics = study.case.characteristics
     settings = {}
@@ -46,7 +48,7 @@ def replays(
         settings["Fewest changes"] = fewest.settings[0]
     settings.update(zip(study.choices, study.chosen_settings, strict=True))
 
-    # Many causes change the same characteristics: the first of them is enough.
+    # Many settings change the same characteristics: only the first of them is replayed.
     changes: dict[tuple[str, ...], tuple[NamedValues, NamedValues]] = {}
     for answer in study.answers:
         for frame in answer.tables.values():
@@ -62,7 +64,8 @@ def replays(
             name += ", in its encounter"
         settings[name] = characteristics.setting({**row, **encounter}, beyond=True)
 
-    # A replay also simulates the original vehicle, and all points of a matrix to know the worst.
+    # A replay simulates all points of a matrix to find the worst one, then the setting and the
+    # original vehicle at this point.
     if limit is not None:
         simulations = simulations_of_setting(study.system) + 2 * study.system.repeats
         settings = dict(islice(settings.items(), limit // simulations))
@@ -74,7 +77,7 @@ def replays(
                 study.case.study, study.system, setting, filtered=False
             )
         )
-        # Nothing can be shown if a simulator of the user's own logs no positions.
+        # A user's simulator that states no positions gives nothing to show.
         if not comparison.has_position:
             return
         index = comparison.rows[-1]
@@ -104,7 +107,9 @@ def replays(
 
 
 def page_commands(study: ReportedStudy) -> Iterator[tuple[str, str]]:
-    """The commands that give the numbers of the page, each after what it gives."""
+    """Yield the commands that compute the numbers of the page again: the purpose of each command,
+    and the command.
+    """
     directory = str(study.directory)
     flag = " --as-it-is-now" if study.later_changes else ""
     if study.case.has_runs:

@@ -1,6 +1,4 @@
-"""What stands on a page beside the answers: what was tested, how far to trust it, replays, and
-commands.
-"""
+"""The sections of a page besides the answers: what was tested, and how far to trust the results."""
 
 from __future__ import annotations
 
@@ -37,7 +35,9 @@ from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import VEHICLES
 
 FIRST_CHOICES = ("smallest", "most_severe")
-"""Choices of `REASONS` that select the solutions to replay, as the flags of `simulate` do."""
+"""Choices of solutions that a page replays; `REASONS` has their reasons. The option `--solution` of
+`simulate` has the same choices.
+"""
 NO_RESULT = {
     Outcome.SIMULATOR_ERROR: "could not be simulated and are in no result.",
     Outcome.INVALID_TEST: (
@@ -46,7 +46,7 @@ NO_RESULT = {
         " happens."
     ),
 }
-"""Outcomes of vehicles about which nothing is known."""
+"""Outcomes of vehicles that are neither safe nor unsafe, with the end of a sentence about them."""
 GENERAL_LIMITS = (
     "A search that finds no failure proves nothing about vehicles that it did not simulate.",
     (
@@ -64,26 +64,28 @@ CHARACTERISTICS, AGREEMENT, SPREAD, PUBLISHED = shipped_columns("report").values
 
 @dataclass(frozen=True, kw_only=True)
 class ReportedStudy:
-    """One study of a page.
+    """One study of a page: its results, and the answers about them.
 
     Attributes
     ----------
     directory
-        The results.
+        The directory of the results.
     case
-        The results; at a point, with their solutions simulated again there.
+        The results. If the page is about a point, their solutions were simulated again there.
     versions
-        The packages that the results were computed with.
+        The versions of the packages that computed the results, by package.
     answers
-        Answers about the results.
+        Answers about the results, in the order of the page.
     point
         The only point of the matrix that the page is about; "" for the whole study.
     later_changes
-        The files and versions that have changed since.
+        The changes of files and versions since the results were computed.
     speed
-        The answer to `speed_values`, which is among the answers, too.
+        The answer about the greatest speed on the sheet, which is among `answers`, too; None
+        without it.
     simulations
-        The largest number of simulations of its replays in a simulator of the user's own.
+        The largest number of simulations of the replays in a simulator that takes long; None
+        without a limit.
     """
 
     directory: Path
@@ -101,8 +103,8 @@ class ReportedStudy:
 
     @cached_property
     def choices(self) -> dict[str, str]:
-        """The handles of the solutions that `FIRST_CHOICES` select, and why; if none is unsafe, of
-        the most severe.
+        """The reasons for the solutions that `FIRST_CHOICES` select, by their handles. If no
+        solution is unsafe, only the most severe one is selected.
         """
         solutions = self.case.solutions
         chosen = dict[str, list[str]]()
@@ -116,7 +118,7 @@ class ReportedStudy:
 
     @cached_property
     def chosen_solutions(self) -> pd.DataFrame:
-        """The rows of these solutions, by their handles."""
+        """The rows of the solutions in `choices`, by their handles."""
         solutions = self.case.solutions
         handles = pd.Index(map(str, handles_of(solutions)))
         return solutions.set_index(handles).loc[list(self.choices)]
@@ -129,14 +131,14 @@ class ReportedStudy:
 
     @property
     def chosen_settings(self) -> FloatArray:
-        """Their settings, shape (M, n)."""
+        """The settings of the M solutions in `choices`, shape (M, n)."""
         return self.chosen_solutions[list(self.case.characteristics.names)].to_numpy(
             float
         )
 
 
 def tested(study: ReportedStudy) -> Answer:
-    """The tested vehicle, driving system and scenario, and the search."""
+    """The section on what was tested: the vehicle, driving system and scenario, and the search."""
     case = study.case
     models = [
         f"The {kind} is {name_and_sentence(catalogue, table.model)}."
@@ -176,7 +178,7 @@ def _remarks(texts: Sequence[str]) -> AnswerTable:
 
 
 def _scenario(study: ReportedStudy) -> str:
-    """The scenario with its weather or, by test, the points of the matrix."""
+    """A sentence on the scenario, with its weather, or with the number of test cases by test."""
     points = study.system.matrix
     weather = study.case.weather
     model = name_and_sentence(SCENARIOS, study.case.study.scenario.model)
@@ -228,15 +230,15 @@ def _search(study: ReportedStudy) -> str:
 
 
 def name_and_sentence(models: Mapping[str, type], name: str) -> str:
-    """A model's name with its description; user code has the name alone."""
+    """The name of a model with its description in brackets; of user code, only the name."""
     if name in models:
         return f"{name} ({description_of(models[name]).rstrip('.')})"
     return name
 
 
 def trust(study: ReportedStudy) -> Answer:
-    """How far the results agree with published data and with other parameter sets, and what
-    they leave out.
+    """The section on trust: how far the results agree with published data and with other parameter
+    sets of the vehicle model, and what the simulations leave out.
     """
     case = study.case
     tables = dict[str, AnswerTable]()
@@ -270,7 +272,7 @@ def trust(study: ReportedStudy) -> Answer:
         title = "Uncertainty of the vehicle model: safety degree with its other parameter sets"
         tables["spread"] = tabulate(title, SPREAD, rows)
 
-    # No published value is 0: the study refuses it.
+    # The quotient is safe: a study refuses a published value of 0.
     published = [
         (name, value, metric, 100 * (metric / value - 1))
         for name, value in case.study.published.items()

@@ -1,5 +1,5 @@
-"""The first sheet of a page: limits for a workshop and an operator, without statistics, which can
-be printed alone. Its sentences stand in `web/sheet.html.j2`.
+"""The sheet of a page, which can be printed alone: limits for a workshop and an operator, without
+statistics. Its sentences stand in `web/sheet.html.j2`.
 """
 
 from __future__ import annotations
@@ -40,16 +40,17 @@ PARTS: Columns = {
 }
 UNSAID = "the study does not say"
 BLANK = "_" * 8
-"""Place for a value that is filled in by hand."""
+"""The place for a value that somebody fills in by hand."""
 DIGITS = 16
-"""Number of hexadecimal digits of the digest that are printed."""
+"""Number of hexadecimal digits to which the printed digest is cut."""
 
 
 def sheet_of(study: ReportedStudy) -> JsonObject | None:
-    """The sheet for the template; None if nobody asked for joint limits.
+    """The values of the sheet for the template; None if the page does not answer `tolerance`.
 
-    A sheet without joint limits that hold has no table; one whose limits are only rough or for
-    screening, or that other files and versions gave, has no line to sign.
+    A sheet without joint limits that hold has no table. A sheet has no line to sign if its limits
+    are rough, are only for screening (the criterion compares with the original vehicle), or if
+    files or versions have changed since.
     """
     limits = _limits_of(study)
     if limits is None:
@@ -80,7 +81,8 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         for item in items
         if item.is_for_workshop and not problem
     ]
-    # The greatest speed holds for the values that the study states of what no workshop measures.
+    # The greatest speed is computed with stated values of characteristics that no workshop
+    # measures: the sheet prints these values instead of limits.
     stated = {}
     if up_to:
         stated = study.case.study.unmeasured_values
@@ -119,7 +121,7 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
 
 
 def _row_of_part(item: Characteristic, row: JsonObject | None) -> tuple[str, ...]:
-    """A row of `PARTS`."""
+    """The row of `PARTS` about one item; `row` is its row in the table of limits, if it has one."""
     name = item.meaning or item.short_name
     limit = _limit_in_words(item, row)
     blank = f"{BLANK}{item.suffix}"
@@ -133,8 +135,8 @@ def _row_of_part(item: Characteristic, row: JsonObject | None) -> tuple[str, ...
 
 
 def speed_values(study: ReportedStudy) -> JsonObject:
-    """The options with which `permit` says how fast vehicles within the limits of the sheet may
-    drive; none where nobody may work by the sheet, or the study varies no speed.
+    """The options of the question `permit` about the greatest speed of vehicles within the limits
+    of the sheet. Empty if nobody may work by the sheet, or if the study varies no speed.
     """
     limits = _limits_of(study)
     if (
@@ -149,7 +151,7 @@ def speed_values(study: ReportedStudy) -> JsonObject:
     if _is_relative(study.case, unsafe):
         return {}
 
-    # What a workshop does not measure has the value that the study states, if it states one.
+    # A characteristic that no workshop measures has the value that the study states for it.
     texts = []
     rows = _rows_of(limits)
     for item in study.case.characteristics.vehicle:
@@ -167,8 +169,9 @@ def speed_values(study: ReportedStudy) -> JsonObject:
 def with_answers(
     study: ReportedStudy, questions: Sequence[str], ask: Callable[..., Answer]
 ) -> ReportedStudy:
-    """A study with the answers to questions and, if it has a sheet, with that about its speed as
-    the last one: the sheet is about the limits of that question, whatever else was asked.
+    """The study with the answers to `questions`. If it has a sheet with limits, the last answer is
+    about the greatest speed of vehicles within these limits, because the sheet states this speed
+    even if nobody asked for it.
     """
     study = replace(study, answers=list(map(ask, questions)))
     values = speed_values(study)
@@ -193,7 +196,7 @@ def _records(frame: pd.DataFrame) -> list[dict[Any, Any]]:
 
 
 def speeds_of(case: Case) -> Span | None:
-    """The speeds of a study; None if it varies none."""
+    """The range of speeds of a study; None if the study varies no speed."""
     try:
         return span_of(case.study, None)
     except InputError:
@@ -203,10 +206,11 @@ def speeds_of(case: Case) -> Span | None:
 def _greatest_speed(
     study: ReportedStudy, speed: Answer, ranges: Sequence[JsonObject]
 ) -> tuple[str, str]:
-    """The greatest speed of vehicles within the limits, with its unit; empty if there is no answer
-    or they are not safe at the least one, with a sentence that says so.
+    """The greatest speed of vehicles within the limits, in words, and "". If there is no such
+    speed, "" and a sentence that says why.
 
-    It is below the least speed at which such a vehicle fails in the ranges of the study.
+    The greatest speed is below the least speed at which such a vehicle fails in the `ranges` of the
+    study.
     """
     if not speed.tables:
         return "", "The question about the greatest speed has no answer."
@@ -230,15 +234,15 @@ def _greatest_speed(
 
 
 def _is_relative(case: Case, unsafe: Unsafe) -> bool:
-    """Whether a criterion compares vehicles with the original one: the default where nothing
-    collides.
+    """Whether a criterion compares vehicles with the original vehicle: the default criterion does
+    so if no vehicle collides.
     """
     is_default = case.stated is None and not case.study.unsafe.criterion
     return is_default and not unsafe.is_collision and unsafe == case.unsafe
 
 
 def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
-    """Why nobody may work by this sheet, in a sentence; empty if there are joint limits."""
+    """The reason why nobody may work by this sheet, as a sentence; "" if somebody may."""
     numbers = limits.numbers
     if "limits" not in limits.tables:
         return "The question about limits has no answer."
@@ -264,8 +268,8 @@ def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
 
 
 def _together(item: Characteristic, row: JsonObject | None) -> Interval:
-    """The joint limits of an item; one whose limits were not asked for, and one without room, stays
-    as in the original.
+    """The joint limits of an item. Both are its original value if nobody asked for its limits, or
+    if the joint limits leave no room for a change.
     """
     if row is None or pd.isna(row["together_low"]):
         return item.original, item.original
@@ -275,9 +279,10 @@ def _together(item: Characteristic, row: JsonObject | None) -> Interval:
 def _limit_in_words(
     item: Characteristic, row: JsonObject | None, value: float | None = None
 ) -> str:
-    """A limit: `at least 3 mm`, or the value that the study states. An end of the domain is none,
-    unless both are; an item whose original is at one end has a limit on the other side all the
-    same.
+    """The limit of an item in words, such as `at least 3 mm`, or the `value` that the study states.
+
+    An end of the domain is no limit. If both limits are ends of the domain, the words state the
+    domain; but if the original value is one of its ends, only the other end.
     """
     if value is not None:
         return f"{value:.10g}{item.suffix}"
@@ -286,7 +291,7 @@ def _limit_in_words(
     if row is None or (low == high and low not in domain):
         return f"{item.original:.10g}{item.suffix}, as in the original vehicle"
 
-    # A pure number that is 1 in the original vehicle is a share of its value.
+    # A number without a unit that is 1 in the original vehicle is a share of the original value.
     is_share = not item.suffix and item.original == 1
     unit = " of the original vehicle's"
     if not is_share:
@@ -305,10 +310,10 @@ def _domain_in_words(item: Characteristic) -> str:
 
 
 def _tests_in_words(phrase: str) -> str:
-    """A phrase of a scope as what happens in Euro NCAP's tests: `an adult crosses from the far
-    side; this vehicle drives at 10 to 40 km/h`.
+    """Words for what happens in tests by Euro NCAP, from a phrase of a scope: `an adult crosses
+    from the far side; this vehicle drives at 10 to 40 km/h`. Other phrases stay as they are.
     """
-    # The phrase has the names of tests, their scenario in brackets, and their speeds.
+    # A phrase has the names of tests, then their scenario in brackets, then their speeds.
     tests, _, scenario = phrase.partition(" (scenario ")
     speeds = scenario.partition(")")[2]
     names = re.split(", | and ", re.sub("^the tests? ", "", tests))

@@ -1,4 +1,6 @@
-"""Questions of pages and packs: read from their texts, completed, and answered."""
+"""Questions of pages and packs: this module reads them from texts, completes them with options of
+the page, and answers them.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ from safevar_sumo.terminal import Progress
 
 
 def parse_question(text: str) -> tuple[Question, JsonObject]:
-    """A question and values of its options, from its command without subjects: `risk --samples
-    4000`.
+    """Read a question and the values of its options from a text, a command without a study or
+    results: `risk --samples 4000`.
 
     Raises
     ------
@@ -31,7 +33,7 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
     try:
         name, *words = split(text)
     except ValueError:
-        # Nothing, or a quotation mark without its second one.
+        # The text is empty, or lacks the second of two quotation marks.
         raise InputError(
             "ask",
             repr(text),
@@ -69,8 +71,8 @@ def completed(
     *,
     quick: bool,
 ) -> JsonObject:
-    """Values of a question with what it does not state itself: a criterion, its part of the
-    simulations, and whether its answer is rough.
+    """The values of a question's options, with values of the page for options that the question
+    does not state: the criterion, `part` of the simulations, and whether the answer is rough.
     """
     usual: JsonObject = {SIMULATIONS.name: part}
     if unsafe is not None and any(
@@ -96,12 +98,14 @@ def answer_about(
     pool: Pool | None = None,
     questions: int = 1,
 ) -> Answer:
-    """The answer to a question about results; if nobody asked for it and it has none, the reason.
+    """The answer to a question about results. If the question has no answer, and the user has not
+    asked it (`is_asked` is false), the answer is the reason.
 
     Raises
     ------
     InputError
-        If the question is asked for and has no answer, or is about another number of results.
+        If the user has asked the question, and it has no answer, or is about another number of
+        results.
     """
     options = {**values}
     simulations = options.pop(SIMULATIONS.name, None)
