@@ -1,8 +1,8 @@
-"""RQ3 and the discussion: number, kind and size of changes that make the vehicle unsafe,
-collisions, combinations.
+"""RQ3 and the paper's discussion: the number, kind and size of the changes of critical solutions
+(less safe than the original vehicle), collisions, and combinations of changes.
 
-Functions of a case raise `UnanswerableError` as `critical_solutions` does; `rq31` also raises it if
-solutions belong to no run.
+Functions of a case raise `UnanswerableError` in the same cases as `critical_solutions`. `rq31` also
+raises it if the solutions belong to no run.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ ANY = "any"
 COMBINATION_SIZE = 4
 """Number of changed characteristics in the combinations that are counted."""
 COMBINATIONS_SHOWN = 3
-"""Number of the most frequent combinations that are shown."""
+"""Number of combinations that are shown: the most frequent ones."""
 SAFETY_SCALES = {
     "avgSD_mD": SAFETY_DEGREE,
     "TET": "tet",
     "TIT": "tit",
     "aveDece": "ave_dece",
 }
-"""For each quantity of `rq33_safety` with a percentage: the metric whose value for the original
-vehicle is 100 %.
+"""By the quantity of `rq33_safety`, the metric whose value for the original vehicle is 100 %. Only
+quantities with a percentage are in it.
 """
 
 
 def critical_solutions(case: Case) -> pd.DataFrame:
-    """NSGA-II's solutions with a safety degree below the original's.
+    """The critical solutions: NSGA-II's solutions with a safety degree below the original's.
 
     Raises
     ------
     UnanswerableError
-        If NSGA-II is missing or the original's safety degree is undefined.
+        If NSGA-II has no finished run, or the original's safety degree is undefined.
     """
     solutions = case.solutions_of(NSGA2)
     if np.isnan(case.original[SAFETY_DEGREE]):
@@ -53,8 +53,8 @@ def critical_solutions(case: Case) -> pd.DataFrame:
 
 
 def changes_of(case: Case) -> FloatArray:
-    """Changes of the vehicle's n characteristics in the M critical solutions, each in its unit:
-    filtered minus original value, the paper's v'' - v; shape (M, n).
+    """The changes of the vehicle's n characteristics in the M critical solutions, in their units,
+    shape (M, n). A change is the filtered value minus the original value, the paper's v'' - v.
     """
     vehicle = case.characteristics.vehicle
     values = critical_solutions(case)[list(vehicle.names)].to_numpy(float)
@@ -62,12 +62,14 @@ def changes_of(case: Case) -> FloatArray:
 
 
 def change_numbers(case: Case) -> list[str]:
-    """The numbers of changed characteristics, "1".."n"."""
+    """All possible numbers of changed characteristics, as texts: "1".."n"."""
     return list(map(str, range(1, len(case.characteristics.vehicle) + 1)))
 
 
 def count_changes(case: Case) -> TextArray:
-    """The number j of changed characteristics of each critical solution, "1".."n"."""
+    """The number j of changed characteristics of each of the M critical solutions, as texts, shape
+    (M,).
+    """
     counts = np.count_nonzero(changes_of(case), axis=1)
     return np.asarray(counts.astype(str))
 
@@ -155,11 +157,10 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     - TET [s], TIT [s^2]: mean increase over solutions without collision;
     - aveDece: mean decrease over all solutions [m/s^2].
 
-    Where encounters are ranges only the original's safety degree is known in the
-    encounter of a solution, so that TET, TIT and aveDece are undefined; the original's value is the
-    mean over these encounters.
+    If encounters are ranges, only the original's safety degree is known in the encounter of a
+    solution. Then TET, TIT and aveDece are undefined, and the original's safety degree is the mean
+    over these encounters.
     """
-    # The critical solutions and their original vehicles.
     solutions = critical_solutions(case)
     has_collided = are_collisions(solutions).to_numpy()
     safety_degree, tet, tit, deceleration = (
@@ -170,7 +171,6 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     if case.study.ranges:
         original = {**dict.fromkeys(original, np.nan), SAFETY_DEGREE: degrees.mean()}
 
-    # Differences from the original, by quantity.
     values = {
         ("avgSD_mD",): np.where(has_collided, np.nan, degrees - safety_degree),
         ("avgSD_cS",): np.where(has_collided, -safety_degree, np.nan),
@@ -180,7 +180,6 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     }
     frame = _means_by_change_count(case, ["quantity"], "value", values.items())
 
-    # Relative to the original's values.
     scales = frame["quantity"].map(SAFETY_SCALES).map(original)
     frame["percent"] = 100 * frame["value"] / scales.abs().replace(0.0, np.nan)
     return frame
@@ -208,17 +207,15 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     """The most frequent combinations among the critical solutions with exactly four characteristics
     changed.
 
-    Columns rank (ties share the better one), characteristics (a list), percent (of the solutions
-    with exactly four changes); no row where there is no such solution. Of combinations that are
-    equally frequent, those with the earlier characteristics in the study come first.
+    Columns rank (ties share the better rank), characteristics (a list), percent (of the solutions
+    with exactly four changes). There is no row without such a solution. Of equally frequent
+    combinations, the one with earlier characteristics in the study comes first.
     """
-    # Combinations of exactly so many characteristics.
     is_changed = changes_of(case) != 0
     masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
     counts = Counter(tuple(np.flatnonzero(mask)) for mask in masks)
     in_order = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
-    # The most frequent ones, with equal ranks for equal numbers.
     names = case.characteristics.vehicle.names
     numbers = np.array(list(counts.values()))
     rows = []

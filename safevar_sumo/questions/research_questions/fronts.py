@@ -1,6 +1,7 @@
-"""The quality of the fronts that runs return (docs/method.md, section 7): IGD+ and hypervolume on
-normalised objectives; IGD, as published, on objectives in their units; and the number of
-evaluations. Of all evaluations: the non-dominated ones, and the growth of their hypervolume.
+"""Quality indicators of the fronts (non-dominated solutions) that runs return; see docs/method.md,
+section 7. IGD+ and hypervolume use normalised objectives; IGD, as published, uses objectives in
+their units. The module also finds the non-dominated ones of all evaluations, counts evaluations,
+and follows the growth of the hypervolume.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from safevar_sumo.results import RunName
 MORE_IS_BETTER = {"igd_plus": False, "hypervolume": True, "igd": False}
 INDICATOR_TITLES = {"igd_plus": "IGD+", "hypervolume": "HV", "igd": "IGD"}
 NO_FRONT = (math.inf, 0.0, math.inf)
-"""IGD+, hypervolume and IGD of a run without solutions: worse than those of any other run."""
+"""IGD+, hypervolume and IGD of a run without solutions: no run with solutions has worse values."""
 USUAL_SHARE = 0.9
-"""Share of its budget from which on nobody asks why an algorithm simulates less."""
+"""An algorithm that simulates less than this share of its budget gets a remark."""
 CURVE_POINTS = 50
-"""Maximum number of points of a run's convergence."""
+"""Maximum number of points of the curve that shows a run's convergence."""
 
 
 def nondominated_points(points: FloatArray) -> FloatArray:
@@ -32,15 +33,17 @@ def nondominated_points(points: FloatArray) -> FloatArray:
 
 
 def hypervolume(front: FloatArray, coordinate: float) -> float:
-    """The volume between `front` and the reference point, whose coordinates are equal."""
+    """The volume between `front`, shape (points, objectives), and the reference point, all of whose
+    coordinates are `coordinate`.
+    """
     return float(moocore.hypervolume(front, ref=np.full(front.shape[1], coordinate)))
 
 
 def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
-    """Points on the scale from the best (0) to the worst value (1) of each objective in a reference
-    front.
+    """Points on a scale on which, for each objective, the best value of a reference front is 0, and
+    its worst value is 1.
 
-    Where the best value is also the worst, an objective keeps its unit.
+    If all values of an objective in the reference front are equal, the objective keeps its unit.
     """
     ideal = reference.min(axis=0)
     nadir = reference.max(axis=0)
@@ -48,8 +51,8 @@ def normalised(points: FloatArray, reference: FloatArray) -> FloatArray:
 
 
 def minimised_values(case: Case, frame: pd.DataFrame) -> FloatArray:
-    """The objectives' values, smaller being better, shape (rows, objectives); NaN where
-    undefined.
+    """The values of the objectives, with such signs that smaller values are better, shape (rows,
+    objectives); NaN for an undefined value.
     """
     signs = {item.name: item.sign for item in case.scoring.objectives}
     return frame[list(signs)].to_numpy(float) * list(signs.values())
@@ -62,7 +65,7 @@ def points_of(case: Case, frame: pd.DataFrame) -> FloatArray:
 
 
 def reference_front(case: Case) -> FloatArray:
-    """The non-dominated union of the results of all runs of all algorithms.
+    """The non-dominated points among the solutions of all runs of all algorithms.
 
     Raises
     ------
@@ -78,8 +81,8 @@ def reference_front(case: Case) -> FloatArray:
 
 
 def compute_indicators(case: Case) -> pd.DataFrame:
-    """IGD+, hypervolume and IGD of every finished run; index algorithm and run, a column for each
-    indicator. A run without solutions has those of `NO_FRONT`.
+    """IGD+, hypervolume and IGD of every finished run. The index has algorithm and run, and each
+    indicator is a column. A run without solutions has the values of `NO_FRONT`.
 
     IGD is the mean Euclidean distance from each point of the reference front to the run's nearest
     point, in the objectives' units; IGD+ counts only the objectives in which this point is worse,
@@ -108,15 +111,15 @@ def compute_indicators(case: Case) -> pd.DataFrame:
 def frames_of_runs(
     case: Case, frame: pd.DataFrame
 ) -> list[tuple[RunName, pd.DataFrame]]:
-    """The finished runs, each with its rows, in the study's order of algorithms; raises
-    UnanswerableError if none of them has rows.
+    """Each finished run with its rows of `frame`, in the study's order of algorithms. Raises
+    UnanswerableError if no finished run has rows.
     """
     groups = dict(list(frame.groupby(["algorithm", "run"])))
     runs = list[RunName]()
     for algorithm in case.algorithms:
         runs += product([algorithm], case.runs_of(algorithm))
     if not runs:
-        # It says that no run is finished.
+        # The error of this call says that no run is finished.
         case.require_solutions()
     if not groups.keys() & set(runs):
         raise UnanswerableError(
@@ -126,7 +129,7 @@ def frames_of_runs(
 
 
 def valid_evaluations(case: Case, frame: pd.DataFrame) -> pd.DataFrame:
-    """The evaluations that a search may return: all objectives are defined, and the original
+    """The rows of `frame` that a search may return: all objectives are defined, and the original
     vehicle is safe in the same encounter.
     """
     is_defined = np.isfinite(minimised_values(case, frame)).all(axis=1)
@@ -134,8 +137,8 @@ def valid_evaluations(case: Case, frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def nondominated_evaluations(case: Case) -> pd.DataFrame:
-    """The evaluations of each finished run that no other one of the run dominates: what random
-    search returns.
+    """The evaluations of each finished run that no other evaluation of the run dominates. Random
+    search returns exactly these.
 
     Raises
     ------
@@ -152,13 +155,12 @@ def nondominated_evaluations(case: Case) -> pd.DataFrame:
 
 
 def describe_rules(case: Case) -> str:
-    """Which algorithms return other settings than `nondominated_evaluations`, in a sentence; "" if
-    none does, or if the evaluations are unknown.
+    """A sentence that names the algorithms whose solutions are not exactly the
+    `nondominated_evaluations`; "" if there are none, or if the evaluations are unknown.
     """
     if case.evaluations.empty:
         return ""
 
-    # Do solutions differ from what nothing in the run dominates?
     columns = ["algorithm", "run", *case.characteristics.names]
     fronts = nondominated_evaluations(case)
     joined = case.solutions[columns].merge(fronts[columns], "outer", indicator=True)
@@ -173,7 +175,8 @@ def describe_rules(case: Case) -> str:
 
 
 def count_evaluations(case: Case) -> pd.DataFrame:
-    """The evaluations of every finished run; columns algorithm, run, requested, simulated, budget.
+    """The numbers of evaluations of every finished run. The columns are algorithm, run, requested,
+    simulated and budget.
 
     Equal settings are simulated once, so `simulated` counts different settings. A run has requested
     its whole budget if a new setting is in its last generation; else it ended with its last new
@@ -197,8 +200,8 @@ def count_evaluations(case: Case) -> pd.DataFrame:
 
 
 def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
-    """How many settings a run of each algorithm simulates, the mean of `count_evaluations`, and why
-    fewer than the budget.
+    """A phrase that states, for each algorithm, how many settings a run simulates on average, and
+    why these are fewer than the budget. `counts` are rows of `count_evaluations`.
     """
     texts = []
     for algorithm, rows in counts.groupby("algorithm", sort=False):
@@ -220,13 +223,12 @@ def describe_evaluations(case: Case, counts: pd.DataFrame) -> str:
 
 
 def why_few_evaluations(case: Case) -> str:
-    """A remark on algorithms whose runs simulate less than `USUAL_SHARE` of their budget, without
-    those that say that they stop by themselves; "" without any.
+    """A remark on algorithms whose runs simulate less than `USUAL_SHARE` of their budget; "" if
+    there are none. Algorithms that declare that they stop by themselves are not named.
     """
     if not case.has_runs or case.evaluations.empty or not case.finished_runs:
         return ""
 
-    # Runs that simulate less than is usual.
     counts = count_evaluations(case)
     sums = counts.groupby("algorithm", sort=False)[["simulated", "budget"]].transform(
         "sum"
@@ -244,8 +246,8 @@ def why_few_evaluations(case: Case) -> str:
 
 
 def compute_convergence(case: Case) -> pd.DataFrame:
-    """The hypervolume of all that each run has simulated after a number of evaluations, which are
-    different settings; columns algorithm, run, evaluations, hypervolume.
+    """The hypervolume of all settings that each run has simulated after several numbers of
+    evaluations (different settings). The columns are algorithm, run, evaluations and hypervolume.
 
     Objectives are normalised as in `compute_indicators`. The numbers end with the longest run of
     the algorithm. The hypervolume is 0 as long as no evaluation dominates the reference point.
@@ -255,13 +257,13 @@ def compute_convergence(case: Case) -> pd.DataFrame:
     UnanswerableError
         If there are no evaluations or no solutions.
     """
-    # The same numbers of evaluations for all runs.
+    # All runs have the same numbers of evaluations, so that their medians can be computed.
     reference = reference_front(case)
     frames = []
     counts = np.linspace(0, case.study.search.evaluations, CURVE_POINTS + 1, dtype=int)
     ends = count_evaluations(case).groupby("algorithm")["simulated"].max()
     for (algorithm, run), group in frames_of_runs(case, case.evaluations):
-        # The front grows by what each stretch adds.
+        # The front so far and the new points are enough: a dominated point stays dominated.
         valid = valid_evaluations(case, group.assign(number=range(len(group))))
         points = normalised(minimised_values(case, valid), reference)
         numbers = valid["number"].to_numpy()
@@ -278,8 +280,8 @@ def compute_convergence(case: Case) -> pd.DataFrame:
 
 
 def summarise_convergence(case: Case) -> pd.DataFrame:
-    """`compute_convergence` over the runs: the median, and the quartiles as low and high; columns
-    algorithm, evaluations, hypervolume, low, high.
+    """The median and the quartiles of `compute_convergence` over the runs. The columns are
+    algorithm, evaluations, hypervolume (the median), low and high (the quartiles).
     """
     growth = compute_convergence(case).groupby(
         ["algorithm", "evaluations"], sort=False

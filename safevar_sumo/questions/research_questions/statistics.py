@@ -19,18 +19,18 @@ from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.records import FloatArray
 
 ALPHA = 0.01
-"""By default, a p-value below this level is significant, and intervals have the confidence 1 -
-ALPHA.
+"""Default level of significance: a smaller p-value is significant. Intervals have the confidence 1
+- ALPHA.
 """
 EXACT_SAMPLE_SIZE = 8
-"""Without ties, the p-value of U is exact if one sample has at most this many values; otherwise it
-is a normal approximation.
+"""Number of values up to which the p-value of the U test is exact, if the smaller sample has no
+more values, and no values are tied. Otherwise the p-value is a normal approximation.
 """
 MAX_EXACT_RUNS = 50
-"""Without ties and differences of zero, the signed-rank test is exact for up to this many runs."""
+"""Number of runs up to which the signed-rank test is exact, if no differences are tied or zero."""
 RANKED_DIGITS = 12
-"""Number of significant digits of a value that is ranked: values that only rounding errors
-distinguish are ties.
+"""Values are rounded to this number of significant digits before they are ranked. Otherwise
+rounding errors would distinguish values that are ties.
 """
 EXACT_TEST = "Mann-Whitney U, two-sided, exact"
 ASYMPTOTIC_TEST = (
@@ -43,12 +43,12 @@ ASYMPTOTIC_SIGNED_TEST = (
     " for continuity"
 )
 MAGNITUDES = ((0.714, "large"), (0.638, "medium"), (0.556, "small"))
-"""Kitchenham's magnitudes; each holds from this value of max(A12, 1 - A12) on."""
+"""Kitchenham's magnitudes of effects. Each begins at its value of max(A12, 1 - A12)."""
 
 
 def fewest_runs(question: str, alpha: float = ALPHA, tests: int = 1) -> int:
-    """Smallest number of runs of every algorithm with which a test of RQ1 or RQ2 can be
-    significant, after Holm's correction for so many tests.
+    """The smallest number of runs of every algorithm with which a test of RQ1 or RQ2 can be
+    significant, after Holm's correction for `tests` tests.
     """
     return next(n for n in count(1) if can_be_significant(question, n, n, alpha, tests))
 
@@ -56,19 +56,19 @@ def fewest_runs(question: str, alpha: float = ALPHA, tests: int = 1) -> int:
 def can_be_significant(
     question: str, m: int, n: int, alpha: float = ALPHA, tests: int = 1
 ) -> bool:
-    """Whether a test of m runs, of RQ2 against n runs of another algorithm, can be significant
-    after Holm's correction for so many tests.
+    """Whether a test can be significant after Holm's correction for `tests` tests. A test of RQ1
+    has m runs. A test of RQ2 has m runs, against n runs of another algorithm.
 
-    The smallest two-sided p-value is 2 / 2^m by the exact distribution of RQ1's signed-rank test,
-    and 2 / C(m + n, n) by that of RQ2's U test. Holm multiplies the smallest one of a family by the
-    number of its tests.
+    By the exact distribution, the smallest two-sided p-value of RQ1's signed-rank test is 2 / 2^m.
+    For RQ2's U test it is 2 / C(m + n, n). Holm multiplies the smallest p-value by the number of
+    tests.
     """
     orders = 2**m if question == "RQ1" else math.comb(m + n, n)
     return 2 * max(tests, 1) / orders < alpha
 
 
 class TwoSampleTest(NamedTuple):
-    """Comparison of two samples X and Y; NaN and None where a sample is empty.
+    """The comparison of two samples X and Y. If a sample is empty, the results are NaN or None.
 
     `effect_size` is Vargha-Delaney's A12 = P(X > Y) + 0.5 P(X = Y), `n1` and `n2` the samples'
     sizes, `method` the name of the test.
@@ -82,8 +82,8 @@ class TwoSampleTest(NamedTuple):
     method: str | None
 
     def oriented(self, *, larger_is_better: bool) -> TwoSampleTest:
-        """The test whose effect size is above 0.5 where X is better: A12, or 1 - A12 where smaller
-        values are better.
+        """The same test, but with an effect size that is above 0.5 if X is better: A12, or 1 - A12
+        if smaller values are better.
         """
         if larger_is_better:
             return self
@@ -91,7 +91,7 @@ class TwoSampleTest(NamedTuple):
 
 
 def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
-    """Compare two samples without undefined values by U test and effect size."""
+    """Compare two samples by the Mann-Whitney U test and A12. No value may be undefined."""
     sample = rounded_to_rank(x)
     baseline = rounded_to_rank(y)
     if not sample.size or not baseline.size:
@@ -108,7 +108,7 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
 
 
 def rounded_to_rank(values: ArrayLike) -> FloatArray:
-    """Values with `RANKED_DIGITS` significant digits, of any shape, in one dimension."""
+    """Values of any shape as an array of one dimension, rounded to `RANKED_DIGITS` digits."""
     return np.array(_decimals(values), float)
 
 
@@ -124,7 +124,7 @@ def has_distinct_values(values: ArrayLike) -> bool:
 
 def magnitude_of(effect_size: float) -> str:
     """The magnitude of an effect size, by Kitchenham's intervals."""
-    # Without its rounding error, 1 - 0.286 is a large effect like 0.714.
+    # 1 - 0.286 must be a large effect, as 0.714 is: the rounding error is removed first.
     folded_effect = round(max(effect_size, 1 - effect_size), 12)
     return next(
         (name for limit, name in MAGNITUDES if folded_effect >= limit), "negligible"
@@ -132,20 +132,18 @@ def magnitude_of(effect_size: float) -> str:
 
 
 def signed_rank_test(x: ArrayLike, y: ArrayLike = 0.0) -> TwoSampleTest:
-    """Compare pairs, each of shape (N,), or values with one value, by Wilcoxon's test; the effect
-    size is the share of pairs in which x is greater.
+    """Compare N pairs by Wilcoxon's signed-rank test. `x` has shape (N,); `y` has the same shape,
+    or is one value for all pairs. The effect size is the share of pairs in which x is greater.
 
-    The test drops differences of 0 (as Wilcoxon did); the effect size counts them by half.
+    The test drops differences of 0, as Wilcoxon did. The effect size counts them by half.
     """
     # Differences of decimal numbers have no rounding errors.
     pairs = zip(_decimals(x), _decimals(np.broadcast_to(y, np.shape(x))), strict=True)
     differences = np.array([value - baseline for value, baseline in pairs], float)
 
-    # No test of undefined values.
     if not differences.size or np.isnan(differences).any():
         return TwoSampleTest(np.nan, np.nan, None, differences.size, 0, None)
 
-    # The effect, and the exact test if no values are tied.
     effect = float(np.mean(differences > 0) + np.mean(differences == 0) / 2)
     p_value, name = 1.0, EXACT_SIGNED_TEST
     if differences.any():
@@ -171,13 +169,14 @@ def correct_by_holm(p_values: Iterable[float]) -> FloatArray:
 
 
 def effect_interval(effect: float, m: int, n: float, alpha: float = ALPHA) -> Interval:
-    """The interval of an effect size of m against n values, or if n is NaN against one, at the
-    confidence 1 - alpha.
+    """The interval of an effect size A12 at the confidence 1 - alpha; NaN for an undefined effect.
+    The effect size compares m values with n values or, if n is NaN, with a single value.
 
-    It holds the values that differ from the effect by at most as many standard errors, as these
-    values have them, as the normal distribution allows: Newcombe's (2006, method 5) and, against
-    one value, Wilson's of a share. Unlike the bootstrap's it has a width where all values of one
-    sample are greater. NaN for an undefined effect.
+    The interval holds all values A for which the effect is at most z standard errors away from A.
+    The standard error is that of A, and z is the quantile of the normal distribution. This is
+    Newcombe's interval (2006, method 5); with a single value it is Wilson's interval of a share. A
+    bootstrap interval would have no width if all values of a sample are greater; this interval has
+    one.
     """
     limit = float(scipy.stats.norm.isf(alpha / 2)) ** 2
 
@@ -193,7 +192,7 @@ def effect_interval(effect: float, m: int, n: float, alpha: float = ALPHA) -> In
     if math.isnan(effect):
         return math.nan, math.nan
     low, high = 0.0, 1.0
-    # From beside the effect, where the excess is below 0, whatever the effect.
+    # The search for a root begins beside the effect, where the excess is below 0 for every effect.
     if effect > low:
         low = scipy.optimize.brentq(excess, effect + 1e-9 * (low - effect), low)
     if effect < high:
@@ -202,11 +201,12 @@ def effect_interval(effect: float, m: int, n: float, alpha: float = ALPHA) -> In
 
 
 def median_interval(values: ArrayLike, alpha: float = ALPHA) -> Interval:
-    """The interval of a median, at a confidence of at least 1 - alpha, between two order
-    statistics; NaN if there are too few values.
+    """The interval of a median at a confidence of at least 1 - alpha. Its ends are two of the
+    ordered values; NaN if there are too few values.
     """
     ordered = np.sort(np.asarray(values, float))
-    # The first rank whose probability is not too small.
+    # The number of values below the median is binomial. The rank leaves out at most alpha / 2 on
+    # each side.
     rank = int(scipy.stats.binom.ppf(alpha / 2, ordered.size, 0.5))
     if rank:
         return (ordered[rank - 1], ordered[-rank])
