@@ -1,7 +1,8 @@
-"""What one of two systems is simulated in and the other is not: test cases, weathers, ranges,
-what a constraint or a margin excludes, and parameter sets.
+"""Finds the parts of one version's tests that the other version lacks: test cases, weathers, ranges
+and parameter sets; also the vehicles and encounters that a constraint or margin excludes.
 
-A version whose failing tests were deleted looks safer, although nothing shows that it is.
+A version whose failing tests were deleted would look safer, although nothing shows that it is
+safer.
 """
 
 from __future__ import annotations
@@ -21,13 +22,15 @@ from safevar_sumo.study import Study, Weather
 MAX_PARTS_NAMED = 4
 """Maximum number of missing parts that a sentence names."""
 OF_VEHICLE = "vehicle."
-"""Prefix of the parameters of a set that belong to the vehicle, which versions of a driving system
-have in common.
+"""Prefix of the parameters of a parameter set that belong to the vehicle. Versions of a driving
+system have these parameters in common.
 """
 
 
 class TestCase(NamedTuple):
-    """What vehicles meet at a point, without the name of its test, which versions may change."""
+    """The encounter at a point of a matrix. It lacks the name of the test, which versions may
+    change.
+    """
 
     model: str
     parameters: dict[str, Any]
@@ -36,7 +39,9 @@ class TestCase(NamedTuple):
 
 
 def cases_of(side: Evaluator) -> Iterator[tuple[str, Point, TestCase]]:
-    """The test cases of a system, each with the name of its test and its point."""
+    """Yield the test cases of a version, each with the name of its test (without tests: of its
+    scenario) and its point.
+    """
     scenario = side.study.scenario
     for test, points in points_of_tests(side.study, side.system.points):
         model = (test and test.model) or scenario.model
@@ -53,7 +58,7 @@ def cases_of(side: Evaluator) -> Iterator[tuple[str, Point, TestCase]]:
 
 
 def missing_parts(side: Evaluator, reference: Evaluator) -> list[str]:
-    """What the other system is simulated in and this one is not, as phrases."""
+    """The parts of the version `reference` that the version `side` lacks, as phrases."""
     parts = [
         *_missing_cases(side, reference),
         *_missing_ranges(side, reference),
@@ -66,7 +71,9 @@ def missing_parts(side: Evaluator, reference: Evaluator) -> list[str]:
 def missing_in_words(
     a: Evaluator, b: Evaluator, titles: Mapping[str, str]
 ) -> Iterator[Sentence]:
-    """What each of two systems lacks: `Version b lacks the test CCRs, which a has.`"""
+    """Yield a sentence for each version that lacks parts of the other version, such as `Version b
+    lacks the test CCRs, which a has.` `titles` are the names of the versions.
+    """
     for side, reference, names in ((a, b, "ab"), (b, a, "ba")):
         parts = missing_parts(side, reference)
         if len(parts) > MAX_PARTS_NAMED:
@@ -101,7 +108,7 @@ def _missing_ranges(side: Evaluator, reference: Evaluator) -> Iterator[str]:
     tests = points_of_tests(side.study, side.system.points)
     by_name = {test and test.name: side.study.ranges_of(test) for test, _ in tests}
     for test, _ in points_of_tests(reference.study, reference.system.points):
-        # Those of all tests, where none has this name.
+        # If the version has no test of this name, its ranges for all tests count.
         ranges = by_name.get(test and test.name, side.study.ranges)
         for name, domain in reference.study.ranges_of(test).items():
             narrower = ranges.get(name)
@@ -115,7 +122,9 @@ def _missing_ranges(side: Evaluator, reference: Evaluator) -> Iterator[str]:
 
 
 def _excluded(study: Study, reference: Study) -> Iterator[str]:
-    """What a constraint or the margin of the original vehicle excludes in one study alone."""
+    """Yield the vehicles and encounters that a constraint or margin of `study` excludes, but no
+    constraint or margin of `reference`, as phrases.
+    """
     for constraint in study.constraints:
         low, high = constraint.ends
         if not any(

@@ -1,8 +1,9 @@
-"""Algorithms after equal numbers of simulations, from the journals of their runs: the hypervolume
-and the unsafe settings of all settings so far, and how many runs would show a difference.
+"""Compares algorithms after equal numbers of simulations (budgets), from the journals of their
+runs. Compared are the hypervolume and the number of unsafe settings of all settings so far. A plan
+says how many runs would show a difference.
 
-A simulation is a setting of a journal, as a run simulates equal settings once. A run that simulates
-fewer settings than a budget counts with all of them.
+A simulation is a setting of a journal, because a run simulates equal settings once. A run that
+simulates fewer settings than a budget counts with all its settings.
 """
 
 from __future__ import annotations
@@ -40,14 +41,17 @@ BUDGETS = (
     200_000,
     500_000,
 )
-"""Numbers of simulations of a run after which algorithms are compared, besides its whole budget."""
+"""Numbers of simulations of a run after which algorithms are compared. They are also compared after
+the whole budget of a run.
+"""
 POWER = 0.8
 """Probability with which a planned number of runs shows an effect."""
 
 
 def within_budgets(case: Case) -> pd.DataFrame:
-    """All settings that the finished runs of a case might return, once for each budget that has
-    them: one of `BUDGETS`, or the whole budget of a run, in the column `simulations`.
+    """All settings that the finished runs of a case might return. A setting has a row for each
+    budget in which it was simulated. The column `simulations` is the budget: one of `BUDGETS`, or
+    the whole budget of a run.
 
     Raises
     ------
@@ -66,27 +70,26 @@ def within_budgets(case: Case) -> pd.DataFrame:
 
 
 def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
-    """Every pair of algorithms within each budget.
+    """Compare every pair of algorithms within each budget.
 
-    `effect_size` is A12 of the hypervolume of the runs, above 0.5 where the algorithm is better.
-    `hypervolume` is the median, `unsafe` the mean number of unsafe settings over all finished runs;
-    a run without a valid setting within the budget has 0 of both. The reference front is the same
-    for all budgets.
+    `effect_size` is A12 of the hypervolume of the runs, above 0.5 if the algorithm is better.
+    `hypervolume` is the median over all finished runs. `unsafe` is the mean number of unsafe
+    settings over all finished runs. A run without a valid setting within the budget has 0 of both.
+    The reference front is the same for all budgets.
 
-    With `runs_needed` runs of each algorithm, N / 2, a Mann-Whitney test shows the effect: N =
-    (z_{1 - level / 2} + z_{power})^2 / (12 c (1 - c) (A12 - 0.5)^2) with c = 1 / 2, for many runs
-    without ties (Noether 1987: Sample size determination for some common nonparametric tests.
-    Journal of the American Statistical Association 82, 645-647). It is infinite for 0.5. The level
-    is alpha, divided by the number of tests of `rq2_runs`, as Holm's method does with the smallest
-    p-value.
+    `runs_needed` is the number N / 2 of runs of each algorithm with which a Mann-Whitney test shows
+    the effect: N = (z_{1 - level / 2} + z_{power})^2 / (12 c (1 - c) (A12 - 0.5)^2) with c = 1 / 2.
+    The formula is for many runs without ties (Noether 1987: Sample size determination for some
+    common nonparametric tests. Journal of the American Statistical Association 82, 645-647). The
+    number is infinite if A12 is 0.5. The level is alpha divided by the number of tests of
+    `rq2_runs`, because Holm's method multiplies the smallest p-value by this number.
 
     Raises
     ------
     UnanswerableError
         If there are no evaluations or no solutions, or a single algorithm.
     """
-    # Every run within each budget, also if it has no valid setting there.
-    # It raises if there is a single algorithm.
+    # The call raises an error if there is a single algorithm.
     tests = rq2_runs(case, choices)
     count = tests["p_value"].count()
     reference = reference_front(case)
@@ -101,7 +104,8 @@ def compare_budgets(case: Case, choices: Choices) -> pd.DataFrame:
         runs, columns=["algorithm", "n1", "simulations", "hypervolume", "unsafe"]
     )
 
-    # Every pair of runs; A12 is the share in which the first is better, and half of the ties.
+    # A12 is the share of all pairs of runs in which the first run is better, plus half of the share
+    # of ties.
     baselines = growth.rename(columns={"algorithm": "baseline", "n1": "n2"})
     pairs = growth.merge(baselines, on="simulations", suffixes=("", "_baseline"))
     pairs["effect_size"] = np.heaviside(

@@ -1,5 +1,5 @@
-"""The tables of the research questions by name: what computes them; titles, columns, and how
-readers see them are in tables.toml beside this module.
+"""The tables of the research questions, and the functions that compute them. The file tables.toml
+beside this module has their titles and columns, and how readers see them.
 """
 
 from __future__ import annotations
@@ -30,12 +30,14 @@ CHOSEN = (
     "rq2",
     "a12",
 )
-"""The tables that depend on a reader's choices."""
+"""Names of the tables that depend on a reader's `Choices`."""
 Compute = Callable[..., pd.DataFrame]
 
 
 class PaperTable(NamedTuple):
-    """A table: its title, the function of a case that computes it, and its columns."""
+    """A table: its title, the function of a case that computes it, its columns, and how readers see
+    a long table (`wide`; None for no other form).
+    """
 
     title: str
     compute: Compute
@@ -44,7 +46,7 @@ class PaperTable(NamedTuple):
 
     @classmethod
     def of(cls, name: str, compute: Compute) -> PaperTable:
-        """A table as the file has it."""
+        """The table `name` as tables.toml declares it."""
         table = DATA["tables"][name]
         definitions = DATA["columns"] | table.get("own", {})
         return cls(
@@ -75,12 +77,13 @@ FUNCTIONS: dict[str, Compute] = {
     "combinations": changes.frequent_combinations,
 }
 ON_REQUEST = {"budget": budgets.compare_budgets}
-"""The tables that are computed only if they are named, and then alone."""
+"""Tables that are computed only if a user names them. Then no other table is computed."""
 OVER_RUNS = ("rq1-runs", "rq2-runs", "rq2-common", "a12", "collisions", CAUSES)
 AS_PUBLISHED = ("rq1", "rq2")
 POOLED = (*AS_PUBLISHED, "collisions")
-"""The tables that answer the questions about results with runs, and about imported solutions, which
-have none; those of them that pool the solutions of all runs as the paper does.
+"""Names of tables. `OVER_RUNS` may lead an answer about results with runs, and `POOLED` an answer
+about imported solutions, which belong to no run. `AS_PUBLISHED` pool the solutions of all runs, as
+the paper does.
 """
 TABLES = {
     name: PaperTable.of(name, compute)
