@@ -1,4 +1,6 @@
-"""The value from which on a cause is unsafe, and how many vehicles around it are."""
+"""Finds the limits of causes: how far the changes of a cause can shrink while the vehicle stays
+unsafe.
+"""
 
 from __future__ import annotations
 
@@ -16,21 +18,22 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import FloatArray, NamedValues
 
 PARTS = (32, 8, 8, 8)
-"""Number of parts into which each round divides what is left of a line from the original to a
-setting. The search finds every unsafe stretch of the line that is as long as the first parts.
+"""For each round of the search, the number of parts into which the rest of a line is divided. The
+line leads from the original to a setting. The search finds every unsafe stretch of the line that is
+as long as a part of the first round.
 """
 COARSE_PARTS = (8, 4, 4)
-"""The same where few simulations are allowed."""
+"""The numbers of parts if few simulations are allowed."""
 
 
 def settings_of_line(parts: Sequence[int]) -> int:
-    """How many settings of a line are simulated."""
+    """The number of settings of a line that are simulated."""
     return sum(parts) - len(parts) + 1
 
 
 class BoundaryState(StrEnum):
-    """What lies on a line from the original just below the smallest share of the line that is
-    unsafe.
+    """The kind of setting just below the smallest unsafe share of a line: a safe setting, the
+    smallest change that the filter keeps, or a setting that could not be simulated.
     """
 
     SAFE = "safe"
@@ -48,12 +51,12 @@ class Limits(NamedTuple):
         The values after all changes are multiplied by `fraction`, the smallest factor at which the
         vehicle is unsafe.
     single_boundary
-        For each characteristic, the value to which this one can return towards the original while
-        the others stay.
+        For each characteristic, the value to which it can return towards the original, while all
+        other changes stay, and the vehicle stays unsafe.
     fraction
-        The factor.
+        The factor of `boundary`; 0 for a cause without changes.
     end
-        What lies just below the factor.
+        The kind of setting just below this factor.
     """
 
     boundary: NamedValues
@@ -65,16 +68,15 @@ class Limits(NamedTuple):
 def find_cause_limits(
     evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe
 ) -> list[Limits]:
-    """Find the limits of causes."""
+    """Find the limits of each cause, in the order of the causes."""
     if not causes:
         return []
-
-    # What each cause changes.
     characteristics = evaluator.characteristics
     settings = settings_of(characteristics, causes)
     original = characteristics.with_original_vehicle(settings)
     is_changed = settings != original
-    # A cause has a line on which all its changes are scaled, then a line for each change by itself.
+    # A cause has several lines: first a line on which all its changes are scaled, then, for each
+    # change, a line on which only this change is scaled.
     groups = [
         np.vstack([flags, np.eye(len(flags), dtype=bool)[flags]])
         for flags in is_changed
@@ -84,7 +86,8 @@ def find_cause_limits(
     ends = np.repeat(settings, line_counts, axis=0)
     original = np.repeat(original, line_counts, axis=0)
 
-    # A line begins where what it scales is as in the original.
+    # At the start of a line, the scaled changes are undone. Below the threshold, the filter would
+    # undo a change.
     starts = np.where(is_scaled, original, ends)
     thresholds = np.divide(
         characteristics.threshold,
@@ -100,7 +103,6 @@ def find_cause_limits(
             evaluator, starts, ends, unsafe, thresholds.max(axis=1), parts
         )
 
-    # The limits of each cause, from its lines.
     first_lines = np.cumsum([0, *line_counts])
     limits_of_causes = []
     for cause, flags, (line, stop) in zip(
@@ -127,15 +129,14 @@ def _first_unsafe_shares(
     lowest: FloatArray,
     parts: Sequence[int],
 ) -> tuple[FloatArray, FloatArray, list[BoundaryState]]:
-    """The first unsafe share of each of M lines, shape (M,), the setting there, shape (M, n), and
-    what lies just below it.
+    """The first unsafe share of each of M lines, shape (M,), the setting at this share, shape (M,
+    n), and the kind of setting just below it.
 
-    A line leads from `starts` to `ends`, shape (M, n); its settings count from the share `lowest`,
-    shape (M,), on, and its end must be unsafe. Rounds divide it into `parts`, whose product is
-    16,384 by default. A setting that cannot be simulated is neither safe nor unsafe; just below the
-    share, it gives the state `NOT_SIMULATED`.
+    A line leads from `starts` to `ends`, shape (M, n). Only shares from `lowest`, shape (M,), on
+    are searched. The end of a line must be unsafe. The search divides a line in rounds (`parts`). A
+    setting that cannot be simulated is neither safe nor unsafe. Just below the share, it gives the
+    state `NOT_SIMULATED`.
     """
-    # The first unsafe share of each line.
     boundaries = find_boundaries(
         starts,
         ends,
@@ -144,7 +145,6 @@ def _first_unsafe_shares(
         lowest,
     )
 
-    # What ends the line on the safe side.
     is_valid = evaluator.evaluate(boundaries.safe, BOUNDARIES).valid
     is_at_threshold = (boundaries.safe_shares == lowest) & (lowest > 0)
     states = np.select(

@@ -1,4 +1,5 @@
-"""Which characteristics decide: shares of the variance (Sobol indices)."""
+"""Computes the influence of characteristics: shares of the variance of a measure (Sobol indices).
+"""
 
 from __future__ import annotations
 
@@ -26,11 +27,11 @@ from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 
 SENSITIVITY = "sensitivity analysis"
-"""Phase of progress."""
+"""The phase of progress in which the settings of the design are simulated."""
 BASE_POINTS = 512
 """Number of base points of Saltelli's design, which has n + 2 settings for each base point."""
 LEAST_VEHICLES = 200
-"""Number of vehicles from which on shares say what decides: of fewer, the largest share of 20
+"""Least number of vehicles for indices. With fewer vehicles, the largest share of 20
 characteristics without any effect is usually above 0.1.
 """
 RESAMPLES = 200
@@ -38,22 +39,22 @@ RESAMPLES = 200
 MIN_OUTCOMES = 100
 """Minimum number of unsafe settings, and of safe settings, for indices of the unsafe outcome."""
 OUTPUTS = {"degree": "the safety degree", "unsafe": "whether the vehicle is unsafe"}
-"""What varies, by the beginning of the names of its columns; another measure may stand in place of
-the safety degree.
+"""The outputs whose variance is shared out, by the beginning of the names of their columns. The
+measure of the criterion may replace the safety degree.
 """
 MAX_DECIDING = 5
-"""Number of characteristics that one screen names."""
+"""Largest number of characteristics on one screen."""
 UNDEFINED = ("", "undefined here")
-"""SALib's key and the meaning of an index that does not exist."""
+"""An empty key of SALib's results, and the meaning, for an index that does not exist."""
 Indices = Mapping[str, FloatArray]
-"""As SALib's results: by key, an index of each characteristic, shape (n,), or half of its
+"""SALib's results by key: the index of each characteristic, shape (n,), or half of the width of its
 confidence interval.
 """
 
 
 def _problem(names: Sequence[str]) -> JsonObject:
-    """SALib's problem: each characteristic by its quantile. SALib reserves endings of names, so
-    that it gets numbers.
+    """The problem as SALib wants it: the quantile of each characteristic varies from 0 to 1. The
+    names are numbers, because SALib reserves some endings of names.
     """
     return {
         "num_vars": len(names),
@@ -63,7 +64,7 @@ def _problem(names: Sequence[str]) -> JsonObject:
 
 
 def _seed(evaluator: Evaluator) -> int:
-    """The study's seed for SALib, to which 0 means that numbers differ each time."""
+    """The study's seed for SALib. It is never 0: with 0, SALib's numbers would differ each time."""
     return evaluator.seed % 2**32 or 1
 
 
@@ -73,7 +74,9 @@ def size_of_design(evaluator: Evaluator) -> int:
 
 
 def design_of(evaluator: Evaluator, model: VariationModel) -> Evaluations:
-    """Saltelli's design, in which each characteristic varies alone and with all others."""
+    """The evaluations of the settings of Saltelli's design, in which each characteristic varies
+    alone, and together with all others.
+    """
     from SALib.sample import sobol as design
 
     seed = evaluator.seed % 2**32
@@ -85,9 +88,12 @@ def design_of(evaluator: Evaluator, model: VariationModel) -> Evaluations:
 def sobol_indices(
     evaluator: Evaluator, evaluations: Evaluations, criterion: Unsafe, confidence: float
 ) -> tuple[AnswerTable, str]:
-    """Sobol indices, first order and total, of independent characteristics, from Saltelli's design;
-    undefined where nothing varies, or too few settings are unsafe or safe. Base points with a
-    setting that could not be simulated do not count. And the name of the measure that varies.
+    """The table of the Sobol indices, first order and total, of independent characteristics; and
+    the name of the measure whose variance is shared out.
+
+    The indices come from Saltelli's design (`evaluations`). They are undefined if the output does
+    not vary, or if too few settings are unsafe or safe. A base point counts only if all its
+    settings have valid simulations.
     """
     from SALib.analyze import sobol as analysis
 
@@ -113,19 +119,21 @@ def sobol_indices(
 def given_data_indices(
     evaluator: Evaluator, evaluations: Evaluations, criterion: Unsafe, confidence: float
 ) -> tuple[AnswerTable, str]:
-    """The first-order index from any sample of vehicles: the share of the variance that knowing a
-    characteristic removes, with what depends on it. And the name of the measure that varies.
+    """The table of the first-order indices from any sample of vehicles (`evaluations`); and the
+    name of the measure whose variance is shared out.
+
+    The index is the share of the variance that disappears if a characteristic is known. It includes
+    the influence of other characteristics that depend on this one.
     """
     from SALib.analyze import delta as analysis
 
-    # Characteristics that vary in the sample.
     varies = np.ptp(evaluations.settings, axis=0) > 0
     names = list(compress(evaluator.characteristics.names, varies))
     problem = _problem(names)
     options = {"num_resamples": RESAMPLES, "conf_level": confidence, "method": "sobol"}
 
     def indices_of(output: FloatArray) -> Indices:
-        # SALib sets both for the process.
+        # SALib changes the warning filters and `formatwarning` of the whole process: undo this.
         with warnings.catch_warnings(), patch.object(warnings, "formatwarning"):
             settings = evaluations.settings[:, varies]
             seed = _seed(evaluator)
@@ -148,12 +156,12 @@ def _table(
     indices_of: Callable[[FloatArray], Indices],
     kinds: dict[str, tuple[str, str]],
 ) -> tuple[AnswerTable, str]:
-    """A row for each characteristic, the one that decides most of the measure first; `kinds` maps
-    an index to SALib's key and its meaning. Readers see the name of a measure other than the safety
-    degree above its column.
+    """The table with a row for each characteristic, the one with the largest influence first; and
+    the name of the measure. `kinds` maps the name of an index to SALib's key and the index's
+    meaning.
     """
-    # The criterion's measure, or the safety degree where the measure is undefined for a vehicle,
-    # such as one that collides.
+    # The measure is that of the criterion. If it is undefined for some vehicle, such as a vehicle
+    # that collides, the safety degree replaces it.
     degree = evaluations.f_safe
     output_names = dict(OUTPUTS)
     measured = evaluations.column(criterion.measure)
@@ -161,7 +169,6 @@ def _table(
         degree = measured
         output_names["degree"] = criterion.measure
 
-    # Outputs that vary enough have indices.
     is_unsafe = criterion.runs(evaluations).mean(axis=0)
     failures = is_unsafe.sum()
     indices = {}
@@ -170,7 +177,6 @@ def _table(
     if MIN_OUTCOMES <= failures <= len(degree) - MIN_OUTCOMES:
         indices["unsafe"] = indices_of(is_unsafe)
 
-    # An index of each output, with its interval.
     columns: Columns = {
         "characteristic": "characteristic of the vehicle, or of its encounter"
     }
@@ -182,7 +188,7 @@ def _table(
             name = f"{output}_{index}"
             value = np.asarray(of_output.get(key, undefined), float)
             half = np.asarray(of_output.get(f"{key}_conf", undefined), float)
-            # An estimate may lie beyond what a share can be.
+            # An estimate may lie outside of 0 to 1, although a share cannot.
             values[name] = np.clip(value, 0, 1)
             values[f"{name}{LOW}"] = np.clip(value - half, 0, 1)
             values[f"{name}{HIGH}"] = np.clip(value + half, 0, 1)
@@ -197,7 +203,6 @@ def _table(
                 column = column._replace(is_detail=True)
             columns |= with_interval(name, column)
 
-    # The characteristic that decides most comes first.
     frame = pd.DataFrame({"characteristic": names, **values})
     largest = "degree_first" if kinds["total"] == UNDEFINED else "degree_total"
     frame = frame.sort_values(

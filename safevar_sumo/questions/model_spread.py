@@ -1,5 +1,5 @@
-"""Uncertainty of the vehicle model: predictions for one setting by all parameter sets that fit the
-published data equally well.
+"""The uncertainty of the vehicle model: the spread of the predictions for a setting by all
+parameter sets (calibrations) that fit the published data equally well.
 """
 
 from __future__ import annotations
@@ -31,13 +31,14 @@ ROUNDING_TOLERANCE = 1e-5
 the first set of [spread].
 """
 LEAST_DISTANCE = 0.3
-"""The model's error takes no vehicle as nearer to the original than this distance [domain widths]:
-near the original, too, a decision may fall a frame off.
+"""Least distance from the original vehicle to which the model's error is proportional [domain
+widths]. Also near the original, a decision of the driving system may fall one step earlier or
+later.
 """
 
 
 class ModelSpread(NamedTuple):
-    """Predictions for one setting by the parameter sets of a study's table [spread].
+    """The predictions for a setting by the parameter sets of a study's table [spread].
 
     Attributes
     ----------
@@ -83,8 +84,8 @@ def compute_model_spreads(
 def band_of(
     study: Study, evaluations: Sequence[Evaluations]
 ) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper ends, shape (M,) each, of the band of the sets' predictions for M
-    settings.
+    """The lower and upper ends, shape (M,) each, of the band that holds the predictions for M
+    settings. `evaluations` has the evaluations of these settings with each parameter set.
     """
     error = study.model_error.get(SAFETY_DEGREE, 0.0) * error_distance(
         study, evaluations[0].settings
@@ -149,7 +150,8 @@ def evaluate_sets(
 
 
 def studies_of_sets(study: Study) -> list[Study]:
-    """One study for each parameter set; the `parameters_outside_sets` keep their values.
+    """The study with each of its parameter sets, first the study itself. Parameters that are
+    `parameters_outside_sets` keep the study's values.
 
     Raises
     ------
@@ -163,7 +165,6 @@ def studies_of_sets(study: Study) -> list[Study]:
             "a study that was fitted to data, such as sun or rain",
         )
 
-    # Parameters outside the sets keep their values.
     outside_names = parameters_outside_sets(study)
     names = [key for key in study.spread if key not in outside_names]
     studies = [study]
@@ -174,14 +175,15 @@ def studies_of_sets(study: Study) -> list[Study]:
 
 
 def other_sets(study: Study, fits: int | None) -> list[Study]:
-    """The study with each of its first `fits` parameter sets but its own, by default with all."""
+    """The study with each of its first `fits` parameter sets, except its own (the first). None
+    means all sets. There are no other sets if `fits` is 0, or the study has no [spread].
+    """
     return studies_of_sets(study)[1:fits] if study.spread and fits != 0 else []
 
 
 def parameters_outside_sets(study: Study) -> list[str]:
-    """The parameters under [spread] whose value in `study` is not that of the first set.
-
-    The sets say nothing about such a value.
+    """The parameters under [spread] whose value in `study` is not the value in the first set. The
+    sets were not fitted for such a value, so they say nothing about it.
     """
     return [
         key

@@ -1,5 +1,5 @@
-"""Models of the vehicle in which a claim is tested: the parameter sets of its study, at the study's
-points and between them.
+"""The models in which a claim is tested: each is a parameter set (calibration) of the study's
+vehicle model, with the criterion of an unsafe vehicle.
 """
 
 from __future__ import annotations
@@ -21,23 +21,28 @@ from safevar_sumo.study import SAFETY_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 DEFAULT_MARGIN = 0.3
-"""Distance to keep in a study that states no error of its model [m]."""
+"""Clearance to keep in a study that states no error of its model [m]."""
 SEARCHED_MARGIN = 0.1
-"""Distance to keep where encounters are ranges [m]: where the original keeps just its
-margin, wear may use up the rest, and contact is no limit to release.
+"""Clearance to keep if encounters are ranges [m]. In some of these encounters even the original
+only just keeps the study's margin: wear may use up most of it, but the vehicle must not touch
+anything.
 """
 
 
 class Model(NamedTuple):
-    """A parameter set of the vehicle model, in which a claim about a study is tested, and what is
-    unsafe with it.
+    """A parameter set of the vehicle model in which a claim about a study is tested.
 
     Attributes
     ----------
     fit
-        Its number among the sets of [spread]; the study's own is 0.
+        The number of the parameter set under [spread]; 0 is the study's own set.
+    evaluator
+        Simulates settings with this parameter set.
+    unsafe
+        The criterion of an unsafe vehicle.
     new_car
-        What the original must not be in an encounter that counts, beside the rule of the study.
+        A criterion for the original vehicle: an encounter in which the original is unsafe by it
+        does not count. None if only the study's own rule decides.
     """
 
     fit: int
@@ -47,12 +52,14 @@ class Model(NamedTuple):
 
     @property
     def characteristics(self) -> CharacteristicSet:
-        """Those of its study."""
+        """The characteristics of the study with this parameter set."""
         return self.evaluator.characteristics
 
     @property
     def in_phases(self) -> Model | None:
-        """The model of settings that end with the phase of their encounter; None without phases."""
+        """The same model for settings whose last value is the phase of the encounter; None if the
+        study has no phases.
+        """
         evaluator = self.evaluator.in_phases
         if evaluator is None:
             return None
@@ -63,8 +70,8 @@ class Model(NamedTuple):
         return self.evaluator.evaluate(settings, stage)
 
     def robustness(self, settings: FloatArray, stage: str) -> FloatArray:
-        """What each of M settings leaves to the limit, shape (M,): below 0 it is unsafe; infinite
-        where it does not count.
+        """The robustness of M settings (the distance to the limit of the criterion), shape (M,). A
+        setting is unsafe below 0, and does not count at infinity.
         """
         robustness = np.where(
             self.evaluator.region.feasible(settings),
@@ -82,7 +89,7 @@ class Model(NamedTuple):
         return robustness
 
     def robustness_by(self, evaluations: Evaluations) -> FloatArray:
-        """What evaluated settings leave; see `robustness`."""
+        """The robustness of evaluated settings, shape (M,); infinite without a valid simulation."""
         return np.where(evaluations.valid, self.unsafe.robustness(evaluations), np.inf)
 
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
@@ -91,8 +98,8 @@ class Model(NamedTuple):
 
 
 class Models(NamedTuple):
-    """The parameter sets in which a claim is tested, the study's own first, and those left out, in
-    which the original itself is unsafe, or keeps less than the margin.
+    """The models in which a claim is tested, the study's own first (`members`). Models in which the
+    original vehicle itself is unsafe, or keeps less than the margin, are left out (`exclusions`).
     """
 
     members: tuple[Model, ...]
@@ -114,9 +121,9 @@ def limit_criterion(
     margin: float | None,
     original: Evaluations,
 ) -> Unsafe:
-    """What is unsafe for limits: the stated criterion as it is, else a collision or less than the
-    margin [m], which is by default that of the study; `SEARCHED_MARGIN` in one that searches its
-    scenario, whose originals keep more.
+    """The criterion for a question about limits: the stated criterion `unsafe`, or else a
+    collision, or less clearance than the margin [m]. The default margin is that of the study, or
+    `SEARCHED_MARGIN` if encounters are ranges.
     """
     is_distance = unsafe is None and margin is not None
     criterion = evaluator.choose_criterion(
@@ -128,9 +135,9 @@ def limit_criterion(
 def keeping_distance(
     evaluator: Evaluator, criterion: Unsafe, margin: float | None, *, is_stated: bool
 ) -> Unsafe:
-    """A criterion of an evaluator's study, with the distance to keep from a collision: the margin
-    [m], else `SEARCHED_MARGIN` or that of the study; one that is stated without a margin stands
-    alone.
+    """The criterion with a clearance to keep [m], if the criterion is a collision. The clearance is
+    the margin, or else `SEARCHED_MARGIN` if encounters are ranges, or else that of the study. A
+    collision that the user states (`is_stated`) without a margin gets no clearance.
     """
     check_margin(criterion, margin)
     criterion = replace(criterion, contact=evaluator.system.contact)
@@ -144,8 +151,8 @@ def keeping_distance(
 
 
 def margin_of(study: Study, margin: float | None) -> float:
-    """The distance to keep [m]: the stated one, else the study's error of its model, else
-    `DEFAULT_MARGIN`.
+    """The clearance to keep [m]: the stated margin, else the model's error that the study states,
+    else `DEFAULT_MARGIN`.
     """
     if margin is None:
         return study.model_error.get(SAFETY_DEGREE, DEFAULT_MARGIN)
@@ -153,7 +160,7 @@ def margin_of(study: Study, margin: float | None) -> float:
 
 
 def check_margin(criterion: Unsafe, margin: float | None) -> None:
-    """Refuse a distance to keep beside another criterion than a collision."""
+    """Refuse a margin if the criterion is not a collision."""
     if margin is not None and not criterion.is_collision:
         raise InputError(
             "margin",
@@ -169,9 +176,12 @@ def models_of(
     *,
     with_unsafe_originals: bool = False,
 ) -> Models:
-    """The first `fits` parameter sets of a study, by default all: what is unsafe holds in the
-    study's own, and a distance to keep there alone. No other set may collide. Those with an unsafe
-    original are left out unless they are wanted.
+    """The models of a study with its first `fits` parameter sets, or with all sets if `fits` is
+    None.
+
+    All models have the criterion `unsafe`, but only the study's own model has its clearance to
+    keep. A further model in which the original vehicle is unsafe is left out, unless
+    `with_unsafe_originals`.
     """
     in_fits = replace(unsafe, keep=0.0)
     members = [Model(0, evaluator, unsafe)]

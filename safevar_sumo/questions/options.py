@@ -1,5 +1,5 @@
-"""Options of functions: their types, ranges, defaults and meanings, as signatures and docstrings
-have them.
+"""Reads the options of a function from its signature and docstring: types, ranges, defaults and
+meanings. The module also defines the types that options share.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from safevar_sumo.metrics import Unsafe
 
 
 class Range(NamedTuple):
-    """The range of a number; `is_open` leaves out its ends."""
+    """The range of a number. The ends belong to it, unless `is_open`."""
 
     low: float
     high: float
@@ -49,37 +49,53 @@ Fraction = Annotated[float, Range(0, 1, is_open=True)]
 Margin = Annotated[float | None, Range(0, 100)]
 """A distance to keep from a collision [m]."""
 CRITERION = '"METRIC < X"|collision|below=X'
-"""The form of a criterion."""
+"""The form of a criterion, as help shows it."""
 CARS_FILE = "FILE.csv"
-"""A list of cars: its path, or in the library also a DataFrame or a mapping."""
+"""The form of a list of cars, as help shows it. In the library the list may also be a DataFrame or
+a mapping.
+"""
 LimitTexts = Annotated[tuple[str, ...], '"NAME >= X"']
-"""Limits of characteristics."""
+"""Texts that state limits of characteristics."""
 ValueTexts = Annotated[tuple[str, ...], "NAME=VALUE"]
-"""Values of characteristics."""
+"""Texts that state values of characteristics."""
 Fits = Annotated[int | None, Range(0, 1000)]
 """A number of parameter sets; None for all."""
 PointName = Annotated[str | None, "NAME"]
-"""A test, or a point, of a study's matrix."""
+"""The name of a test, or of a point, of a study's matrix."""
 UpTo = Annotated[str | None, "NAME=V"]
-"""A value at which an axis ends."""
+"""The largest value of an axis that encounters may have."""
 Jobs = Annotated[int | None, Range(1, MAX_JOBS)]
 """A number of worker processes."""
 Cluster = Annotated[str | None, "ADDRESS"]
 """The address of a Dask scheduler."""
 UP_TO = "up_to"
-"""The option that cuts an axis."""
+"""The name of the option that states the largest value of an axis."""
 Simulations = Annotated[int | None, Range(1, 1_000_000_000)]
 """The largest number of simulations."""
 
 
 def flag_of(name: str) -> str:
-    """The flag of an option."""
+    """The flag of an option on the command line."""
     return f"--{name.replace('_', '-')}"
 
 
 class Option(NamedTuple):
-    """An option of a function: the type of a value, its range, choices or the form of its text, its
-    default and its meaning.
+    """An option of a function.
+
+    Attributes
+    ----------
+    kind
+        The type of a value.
+    limits
+        The range of a number; None without a range.
+    choices
+        All allowed texts; () if other texts are allowed.
+    metavar
+        The form of a text, as help shows it; None without a form.
+    is_repeated
+        Whether the option may be given several times.
+    meaning
+        The text of the docstring.
     """
 
     name: str
@@ -96,10 +112,12 @@ class Option(NamedTuple):
         return flag_of(self.name)
 
     def check(self, value: Any) -> Any:
-        """The value, of a repeated option a tuple, a mapping as texts NAME=VALUE, a criterion as
-        `Unsafe`; refuses what has another type or is outside the range.
+        """The value in its final form. A value of another type, or outside of the range, is
+        refused.
+
+        The value of a repeated option becomes a tuple of texts; a mapping becomes texts NAME=VALUE.
+        A criterion becomes an `Unsafe`.
         """
-        # A table NAME=VALUE, a text, or several.
         if self.is_repeated:
             if isinstance(value, Mapping):
                 value = [f"{name}={number}" for name, number in value.items()]
@@ -118,7 +136,6 @@ class Option(NamedTuple):
         if self.kind not in (int, float):
             return check_text(self.name, value)
 
-        # A number within its limits.
         number, words = Real, "a number"
         if self.kind is int:
             number, words = Integral, "a whole number"
@@ -141,12 +158,12 @@ SIMULATIONS = Option(
     None,
     "the largest number",
 )
-"""The option that questions on pages and in packs have, too."""
+"""The option `simulations`, which pages and packs of evidence have for their questions, too."""
 
 
 def options_of(function: Callable[..., Any]) -> list[Option]:
-    """The options of a function: its keyword-only parameters, as signature and numpydoc docstring
-    describe them.
+    """The options of a function: its keyword-only parameters. The signature has their types and
+    defaults, and the numpydoc docstring has their meanings.
     """
     pattern = re.compile(r"^(\w+)\n((?:    .*\n?)+)", re.MULTILINE)
     texts = dict(pattern.findall(inspect.cleandoc(function.__doc__ or "")))
@@ -155,7 +172,7 @@ def options_of(function: Callable[..., Any]) -> list[Option]:
     for parameter in inspect.signature(function).parameters.values():
         if parameter.kind is parameter.KEYWORD_ONLY:
             hint = parameter.annotation
-            # The module postpones annotations.
+            # A module with postponed annotations has a text in place of the type.
             if isinstance(hint, str):
                 hint = eval(hint, names)
             meaning = " ".join(texts.get(parameter.name, "").split())

@@ -2,9 +2,10 @@
 the same vehicle?
 
 If a competent driver avoids a collision, the driving system failed. If not even full braking at the
-first possible moment avoids it, the vehicle is the cause. A driver who collides at a point in the
-original vehicle, too, says nothing about a changed vehicle there: no verdict. UN R157 means its
-driver for cars that cut in, cut out or brake on motorways; its use for pedestrians is ours.
+first possible moment avoids the collision, the vehicle is the cause. A driver who also collides
+with the original vehicle at the same point says nothing about the changed vehicle: no verdict. UN
+R157 defines its driver for cars that cut in, cut out or brake on motorways; this module also uses
+the driver for pedestrians.
 """
 
 from __future__ import annotations
@@ -26,25 +27,29 @@ from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System
 
 REFERENCE_DRIVERS = "let other drivers drive"
-"""The stage of progress."""
+"""The phase of progress in which other drivers drive."""
 MAX_SAMPLE = 6_666
-"""Maximum number of collisions that are simulated: of more a random sample is."""
+"""Maximum number of collisions that other drivers drive. Of more collisions, a random sample is
+taken.
+"""
 LETTER, FULL = "competent_driver", "full_braking"
 TITLES = {LETTER: "competent driver", FULL: "full braking"}
-"""The drivers, the weakest first."""
+"""The reference drivers for all scenarios, the weakest first."""
 OF_LANES = ("rss", "fuzzy_safety", "r157")
-"""Further drivers where somebody drives ahead in the lane, or comes into it."""
+"""Further drivers, for scenarios in which somebody drives ahead in the lane, or comes into it."""
 NOBODY, NO_VERDICT = "nobody", "no verdict"
-"""In the place of a driver who avoids a collision."""
+"""Texts in place of a driver who avoids a collision: no driver avoids it, or this is unknown."""
 COLUMNS = shipped_columns("drivers")["drivers"]
-"""The interval is Clopper and Pearson's for a sample (slightly too wide, without a correction for
-the finite population), the share itself if all collisions were simulated.
+"""The columns of the table of drivers. For a sample of the collisions, the interval is that of
+Clopper and Pearson, which is slightly too wide, because it does not correct for the finite
+population. If all collisions were simulated, both ends are the share itself.
 """
 
 
 def has_reference_drivers(evaluator: Evaluator) -> bool:
-    """Whether reference drivers drive instead: not in a simulator of the user's own, which drives
-    itself, nor where few simulations are allowed.
+    """Whether reference drivers can drive in place of the driving system. They cannot in a
+    simulator of the user that has its own driving system. They do not if only few simulations are
+    allowed.
     """
     return evaluator.system.mover.has("a driving system") and evaluator.left is None
 
@@ -52,10 +57,9 @@ def has_reference_drivers(evaluator: Evaluator) -> bool:
 def assess_sample(
     evaluator: Evaluator, collisions: Evaluations, max_sample: int = MAX_SAMPLE
 ) -> tuple[pd.DataFrame, int]:
-    """The result of `assess_collisions` for evaluated collisions, of which equal settings count
-    once, and the number of these collisions.
-
-    Of more than `max_sample` only a random sample is simulated, drawn with the study's seed.
+    """The result of `assess_collisions` for different collisions, and the number of different
+    collisions (equal settings count once). If there are more than `max_sample`, only a random
+    sample is simulated, which depends on the study's seed.
     """
     _, distinct = np.unique(collisions.settings, axis=0, return_index=True)
     shuffled = np.random.default_rng(evaluator.seed).permutation(distinct)
@@ -64,10 +68,9 @@ def assess_sample(
 
 
 def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
-    """A row of `COLUMNS` for each driver, if a collision was simulated; `verdicts` are those of
-    `assess_sample`.
+    """The frame with a row of `COLUMNS` for each driver; without a row if no collision was
+    simulated. `verdicts` and `collisions` are the results of `assess_sample`.
     """
-    # What each driver avoids, of the collisions with a verdict.
     rows = []
     drivers = [*TITLES, *(name for name in OF_LANES if name in verdicts)]
     for driver in drivers if len(verdicts) else ():
@@ -84,8 +87,8 @@ def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
 
 
 def avoided_by(verdicts: Mapping[Any, Any]) -> str:
-    """The weakest driver who avoids a collision, in words; `verdicts` is a row of
-    `assess_collisions`.
+    """The name of the weakest driver who avoids a collision; `NOBODY` or `NO_VERDICT` without such
+    a driver. `verdicts` is a row of `assess_collisions`.
     """
     otherwise = NO_VERDICT if np.isnan(verdicts[FULL]) else NOBODY
     return next(
@@ -101,7 +104,6 @@ def assess_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataF
     too, or if he cannot be simulated. The columns are the drivers' names and `point`, the name of
     the point.
     """
-    # Drivers, and those for lanes.
     system = evaluator.system
     has_lanes = any(point.scenario.border for point in system.points)
     drivers = [*TITLES, *(OF_LANES if has_lanes else ())]
@@ -109,7 +111,6 @@ def assess_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataF
         np.nan, index=range(len(collisions)), columns=drivers
     ).assign(point="")
 
-    # Every collision at its own point.
     for index in np.unique(collisions.points).tolist():
         rows = np.flatnonzero(collisions.points == index)
         point = system.points[index]
@@ -133,7 +134,9 @@ def assess_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataF
 def _assess_at_point(
     evaluator: Evaluator, system: System, settings: FloatArray, drivers: Sequence[str]
 ) -> FloatArray:
-    """The verdicts of all drivers on M collisions at one point, shape (M, drivers)."""
+    """The verdicts of all drivers on M collisions at one point, shape (M, drivers): 1 if the driver
+    avoids the collision, 0 if not, NaN without a verdict.
+    """
     approach = approach_parameters(system)
     verdicts = []
     if approach is None:
@@ -148,21 +151,22 @@ def _assess_at_point(
         )
         runs = with_driver.evaluate(with_original, REFERENCE_DRIVERS)
         avoided = np.where(runs.valid, ~runs.collided, np.nan)
-        # In a searched scenario the original meets each encounter: where it is unsafe, the setting
-        # is infeasible.
+        # If encounters are ranges, the evaluator also drives the original vehicle in the setting's
+        # encounter. A setting whose original is unsafe there has no valid simulation.
         has_verdict = is_searched or avoided[0] == 1
         verdicts.append(np.where(has_verdict, avoided[1:], np.nan))
     return np.column_stack(verdicts)
 
 
 def approach_parameters(system: System) -> JsonObject | None:
-    """Parameters with which a reference driver approaches from rest as the driving system does with
-    the original vehicle; None where encounters are ranges, where that would be the
-    approach to another encounter.
+    """Parameters with which a reference driver approaches as the driving system does with the
+    original vehicle.
 
-    The driver replays the throttle until the driving system first brakes or reaches its peak speed,
-    and holds that speed, so that both are at the same position when the danger begins. If the run
-    begins at speed, the driver keeps that speed.
+    From rest, the driver replays the throttle until the driving system first brakes or reaches its
+    peak speed, and then holds this speed. So both are at the same position when the danger begins.
+    There are no parameters if the run begins at speed, because the driver keeps the speed, or if
+    the vehicle never moves. The result is None if encounters are ranges and the run begins at rest:
+    each encounter would have an approach of its own.
     """
     trace = drive_worst(system, system.characteristics.original_settings).trace
     speed = trace.speed[:, 0]

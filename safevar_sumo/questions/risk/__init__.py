@@ -1,10 +1,11 @@
-"""How likely is an unsafe vehicle when vehicles vary as a study specifies, and which characteristic
-decides?
+"""The question `risk`: how likely is an unsafe vehicle if vehicles vary as a study states, and
+which characteristics have the largest influence?
 
-Plain Monte Carlo with the exact interval of Clopper and Pearson. What decides: Sobol indices, first
-order and total (Saltelli's design); where this design does not exist, as for constrained
-characteristics, or takes too many simulations, the first-order index from the drawn vehicles
-themselves (Plischke, Borgonovo, Smith 2013, European Journal of Operational Research 226, 536-550).
+The probability is estimated by plain Monte Carlo, with the exact interval of Clopper and Pearson.
+The influence of a characteristic is its Sobol index, first order and total (Saltelli's design).
+This design does not exist for constrained characteristics, and may take too many simulations. Then
+the first-order index is computed from the sampled vehicles themselves (Plischke, Borgonovo, Smith
+2013, European Journal of Operational Research 226, 536-550).
 """
 
 from __future__ import annotations
@@ -57,11 +58,14 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
 
 SAMPLING = "sampling vehicles"
-"""Phase of progress."""
+"""The phase of progress in which the sampled vehicles are simulated."""
 RARE = 1e-4
-"""If no vehicle is unsafe, the verdict says how many would show a probability this small [-]."""
+"""If no vehicle is unsafe, the verdict says how many safe vehicles would show that the probability
+is at most this small [-].
+"""
 MAX_RIVALS = 3
-"""Largest number of characteristics that the verdict names beside the one with the largest share.
+"""Largest number of characteristics that the verdict names beside the characteristic with the
+largest share of the variance.
 """
 COLUMNS = [
     "characteristic",
@@ -109,7 +113,6 @@ def risk(
         Default: the criterion of the study, else a collision (if nothing collides: half of the
         original vehicle's safety degree).
     """
-    # Vehicles as the study says that they vary.
     study = evaluator.study
     model = VariationModel(study)
     has_design = not (model.region or study.ranges)
@@ -119,17 +122,15 @@ def risk(
     criterion = evaluator.choose_criterion(unsafe, subject)
     samples = evaluator.at_most(samples)
     if evaluator.left is not None:
-        # Few simulations are for the design only where it takes at most half of them.
+        # With few simulations, the design is used only if it takes at most half of them.
         has_design = has_design and 2 * of_design <= evaluator.left
         samples = min(samples, evaluator.left - has_design * of_design)
     evaluations = simulate_sample(evaluator, model, samples, SAMPLING)
 
-    # How many are unsafe.
     simulated = evaluations.take(evaluations.valid)
     failures = criterion.number(simulated)
     total = len(simulated)
 
-    # With which probability, also in other parameter sets, and which characteristics decide.
     low, high = clopper_pearson(failures, total, confidence)
     over_sets = SharesOverSets.of(evaluator, criterion, evaluations.settings)
     if has_design:
@@ -148,7 +149,6 @@ def risk(
         **over_sets.numbers(failures / total),
     }
 
-    # In words.
     omissions = int(evaluations.infeasible.sum())
     sentences = _share_in_words(study, criterion, numbers, samples - total - omissions)
     if not has_design and total < LEAST_VEHICLES:
@@ -173,9 +173,10 @@ def risk(
 def _share_in_words(
     study: Study, unsafe: Unsafe, numbers: JsonObject, failed: int
 ) -> list[Sentence]:
-    """The share of unsafe vehicles, and how many vehicles would show more if none is unsafe.
+    """Sentences on the share of unsafe vehicles. If no vehicle is unsafe, they say how many
+    vehicles would show a small probability (`RARE`). `failed` is the number of failed simulations.
 
-    Clopper and Pearson's upper end of 0 of n is 1 - ((1 - confidence) / 2)^(1 / n).
+    Clopper and Pearson's upper end for 0 of n vehicles is 1 - ((1 - confidence) / 2)^(1 / n).
     """
     templates = [words.SHARE, words.SAMPLED, words.NO_PROBABILITY]
     if study.variation:
@@ -210,15 +211,24 @@ def influence_in_words(
     confidence: float,
     names: Mapping[str, str],
 ) -> Iterator[Sentence]:
-    """Which characteristic has the largest influence on the measure, if the interval of its
-    share of the variance is above those of all others, or which may; `names` are those of
-    sentences.
+    """Say which characteristic has the largest influence on the measure. If the interval of its
+    share of the variance overlaps intervals of other characteristics, these are named, too.
+
+    Parameters
+    ----------
+    indices
+        The table of indices, the characteristic with the largest share first.
+    measure
+        The name of the measure in sentences.
+    failures
+        The number of unsafe vehicles.
+    names
+        Names of characteristics in sentences, by their names in the table.
     """
     if indices.empty:
         return
     index = "total" if indices["degree_total"].notna().any() else "first"
 
-    # The largest share, of all orders if it is known.
     share, low, high = (
         100 * indices[f"degree_{index}{end}"] for end in ("", LOW, HIGH)
     )
@@ -236,6 +246,6 @@ def influence_in_words(
         rivals=", ".join(rivals[:MAX_RIVALS]),
     )
 
-    # Without the outcome's own shares, what decides it is unknown.
+    # If too few vehicles are unsafe or safe, the outcome "unsafe" has no indices of its own.
     if failures and indices[f"unsafe_{index}"].isna().all():
         yield words.FEW_OUTCOMES(least=MIN_OUTCOMES)
