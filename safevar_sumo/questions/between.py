@@ -1,8 +1,8 @@
-"""Encounters between those that a matrix lists: the axes that a scenario can move, as ranges, and
-the phase.
+"""Makes studies with encounters between the listed values of a matrix: axes that a scenario can
+move become ranges, and the phase varies.
 
-A driving system decides once in a step, so what a vehicle leaves to the limit depends on when
-between two decisions the encounter begins. Claims meet the worst phase.
+A driving system decides once in a step. The result of an encounter depends on the phase: the moment
+between two decisions at which the encounter begins. Therefore claims are tested at all phases.
 """
 
 from __future__ import annotations
@@ -29,21 +29,22 @@ AT_ONE_PHASE = (
     "Every encounter began at the same moment of a step (the time between two decisions of the"
     " driving system)."
 )
-"""What to know of encounters without phases."""
+"""The remark if a study has no phases."""
 COUNTS_STEPS = (
     "In this study, an encounter that begins one step later ends differently, because the driving"
     " system or a sensor counts steps. Only encounters that begin within one step were simulated."
 )
-"""What to know of a driving system whose cycle is longer than a step."""
+"""The remark if the driving system or a sensor has a cycle that is longer than a step."""
 SAME = 1e-6
-"""Difference up to which what is left at two phases is the same."""
+"""Largest difference of the robustness at two phases that counts as no difference."""
 DOMAIN = Domain(unit=PHASES[PHASE].unit, original=0.0, lower=0.0, upper=1.0)
-"""All phases: an encounter that begins a whole step later is the same one."""
+"""All phases. An encounter that begins a whole step later (phase 1) should end as at phase 0."""
 
 
 def in_phases(study: Study, system: System) -> Study:
-    """A study that searches the phase, too, as its last parameter; itself where the encounters of
-    some point have none, as bodies do not move on tracks.
+    """The study with the phase as a further searched parameter, which comes last. The study itself
+    is returned if it has the phase already, or if the encounters of some point have no phase,
+    because bodies do not move on tracks.
     """
     has_phases = all(point.scenario.has_phase for point in system.points)
     if (
@@ -60,8 +61,9 @@ def in_phases(study: Study, system: System) -> Study:
 
 
 def remark_on_phases(claim: Model | None) -> str:
-    """What to know of claims without phases, or in whose model the original vehicle ends otherwise
-    in its own encounter, if that begins a whole step later; else "".
+    """The remark on the phases of a claim; "" if none is needed. `claim` is the model with phases,
+    or None if the study has no phases. The second remark is needed if the original vehicle's
+    encounter ends in another way when it begins a whole step later.
     """
     if claim is None:
         return AT_ONE_PHASE
@@ -74,8 +76,8 @@ def remark_on_phases(claim: Model | None) -> str:
 def in_ranges(
     study: Study, tests: Sequence[tuple[MatrixTest, dict[str, Domain]]]
 ) -> Study:
-    """A study of some tests alone, of which some axes may have any value of a domain; all of its
-    encounters count.
+    """The study with only some tests. Each test comes with the axes that become ranges, and with
+    their domains. All encounters count, also if the original vehicle is unsafe in them.
     """
     moving = []
     for test, domains in tests:
@@ -90,14 +92,16 @@ def in_ranges(
 def with_set_axes(
     study: Study, system: System, changes: Collection[str]
 ) -> tuple[Study, System]:
-    """A study and its system; if axes of its matrix, or the phase, are among the names of what a
-    user sets, settings have values of these, in the tests that have all of the axes.
+    """The study and its system, in a form in which a user can set the values called `changes`.
+
+    If axes of the matrix, or the phase, are among these names, they become searched parameters, so
+    that settings have values of them. Only tests that have all these axes remain.
 
     Raises
     ------
     InputError
-        If the phase is set, and the study's encounters have none; or axes that no test has
-        together.
+        If the phase is set, but the study's encounters have no phase; or if no test has all the
+        axes that are set.
     """
     names = {*changes} - {*system.characteristics.names}
     extended = _with_axes(study, system, names)
@@ -116,8 +120,8 @@ def with_set_axes(
 
 
 def _with_axes(study: Study, system: System, names: set[str]) -> Study:
-    """A study in which those of the names that are listed axes, which a scenario can move, may have
-    any value, in the tests that have all of them.
+    """The study in which some listed axes become ranges: those of `names` that a scenario can move.
+    Only tests that have all of them remain.
     """
     moving = []
     axes = set[str]()

@@ -1,4 +1,4 @@
-"""When a vehicle begins to brake for an obstacle."""
+"""Finds the moment at which a vehicle begins to brake for an obstacle."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ REGULATION_SHARE = 0.05
 
 
 def brake_onset(runs: SimulationRuns, column: int) -> int | None:
-    """The sample at which vehicle `column` begins to brake for the obstacle, before the obstacle is
-    nearest; None if it does not brake, or if its simulator does not say.
+    """The number of the sample at which vehicle `column` begins to brake for the obstacle, before
+    the obstacle is nearest; None if the vehicle does not brake, or if its simulator states no brake
+    commands.
 
-    A braking manoeuvre has brake commands of at least `REGULATION_SHARE` times the largest one. It
-    begins where the command starts to rise towards that, and ends where the throttle or a smaller
-    brake command regulates the speed again. The manoeuvre that counts is
+    A braking manoeuvre has brake commands of at least `REGULATION_SHARE` times the largest command.
+    It begins where the command starts to rise to this size, and ends where the throttle or a
+    smaller brake command regulates the speed again. The manoeuvre that counts is
 
-    1. the one in which the speed falls below `CRUISE_SHARE` of the highest speed for the last time,
-       as earlier manoeuvres, such as those of a cruise control after an overshoot, did not slow the
-       vehicle down;
-    2. otherwise the first one after that;
-    3. otherwise none if the vehicle collides, and its last one if it does not.
+    1. the manoeuvre in which the speed falls below `CRUISE_SHARE` of the highest speed for the last
+       time: earlier manoeuvres, such as those of a cruise control after an overshoot, did not slow
+       the vehicle down;
+    2. otherwise the first manoeuvre after that; 3. otherwise no manoeuvre if the vehicle collides,
+    and its last manoeuvre if it does not.
     """
-    # Speed and brake until the obstacle is nearest.
+    # Only samples until the obstacle is nearest count.
     if runs.lacking("brake")[column]:
         return None
     trace = runs.trace
@@ -38,7 +39,6 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     speed = np.where(active, trace.speed[: len(active), column], 0.0)
     brake = np.where(speed > STANDSTILL, trace.brake[: len(active), column], 0.0)
 
-    # Braking that belongs to the manoeuvre, after the last cruise.
     is_braking = (brake > 0) & (brake >= REGULATION_SHARE * brake.max())
     braking_samples = np.flatnonzero(is_braking)
     last_cruise = np.flatnonzero(speed >= CRUISE_SHARE * speed.max())[-1]
@@ -47,17 +47,17 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
         not later_samples.size and np.isfinite(runs.collision_speed[column])
     ):
         return None
-    # A sample of the manoeuvre that counts.
+    # This sample lies in the manoeuvre that counts.
     sample = later_samples[0] if later_samples.size else braking_samples[-1]
 
-    # Where the pedals no longer regulate the speed, the brake begins to rise.
+    # The manoeuvre begins after the last sample in which pedals only regulate the speed.
     regulation = np.flatnonzero(
         ((trace.throttle[:sample, column] > 0) | (brake[:sample] > 0))
         & ~is_braking[:sample]
     )
     end = regulation[-1] if regulation.size else 0
     onset = int(braking_samples[braking_samples >= end][0])
-    # The command already rises.
+    # The command may have begun to rise while it was still small: go back to this beginning.
     while onset > 0 and brake[onset - 1] > (brake[onset - 2] if onset > 1 else 0):
         onset -= 1
     return onset

@@ -1,5 +1,5 @@
-"""A study and results by the measure of a criterion: it is simulated, and decides which point of a
-matrix is worst.
+"""Adapts studies and results to a criterion. If the criterion bounds a metric, simulations measure
+this metric, and the metric decides which point of a matrix is worst.
 """
 
 from __future__ import annotations
@@ -25,15 +25,14 @@ STAGE = "solutions by the measure"
 
 
 def study_by(study: Study, unsafe: Unsafe) -> Study:
-    """A study in which each setting has the measure of a criterion's bound, and in a matrix counts
-    at the point where that is worst; any other criterion leaves it as it is.
+    """The study that measures the metric of a criterion. In a matrix, a setting counts at the point
+    at which this metric is worst. A criterion that bounds no metric leaves the study as it is.
 
     Raises
     ------
     InputError
         If the study has no such metric.
     """
-    # The study also measures what the criterion is about.
     if unsafe.bound is None:
         return study
     name = unsafe.bound.measure
@@ -54,7 +53,6 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
             "a bound on impact_excess, or collision",
         )
 
-    # And counts the point that is worst by it.
     if matrix is not None:
         matrix = replace_in(
             matrix, aggregate=f"{name} {'>' if unsafe.bound.worst_is_largest else '<'}"
@@ -65,7 +63,7 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
 def subject_by(
     subject: Subject | Path, unsafe: Unsafe, evaluator: Evaluator
 ) -> Subject | Path:
-    """A subject of a question by a criterion; files stay as they are."""
+    """The subject of a question, adapted to a criterion. Files stay as they are."""
     if isinstance(subject, Path):
         return subject
     if isinstance(subject, Study):
@@ -80,12 +78,13 @@ def cases_by(
     progress: Progress,
     cluster: str | None = None,
 ) -> list[Case]:
-    """Results by a criterion; as they are without one, but for a clearance that their study states.
+    """Results, adapted to a criterion. Without a criterion, results stay as they are, unless their
+    study states a clearance as its criterion.
 
     Raises
     ------
     InputError
-        If it is not one of a study.
+        If a study has no metric of the criterion's name.
     """
     cases = list(cases)
     for place, case in enumerate(cases):
@@ -98,8 +97,8 @@ def cases_by(
 
 
 def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:
-    """Results by a criterion: with a bound on a metric that they lack, or that is of another point
-    of a matrix, all solutions are simulated again.
+    """Results, adapted to a criterion. If the criterion bounds a metric that the results lack, or
+    that belongs to another point of a matrix, all solutions are simulated again.
     """
     study = study_by(case.study, unsafe)
     evaluator = evaluator.for_study(study, verified=0)

@@ -1,4 +1,4 @@
-"""Changed values of characteristics as users type them: `mass=2500` or `mass=+10%`."""
+"""Reads changed values of characteristics as users type them: `mass=2500` or `mass=+10%`."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def read_changes(
     *,
     beyond: bool | None = None,
 ) -> NamedValues:
-    """Parse changes into the value of each named characteristic; without `beyond`, an error does
-    not suggest this option.
+    """Read changes as the value of each named characteristic. `beyond` says whether values outside
+    of their domains are allowed; None also keeps an error from suggesting the option --beyond.
 
     Raises
     ------
@@ -36,7 +36,6 @@ def read_changes(
     switch = "" if beyond is None else "--beyond"
     values = NamedValues()
 
-    # A name and its value, which is legal.
     for change in changes:
         name, equals, text = (text.strip() for text in change.partition("="))
         if not equals:
@@ -59,7 +58,6 @@ def read_changes(
 
 
 def _parse(change: str, text: str, original: float) -> float:
-    # A percentage of the original, or a number.
     if percentage := PERCENTAGE.fullmatch(text):
         if not original:
             raise InputError(

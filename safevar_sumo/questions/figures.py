@@ -24,11 +24,11 @@ PICTURE_METADATA: Mapping[str, JsonObject] = {
     ".pdf": {"CreationDate": None},
     ".svg": {"Date": None},
 }
-"""Metadata by file ending; they keep the date out of the file, so that equal figures have equal
-bytes.
+"""Metadata of pictures by file ending. They keep the date out of a file, so that equal figures have
+equal bytes.
 """
 TRUETYPE = 42
-"""matplotlib's number of the fonts in a pdf: publishers refuse its default, Type 3."""
+"""matplotlib's number for TrueType fonts in a pdf. Publishers refuse the default, Type 3."""
 FONT_SIZE = 8
 GREY, SKY_BLUE, BLUE, VERMILION = "#bbbbbb", "#56b4e9", "#0072b2", "#d55e00"
 """Grey and colours of Okabe and Ito. Grey and the two blues differ in lightness, so that they
@@ -39,9 +39,8 @@ differ in a print without colours too.
 def new_figure(
     title: str, rows: int, columns: int, size: Interval, **options: Any
 ) -> tuple[Figure, np.ndarray]:
-    """A figure, which pyplot does not know, and its axes, shape (rows, columns).
-
-    `size` is in inches; `options` go to `Figure.subplots`.
+    """A new figure and its axes, shape (rows, columns). pyplot does not know the figure, so that it
+    need not be closed. `size` is in inches; `options` go to `Figure.subplots`.
     """
     import matplotlib.style
     from matplotlib.figure import Figure
@@ -70,8 +69,8 @@ def new_panels(
     min_width: float,
     title_height: float,
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with `number` panels, at most `max_columns` of them side by side, and the axes of
-    the panels; all sizes are in inches.
+    """A new figure with `number` panels, at most `max_columns` of them side by side; and the axes
+    of the panels. All sizes are in inches.
     """
     columns = min(max_columns, number)
     rows = math.ceil(number / columns)
@@ -120,5 +119,5 @@ def escape_dollars(name: str) -> str:
 
 
 def as_formula(unit: str) -> str:
-    """A unit with its powers as superscripts."""
+    """A unit in which matplotlib draws powers as superscripts."""
     return re.sub(r"\^(-?\d+)", r"$^{\1}$", escape_dollars(unit))

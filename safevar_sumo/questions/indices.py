@@ -1,5 +1,4 @@
-"""Computes the influence of characteristics: shares of the variance of a measure (Sobol indices).
-"""
+"""Computes the influence of characteristics: shares of a measure's variance (Sobol indices)."""
 
 from __future__ import annotations
 

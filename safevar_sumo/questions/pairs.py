@@ -1,5 +1,5 @@
-"""The same settings in two systems, A and B: where they are unsafe, and a test of their safety
-degrees.
+"""The table and the figure of settings that were simulated in two versions A and B: in which
+version a setting is unsafe, and its safety degree in both.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ UNSAFE_IN = {
     "both": "both",
     "neither": "neither",
 }
-"""In which systems a setting is unsafe, as the table says it, and the number that counts such
-settings.
+"""By the versions in which a setting is unsafe, as the table states them, the name of the number
+that counts such settings.
 """
 SETTING_COLUMNS = shipped_columns("compare")["settings"]
 ENDS = [name for name in SETTING_COLUMNS if name.startswith(("a_", "b_"))]
@@ -35,8 +35,8 @@ ENDS = [name for name in SETTING_COLUMNS if name.startswith(("a_", "b_"))]
 def table_of_pairs(
     solutions: pd.Series[str], runs: Sequence[Evaluations], criteria: Sequence[Unsafe]
 ) -> pd.DataFrame:
-    """The frame with `SETTING_COLUMNS` of settings that were evaluated in A and in B, each
-    with its criterion.
+    """The frame with `SETTING_COLUMNS` for settings that were evaluated in A and in B. `runs` and
+    `criteria` have the evaluations and the criterion of each version.
     """
     a, b = runs
     in_a, in_b = (unsafe.of(run) for unsafe, run in zip(criteria, runs, strict=True))
@@ -48,7 +48,7 @@ def table_of_pairs(
 
 
 def counts_of(settings: pd.DataFrame) -> dict[str, int]:
-    """How many settings of a table are unsafe in A only, in B only, in both and in neither."""
+    """The numbers of settings that are unsafe in A only, in B only, in both and in neither."""
     return {
         number: int((settings["unsafe_in"] == where).sum())
         for where, number in UNSAFE_IN.items()
@@ -56,7 +56,9 @@ def counts_of(settings: pd.DataFrame) -> dict[str, int]:
 
 
 def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:
-    """The safety degree of every setting in B over that in A; on the line they agree."""
+    """Draw the safety degree of every setting in B over its safety degree in A. Both are equal on
+    the line.
+    """
     from safevar_sumo.questions.figures import (
         BLUE,
         FONT_SIZE,
@@ -67,7 +69,6 @@ def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:
         new_figure,
     )
 
-    # A point for each setting.
     frame = answer.tables["settings"]
     figure, ((axis,),) = new_figure(
         f"Unsafe means: {answer.numbers['unsafe']}", 1, 1, (4.6, 4.0)
@@ -88,7 +89,6 @@ def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:
             rasterized=True,
         )
 
-    # The line on which both agree.
     axis.axline((0, 0), slope=1, color="black", linewidth=0.6)
     labels = [
         escape_dollars(f"safety degree in {name} [m, below 0: -m/s]") for name in titles

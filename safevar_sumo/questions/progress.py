@@ -1,4 +1,4 @@
-"""Progress of a question: its phases one after another, and its simulations."""
+"""Shows the progress of a question: its phases, and the number of simulations."""
 
 from __future__ import annotations
 
@@ -8,20 +8,22 @@ from contextlib import contextmanager
 from safevar_sumo.terminal import Progress
 
 OVERRUN = 0.18
-"""The least share of its simulations so far that follow in a phase of rounds whose number is not
-known: nobody knows whether this round is the last.
+"""In a phase with an unknown number of rounds, at least this share of its simulations so far is
+expected to follow, because nobody knows whether a round is the last.
 """
 
 
 LEAST_SHARE = 0.06
-"""The least share of its simulations so far that follow in a phase that says what it expects."""
+"""In a phase that states how many simulations follow, at least this share of its simulations so far
+is expected to follow.
+"""
 
 
 class Phases:
-    """Progress of a question whose phases come one after another, without a way back.
+    """The progress of a question. Phases come one after another, and never come back.
 
-    A phase is planned, or is the first part that is simulated. What is not planned, or belongs to
-    an earlier phase, counts in the phase under way.
+    A phase is planned, or is the first part that is simulated. A part that is not planned, or that
+    belongs to an earlier phase, counts in the present phase.
     """
 
     def __init__(self, show: Progress) -> None:
@@ -31,47 +33,48 @@ class Phases:
         self._later = dict[str, float]()
         """The planned phases that have not begun, with their expected numbers of simulations."""
         self._done = self._before = 0
-        """Number of simulations so far, and of those before the phase under way."""
+        """Number of simulations so far, and number of simulations before the present phase."""
         self._name = self._round = ""
         self._is_stage = False
         self._expected = self._planned_round = 0.0
-        """The phase under way, its round, whether all parts belong to it, how many simulations it
-        is expected to take, and each of its rounds if their number is known.
+        """The present phase: its name, its round, whether all parts belong to it, the expected
+        number of its simulations, and the expected number of each round's if the number of rounds
+        is known.
         """
         self._waiting = 0
-        """Number of simulations that the part under way still has to do."""
+        """Number of simulations that the present part still has to do."""
 
     def plan(self, settings: Mapping[str, float], points: int = 1) -> None:
-        """Plan the phases, each with the number of settings that it is expected to simulate, at so
-        many points.
+        """Plan the phases: `settings` holds the expected number of settings of each phase. A
+        setting is simulated at `points` points.
         """
         self._points = points
         self._later = {name: points * number for name, number in settings.items()}
 
     def begin_part(self, part: str, simulations: int) -> None:
-        """Begin a part, by itself a phase or within one."""
+        """Begin a part of `simulations` simulations, which may be a phase or belong to a phase."""
         if not self._is_stage:
             self._begin(part)
         self._waiting = simulations
         self._show()
 
     def add(self, simulations: int) -> None:
-        """Count simulations that the part under way has done."""
+        """Count simulations that the present part has done."""
         self._done += simulations
         self._waiting -= simulations
         self._show()
 
     def say(self, text: str, number: int, total: int) -> None:
-        """Show something that is no simulation."""
+        """Show a text about work that is no simulation."""
         self._show_whole(text, *self._counts())
 
     @contextmanager
     def stage(
         self, name: str, settings: float | None = None
     ) -> Iterator[Callable[[float], None]]:
-        """Within the block, all parts count in one phase, of about so many settings, by default as
-        planned; a stage within a stage is a part of it. The function that it yields takes a better
-        estimate of how many follow.
+        """Count all parts within the block in one phase, of about `settings` settings, by default
+        as planned. A stage within a stage belongs to the outer stage. The context manager yields a
+        function, which takes a better estimate of the number of settings that follow.
         """
         if self._is_stage:
             yield lambda number: None
@@ -85,15 +88,15 @@ class Phases:
             self._is_stage = False
 
     def begin_round(self, number: int, rounds: int, *, is_known: bool = False) -> None:
-        """Begin a round of the phase under way, from 1 on; there are at most, or known to be, as
-        many as `rounds`.
+        """Begin round `number` (from 1 on) of the present phase. There are `rounds` rounds if
+        `is_known`, else at most so many.
         """
         self._round = f", round {number} of {'' if is_known else 'at most '}{rounds}"
         simulations = self._done - self._before
         if not is_known:
             self._expected = max(self._expected, (1 + OVERRUN) * simulations)
         else:
-            # The mean of the rounds so far, and of one as it was planned.
+            # A round is expected to take the mean of the rounds so far and of a planned round.
             self._planned_round = self._planned_round or self._expected / rounds
             self._expected = simulations + (rounds - number + 1) * (
                 (self._planned_round + simulations) / number
@@ -101,7 +104,7 @@ class Phases:
         self._show()
 
     def _begin(self, name: str, settings: float | None = None) -> None:
-        """Begin a phase, if it is later than the one under way."""
+        """Begin a phase, if it comes after the present phase."""
         if name not in self._later and self._name:
             return
         planned = 0.0
@@ -116,8 +119,8 @@ class Phases:
         self._expected = planned if settings is None else self._points * settings
 
     def expect(self, settings: float) -> None:
-        """Expect that so many settings follow in the phase under way, and at least a small share of
-        those so far: nobody knows whether one of them fails, and more are necessary.
+        """Expect that `settings` settings follow in the present phase, but at least `LEAST_SHARE`
+        of those so far: a failure may make more settings necessary.
         """
         simulations = self._done - self._before
         self._expected = simulations + max(

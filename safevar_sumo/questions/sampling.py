@@ -1,4 +1,4 @@
-"""Random numbers, points that cover a domain evenly, and what a sample says about a share."""
+"""Random numbers, points that cover a domain evenly, and confidence intervals of shares."""
 
 from __future__ import annotations
 
@@ -16,34 +16,37 @@ CONFIDENCE = 0.95
 
 
 class Stream(IntEnum):
-    """What random numbers are drawn for: what one use draws does not depend on the others.
+    """The uses of random numbers. Each use has a stream of its own, so that its numbers do not
+    depend on other uses.
 
-    Results depend on the numbers of the streams; a new use takes a new number.
+    Results depend on the numbers of the streams: a new use takes a new number.
     """
 
     CONFIDENCE_BOUND = 1  # vehicles within joint limits, for the upper confidence bound
     LARGER_BOXES = 2  # steps from the largest safe box that is known to larger ones
-    JOINT_LIMITS = 4  # falsification of joint limits
-    LIMITS_ALONE = 6  # falsification of the limits of one characteristic alone
-    REPAIRED_BOUND = 7  # vehicles within the required range, for the bound of a repair
-    # Falsification of a limit in place of a specified one that does not hold.
+    JOINT_LIMITS = 4  # searches for counterexamples to joint limits
+    LIMITS_ALONE = 6  # searches for counterexamples to limits alone
+    REPAIRED_BOUND = 7  # vehicles within the promised wear, for the bound of a repair
+    # Searches for the safe value that is nearest to a specified limit that does not hold.
     NEAREST_LIMIT = 8
-    # Falsification of limits in the ranges of a study.
+    # Searches for counterexamples to limits in the ranges of a study.
     WIDER_SCOPE = 9
-    EXTENSION = 10  # falsification of joint limits of which one is extended
-    SPECIFIED_BETWEEN = 11  # specified limits between the tests of a matrix
-    VALIDATION = 15  # further falsifications of joint limits that passed one
+    EXTENSION = 10  # searches for counterexamples to joint limits with a longer side
+    SPECIFIED_BETWEEN = 11  # searches for counterexamples to specified limits
+    VALIDATION = 15  # further searches, after a first search has found nothing
     FIRST_CORNERS = 17  # corners with which the test of joint limits begins
     PERMIT = 18  # search for counterexamples to the speed of a car
 
     def generator(self, seed: int, *counts: int) -> Generator:
-        """The generator of a draw, by the seed of the study's search and what counts the draws."""
+        """The generator of random numbers for this use. It depends on the seed of the study's
+        search and on `counts`, which number the draws.
+        """
         return default_rng((seed, self, *counts))
 
 
 def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
-    """Scrambled Sobol points in the unit cube, shape (number, dimensions); they are most even if
-    `number` is a power of two.
+    """Scrambled Sobol points in the unit cube, shape (number, dimensions). They cover the cube most
+    evenly if `number` is a power of two.
     """
     import scipy  # takes longer to load than a simulation
 
@@ -53,7 +56,7 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
 
 
 def sobol_settings(characteristics: CharacteristicSet, number: int) -> FloatArray:
-    """`number` settings that cover the whole domain evenly, shape (number, n), feasible or not."""
+    """Settings that cover the whole domain evenly, shape (number, n); some may be infeasible."""
     lower = characteristics.lower
     upper = characteristics.upper
     return lower + sobol_points(number, len(characteristics), 0) * (upper - lower)
@@ -62,8 +65,8 @@ def sobol_settings(characteristics: CharacteristicSet, number: int) -> FloatArra
 def clopper_pearson(
     count: float, total: float, confidence: float = CONFIDENCE
 ) -> Interval:
-    """Exact confidence interval (Clopper and Pearson) of the share `count` / `total`; its ends are
-    quantiles of beta distributions, also between whole numbers.
+    """The exact confidence interval (Clopper and Pearson) of the share `count` / `total`. If
+    `count` or `total` is no whole number, the ends are quantiles of the same beta distributions.
     """
     import scipy
 
@@ -82,7 +85,7 @@ def clopper_pearson(
 
 
 def share_with_interval(count: float, total: float) -> list[float]:
-    """A share, and the ends of its interval; undefined of nothing."""
+    """The share `count` / `total`, and the ends of its interval; all NaN if `total` is 0."""
     if not total:
         return [math.nan] * 3
     return [count / total, *clopper_pearson(count, total)]

@@ -1,4 +1,4 @@
-"""The sentences of a verdict: each is one template, which names and numbers fill."""
+"""The sentences of a verdict. Each sentence is one template, whose slots names and numbers fill."""
 
 from __future__ import annotations
 
@@ -9,36 +9,35 @@ from typing import Any, NamedTuple
 
 FIRST_WORD = re.compile(r"^[a-z]+\b")
 KINDS = "answer", "evidence", "condition", "note"
-"""What a sentence is to its reader, the most important kind first; a note stands below the table.
-"""
+"""The kinds of sentences, in the order in which readers see them. A note stands below the table."""
 
 
 class Sentence(NamedTuple):
-    """A whole sentence, or the template of one, whose slots are in braces; more than one where a
-    reader needs them together.
+    """A whole sentence, or its template with slots in braces. The text may have several sentences,
+    if a reader needs them together.
     """
 
     kind: str
     text: str
 
     def __call__(self, **values: object) -> Sentence:
-        """The sentence with values in its slots."""
+        """The sentence with values in its slots, and a capital letter at its beginning."""
         text = self.text.format(**values)
-        # A key, such as `brake_force` or `sensorLatency`, stays as users write it.
+        # A first word such as `brake_force` or `sensorLatency` is a key: users write it so.
         return self._replace(text=FIRST_WORD.sub(lambda word: word[0].title(), text))
 
 
 answer, evidence, condition, note = (partial(Sentence, kind) for kind in KINDS)
-"""A sentence of this kind."""
+"""Functions that make a sentence of their kind from a text."""
 
 
 class Verdict(str):
-    """Sentences by kind, joined to one text by spaces."""
+    """A text of several sentences, which knows the kind of each sentence."""
 
     sentences: list[Sentence]
 
     def __new__(cls, sentences: Iterable[Sentence]) -> Verdict:
-        """The text of sentences, sorted by kind; each once, and none without text."""
+        """Join sentences, sorted by kind. Equal sentences occur once, and empty ones not at all."""
         kept_sentences = [item for item in dict.fromkeys(sentences) if item.text]
         kept_sentences.sort(key=lambda sentence: KINDS.index(sentence.kind))
         verdict = super().__new__(cls, " ".join(text for _, text in kept_sentences))
@@ -46,10 +45,10 @@ class Verdict(str):
         return verdict
 
     def __getnewargs__(self) -> tuple[Any]:
-        """What makes the same verdict again, in a copy or in another process."""
+        """The arguments with which pickle or copy makes the same verdict again."""
         return (self.sentences,)
 
     @classmethod
     def of(cls, text: str) -> Verdict:
-        """A text as a verdict; one without kinds is a single sentence."""
+        """A text as a verdict. A text that knows no kinds becomes a single answer."""
         return text if isinstance(text, Verdict) else cls([answer(text)])

@@ -1,4 +1,4 @@
-"""How the characteristics of real vehicles vary, by a study's `[variation]`."""
+"""Samples vehicles whose characteristics vary as a study states under `[variation]`."""
 
 from __future__ import annotations
 
@@ -24,14 +24,15 @@ from safevar_sumo.vehicles.region import REJECTIONS
 
 
 class VariationModel:
-    """The random variation of a study's characteristics, by its `[variation]`."""
+    """The random variation of a study's characteristics. A characteristic without a distribution
+    under `[variation]` varies uniformly over its domain.
+    """
 
     def __init__(self, study: Study) -> None:
         with about(study.source):
             self.region: FeasibleRegion = region_of(study)
         self.characteristics = self.region.characteristics
 
-        # A distribution for each characteristic.
         distributions = [
             study.variation.get(name, Uniform()) for name in self.characteristics.names
         ]
@@ -41,7 +42,7 @@ class VariationModel:
         )
 
     def settings(self, probabilities: FloatArray) -> FloatArray:
-        """Settings at N points of the unit cube, shape (N, n)."""
+        """The settings with the quantiles at N points of the unit cube, shape (N, n)."""
         columns = [
             quantile(column)
             for quantile, column in zip(self._quantiles, probabilities.T, strict=True)
@@ -55,8 +56,8 @@ class VariationModel:
     def draw(
         self, number: int, rng: np.random.Generator, *, filtered: bool = False
     ) -> FloatArray:
-        """Random vehicles that satisfy the constraints, shape (number, n); if `filtered`, after the
-        filter.
+        """Random settings that satisfy the constraints, shape (number, n). With `filtered`, the
+        settings satisfy them after the study's filter.
         """
         settings = self.region.draw_feasible(
             lambda count: self.settings(rng.random((count, len(self.characteristics)))),
@@ -84,7 +85,6 @@ def _quantile_function(
     characteristic: Characteristic, distribution: Distribution
 ) -> Callable[[FloatArray], FloatArray]:
     """The function that turns cumulative probabilities into values in the characteristic's unit."""
-    # The ends, as stated or those of the domain.
     low = characteristic.lower
     high = characteristic.upper
     original = characteristic.original
@@ -92,7 +92,6 @@ def _quantile_function(
     lower = stated.get("lower", low)
     width = stated.get("upper", high) - lower
 
-    # The quantiles of each kind of distribution.
     match distribution:
         case Fixed():
             return lambda p: np.full_like(p, stated.get("value", original))

@@ -1,4 +1,6 @@
-"""Is a failure robust: are its neighbours unsafe too, also with other time steps?"""
+"""Tests whether a failure is robust: whether vehicles with nearly the same values (neighbours) are
+unsafe, too, also with other time steps.
+"""
 
 from __future__ import annotations
 
@@ -12,26 +14,26 @@ from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
 NEIGHBOURS = "check similar vehicles"
-"""The stage of progress."""
+"""The phase of progress in which neighbours are simulated."""
 NEIGHBOUR_COUNT = 64
 """Number of neighbours of a setting that are simulated with each time step."""
 LEAST_NEIGHBOURS = 8
-"""Number of them in a rough answer. With fewer, where few simulations are allowed, the share is
-unknown.
+"""Number of neighbours in a rough answer. If so few simulations are allowed that there are fewer
+neighbours, the share of unsafe neighbours is unknown.
 """
 STEP_FACTORS: Sequence[float] = (1.0, 0.5, 2.0)
 """Factors by which the study's time step is multiplied; the step itself comes first."""
 MIN_ROBUST_SHARE = 0.8
-"""Share of unsafe neighbours from which on a failure is called robust; below, it is borderline."""
+"""Least share of unsafe neighbours of a robust failure. With a smaller share it is borderline."""
 
 
 def draw_neighbours(
     characteristics: CharacteristicSet, settings: FloatArray, seed: int, count: int
 ) -> FloatArray:
-    """The neighbours of M settings, shape (M, n), `count` of each, those of one setting after those
-    of another.
+    """The neighbours of M settings, shape (M, n): `count` neighbours of the first setting, then of
+    the second, and so on, shape (M * count, n).
 
-    A neighbour differs from its setting by at most the filter's threshold.
+    A neighbour differs from its setting by at most the filter's threshold in each value.
     """
     n = len(characteristics)
     offsets = (
@@ -46,10 +48,12 @@ def draw_neighbours(
 def robust_shares(
     evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe
 ) -> FloatArray:
-    """The shares of unsafe outcomes among the neighbours of M settings, shape (M, n), with each of
-    `STEP_FACTORS` times the study's time step; shape (M, factors).
+    """The unsafe shares of the neighbours of M settings, shape (M, n), with the study's time step
+    times each of `STEP_FACTORS`; shape (M, factors). With few simulations only the study's step is
+    used. Shares are NaN if there would be too few neighbours.
 
-    Neighbours are simulated without the filter; those that cannot be simulated do not count.
+    Neighbours are simulated without the filter. A neighbour without a valid simulation does not
+    count.
     """
     count, factors = NEIGHBOUR_COUNT, STEP_FACTORS
     if evaluator.account.effort < 1:
@@ -67,7 +71,6 @@ def robust_shares(
     if evaluator.system.mover.has_own_step:
         factors = (1.0,)
 
-    # The share of neighbours that are unsafe, with each length of the time step.
     with evaluator.phases.stage(NEIGHBOURS, len(neighbours) * len(factors)):
         for factor in factors:
             step_evaluator = (
