@@ -1,5 +1,5 @@
-"""Limits that are looked at: each characteristic's domain as a bar, in SVG for pages, in blocks for
-the terminal, and as a figure.
+"""Draws limits: the domain of each characteristic is a bar, in which the limits are marked. A bar
+is SVG on a page, block characters on the terminal, and a row of a figure.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 CELLS = 16
 """Width of a bar on the terminal [characters]."""
 WIDTH, HEIGHT = 120, 14
-"""Size of a bar on a page [px]."""
+"""Width and height of a bar on a page [px]."""
 MARGIN = HEIGHT / 2
-"""Room for the dot of the original at either end [px]."""
+"""Room at each end of a bar, where the dot of the original may stand [px]."""
 LEGEND = {
     "text": "bar: █ together, ▒ alone (all others as new), · domain, o original, | specified",
     "html": (
@@ -31,8 +31,17 @@ LEGEND = {
 
 
 class Bar(NamedTuple):
-    """A domain, and in it the ranges together and alone, the original and the specified limits, as
-    shares from 0 to 1; a range is empty where there is none.
+    """The limits of a characteristic in its domain, as positions from 0 (lower end) to 1 (upper
+    end).
+
+    Attributes
+    ----------
+    original
+        The original value.
+    together, alone
+        The joint limits, and the limits alone; () if there are none.
+    specified
+        The specified limits, at most two; () if there are none.
     """
 
     original: float
@@ -42,7 +51,7 @@ class Bar(NamedTuple):
 
     @property
     def blocks(self) -> str:
-        """The bar in block characters; a range fills the cells whose middle is in it."""
+        """The bar in block characters. A range fills the cells whose middle is in the range."""
         middles = (np.arange(CELLS) + 0.5) / CELLS
         cells = np.full(CELLS, "·")
         for ends, letter in ((self.alone, "▒"), (self.together, "█")):
@@ -56,7 +65,7 @@ class Bar(NamedTuple):
 
     @property
     def svg(self) -> str:
-        """The bar as inline SVG, whose colours are those of the page."""
+        """The bar as inline SVG. The page's style sheet gives the colours."""
         inside = WIDTH - 2 * MARGIN
 
         def x(share: float) -> str:
@@ -71,7 +80,7 @@ class Bar(NamedTuple):
                 f' height="{HEIGHT - 6}"/>'
             )
 
-        # Ranges beneath, then the domain's outline, limits and the original.
+        # Later shapes cover earlier ones: ranges first, then the outline, limits and the original.
         shapes = rectangle(self.alone, "alone")
         shapes += rectangle(self.together, "together")
         shapes += rectangle((0, 1), "domain")
@@ -83,7 +92,9 @@ class Bar(NamedTuple):
 
 
 def bars_of(limits: pd.DataFrame, domains: Iterable[tuple[float, float]]) -> list[Bar]:
-    """The bars of a table of limits, whose characteristics have these domains."""
+    """The bars of the rows of a table of limits. `domains` are the ends of the domain of each row's
+    characteristic.
+    """
     bars = []
     for row, (lower, upper) in zip(limits.to_dict("records"), domains, strict=True):
         ends = [row["original"]]
@@ -99,7 +110,7 @@ def bars_of(limits: pd.DataFrame, domains: Iterable[tuple[float, float]]) -> lis
 
 
 def draw_bars(answer: Answer) -> Figure:
-    """The bars of a table of limits, a row for each characteristic."""
+    """Draw the bars of an answer's table of limits, a row for each characteristic."""
     from safevar_sumo.questions.figures import (
         BLUE,
         SKY_BLUE,

@@ -33,7 +33,7 @@ class Stream(IntEnum):
     WIDER_SCOPE = 9
     EXTENSION = 10  # searches for counterexamples to joint limits with a longer side
     SPECIFIED_BETWEEN = 11  # searches for counterexamples to specified limits
-    VALIDATION = 15  # further searches, after a first search has found nothing
+    VALIDATION = 15  # searches that a proposed box of joint limits must pass
     FIRST_CORNERS = 17  # corners with which the test of joint limits begins
     PERMIT = 18  # search for counterexamples to the speed of a car
 

@@ -1,4 +1,4 @@
-"""What `compare` can say of two versions, `{a}` and `{b}`."""
+"""The sentences of `compare` about two versions, `{a}` and `{b}`."""
 
 from __future__ import annotations
 

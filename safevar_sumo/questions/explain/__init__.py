@@ -1,5 +1,6 @@
-"""Why does a vehicle fail? Which changes cause the failure, how small a change is enough, is the
-failure robust, and would a reference driver have avoided it?
+"""The question `explain`: why does a vehicle fail? The answer says which changes cause the failure,
+how small a change is enough, whether the failure is robust, and whether a reference driver would
+have avoided it.
 """
 
 from __future__ import annotations
@@ -71,15 +72,15 @@ if TYPE_CHECKING:
 
 COLLISION_NUMBERS = ("collisions", "avoidable", "unavoidable")
 LIMIT = 40_000
-"""Approximate number of simulations for the minimal causes of all failures; if all would take more,
-a random sample is analysed.
+"""Approximate number of simulations for the minimal causes of all failures of results. If all
+failures would take more, a random sample is analysed.
 """
 STUDY_LIMIT, OF_SAMPLE = 12_000, 600
-"""The same for failures that were sampled over the domain of a study, and the least number of
-settings.
+"""The number of simulations for failures that were sampled over the domain of a study. It is larger
+if otherwise fewer than `OF_SAMPLE` settings could be simulated at all points.
 """
 FOR_ONE = 800
-"""Settings for each failure that is explained, where few simulations are allowed."""
+"""Number of settings for each failure that is explained, if few simulations are allowed."""
 LATER = {REFERENCE_DRIVERS: 3000, OTHER_SETS: 1000, BOUNDARIES: 3000}
 """The last phases of progress, with their usual numbers of settings."""
 
@@ -152,16 +153,16 @@ def explain(
     limit = _plan(subject, evaluator, fits)
     fits = 0 if evaluator.left is not None else fits
 
-    # The failures.
     if evaluator.left is not None:
         top = max(1, min(top, evaluator.left // FOR_ONE))
     population = gather_failures(subject, evaluator, solution, unsafe, fits)
     runs = population.evaluations
-    # Of an unsafe original no change is a cause, but in another encounter it may be safe.
+    # If the original vehicle is unsafe, no change is a cause of a failure. If encounters are
+    # ranges, the original may still be safe in the encounter of a failure.
     is_caused = bool(study.ranges or not population.unsafe.of(population.original)[0])
 
-    # The smallest changes of all, of a study; and the minimal causes of a sample of the failures,
-    # with what is left where few simulations are allowed.
+    # Of a study, the smallest changes are found first. With few simulations, the minimal causes of
+    # failures get a half (of results: a quarter) of what is left.
     has_smallest = of_study and is_caused
     smallest = Smallest.of(evaluator, population.unsafe, fits) if has_smallest else None
     if evaluator.left is not None:
@@ -180,13 +181,11 @@ def explain(
     )
     necessity = necessity if is_caused else necessity.head(0)
 
-    # What reference drivers avoid.
     has_drivers = has_reference_drivers(evaluator)
     verdicts, collisions = assess_sample(
         evaluator, runs.take(runs.collided & has_drivers)
     )
 
-    # Tables, numbers and the verdict.
     solutions = failures_frame(population, evaluator, reasons)
     distinct = count_distinct_causes(evaluator.characteristics, of_sample)
     if of_study:
@@ -225,7 +224,9 @@ def explain(
 
 
 def _plan(subject: Subject, evaluator: Evaluator, fits: int) -> int:
-    """Plan the phases; returns the number of simulations for minimal causes of failures."""
+    """Plan the phases of progress. Returns the number of simulations for the minimal causes of
+    failures.
+    """
     points = len(evaluator.system.points)
     if isinstance(subject, Study):
         limit = evaluator.scaled(max(STUDY_LIMIT, OF_SAMPLE * points))
@@ -246,9 +247,12 @@ def _plan(subject: Subject, evaluator: Evaluator, fits: int) -> int:
 def _counts(
     population: Population, subject: Subject, analysed: int, explained: int
 ) -> JsonObject:
-    """The numbers of settings, and of failures that were analysed and are explained; the unsafe
-    share of drawn settings with each parameter set; how the original vehicle ends, and the number
-    of collisions that the search simulated but its objectives leave out of the solutions.
+    """The numbers of the answer on settings and failures.
+
+    `settings`, `failures`, `analysed` and `explained` count settings and failures. The unsafe share
+    of sampled settings is stated for each parameter set. `original_outcome` and `original_degree`
+    say how the original vehicle ends. `left_out` is the number of collisions that the search
+    simulated, but did not return, if no solution collides.
     """
     runs = population.evaluations
     original = population.original
@@ -279,8 +283,9 @@ def _counts(
 
 
 def _collision_numbers(verdicts: pd.DataFrame, collisions: int | None) -> JsonObject:
-    """The numbers of all collisions, of those assessed that some driver avoids, and that even full
-    braking does not; undefined where no driver was asked.
+    """The numbers of all collisions, of examined collisions that some driver avoids, and of
+    examined collisions that not even full braking avoids. All are None if `collisions` is None,
+    because no other driver drove.
     """
     if collisions is None:
         return dict.fromkeys(COLLISION_NUMBERS)
@@ -291,7 +296,7 @@ def _collision_numbers(verdicts: pd.DataFrame, collisions: int | None) -> JsonOb
 
 
 def draw_needed(answer: Answer) -> Figure:
-    """How often each characteristic is needed, beside how often it is changed."""
+    """Draw how often each characteristic is needed, and how often it is changed."""
     from safevar_sumo.questions.figures import (
         BLUE,
         FONT_SIZE,
@@ -301,8 +306,8 @@ def draw_needed(answer: Answer) -> Figure:
         new_figure,
     )
 
-    # Bars over each other, the most necessary characteristic at the top: bars are drawn from the
-    # bottom up.
+    # Bars are drawn from the bottom up: the most necessary characteristic, which comes first in the
+    # table, must be the last bar.
     frame = answer.tables["characteristics"].iloc[::-1]
     size = (6.4, 1.4 + 0.3 * max(len(frame), 4))
     figure, ((axis,),) = new_figure(

@@ -1,4 +1,4 @@
-"""What is told about causes: which templates, and what fills them."""
+"""Makes the sentences of `explain`: chooses templates, and fills them with what was found."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
 
 BEYOND = 256
-"""Number of vehicles beyond the values of a cause that are simulated."""
+"""Number of simulated vehicles whose changes are larger than those of a cause."""
 NUMBERS = [
     "none",
     "one",
@@ -51,13 +51,15 @@ NUMBERS = [
     "ten",
 ]
 AVOIDING = {LETTER: words.COMPETENT_DRIVER, FULL: words.FULL_BRAKING}
-"""Who might have avoided a collision."""
+"""The drivers who might have avoided a collision, and the sentences about them."""
 
 
 def smallest_sentences(
     smallest: Smallest, evaluator: Evaluator, unsafe: Unsafe
 ) -> Iterator[Sentence]:
-    """The smallest changes of a study, how sure they are, and what was simulated."""
+    """Yield the sentences on the smallest unsafe changes of a study, on how sure they are, and on
+    what was simulated.
+    """
     members = evaluator.characteristics
     yield from _leading_of_study(smallest, members, unsafe)
     for size, number in smallest.at_ends.existing.items():
@@ -73,7 +75,9 @@ def smallest_sentences(
 def _leading_of_study(
     smallest: Smallest, members: CharacteristicSet, unsafe: Unsafe
 ) -> Iterator[Sentence]:
-    """The fewest changes that begin nearest to the original, and how sure they are."""
+    """Yield the sentences on the leading cause, and on how sure it is. The leading cause has the
+    fewest changes and, among several such causes, begins nearest to the original.
+    """
     table = smallest.table
     if not smallest.at_ends.tried:
         yield words.TOO_FEW
@@ -97,7 +101,6 @@ def _leading_of_study(
     if number_of_others := len(fewest) - 1:
         yield words.OTHERS(causes=number_of(number_of_others, "further cause"))
 
-    # How sure they are.
     if pd.notna(leading["safe_again"]):
         yield words.GAP(share=percentage(leading["safe_again"]))
     is_checked = pd.notna(leading["robust_share"])
@@ -115,7 +118,9 @@ def _enough(
     changes: NamedValues,
     share: float = 1.0,
 ) -> Sentence:
-    """That changes are enough, by the template of one or of several."""
+    """Say that changes are enough for an unsafe vehicle. `templates` has the sentence for one
+    change and the sentence for several.
+    """
     return templates[len(changes) > 1](
         unsafe=unsafe.event,
         number=_count(len(changes)),
@@ -125,7 +130,7 @@ def _enough(
 
 
 def _of_size(at_ends: Enumeration, unsafe: Unsafe, size: int) -> Sentence:
-    """How many combinations of a size are unsafe."""
+    """Say how many combinations of `size` changes are unsafe."""
     number = sum(len(cause.changes) == size for cause in at_ends.causes)
     existing = at_ends.existing[size]
     simulated = at_ends.simulated[size]
@@ -148,7 +153,9 @@ def _of_size(at_ends: Enumeration, unsafe: Unsafe, size: int) -> Sentence:
 
 
 def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Iterator[Sentence]:
-    """The fewest changes at each share of the way that was simulated beside the ends."""
+    """Say how many changes are needed at each share of the way to the ends. Successive shares with
+    equal results share a sentence.
+    """
     by_size = groupby(steps, lambda step: (step.size, max(step.simulated)))
     for (size, largest), group in by_size:
         alike = [*group]
@@ -174,7 +181,7 @@ def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Iterator[Sentence]:
 
 
 def _containing(smallest: Smallest) -> Iterator[Sentence]:
-    """How many combinations contain a smaller cause, and how many of these are safe."""
+    """Say how many combinations contain a smaller cause, and how many of these are safe."""
     total, simulated, cures = smallest.containing
     if total:
         yield words.CONTAINING(combinations=number_of(total, "combination"))
@@ -183,7 +190,9 @@ def _containing(smallest: Smallest) -> Iterator[Sentence]:
 
 
 def _in_none(at_ends: Enumeration, members: CharacteristicSet) -> Iterator[Sentence]:
-    """Which characteristics no cause has, up to the size of which all were simulated."""
+    """Say which characteristics are in no cause, up to the number of changes up to which all
+    combinations were simulated.
+    """
     size = at_ends.complete_up_to
     changed = {name for cause in at_ends.causes for name in cause.changes}
     names = [item.short_name for item in members.vehicle if item.name not in changed]
@@ -197,8 +206,15 @@ def _in_none(at_ends: Enumeration, members: CharacteristicSet) -> Iterator[Sente
 def failure_sentences(
     evaluator: Evaluator, population: Population, causes: pd.DataFrame, analysed: int
 ) -> Iterator[Sentence]:
-    """What is enough for the failures in results, of which so many were analysed, and how sure that
-    is.
+    """Yield the sentences on the causes of failures in results: which changes are enough, and how
+    sure the leading cause is.
+
+    Parameters
+    ----------
+    causes
+        The table of causes, the leading cause first.
+    analysed
+        Number of analysed failures.
     """
     unsafe = population.unsafe
     original = population.original
@@ -221,7 +237,6 @@ def failure_sentences(
         yield words.UNSAFE_IN_ENCOUNTER
         return
 
-    # The values of the cause that leads, its encounter, and how sure it is.
     members = evaluator.characteristics
     boundary = leading["boundary"]
     yield _enough(words.CHANGES, members, unsafe, boundary)
@@ -241,8 +256,9 @@ def failure_sentences(
 def _beyond(
     evaluator: Evaluator, unsafe: Unsafe, cause: NamedValues, encounter: NamedValues
 ) -> Iterator[Sentence]:
-    """How many vehicles beyond all values of a cause, all else as in the original, are unsafe;
-    nothing if there are none, or too few may be simulated.
+    """Say how many vehicles with larger changes than those of a cause are unsafe. All other values
+    are as in the original. There is no sentence if no change can be larger, or if too few vehicles
+    may be simulated.
     """
     members = evaluator.characteristics
     number = evaluator.at_most(BEYOND, 4)
@@ -266,7 +282,9 @@ def _beyond(
 
 
 def _sureness(row: Mapping[Any, Any]) -> Iterator[Sentence]:
-    """How robust the cause of a row is, and in how many parameter sets it is one, if known."""
+    """Say how robust the cause in a row of the table is, and in how many parameter sets it is a
+    cause, as far as this is known.
+    """
     share = row["robust_share"]
     if not np.isnan(share):
         template = words.ROBUST if share >= MIN_ROBUST_SHARE else words.BORDERLINE
@@ -281,7 +299,10 @@ def _sureness(row: Mapping[Any, Any]) -> Iterator[Sentence]:
 def other_sentences(
     study: Study, population: Population, complete: int | None, verdicts: pd.DataFrame
 ) -> Iterator[Sentence]:
-    """Up to which size causes are complete, who avoids the failures, and what counts."""
+    """Yield the sentences below the causes: up to which number of changes the causes are complete,
+    who would have avoided the failures, how many vehicles fail, and what counts. `verdicts` are
+    those of `assess_sample`.
+    """
     unsafe = population.unsafe
     if complete:
         yield words.COMPLETE(changes=number_of(complete, "change"))
@@ -302,8 +323,8 @@ def other_sentences(
 
 
 def avoidance(verdicts: pd.DataFrame) -> Iterator[Sentence]:
-    """What a competent driver, and full braking, would have avoided of the collisions on which each
-    has a verdict.
+    """Say how many collisions a competent driver, and full braking, would have avoided. Only the
+    collisions count on which the driver has a verdict.
     """
     for name, template in AVOIDING.items():
         number = int(verdicts[name].count())

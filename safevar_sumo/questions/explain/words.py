@@ -1,7 +1,7 @@
-"""What `explain` can say.
+"""The sentences of `explain`.
 
-`{unsafe}` is a collision, or an unsafe vehicle by another criterion; `{collide}` and `{causes}` are
-verbs for as many as the sentence counts.
+The slot `{unsafe}` is a collision, or an unsafe vehicle by another criterion. `{collide}` and
+`{causes}` are verbs, in the singular or plural that fits the count of the sentence.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ AT_ENDS = (
         " domain (its range of values)."
     ),
 )
-"""Of one change, and of several."""
+"""The sentence about one change, and the sentence about several changes."""
 ON_THE_WAY = (
     answer(
         "One change is enough for {unsafe}: {changes}, {share} % of the way from the original"
@@ -29,7 +29,7 @@ ON_THE_WAY = (
         " from its original value to an end of its domain (its range of values)."
     ),
 )
-"""Of one change, and of several."""
+"""The sentence about one change, and the sentence about several changes."""
 OTHERS = answer("The table lists {causes} with the same number of changes.")
 NOTHING_FOUND = answer(
     "The search found no cause of {unsafe} with {up_to}, each at an end of its domain (its range"
@@ -62,7 +62,7 @@ CHANGES = (
         " are as in the original vehicle."
     ),
 )
-"""Of one change, and of several."""
+"""The sentence about one change, and the sentence about several changes."""
 ENCOUNTER = answer(
     "The original vehicle is safe in the same encounter, which has {values}."
 )

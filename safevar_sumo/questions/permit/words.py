@@ -1,7 +1,7 @@
-"""What `permit` can say.
+"""The sentences of `permit`.
 
-`{may}` is what safe cars do and `{may_not}` what unsafe ones do, `{reach}` is how far, `{name}` the
-parameter over which cars are driven, and `{event}` how a car fails.
+The slots `{may}` and `{may_not}` are what safe and unsafe cars do. `{reach}` is how far cars are
+safe, `{name}` is the parameter over which cars are driven, and `{event}` is how a car fails.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from safevar_sumo.questions.sentence import answer, condition, evidence, note
 # What cars may do.
 DRIVING = {"may": "may drive", "may_not": "may not drive"}
 PASSING = {"may": "can pass the test", "may_not": "cannot pass the test"}
-"""Verbs of cars, on roads and in a test of a regulation."""
+"""Verbs of sentences about cars on roads, and about cars in a test of a regulation."""
 NAMED_CAR = 'The car "{name}"'
 CAR = answer("{car} {may} {reach}.")
 CAR_STOPS = answer("{car} {may_not}.")
@@ -24,7 +24,7 @@ TOO_SLOW = answer("{count} {may_not} at {need}.")
 ROUGH_NEED = (
     "a rough answer lets no car drive: ask without --quick, or for more simulations"
 )
-"""Why no gate passes on a rough answer."""
+"""The reason for which a gate (a command that must succeed) fails on a rough answer."""
 
 # Why a car may drive no faster.
 NOT_AT_ALL = answer("Already at {low}, {event}.")
@@ -82,7 +82,7 @@ SAFE_WITH_CLEARANCE = (
         " vehicle model (that of the study). With the {others}, the car touches nobody."
     ),
 )
-"""With one parameter set, and with several."""
+"""The sentence for one parameter set, and the sentence for several."""
 TESTED = evidence(
     "In each test, {number} values {values} were simulated. {attacked:,} simulations searched for"
     " an unsafe encounter."

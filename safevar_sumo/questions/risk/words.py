@@ -1,4 +1,4 @@
-"""What `risk` can say."""
+"""The sentences of `risk`."""
 
 from __future__ import annotations
 

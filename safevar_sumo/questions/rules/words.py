@@ -1,4 +1,4 @@
-"""What `rules` can say."""
+"""The sentences of `rules`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
-"""How far may each characteristic go alone, and together with all others: in the largest safe box?
+"""The question `tolerance`: how far may each characteristic change alone, and how far may all
+characteristics change together (the largest safe box)?
 
-The filter of small changes is not applied, as the question is about the vehicle.
+The filter of small changes is not applied, because the question is about the vehicle, and not about
+changes that a search would count.
 """
 
 from __future__ import annotations
@@ -65,16 +67,16 @@ RANGES_STAGE = "counterexamples in the ranges"
 
 
 class LimitsQuestion(NamedTuple):
-    """What the user asks.
+    """The question of a user about limits.
 
     Attributes
     ----------
     base
         The evaluator of the whole study.
     unsafe
-        What is unsafe, with the distance to keep.
+        The criterion of an unsafe vehicle, with the clearance to keep.
     stated, margin
-        The options from which it comes.
+        The criterion and the clearance [m] that the user states; None if not stated.
     columns
         The columns of the characteristics that vary.
     limits
@@ -92,7 +94,9 @@ class LimitsQuestion(NamedTuple):
     at_tests: bool
 
     def is_unsafe(self, original: Evaluations) -> bool:
-        """Whether an original vehicle is unsafe, or drives in no encounter that counts."""
+        """Whether the original vehicle is unsafe, or has no valid simulation. `original` is its
+        evaluation.
+        """
         return bool(not original.valid[0] or self.unsafe.of(original)[0])
 
 
@@ -171,7 +175,8 @@ def tolerance(
     specified = specified_limits(study, limits, columns)
     _check_drawable(evaluator)
 
-    # The criterion is that of the whole study: up to a smaller value nothing stricter counts.
+    # The criterion is chosen for the whole study, also if encounters are left out (`up_to`):
+    # otherwise a smaller value might give a stricter criterion.
     original = evaluator.evaluate_original()
     of_whole = original if end is None else _original_of(base)
     reference = of_whole if of_whole.valid[0] else original
@@ -180,7 +185,8 @@ def tolerance(
         subject, base, criterion, unsafe, margin, columns, specified, fits, at_tests
     )
 
-    # Limits up to a value lie within those up to each smaller one.
+    # Limits up to a value must lie within the limits up to each smaller value: these are found
+    # first.
     wider = None
     for cut in map(base.for_study, smaller):
         if not request.is_unsafe(_original_of(cut)):
@@ -209,7 +215,7 @@ def tolerance(
 
 
 def _original_of(evaluator: Evaluator) -> Evaluations:
-    """The evaluation of the original vehicle of a part of a study."""
+    """The evaluation of the original vehicle in an evaluator's part of the study."""
     return evaluator.evaluate(
         evaluator.characteristics.original_settings, "original vehicle"
     )
@@ -233,7 +239,7 @@ def _usual_settings(
 
 
 def _asked_of(request: LimitsQuestion, evaluator: Evaluator) -> Asked:
-    """The limits that are sought in a part of the study."""
+    """The task of finding the limits in an evaluator's part of the study."""
     models = models_of(evaluator, request.unsafe, request.fits)
     sought = asked_of(
         models,
@@ -246,8 +252,8 @@ def _asked_of(request: LimitsQuestion, evaluator: Evaluator) -> Asked:
 
 
 def _unsafe_solutions(request: LimitsQuestion, evaluator: Evaluator) -> FloatArray:
-    """The vehicles of unsafe solutions of results that change no others than what varies, shape (K,
-    n).
+    """The vehicles of the results' unsafe solutions, shape (K, n). Only vehicles count that change
+    no other characteristics than those in `request.columns`.
     """
     members = evaluator.characteristics
     subject = request.subject
@@ -260,7 +266,8 @@ def _unsafe_solutions(request: LimitsQuestion, evaluator: Evaluator) -> FloatArr
     varies = np.isin(range(len(vehicle)), request.columns)
     settings = np.unique(settings[is_original[:, ~varies].all(axis=1)], axis=0)
     if evaluator is not request.base and len(settings):
-        # They are unsafe in the whole study; those in encounters above the value do not count.
+        # The solutions are unsafe in the whole study. In its part, some of their encounters were
+        # left out: simulate the vehicles again.
         is_inside = (settings >= members.lower) & (settings <= members.upper)
         settings = settings[is_inside.all(axis=1)]
         runs = evaluator.evaluate(settings, "unsafe solutions")
@@ -269,7 +276,7 @@ def _unsafe_solutions(request: LimitsQuestion, evaluator: Evaluator) -> FloatArr
 
 
 def _check_drawable(evaluator: Evaluator) -> None:
-    """Refuse a study of which hardly any setting is feasible, before the long scans."""
+    """Refuse a study in which hardly any setting is feasible, before the long searches begin."""
     region = evaluator.region
     members = region.characteristics
     domain = Box(region, members.lower, members.upper)
@@ -285,8 +292,10 @@ def _check_drawable(evaluator: Evaluator) -> None:
 def _in_ranges(
     request: LimitsQuestion, evaluator: Evaluator, limits: FoundLimits
 ) -> InRanges | None:
-    """What a search for counterexamples to the limits finds in the ranges that a study states
-    beside its tests; to the specified ones without joint limits.
+    """Search for counterexamples to the limits in the ranges that a study states beside its listed
+    encounters. The limits are the joint limits, or else the specified limits. The result is None if
+    the study states no such ranges, if there are no limits, or if the original vehicle cannot be
+    evaluated in the ranges.
     """
     study = study_in_ranges(evaluator.study)
     sides = limits.specified if limits.sides is None else limits.sides
@@ -310,5 +319,7 @@ def _in_ranges(
 
 
 def study_in_ranges(study: Study) -> Study | None:
-    """The study in its ranges; None if it states none beside its listed encounters."""
+    """The study with the ranges that it states beside its listed encounters; None without such
+    ranges.
+    """
     return None if study.ranges or not study.states_ranges else with_ranges(study)

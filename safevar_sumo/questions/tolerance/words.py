@@ -1,7 +1,7 @@
-"""What `tolerance` can say.
+"""The sentences of `tolerance`.
 
-`{names}` and `{limits}` are of characteristics by their short names, `{event}` is how a vehicle
-fails, and `{unsafe}` what is unsafe.
+The slots `{names}` and `{limits}` use the short names of characteristics. `{event}` is how a
+vehicle fails, and `{unsafe}` is what counts as unsafe.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from safevar_sumo.questions.sentence import answer, condition, evidence, note
 ORIGINAL_UNSAFE = "the original vehicle is already unsafe: it {breach}"
 BROKEN = "the specified limit of {name} does not hold"
 ROUGH = "a rough answer confirms no limit; ask again without --quick, or for more simulations"
-"""Why no gate passes."""
+"""The reason for which a gate (a command that must succeed) fails on a rough answer."""
 REFUSAL = answer("No limit can be given, because {reason}.")
 DO_NOT_RELEASE = answer("DO NOT RELEASE: the specified limits do not hold.")
 OUTSIDE = answer(
@@ -39,7 +39,9 @@ LIMITS = {
     (False, True): "{name} at {high} or less",
     (True, True): "{name} between {low} and {high}",
 }
-"""A joint limit, by whether its lower end and its upper end are within the domain."""
+"""Phrases of a joint limit. The key says whether its lower end, and whether its upper end, is
+within the domain.
+"""
 KEEP = answer("Keep {limits}.")
 JOINT = answer("The {number} joint limits in the table hold at the same time.")
 UNLIMITED = answer(
@@ -68,7 +70,7 @@ CLEARANCE = (
         " collides."
     ),
 )
-"""In one parameter set, and in several."""
+"""The sentence for one parameter set, and the sentence for several."""
 LEFT_OUT = condition(
     "The limits do not cover parameter set {fit} of the vehicle model, because even the original"
     " vehicle fails with this set: {event}."
