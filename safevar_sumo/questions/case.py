@@ -278,7 +278,7 @@ class Case:
 
 
 Subject = Study | Case
-"""What a question may be asked about."""
+"""The subject of a question: a study, or the results of one."""
 
 
 def solutions_for_metric(solutions: pd.DataFrame, metric: Measure) -> pd.DataFrame:

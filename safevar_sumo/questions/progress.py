@@ -38,8 +38,8 @@ class Phases:
         self._is_stage = False
         self._expected = self._planned_round = 0.0
         """The present phase: its name, its round, whether all parts belong to it, the expected
-        number of its simulations, and the expected number of each round's if the number of rounds
-        is known.
+        number of its simulations, and the number of simulations planned for each round (0 if
+        unknown).
         """
         self._waiting = 0
         """Number of simulations that the present part still has to do."""

@@ -173,8 +173,9 @@ def _print_table(console: Console, table: AnswerTable) -> None:
 def render(
     answer: Answer, form: str, table: str | None = None, *, details: bool = False
 ) -> str:
-    """An answer, or with one table only, as text, JSON, LaTeX or HTML; one table, by default the
-    first, as CSV. Text is one screen, with a table's name or `details` all.
+    """An answer in a form: text, JSON, LaTeX, HTML or CSV. With `table`, the answer has only this
+    table. CSV is always one table: by default the answer's listing, else the first table. Text is
+    one screen; with `table` or `details` it is complete.
     """
     if form == "csv":
         frame = answer.listing

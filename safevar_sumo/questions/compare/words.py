@@ -22,7 +22,7 @@ BETTER = answer(
 )
 ALIKE = answer("RELEASE: {b} does not differ from {a} in anything that was measured.")
 
-# What decides it.
+# The differences that decide.
 LACKS = answer("Version {version} lacks {parts}, which {other} has.")
 NEW_COLLISION = answer(
     "The original vehicle of {b} collides at {speed:.2f} m/s{place}. The original vehicle of {a}"
@@ -51,14 +51,14 @@ NEEDLESS_BRAKING = answer(
     " them), and version {a} in {before}."
 )
 
-# What was compared.
+# The basis of the comparison.
 WITHIN = note("Only vehicles with {limits} were compared.")
 ORIGINALS_DIFFER = condition(
     "The original vehicles of {a} and {b} differ ({values}). Therefore the same changes of each"
     " original vehicle are compared."
 )
 
-# How it was tested.
+# The statistical test.
 NO_TEST = note("No statistical test is possible, because there is no pair of results.")
 TEST = note(
     "A signed-rank test compares the mean safety degree of the same vehicles in both versions,"

@@ -77,8 +77,8 @@ class Population(NamedTuple):
     otherwise
         Number of rows whose outcome differs from that in the results.
     omissions
-        Number of sampled settings that are left out, because they violate a constraint, or because
-        the original vehicle does not keep its margin in their encounter.
+        Number of sampled settings that are left out, because the original vehicle does not keep its
+        margin in their encounter.
     over_sets
         The unsafe shares of sampled settings over the parameter sets; None for solutions.
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from safevar_sumo.questions.sentence import answer, condition, evidence, note
 
-# Of a study: the smallest changes.
+# The smallest unsafe changes of a study.
 AT_ENDS = (
     answer(
         "One change is enough for {unsafe}: {changes}, an end of its domain (its range of values)."
@@ -43,7 +43,7 @@ UNSAFE_IN_ENCOUNTER = answer(
     "The original vehicle is already unsafe in this encounter, without any change."
 )
 
-# Of results: what is enough for their failures.
+# The causes of failures in results.
 ALREADY_UNSAFE = answer(
     "The original vehicle is already unsafe: it {breach}. A failure needs no change of the"
     " vehicle."
@@ -72,7 +72,7 @@ SHARE = evidence(
 )
 BEYOND = evidence("{count} vehicles that were tested with {larger} {collide}.")
 
-# How sure a cause is.
+# The certainty of a cause.
 GAP = evidence(
     "The unsafe range has a gap: at {share} % of the way to the ends, the vehicle is safe again."
 )
@@ -92,7 +92,7 @@ BORDERLINE = evidence(
     "The cause is borderline: only {share} vehicles with slightly different values are unsafe."
 )
 
-# What was simulated of a study.
+# The simulations of a study.
 OF_SIZE = evidence("{count} {combinations} {causes}.")
 ONLY = evidence("The only simulated combination of {changes} {is_safe}.")
 OF_PART = evidence(
@@ -119,7 +119,7 @@ SCOPE = note(
     " is least safe."
 )
 
-# How many vehicles fail, and who would have avoided it.
+# The number of failures, and the drivers who would have avoided them.
 NUMBER_OF_SAMPLE = evidence("{count} vehicles that were {sampled} {collide}.")
 NUMBER_OF_SOLUTIONS = evidence(
     "{count} different vehicles that the search returned (its solutions) {collide}."
@@ -136,7 +136,7 @@ COMPLETE = condition(
     " {changes} were found."
 )
 
-# In a table: how a failure ends.
+# The end of a failing run, for a table.
 AT_POINT = evidence(
     "In the test case {point}, the original vehicle {original}. The failed vehicle {changed}."
 )

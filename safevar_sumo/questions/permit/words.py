@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from safevar_sumo.questions.sentence import answer, condition, evidence, note
 
-# What cars may do.
+# The verdicts on cars.
 DRIVING = {"may": "may drive", "may_not": "may not drive"}
 PASSING = {"may": "can pass the test", "may_not": "cannot pass the test"}
 """Verbs of sentences about cars on roads, and about cars in a test of a regulation."""
@@ -26,7 +26,7 @@ ROUGH_NEED = (
 )
 """The reason for which a gate (a command that must succeed) fails on a rough answer."""
 
-# Why a car may drive no faster.
+# The reasons for which a car may drive no faster.
 NOT_AT_ALL = answer("Already at {low}, {event}.")
 IN_FIXED_TEST = answer("In a test with a {name} of its own, {event}.")
 SAFE_TO_TOP = answer("The car is safe {reach}, the highest {name} that was simulated.")
@@ -37,7 +37,7 @@ AS_NEW = answer(
 )
 WITH_CHANGES = "with {changes}, {event}"
 
-# What nobody knows of a car.
+# Values of a car that are assumed, or measured inexactly.
 MEASURED = condition(
     "Within its measuring error, the least safe value counts of {names}."
 )
@@ -60,7 +60,7 @@ NO_WORST_END = evidence(
     " values, with the parameter set that limits the car)."
 )
 
-# What was simulated, and what a safe car does.
+# The simulations, and the meaning of "safe".
 ROUGH_LIST = note(
     "Remark: the list is a rough answer (rough = yes), whose speeds prove nothing."
 )

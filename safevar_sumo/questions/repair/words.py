@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from safevar_sumo.questions.sentence import answer, condition, evidence, note
 
-# Whether a repair is necessary.
+# The repair, or the reason for none.
 NOT_NECESSARY = (
     answer(
         "No repair is necessary. With the present driving system, all tested vehicles within the"
@@ -34,7 +34,7 @@ REPAIRED = answer(
     "With this repair, all tested vehicles that wear no further than promised {safe}."
 )
 
-# What the repair costs.
+# The price of the repair.
 EARLIER = evidence(
     "With the repair, the original vehicle brakes up to {metres_earlier:.2f} m earlier."
 )
@@ -50,7 +50,7 @@ NO_SCENES = evidence(
     "Needless braking was not measured, because the study has no benign scenes."
 )
 
-# What it is valid for, and how it was tested.
+# The validity of the repair, and its tests.
 WEAR = note("Required wear: {wear}.")
 NOT_REPAIRABLE = note(
     "Remark: with {parts}, the vehicle is unsafe even with full braking at the first possible"

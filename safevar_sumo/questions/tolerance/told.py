@@ -202,7 +202,7 @@ class Told:
         return finite_or_none(low), finite_or_none(high)
 
     def outside(self, column: int) -> float:
-        """How far a characteristic's specified limit is beyond its limit alone; 0 if it is not."""
+        """How far a specified limit is beyond what is safe alone; 0 if it is within that."""
         alone = self.limits.alone
         ends = float(alone.lower[column]), float(alone.upper[column])
         low, high = self.members[column].rounded_inwards(ends)
@@ -247,7 +247,7 @@ class Told:
 
     @property
     def least(self) -> float | None:
-        """The worst value that the search of the joint limits found; None without a finite one."""
+        """The worst value that the search of the joint limits found; None if no value is finite."""
         return worst_of(self.unsafe, self.limits.attacks)
 
     @property

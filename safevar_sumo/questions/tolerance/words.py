@@ -123,7 +123,7 @@ ALONE = condition(
     " the original vehicle."
 )
 
-# What was left out, and how it was tested.
+# Tests that were left out, and the tests of the limits.
 TESTS_LEFT_OUT = note(
     "Some tests were left out, because all their values are above {up_to}: {tests}."
 )
@@ -158,7 +158,7 @@ NOT_COUNTED = condition(
     " {margin:g} m of clearance in them."
 )
 
-# In a manual: a sentence for each characteristic, all of which may be obeyed at the same time.
+# Sentences for a manual, one for each characteristic. All of them hold at the same time.
 MANUAL_NONE = "{name}: no joint limits were found."
 MANUAL_ORIGINAL = (
     "{name}: keep the original value, {original}. No safe change of this value was found beside the"
