@@ -233,7 +233,7 @@ def as_printed(
                 if value > item.original
                 else np.floor
             )
-            # A value such as 0.3, scaled to 3.0000000000000004, must not be rounded up to 0.4:
+            # A value such as 0.07, scaled to 7.000000000000001, must not be rounded up to 0.08:
             # hence rounding errors are removed first.
             printed[column] = min(
                 max(round_away(np.round(value * scale, 6)) / scale, lower), upper
