@@ -94,6 +94,7 @@ class Contents(NamedTuple):
 
 
 def _without_ellipsis(names: Collection[str | EllipsisType]) -> list[str]:
+    """The names without `...`."""
     return [name for name in names if isinstance(name, str)]
 
 
@@ -121,6 +122,7 @@ def contents(
     def declare(function: AnswerFunction) -> AnswerFunction:
         @wraps(function)
         def with_lead(*arguments: Any, **options: Any) -> Answer:
+            """The function, whose answer gets the declared leading table if it states none."""
             answer = function(*arguments, **options)
             return replace(answer, lead=answer.lead or lead)
 

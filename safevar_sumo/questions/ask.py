@@ -200,6 +200,7 @@ class Question:
         values = {name: options[name].check(value) for name, value in values.items()}
 
         def subject_of(source: StudyLike | Results) -> Subject:
+            """Load the subject of the question, and cut it to the part that is asked about."""
             subject = study_or_case(
                 source, as_it_is_now=as_it_is_now, results_only=self.takes_results_only
             )

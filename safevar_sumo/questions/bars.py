@@ -69,9 +69,11 @@ class Bar(NamedTuple):
         inside = WIDTH - 2 * MARGIN
 
         def x(share: float) -> str:
+            """The horizontal position of a share [px]."""
             return f"{MARGIN + inside * share:.1f}"
 
         def rectangle(ends: tuple[float, ...], name: str) -> str:
+            """A range as an SVG rectangle of the class `name`; "" for an empty range."""
             if not ends:
                 return ""
             width = f"{max(inside * (ends[1] - ends[0]), 1):.1f}"

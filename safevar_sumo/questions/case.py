@@ -93,6 +93,7 @@ class Case:
 
     @property
     def characteristics(self) -> CharacteristicSet:
+        """The characteristics of the study."""
         return CharacteristicSet.of(self.study)
 
     @property
@@ -139,6 +140,7 @@ class Case:
 
     @property
     def weather(self) -> Weather:
+        """The weather of the study."""
         return weather_of(self.study.weather)
 
     @property
@@ -370,6 +372,7 @@ def build_case(
     names = [*metrics, *(objective.name for objective in scoring.objectives)]
 
     def with_all_columns(frame: pd.DataFrame) -> pd.DataFrame:
+        """The frame with a column of NaN for each metric and objective that it lacks."""
         absent = [name for name in names if name not in frame]
         return frame.assign(**dict.fromkeys(absent, np.nan))
 

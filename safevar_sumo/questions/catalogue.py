@@ -208,6 +208,7 @@ def _in_a_workshop(item: Characteristic) -> str | None:
 
 
 def _studies() -> Iterator[tuple[str, ...]]:
+    """The rows of the table of studies."""
     facts = attrgetter(
         *("name", "title", "vehicle.model", "ads.model", "scenario.model")
     )
@@ -216,6 +217,9 @@ def _studies() -> Iterator[tuple[str, ...]]:
 
 
 def _characteristics() -> Iterator[tuple[float | str, ...]]:
+    """The rows of the table of vehicles: the characteristics of each vehicle model, as the first
+    study with this model states them.
+    """
     studies = dict[str, Study]()
     for study in map(read_study, study_names()):
         studies.setdefault(study.vehicle.model or study.scenario.model, study)
@@ -226,6 +230,7 @@ def _characteristics() -> Iterator[tuple[float | str, ...]]:
 
 
 def _described(models: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The name and the description of each model."""
     return ((name, description_of(model)) for name, model in models.items())
 
 
@@ -235,6 +240,7 @@ def description_of(model: Any) -> str:
 
 
 def _scenarios(models: Mapping[str, type[Scenario]]) -> Iterator[tuple[str, ...]]:
+    """The rows of the table of scenarios: name, description, and parameters that may vary."""
     for name, description in _described(models):
         model = models[name]
         parameters = dict[str, Any]()

@@ -58,6 +58,9 @@ def read_changes(
 
 
 def _parse(change: str, text: str, original: float) -> float:
+    """The value that `text` states: a number, or a signed percentage of the original value.
+    `change` is the whole text, for errors.
+    """
     if percentage := PERCENTAGE.fullmatch(text):
         if not original:
             raise InputError(

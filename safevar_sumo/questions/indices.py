@@ -132,6 +132,7 @@ def given_data_indices(
     options = {"num_resamples": RESAMPLES, "conf_level": confidence, "method": "sobol"}
 
     def indices_of(output: FloatArray) -> Indices:
+        """SALib's first-order indices of an output, shape (M,)."""
         # SALib changes the warning filters and `formatwarning` of the whole process: undo this.
         with warnings.catch_warnings(), patch.object(warnings, "formatwarning"):
             settings = evaluations.settings[:, varies]

@@ -107,10 +107,12 @@ class Models(NamedTuple):
 
     @property
     def own(self) -> Model:
+        """The study's own model."""
         return self.members[0]
 
     @property
     def fits(self) -> tuple[int, ...]:
+        """The numbers of the parameter sets in which a claim is tested."""
         return tuple(member.fit for member in self.members)
 
 

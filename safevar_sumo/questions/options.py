@@ -37,6 +37,7 @@ class Range(NamedTuple):
 
 
 def _with_commas(number: float) -> str:
+    """A number as help shows it: thousands have commas."""
     if isinstance(number, int):
         return f"{number:,}"
     return f"{number:,.12g}"
@@ -109,6 +110,7 @@ class Option(NamedTuple):
 
     @property
     def flag(self) -> str:
+        """The flag of the option on the command line."""
         return flag_of(self.name)
 
     def check(self, value: Any) -> Any:
@@ -181,6 +183,7 @@ def options_of(function: Callable[..., Any]) -> list[Option]:
 
 
 def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
+    """The option of a parameter with the type `hint` and the text `meaning`."""
     limits = None
     metavar = None
     if get_origin(hint) is Annotated:

@@ -195,6 +195,7 @@ def _ranges_up_to(study: Study, name: str, high: float) -> Study:
     """
 
     def cut(axes: dict[str, AxisTable]) -> Axes:
+        """Axes in which the range of `name` ends at `high`."""
         axis = axes.get(name)
         if axis is None or axis.range is None or axis.range.upper <= high:
             return {**axes}
@@ -207,6 +208,7 @@ def _ranges_up_to(study: Study, name: str, high: float) -> Study:
         }
 
     def begins_below(test: MatrixTest) -> bool:
+        """Whether a test has no range of this axis, or its range begins below `high`."""
         domain = study.ranges_of(test).get(name)
         return domain is None or domain.lower < high
 
@@ -362,6 +364,9 @@ def _parameters_in_words(
 
 
 def _values_in_words(values: Sequence[float | str], is_range: bool) -> str:
+    """Listed values in words: as a range from the least to the greatest value if `is_range`, else
+    as a list.
+    """
     if is_range and len(values) > 1:
         return f"{min(values):g} to {max(values):g}"
     return join_phrases(

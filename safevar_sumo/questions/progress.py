@@ -128,6 +128,7 @@ class Phases:
         )
 
     def _show(self) -> None:
+        """Show the present phase and the numbers of simulations."""
         self._show_whole(f"{self._name}{self._round}", *self._counts())
 
     def _counts(self) -> tuple[int, int]:

@@ -143,6 +143,7 @@ def print_answer(answer: Answer, console: Console, *, details: bool) -> None:
 
 
 def _print_whole(answer: Answer, max_rows: int, console: Console) -> None:
+    """Print the verdict, at most `max_rows` rows of each short table, and the details."""
     print_text(console, answer.verdict)
     for table in _short_tables(answer).values():
         cut = len(table.frame) - max_rows
@@ -155,6 +156,7 @@ def _print_whole(answer: Answer, max_rows: int, console: Console) -> None:
 
 
 def _print_screen(answer: Answer, max_rows: int, console: Console) -> None:
+    """Print one screen, whose table has at most `max_rows` rows."""
     screen = screen_of(answer, max_rows)
     print_text(console, " ".join(screen.sentences))
     _print_table(console, screen.lead)
@@ -163,6 +165,7 @@ def _print_screen(answer: Answer, max_rows: int, console: Console) -> None:
 
 
 def _print_table(console: Console, table: AnswerTable) -> None:
+    """Print a table in the parts that fit into the width of the terminal."""
     for part in terminal_tables(table, console.width):
         if isinstance(part, str):
             print_text(console, part)
@@ -245,6 +248,7 @@ def _latex(answer: Answer) -> str:
 
 
 def _tested_in_words(answer: Answer) -> str:
+    """How the answer was tested, with an introduction."""
     return f"How this was tested: {answer.tested}"
 
 
@@ -290,6 +294,7 @@ def _shown_tables(answer: Answer) -> dict[str, AnswerTable]:
 
 
 def _short_tables(answer: Answer) -> dict[str, AnswerTable]:
+    """The tables that the details show, without those with more than `MAX_ROWS` rows."""
     tables = _shown_tables(answer).items()
     return {name: table for name, table in tables if len(table.frame) <= MAX_ROWS}
 

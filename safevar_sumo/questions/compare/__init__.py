@@ -409,6 +409,7 @@ def _decide(
 
 
 def _test_in_words(tested: _PairedTest, titles: Mapping[str, str]) -> str:
+    """The result of the paired test in a sentence."""
     if np.isnan(tested.p):
         return words.NO_TEST.text
     return words.TEST(

@@ -88,6 +88,7 @@ def missing_in_words(
 
 
 def _missing_cases(side: Evaluator, reference: Evaluator) -> Iterator[str]:
+    """Yield the weathers, test cases and tests of `reference` that `side` lacks, as phrases."""
     tests, _, cases = zip(*cases_of(side), strict=True)
     weathers = {case.weather for case in cases}
     for test, point, case in cases_of(reference):
@@ -105,6 +106,7 @@ def _missing_cases(side: Evaluator, reference: Evaluator) -> Iterator[str]:
 
 
 def _missing_ranges(side: Evaluator, reference: Evaluator) -> Iterator[str]:
+    """Yield the ranges of `reference` that are no part of a range of `side`, as phrases."""
     tests = points_of_tests(side.study, side.system.points)
     by_name = {test and test.name: side.study.ranges_of(test) for test, _ in tests}
     for test, _ in points_of_tests(reference.study, reference.system.points):
@@ -145,12 +147,14 @@ def _excluded(study: Study, reference: Study) -> Iterator[str]:
 
 
 def _missing_sets(study: Study, reference: Study) -> Iterator[str]:
+    """Yield the number of parameter sets of `reference` that `study` lacks, as a phrase."""
     sets = _sets_of_vehicle(reference) - _sets_of_vehicle(study)
     if sets:
         yield number_of(len(sets), "parameter set")
 
 
 def _sets_of_vehicle(study: Study) -> set[tuple[tuple[str, float], ...]]:
+    """The study's parameter sets, as far as they concern the vehicle: names with values."""
     of_vehicle = {
         name: values
         for name, values in study.spread.items()

@@ -210,6 +210,7 @@ def in_order_of(a: Study, b: Study) -> Study:
         return replace(b.mapped(in_order), vehicle=vehicle)
 
     def in_words(units: set[tuple[str, str]]) -> str:
+        """Names with their units, in alphabetical order; `none` without any."""
         return ", ".join(f"{name} [{unit}]" for name, unit in sorted(units)) or "none"
 
     raise InputError(

@@ -65,6 +65,7 @@ class Enumeration(NamedTuple):
 
     @property
     def tried(self) -> int:
+        """The number of combinations that were simulated."""
         return sum(self.simulated.values())
 
     @property

@@ -339,6 +339,7 @@ def avoidance(verdicts: pd.DataFrame) -> Iterator[Sentence]:
 
 
 def _count(number: int) -> str:
+    """A number as a word up to ten, and with digits above."""
     return NUMBERS[number] if number < len(NUMBERS) else f"{number:,}"
 
 

@@ -71,6 +71,7 @@ def find_failures(
     rng = np.random.default_rng((problem.study.search.seed, number))
 
     def judge(cases: FloatArray) -> FloatArray:
+        """The robustness of cases with the change, shape (L,)."""
         return problem.robustness(change, cases, ATTACK_STAGE)
 
     # Searches with other parameter sets have large generations: a few large ones cost less than
@@ -166,6 +167,7 @@ def find_survivors(
     changes = _survivors_in(problem, fits[:1], cases)
 
     def breaks_one(fit: int) -> bool:
+        """Whether a search in a parameter set finds a counterexample to one of the changes."""
         return any(
             len(find_failures(problem, (fit,), change, cases, 0))
             for change, _ in changes

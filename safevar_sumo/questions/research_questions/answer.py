@@ -179,6 +179,7 @@ def figures(*results: Results | str | Path) -> dict[str, Figure]:
 
 
 def _directories_of(results: Sequence[Results | str | Path]) -> list[Any]:
+    """The directory of each of several results, which are given as `Results` or as paths."""
     return [getattr(source, "directory", source) for source in results]
 
 

@@ -87,24 +87,25 @@ DEFAULT = Choices()
 
 
 def rq1(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """Every algorithm's solutions against the original's value, repeated once for each solution,
-    metric by metric.
+    """Compare, for each metric, every algorithm's pooled solutions with the original's value, which
+    is repeated once for each solution.
 
     `effect_size` is A12, oriented so that smaller values mean that the algorithm's solutions are
-    more unsafe; `mean` is the mean over the algorithm's solutions, `original` the original
+    more unsafe. `mean` is the mean over the algorithm's solutions, and `original` is the original
     vehicle's value.
     """
     return _with_significance(pd.DataFrame(_test_original(case, choices)), choices)
 
 
 def rq2(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """One algorithm, as `opponents_of` chooses it, against every other: its runs' indicators, then
-    its pooled solutions' metrics.
+    """Compare an algorithm, which `opponents_of` chooses, with every other algorithm (baseline).
+    Compared are the quality indicators of runs and the metrics of pooled solutions.
 
     `effect_size` is A12, oriented so that higher values mean that the algorithm is better: a better
-    front, more unsafe solutions. `n1` counts the algorithm's values, `n2` the baseline's;
-    `evaluations` and `baseline_evaluations` are mean numbers of settings that a run simulated.
-    Indicators and evaluations of imported solutions, which belong to no run, are undefined.
+    front, or more unsafe solutions. `n1` and `n2` are the numbers of values of the algorithm and of
+    the baseline. `evaluations` and `baseline_evaluations` are mean numbers of settings that a run
+    simulated. Indicators and evaluations of imported solutions, which belong to no run, are
+    undefined.
     """
     frame = pd.DataFrame(_test_opponents(case, choices))
     simulated = pd.Series(dtype=float)
@@ -117,13 +118,13 @@ def rq2(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 
 
 def rq1_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """Every algorithm's run means against the original's value, metric by metric: Wilcoxon's
-    signed-rank test.
+    """Compare, for each metric, the means of every algorithm's runs with the original's value by
+    Wilcoxon's signed-rank test.
 
     `effect_size` is the share of runs whose mean is safer than the original's value, plus half the
-    share of equal ones (A12 against one value): below 0.5 the runs are less safe. `mean` is the
-    mean of the run means. `p_holm` is `p_value` corrected by Holm's method for all tests of RQ1 of
-    this case, and `enough_runs` says whether it can be significant.
+    share of equal means (A12 against one value): below 0.5 the runs are less safe. `mean` is the
+    mean of the runs' means. `p_holm` is `p_value`, corrected by Holm's method for all tests of RQ1
+    of this case. `enough_runs` says whether the corrected p-value can be significant.
     """
     tests = compare_over_runs(case, choices)
     return tests[tests.index == "RQ1"]
@@ -132,11 +133,12 @@ def rq1_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 def rq2_runs(
     case: Case, choices: Choices = DEFAULT, further: Samples | None = None
 ) -> pd.DataFrame:
-    """Compare one algorithm with every other by Mann-Whitney U, with one value per run: indicators,
-    metrics' means over solutions and, if they were counted, distinct minimal causes.
+    """Compare an algorithm with every other algorithm by the Mann-Whitney U test, with one value
+    for each run. The values are quality indicators, means of metrics over solutions and, if they
+    were counted, numbers of distinct minimal causes.
 
-    `effect_size` is A12, oriented as in `rq2`; `n1` and `n2` count runs; `p_holm` and `enough_runs`
-    are as in `rq1_runs`, for all tests of RQ2.
+    `effect_size` is A12, oriented as in `rq2`. `n1` and `n2` are numbers of runs. `p_holm` and
+    `enough_runs` are as in `rq1_runs`, for all tests of RQ2. `further` are more samples to compare.
     """
     tests = compare_over_runs(case, choices, further)
     # The call raises an error if RQ2 has no answer.
@@ -157,7 +159,7 @@ def rq2_common(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     common = replace(case, solutions=nondominated_evaluations(case))
     valid = valid_evaluations(case, case.evaluations)
     best = valid.groupby(["algorithm", "run"])[SAFETY_DEGREE].min()
-    # A run without valid evaluations is worse than any other one.
+    # A run without valid evaluations counts as the worst run.
     best = best.reindex(
         pd.MultiIndex.from_tuples(case.finished_runs), fill_value=math.inf
     )
@@ -411,8 +413,8 @@ def _originals(
 
 
 def describe_runs_without_solutions(case: Case) -> str:
-    """Which algorithms have runs without solutions, and how these runs count, in sentences; "" if
-    no finished run is without solutions.
+    """Sentences that say which algorithms have runs without solutions, and how these runs count; ""
+    if all finished runs have solutions.
     """
     if not case.has_runs:
         return ""

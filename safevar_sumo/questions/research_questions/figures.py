@@ -199,6 +199,7 @@ def draw_convergence(case: Case) -> Figure:
 
 
 def _add_legend_below(figure: Figure, axis: Axes) -> None:
+    """Add the legend of a panel below the figure."""
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(
         handles,

@@ -113,12 +113,14 @@ def rounded_to_rank(values: ArrayLike) -> FloatArray:
 
 
 def _decimals(values: ArrayLike) -> list[Decimal]:
+    """Values of any shape as decimal numbers with `RANKED_DIGITS` significant digits."""
     return [
         Decimal(f"{value:.{RANKED_DIGITS}g}") for value in np.ravel(values).tolist()
     ]
 
 
 def has_distinct_values(values: ArrayLike) -> bool:
+    """Whether no two values are equal."""
     return np.unique(values).size == np.size(values)
 
 
@@ -181,6 +183,9 @@ def effect_interval(effect: float, m: int, n: float, alpha: float = ALPHA) -> In
     limit = float(scipy.stats.norm.isf(alpha / 2)) ** 2
 
     def excess(value: float) -> float:
+        """The squared distance of `value` from the effect, less its allowed square: 0 at an end of
+        the interval.
+        """
         variance = value * (1 - value) / m
         if not math.isnan(n):
             variance *= (

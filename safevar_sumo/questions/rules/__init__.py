@@ -352,6 +352,7 @@ def _drop_useless_conditions(
     """
 
     def least_density(box: FloatArray) -> float:
+        """The lower bound of the unsafe share in a box; 0 for a box without settings."""
         flags = is_unsafe[is_within(box, settings)]
         if not len(flags):
             return 0.0
