@@ -63,6 +63,7 @@ class WholeTable(Table):
     def __rich_console__(
         self, console: Console, options: ConsoleOptions
     ) -> RenderResult:
+        """Choose the widths of the columns for the width of the terminal, and draw the table."""
         # Rich would break a title at the width of its table.
         if self._title_line:
             yield self._title_line
@@ -191,6 +192,8 @@ class Pace:
 
 
 class _TimeLeft(ProgressColumn):
+    """The column of a bar with the time left."""
+
     def __init__(self, pace: Pace) -> None:
         super().__init__()
         self._pace = pace
@@ -220,6 +223,7 @@ def open_progress(
     line = "searching"
 
     def show(phase: str, number: int, total: int) -> None:
+        """Show the phase, the count and the time left."""
         nonlocal line
         pace.update(number, total)
         line = phase

@@ -205,6 +205,7 @@ class PerVehicleAds(Ads):
         return np.array([bool(driver.warns) for driver in memory], bool)
 
     def _checked_pedals(self, command: Any) -> Pedals:
+        """Refuse an illegal result of a user's `drive`, and convert a legal result to pedals."""
         if type(command) is tuple and len(command) == 2:
             throttle, brake = command
             # The fast path skips the general check, because this code runs for every vehicle in

@@ -256,6 +256,7 @@ class Simulation:
 
     @property
     def _ending(self) -> str:
+        """How the simulation ended: with its impact, its speed or its smallest distance."""
         safety_degree = self.metrics[SAFETY_DEGREE]
         if self.outcome is Outcome.COLLISION and IMPACT_EXCESS.name in self.metrics:
             speed = self.metrics[IMPACT_SPEED.name]
@@ -290,6 +291,7 @@ class Simulation:
         return {"study": self.study.name, "vcs": dict(self.setting), **self.numbers}
 
     def _repr_html_(self) -> str:
+        """A table of the original and the simulated vehicle, for notebooks."""
         import pandas as pd
 
         rows = [

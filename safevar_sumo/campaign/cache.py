@@ -165,6 +165,9 @@ class Cache:
             self._guarded(self._entries.close, None)
 
     def _open(self) -> None:
+        """Open the folder. Beyond `SIZE_LIMIT`, entries that were read least recently are
+        removed.
+        """
         self._entries = diskcache.Cache(
             str(self._folder),
             disk=_PlainBytes,
@@ -231,6 +234,9 @@ class CommandCache:
             self._lock.release()
 
     def _open_own(self, key: bytes) -> None:
+        """Open the cache of this command's user code, and lock it. If another process has the lock,
+        the command has no such cache. A cache that an interrupted command left is continued.
+        """
         self._own_folder = (
             self._folder / sha256(key + self._command.encode()).hexdigest()
         )

@@ -128,6 +128,7 @@ class ProcessWorker:
 
 
 def _begin_work(path: ImportPath, last_words: Path, mark: str) -> None:
+    """Prepare this process, a new worker: import path, signals, files for its last words."""
     path.inherit()
     for interrupt in INTERRUPTS:
         signal.signal(interrupt, signal.SIG_IGN)

@@ -179,6 +179,9 @@ class Pool:
             self._started.popitem()[1].end()
 
     def _begin(self, place: int, function: Work, job: tuple[Any, ...]) -> Future[Any]:
+        """Begin a job at a place of the pool, in its worker or, if this worker is dead, in a new
+        one.
+        """
         if place in self._started:
             # The process of the worker may have died between two jobs.
             with suppress(BrokenExecutor):

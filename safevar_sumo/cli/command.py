@@ -74,6 +74,9 @@ class _Command(click.Command):
     def format_options(
         self, ctx: click.Context, formatter: click.HelpFormatter
     ) -> None:
+        """Write the command's own options, and then a list of common options without
+        explanations.
+        """
         if ctx.meta.get("all"):
             super().format_options(ctx, formatter)
             return
@@ -105,6 +108,9 @@ class _Command(click.Command):
                 formatter.write_dl(lines)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Refuse options of earlier releases and options that are given twice, before the
+        parsing.
+        """
         counts = Counter(word.partition("=")[0] for word in args)
         for word in counts:
             if instead := ENDED_OPTIONS.get(f"{self.name} {word}"):
@@ -208,6 +214,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         constants = {"progress": True}
 
     def call(**values: Any) -> Any:
+        """Call the function with the values of the command line."""
         subjects: list[Any] = []
         for parameter in positional:
             value = values.pop(parameter.name)
@@ -302,6 +309,7 @@ def prints_to_standard_error() -> Iterator[None]:
 
 
 def _argument(parameter: inspect.Parameter) -> click.Argument:
+    """Make the positional argument of a command from a parameter of its function."""
     is_repeated = parameter.kind is parameter.VAR_POSITIONAL
     return click.Argument(
         [parameter.name],
@@ -335,6 +343,7 @@ class _Path(click.Path):
 
 
 def _flag(option: Option) -> click.Option:
+    """Make the option of a command from an option of its function."""
     kind: Any = option.kind
     if option.choices:
         kind = click.Choice(option.choices)

@@ -81,6 +81,7 @@ class LazyCommands(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        """Import the function of a command, and make its command. None if the name is unknown."""
         with _exit_on_interrupt():
             # A name module:Name is a question of the user's own.
             if ":" in name:
@@ -133,6 +134,7 @@ class LazyCommands(click.Group):
     def format_commands(
         self, ctx: click.Context, formatter: click.HelpFormatter
     ) -> None:
+        """Write the commands in groups, each with the first paragraph of its docstring."""
         for title, group in COMMANDS_BY_GROUP.items():
             with formatter.section(title):
                 formatter.write_dl(
@@ -268,6 +270,7 @@ def _exit_on_interrupt() -> Iterator[None]:
 
 
 def _exit_with_error(message: str, code: int) -> NoReturn:
+    """Print an error, and end the program with this exit code."""
     # A second Ctrl-C would change the exit code and the message.
     for interrupt in INTERRUPTS:
         signal.signal(interrupt, signal.SIG_IGN)

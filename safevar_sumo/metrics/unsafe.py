@@ -208,6 +208,7 @@ class Unsafe:
         return np.asarray(np.min(list(map(self._robustness, rounds)), axis=0))
 
     def _robustness(self, evaluations: Evaluations) -> FloatArray:
+        """The robustness of evaluations that are not repeated."""
         robustness = self._excess(evaluations)
         robustness = np.where(np.isnan(robustness), np.inf, robustness)
         is_unsafe = self._holds(evaluations.outcome, evaluations.column)
@@ -239,6 +240,7 @@ class Unsafe:
         )
 
     def _breach_in_words(self, vehicle: Evaluations) -> str:
+        """What an unsafe vehicle does, in words, without the number of runs."""
         degree = float(vehicle.f_safe[0])
         if vehicle.collided[0]:
             return f"collides at {abs(degree):.2f} m/s"

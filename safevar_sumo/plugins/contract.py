@@ -352,6 +352,10 @@ def checked_class(code: UserCode, base: type) -> type:
     candidate = code.target
 
     def checked_method(name: str, returned: Returned) -> Callable[..., UserValue]:
+        """Make a method that calls the user's method with read-only arguments, and checks its
+        result.
+        """
+
         def method(self: Any, *arguments: Any) -> UserValue:
             passed = list(arguments)
             if returned.like is not None:

@@ -85,6 +85,9 @@ def _files_of_module(path: Path) -> set[Path]:
 
 
 def _imported_modules(path: Path) -> Iterator[str]:
+    """The names of the modules that a file imports by their full names, not relative to the
+    file.
+    """
     for node in ast.walk(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

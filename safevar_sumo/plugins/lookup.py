@@ -187,6 +187,7 @@ class Lookup:
         return {**parameters, **path}
 
     def _with_paths(self, value: Any, key: str) -> Any:
+        """Replace the names of data files in a value, at any depth of tables and lists."""
         if isinstance(value, dict):
             return {
                 name: self._with_paths(item, f"{key}.{name}")
@@ -209,6 +210,7 @@ class Lookup:
         return value
 
     def _import(self, name: str, key: str) -> ModuleType:
+        """Import a module of user code by its name. Errors name the `key` of the study."""
         if name.partition(".")[0] == "__main__":
             raise InputError(
                 "",

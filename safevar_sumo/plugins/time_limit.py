@@ -64,6 +64,7 @@ def end_if_longer(time_limit: float, name: str = "a simulation") -> Iterator[Non
 
 @contextmanager
 def _end_process(time_limit: float, last_words: IO[str]) -> Iterator[None]:
+    """Let Python end this process after the time limit, and write its line to `last_words`."""
     faulthandler.dump_traceback_later(time_limit, exit=True, file=last_words)
     try:
         yield
@@ -73,6 +74,8 @@ def _end_process(time_limit: float, last_words: IO[str]) -> Iterator[None]:
 
 @contextmanager
 def _raise_error(time_limit: float, name: str) -> Iterator[None]:
+    """Let a timer raise an error in this process after the time limit."""
+
     def refuse(_signal: int, frame: FrameType | None) -> None:
         problem = f"{name} took longer than the time limit of {time_limit:g} s"
         while frame is not None:

@@ -235,6 +235,7 @@ class SimulationRuns:
         """The runs of a part of the vehicles."""
 
         def select(value: Any) -> Any:
+            """Take the vehicles' part of a field: arrays have the vehicles on their last axis."""
             if isinstance(value, Trace):
                 return value.of(vehicles)
             if isinstance(value, Encounter | Contact):

@@ -175,6 +175,7 @@ def _plain_name(name: str) -> str:
 def _parse_numbers(
     path: Path, column: pd.Series[str], lowest: float, highest: float
 ) -> FloatArray:
+    """Convert a column of texts to numbers. Refuse the first cell without a number in the range."""
     values = pd.to_numeric(column, errors="coerce")
     is_legal = np.isfinite(values) & values.between(lowest, highest)
     for row, cell in column[~is_legal].items():

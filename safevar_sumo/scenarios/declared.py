@@ -94,6 +94,7 @@ def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
     declared = _Declared(tables, places)
 
     def completed(over: Parameters, key: str, test: Parameters) -> Parameters:
+        """Complete the axes of a test, or of [scenario.over]. `key` is their place, for errors."""
         axes = dict(over)
         for name, axis in over.items():
             if isinstance(axis, dict) or (is_range and isinstance(axis, list)):

@@ -241,6 +241,7 @@ def _checked_metrics(
 def _numbers(
     code: UserCode, method: str, values: StatedRun, legal: Mapping[str, Legal]
 ) -> NamedValues:
+    """Check single numbers, and return them as floats."""
     return {
         name: float(code.check_numbers(method, name, value, (), legal[name]))
         for name, value in values.items()

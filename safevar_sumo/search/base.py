@@ -127,6 +127,7 @@ def check_search(
 def _checked_settings(
     code: UserCode, output: Any, problem: Problem, budget: int
 ) -> FloatArray:
+    """Check an array of settings that a user's search yields, and return it as floats."""
     characteristics = problem.characteristics
     shape = (
         f"shape (k, {len(characteristics)}) with k from 1 to the {budget}"

@@ -140,6 +140,7 @@ class Ranges:
         return np.asarray(self._problem.repaired(setting[None])[0])
 
     def _draw_setting(self, rng: Generator) -> FloatArray:
+        """Draw a setting with changes of some characteristics, which may violate constraints."""
         setting = self._characteristics.original.copy()
         count = len(self._characteristics.vehicle)
         for i in rng.choice(

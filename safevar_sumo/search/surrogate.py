@@ -104,6 +104,7 @@ def _learn(
     # The last decimals differ between libraries of linear algebra. Without rounding, a search would
     # take another way on another machine.
     def predict(settings: FloatArray) -> Evaluations:
+        """Predict the evaluations of settings: the mean of the models, and their agreement."""
         values = np.array(
             [model.predict(settings).T for model in bag.estimators_]
         ).round(6)

@@ -181,6 +181,7 @@ def stated_values(distribution: Distribution) -> dict[str, float]:
 
 
 def _check_distribution(key: str, row: Domain, distribution: Distribution) -> None:
+    """Refuse a distribution whose values are outside of the domain, or contradict each other."""
     stated = stated_values(distribution)
     lower = stated.get("lower", row.lower)
     upper = stated.get("upper", row.upper)

@@ -160,6 +160,7 @@ def plain_values(value: Any) -> Any:
 
 
 def _raw_study(study: StudyLike) -> StudyTables:
+    """The tables of a study, from a `Study`, from tables or from a file."""
     if isinstance(study, Study):
         return StudyTables(study.source, tables_of(study), study.origin)
     if isinstance(study, Mapping):

@@ -358,6 +358,7 @@ def tables_of(study: Study) -> Parameters:
 
 
 def _without_defaults(value: Any) -> Any:
+    """Convert records to tables at any depth, without keys that have their default values."""
     if isinstance(value, dict):
         return {key: _without_defaults(item) for key, item in value.items()}
     if isinstance(value, list):

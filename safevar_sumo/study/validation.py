@@ -232,6 +232,7 @@ def _wrong_key(value: Mapping[str, Any], kind: Any) -> str:
 
 
 def _path_text(path: Sequence[str | int]) -> str:
+    """The path of a key as a text, such as `tests[0].name`."""
     text = ""
     for key in path:
         if isinstance(key, int):
