@@ -104,13 +104,15 @@ FAILED = 1e9
 
 
 class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
-    """An algorithm of pymoo; its fields are those arguments of pymoo's class that are plain values.
+    """An algorithm of pymoo. Its fields are the arguments of pymoo's class that are plain values.
 
-    A population that has a size by default has the study's. `ref_dirs` are reference directions, or
-    the number of partitions of Das and Dennis's. The variables are the characteristics' unfiltered
-    values; an algorithm for one objective minimises the first. The result is pymoo's optimum,
-    together with the settings of an incomplete last generation. A setting that could not be scored
-    is infeasible.
+    If pymoo's class has a default size of its population, the study's population replaces this
+    size. `ref_dirs` are reference directions, or the number of partitions in Das and Dennis's
+    method. The search varies the unfiltered values of the characteristics. An algorithm for one
+    objective minimises the first objective.
+
+    The result is pymoo's optimum. If the budget ends within a generation, the settings of this
+    generation count, too. A setting that could not be scored is infeasible.
     """
 
     name: ClassVar[str]
