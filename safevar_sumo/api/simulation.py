@@ -121,21 +121,23 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """One simulated setting.
+    """One simulated setting, beside the original vehicle.
 
     Attributes
     ----------
     study
-        The study that the setting was simulated in.
+        The study in which the setting was simulated.
     pair
-        The original vehicle and a changed one on the road.
+        The original vehicle and the changed vehicle, simulated together.
     row
-        The row of this vehicle in the pair: 0 is the original.
+        The row of this setting's vehicle in the pair: 0 is the original vehicle.
     no_verdict
-        Why simulations of the study tell nothing about its ADS, in a sentence; empty if they do.
+        The reason why simulations of the study say nothing about its ADS, in a sentence; "" if they
+        do.
     reset_values
-        Requested values that the filter resets to the original, by name: for the simulation if it
-        is `filtered`, otherwise for f_diff and f_num_diff alone.
+        Requested values that the filter resets to the original, by name. If the simulation is
+        `filtered`, the original's values were simulated. Otherwise only f_diff and f_num_diff use
+        them.
     """
 
     study: Study
@@ -147,7 +149,7 @@ class Simulation:
     @cached_property
     def original(self) -> Simulation:
         """The simulation of the original vehicle in the same encounter, at the same point of a
-        matrix; for the original vehicle, the simulation itself.
+        matrix. For the original vehicle: the simulation itself.
         """
         if self.row == 0:
             return self
@@ -160,12 +162,12 @@ class Simulation:
 
     @cached_property
     def evaluation(self) -> Evaluations:
-        """Outcome, metrics and objectives as arrays of one row."""
+        """Outcome, metrics and objectives, as arrays with one row."""
         return self.pair.evaluations.take([self.row])
 
     @cached_property
     def runs(self) -> SimulationRuns:
-        """The trajectory and outcome of the only vehicle."""
+        """The trajectory and the outcome of this vehicle alone."""
         return self.pair.runs.of(slice(self.row, self.row + 1))
 
     @property
@@ -190,8 +192,9 @@ class Simulation:
 
     @property
     def objectives(self) -> NamedValues:
-        """f_safe [m, or -m/s on a collision], and of the filtered setting f_diff [fraction] and
-        f_num_diff [characteristics]; all are minimised.
+        """The objectives, which a search minimises: f_safe [m, or -m/s after a collision], f_diff
+        [fraction] and f_num_diff [characteristics]. f_diff and f_num_diff are those of the filtered
+        setting.
         """
         return {
             name: float(self.evaluation.column(name)[0])
@@ -218,7 +221,9 @@ class Simulation:
 
     @cached_property
     def trace(self) -> pd.DataFrame:
-        """One row per step, units in the columns' names; NaN where a value does not exist."""
+        """The trace: one row per step. The names of columns have the units; NaN for a value that
+        does not exist.
+        """
         return trace_frame(self.runs, self.pair.observations, self.row)
 
     @property
@@ -285,7 +290,7 @@ class Simulation:
         return 2
 
     def to_dict(self) -> JsonObject:
-        """Study, setting (vcs: vehicle characteristics), outcome and all numbers as plain
+        """Study, setting (`vcs`: vehicle characteristics), outcome and all numbers, as plain
         values.
         """
         return {"study": self.study.name, "vcs": dict(self.setting), **self.numbers}
