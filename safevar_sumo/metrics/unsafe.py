@@ -287,17 +287,16 @@ class Unsafe:
 
     @classmethod
     def default(cls, original: Tables, outcomes: TextArray | pd.Series[str]) -> Unsafe:
-        """The criterion if none is stated.
-
-        It is a collision if any vehicle collides or the original has no safety degree to halve;
-        otherwise, a safety degree below half of the original's safety degree.
+        """The criterion if the user states none: a collision, if any vehicle collides or the
+        original vehicle has no safety degree to halve; otherwise half of the original's safety
+        degree.
 
         Parameters
         ----------
         original
             The original vehicle's metrics by name; an undefined metric is NaN or None.
         outcomes
-            Outcomes of the other vehicles, as an array or a column of `Outcome`.
+            Outcomes of the vehicles, as an array or a column of `Outcome`.
         """
         safety_degree = original.get(SAFETY_DEGREE) or 0.0
         if (outcomes == COLLISION).any() or not safety_degree > 0:
