@@ -22,13 +22,18 @@ from safevar_sumo.study import Table
 
 WidePositive = Annotated[float, Meta(gt=0, le=1e5)]
 NonNegative = Annotated[float, Meta(ge=0)]
-HOLDING_DECELERATION = 2.0  # m/s^2, commanded to hold at standstill
-TAPER_TIME = 0.3  # s, over which the deceleration fades into the creep
-CREEP_MARGIN = 0.1  # m/s, above the creep speed, where the creep begins
-LEAST_DISTANCE = 0.05  # m, smallest distance over which a deceleration is planned
+# m/s^2. Apollo commands this deceleration to hold the vehicle at standstill.
+HOLDING_DECELERATION = 2.0
+# s. Above the creep speed, Apollo brakes with at most the excess of speed divided by this time.
+TAPER_TIME = 0.3
+# m/s. The creep begins when the speed is less than this margin above the creep speed.
+CREEP_MARGIN = 0.1
+# m. The planned deceleration divides by the distance: without this lower bound it could be 0.
+LEAST_DISTANCE = 0.05
 # m/s^2. The rise of the needed deceleration is a divisor: without this lower bound it could be 0.
 LEAST_RISE = 1e-9
-FIRST_COMMAND_ROUNDING = 1e-9  # s
+# s. Largest rounding error of the time at which the first command is due.
+FIRST_COMMAND_ROUNDING = 1e-9
 
 
 class _ApolloMemory(NamedTuple):
