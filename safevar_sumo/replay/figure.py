@@ -98,7 +98,7 @@ def _mark_moments(
     speed_axis: Axes, gap_axis: Axes, comparison: Comparison, row: int
 ) -> None:
     """Mark the moments at which a vehicle begins to brake, is nearest to the obstacle, and
-    collides. The marks of the original are larger, so that they show behind those of the other.
+    collides. Marks of the original are larger: they show behind marks of the changed vehicle.
     """
     trace = comparison.runs.trace
     start, nearest, end = comparison.moments[row]

@@ -69,7 +69,7 @@ def answer_of_setting(
     system: System, simulation: Simulation, handle: SolutionId | None
 ) -> Answer:
     """The answer about a setting and the original vehicle: values, outcomes, metrics, objectives,
-    and the results at the points of a matrix. `handle` is that of a solution, else None.
+    and the results at the points of a matrix. `handle` is None if the setting is no solution.
     """
     study = simulation.study
     setting = simulation.evaluation.settings[0]

@@ -285,7 +285,7 @@ class Packed:
         return json_bytes(packed_answer(self.answer(text)))
 
     def ask_speed(self) -> ReportedStudy:
-        """The study with the answers of its page, such as that about the sheet's greatest speed."""
+        """The study with the answers of its page, and the answer about its greatest speed."""
         study = ReportedStudy(
             directory=self._directory,
             case=self.judged_case,

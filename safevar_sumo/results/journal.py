@@ -190,7 +190,7 @@ class Journal:
 def read_journal(
     path: Path, head: JsonObject, *, head_only: bool = False
 ) -> JournalContent:
-    """The contents of a journal that another process may be writing. `path` and `head` are those of
+    """The contents of a journal that another process may be writing; for `path` and `head` see
     `Journal`. With `head_only`, only the owner is checked.
 
     Raises
@@ -210,8 +210,8 @@ def read_journal(
 
 
 class _Progress(msgspec.Struct):
-    """The progress of a run by one line of its journal: `evaluation` has positions of a batch,
-    `budget` is that of a finished run (0 in other lines).
+    """The keys of a journal's line that state the progress of its run: `evaluation` has the
+    positions of a batch, `budget` is the budget of a finished run (0 in other lines).
     """
 
     evaluation: list[int] = []

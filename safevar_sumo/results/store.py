@@ -125,8 +125,8 @@ class ResultsDirectory:
                 (self.path / SOLUTIONS).unlink(missing_ok=True)
 
     def finish(self, solutions: Mapping[RunKeyT, Evaluations]) -> None:
-        """Write the table of the solutions of all runs; `solutions` has those of each run by its
-        algorithm and number.
+        """Write the table of the solutions of all runs; `solutions` has the solutions of each run,
+        by its algorithm and number.
         """
         frame = solutions_frame(self._study.domains, solutions.items())
         write_whole(

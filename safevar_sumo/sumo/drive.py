@@ -153,8 +153,8 @@ def drive(
 def _go_on(
     traffic: Traffic, motion: VehicleStates, ends: BoolArray, last_sample: IntArray
 ) -> BoolArray:
-    """Extend those of the runs that end at this sample (`ends`) whose vehicles close in on a body:
-    `last_sample` grows by `OVERTIME`. Returns the extended runs, shape (N,).
+    """Extend runs that end at this sample (`ends`) if their vehicles close in on a body: their
+    `last_sample` grows by `OVERTIME`. Returns whether each run is extended, shape (N,).
     """
     goes_on = ends & traffic.are_closing(motion)
     last_sample[goes_on] += round(OVERTIME / traffic.step)

@@ -76,7 +76,7 @@ def open_in_process(options: Sequence[str]) -> Iterator[Api]:
     EnvironmentFault
         If SUMO does not start.
     """
-    # libsumo prints a warning if pyarrow has another version: results belong to stdout alone.
+    # libsumo prints a warning if pyarrow has another version: stdout is for results alone.
     with redirect_stdout(sys.stderr):
         import libsumo
     with _open(libsumo, "SUMO"):
@@ -135,8 +135,8 @@ def open_world(
     start: Start = open_in_process,
 ) -> Iterator[SumoWorld]:
     """Start SUMO on `n` copies of a network and its traffic; close SUMO at the end, also after an
-    error. `step` is the time step [s] (None: that of the network's options). `create` makes the
-    world. Raises the errors of `start`.
+    error. `step` is the time step [s] (None: the step in the network's options). `create` makes
+    the world. Raises the errors of `start`.
     """
     with start(sumo_options(files, step)) as api:
         yield create(api, n)

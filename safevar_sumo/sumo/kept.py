@@ -1,5 +1,5 @@
-"""What this process keeps between the runs of users' simulators: for each class a handle, such as a
-connection, that is opened only once.
+"""Objects that this process keeps between the runs of users' simulators: for each class a handle,
+such as a connection, that is opened only once.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ open connection, may pass from run to run.
 
 
 class Kept:
-    """What this process keeps of users' simulators: for each class the handle that `open_worker`
-    returned, and the object that simulated last. `simulated` is the number of simulations.
+    """The objects that this process keeps: for each class of a user's simulator, the handle that
+    `open_worker` returned, and the object that simulated last. `simulated` counts simulations.
     """
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class Kept:
         handle = self._handles[name][2]
 
         # A run must not change the scenario, which later runs copy, too. Without `open_worker`,
-        # this object inherits what the run before opened and stored in its own object.
+        # this object inherits connections that the last run opened and stored in its object.
         is_struct = isinstance(scenario, msgspec.Struct)
         set_field: Any = (
             msgspec.structs.force_setattr if is_struct else object.__setattr__

@@ -195,7 +195,8 @@ def evaluate_points(system: System, settings: FloatArray) -> list[Evaluations]:
 
 def settings_per_batch(system: System) -> int:
     """Number of settings in an efficient batch."""
-    # A journal gets the results of a batch at its end: an interruption loses what is not in it.
+    # The journal gets the results of a batch at its end: an interruption must not lose more than
+    # one long simulation.
     if system.mover.takes_long:
         return 1
     if reason_against_scenes(system):
@@ -297,7 +298,7 @@ def _group_points(system: System, size: int) -> Iterator[Points]:
         if isinstance(scenario, TrackScenario):
             n_bodies = 0
             if len(system.points) > size:
-                # The bodies at time 0 are those of all times.
+                # A scenario has the same bodies at all times: time 0 suffices to count them.
                 n_bodies = len(scenario.tracks(np.zeros((1, 1))))
             key = (
                 scenario.vut_length,

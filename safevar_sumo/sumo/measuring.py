@@ -1,4 +1,4 @@
-"""What a study measures: the metrics, measures of change and objectives that it names."""
+"""The measures of a study: the metrics, measures of change and objectives that the study names."""
 
 from __future__ import annotations
 
@@ -148,8 +148,8 @@ class _Named:
         self._own = dict[str, Measure]()
 
     def look_up(self, name: str, key: str, shipped: Mapping[str, Measure]) -> Measure:
-        """The measure with a name: that of a shipped measure, of a user's class
-        (package.module:Name), or of a measure of a user's class that was looked up before.
+        """The measure with this name. The name is that of a shipped measure, a user's class
+        (package.module:Name), or that of a user's measure that was looked up before.
         """
         member = self._lookup.find({**shipped, **self._own}, name, key)
         measure: Measure = member.target

@@ -1,4 +1,4 @@
-"""What ADSs observe: the obstacle in the scene of each vehicle, delayed by the weather."""
+"""Observations of driving systems: the obstacle in each vehicle's scene, delayed by the weather."""
 
 from __future__ import annotations
 

@@ -277,7 +277,7 @@ def _runs_of(
     """The runs of N results. Each run has its own number of samples; 0 for a result without a
     trace.
     """
-    # Metrics of a result with a trace follow from the trace, those of other results are stated.
+    # Metrics of a result with a trace follow from the trace; other results state their metrics.
     traces, rigs = list[StatedRun](), list[StatedRun]()
     for result in results:
         has_trace = TIME in result

@@ -117,7 +117,7 @@ class SumoWorld:
         self._depart()
         self._set_decelerations(decel, emergency_decel)
         if keeps_drivers:
-            # SUMO has drawn a random factor for each vehicle: that of its type replaces the factor.
+            # SUMO has drawn a random factor for each vehicle: the factor of its type replaces it.
             for id_ in ids:
                 self.api.vehicle.setSpeedFactor(id_, vehicletype.getSpeedFactor(id_))
         return self._motion(np.ones(self.n, bool))
