@@ -237,6 +237,7 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
     ]
 
     def show(sample: int) -> list[Patch]:
+        """Show a sample: move the view and the bodies, and write the texts."""
         axis.set_xlim(left_ends[sample], left_ends[sample] + width)
         for body, patch in zip(bodies, patches, strict=True):
             x = body.x[sample]

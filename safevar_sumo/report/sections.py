@@ -212,6 +212,7 @@ def _scenario(study: ReportedStudy) -> str:
 
 
 def _search(study: ReportedStudy) -> str:
+    """A sentence on the search that found the solutions, or on their import."""
     case = study.case
     search = case.study.search
     versions = ", ".join(f"{name} {value}" for name, value in study.versions.items())

@@ -90,6 +90,7 @@ def _without_ranges(tables: Tables) -> JsonObject:
     """
 
     def lists(table: JsonObject) -> JsonObject:
+        """A table whose axes in `over` have only their listed values."""
         listed = dict(table)
         over = {}
         for name, values in listed.pop("over", {}).items():

@@ -267,6 +267,7 @@ class FirstContacts:
             )
 
     def _locate(self, pairs: BodyPairs, scene: Scene) -> None:
+        """Note side, place and speed of the first contact of each pair."""
         copies, body, obstacle = pairs
         touches = find_touches(body, obstacle)
         lateral_speed = np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[

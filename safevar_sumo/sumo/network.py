@@ -355,6 +355,9 @@ def road_digests(network: NetworkFiles) -> list[str]:
 
 
 def _run_netconvert(network: NetworkFiles, file: Path) -> None:
+    """Build a network from its recipe. An error of the machine, such as no memory or no place on
+    the disk, is an EnvironmentFault; any other error is an error of the recipe.
+    """
     netconvert = program_of_sumo("netconvert", network.path(network.roads_file))
     arguments = ("-c", network.roads_file, "-o", str(file), "--no-warnings", "true")
     exit_code, errors = run_program(network.folder, netconvert, *arguments)
@@ -438,6 +441,7 @@ def _lane_shapes(network: NetworkFiles) -> dict[str, str]:
 
 
 def _changed(file: Path, changes: Changes) -> ElementTree.Element:
+    """The root of an XML file with these changes. A path without an element is an error."""
     root = parse_xml(file)
     for path, attributes in changes:
         elements = root.findall(path)

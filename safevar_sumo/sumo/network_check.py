@@ -211,6 +211,9 @@ def _is_same(stated: str, value: str) -> bool:
 
 @lru_cache(maxsize=100)
 def _check_files(network: NetworkFiles) -> None:
+    """Check the options, the vehicle under test, its roads and the traffic, and let SUMO load the
+    network.
+    """
     # With the option remote-port SUMO would wait for a client for ever.
     options = {
         "step-length": str(STEP_LENGTH),

@@ -115,6 +115,7 @@ class TraciController(Ads):
         return command, memory._replace(initial_trim=initial_trim)
 
     def _call(self, view: TraciView, function: Callable[..., None]) -> None:
+        """Call a function of the user's controller, whose calls of traci go to `view`."""
         global _active_view
         _active_view = view
         try:

@@ -135,6 +135,7 @@ class SensedTraffic:
     def _snapshot(
         self, copy: int, names: Mapping[tuple[int, str], list[str]]
     ) -> Snapshot:
+        """The traffic of this step in one copy. `names` has the actors by copy and domain."""
         api = self._world.api
         vut = copied_id(copy, VUT)
         if vut not in self._world.driving:
@@ -308,6 +309,9 @@ class TraciView:
             ) from None
 
     def _command(self, domain: str, name: str, vehicle: str, *values: Value) -> Value:
+        """Note a command for the vehicle under test. SUMO itself only gets commands that change
+        attributes of its driver.
+        """
         if vehicle != VUT:
             raise refused(
                 domain,

@@ -214,6 +214,7 @@ class Traffic:
         return np.asarray(blocks & self._row(body.is_there))
 
     def _scene_of(self, view: _View, over: BoolArray) -> Scene:
+        """The scene with the body of a view as the obstacle of all vehicles."""
         body = self._bodies[view.body]
         zeros = np.zeros(self.n)
         return Scene(

@@ -77,6 +77,9 @@ class Placed(NamedTuple):
 
     @classmethod
     def of(cls, track: Track, ids: list[str], start: Frame) -> Placed:
+        """The actor of a track. `start` has the lane's coordinates, in which tracks are, with their
+        origin at the first front of the vehicle under test.
+        """
         is_person = track.kind in PERSONS
         offset = 0.0 if is_person else track.length.max(axis=0) / 2
         x, y = start.point(
