@@ -191,7 +191,7 @@ class Comparison:
 BODY_LENGTH, BODY_WIDTH, LANE_WIDTH = 4.5, 1.8, 3.5
 """Sizes of bodies and lane in pictures of a user's simulator, which states no sizes [m]."""
 ROAD_BEHIND, ROAD_AHEAD = 20.0, 100.0
-"""Lengths by which this lane extends behind and ahead of all positions of the vehicles [m]."""
+"""Lengths of lane behind and ahead of all positions of the vehicles in such pictures [m]."""
 
 
 def films_along(trace: Trace) -> dict[str, Film]:

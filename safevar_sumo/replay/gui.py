@@ -65,7 +65,7 @@ def show_in_gui(comparison: Comparison, pictures: Path | None = None) -> None:
     start = 0.0
 
     def watch(world: SumoWorld) -> None:
-        """Follow the vehicles at a sample, and wait, so that the time of the window is real."""
+        """Follow the vehicles at a sample, and wait, so that the window plays in real time."""
         nonlocal start
         sample = next(samples)
         # The clock starts with the first step, because opening the window takes a while.

@@ -494,7 +494,7 @@ def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
 
 
 def _shown(line: str, counterpart: str) -> str:
-    """A line without spaces around it. If lines differ only in them, the quoted line."""
+    """A line without spaces around it; the quoted line if both lines differ only in spaces."""
     if line.strip() in ("", counterpart.strip()):
         return repr(line)
     return line.strip()

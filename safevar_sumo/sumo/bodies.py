@@ -66,7 +66,7 @@ class Body(NamedTuple):
         width: Quantity,
         speed: FloatArray | float,
     ) -> Body:
-        """The body whose front's middle is at `front`, or M such bodies."""
+        """The body whose middle of the front is at `front`, or M such bodies."""
         middle = front - along * (np.asarray(length)[..., None] / 2)
         return cls(middle, along, length, width, speed, np.zeros_like(speed))
 

@@ -244,7 +244,7 @@ def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
     latency, reach, scale = system.vehicle.sensors(prepared) or Sensors.perfect(n)
     reach = reach * point.weather.visibility
     if system.sees_nobody:
-        # Nobody is within a negative range.
+        # A negative range hides everybody.
         reach = np.full(n, -1.0)
     return Sensors(latency + point.weather.recognition_delay, reach, scale)
 

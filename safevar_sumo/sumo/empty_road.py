@@ -68,7 +68,7 @@ def find_problems(system: System) -> dict[str, EmptyRoadFault]:
     original = system.characteristics.original_settings
     try:
         results = simulate_all_points(replace(system, sees_nobody=True), original)
-    # The study's own simulations decide, and report their errors.
+    # The study's own simulations will report the error.
     except SimulationError:
         return {}
     problems = {}

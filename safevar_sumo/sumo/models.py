@@ -103,7 +103,7 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
                 CONTROLLER_FORMS,
             ) from None
 
-        # Each vehicle gets its own controller, because controllers keep values between steps.
+        # Each vehicle gets its own controller, because controllers may keep values between steps.
         create: Callable[[], Controller]
         if is_class:
             create = partial(instance_of, member, parameters, name, "ads.parameters")
@@ -276,7 +276,7 @@ def create_ads(table: ModelTable, lookup: Lookup) -> Ads:
         fleet.max_vehicles = MAX_INSTANCES
         return fleet
 
-    # A ScalarAds, too, is created once, so that wrong parameters raise their errors here.
+    # Each vehicle gets its own ScalarAds. One is created here, to find wrong parameters at once.
     member, create = _class_and_creator("ads", ADS, table, lookup, ScalarAds, Ads)
     ads: Ads = create()
     if not isinstance(ads, ScalarAds):

@@ -22,7 +22,7 @@ processor's first cache.
 TYRE_STEPS = 3
 """Tyre steps in a substep, at every speed; PhysX's number below 5 m/s (setSubStepCount)."""
 NEUTRAL, FIRST_GEAR, TOP_GEAR = 0.0, 1.0, 4.0
-"""The lowest and the highest forward gear, and neutral."""
+"""Numbers of neutral, of the first gear, and of the highest gear."""
 
 
 class Car(NamedTuple):
