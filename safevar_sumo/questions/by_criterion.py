@@ -15,13 +15,14 @@ from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import OPTIONAL_METRICS, Unsafe
 from safevar_sumo.questions.evaluator import Evaluator, open_evaluator
 from safevar_sumo.study import Study
+from safevar_sumo.study.encounters import DecidingMetric
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress
 
 if TYPE_CHECKING:
     from safevar_sumo.questions.case import Case, Subject
 
-STAGE = "solutions by the measure"
+SOLUTIONS_STAGE = "solutions by the measure"
 
 
 def study_by(study: Study, unsafe: Unsafe) -> Study:
@@ -54,9 +55,8 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
         )
 
     if matrix is not None:
-        matrix = replace_in(
-            matrix, aggregate=f"{name} {'>' if unsafe.bound.worst_is_largest else '<'}"
-        )
+        deciding = DecidingMetric(name, unsafe.bound.worst_is_largest)
+        matrix = replace_in(matrix, aggregate=str(deciding))
     return replace_in(study, metrics=metrics, matrix=matrix)
 
 
@@ -105,5 +105,5 @@ def case_by(case: Case, unsafe: Unsafe, evaluator: Evaluator) -> Case:
     case = replace(case, stated=evaluator.checked(unsafe))
     if study == case.study:
         return case
-    evaluations = evaluator.evaluate(case.settings, STAGE)
+    evaluations = evaluator.evaluate(case.settings, SOLUTIONS_STAGE)
     return case.simulated_as(study, evaluator.system.measuring.scoring, evaluations)

@@ -14,7 +14,6 @@ from safevar_sumo.study.characteristics import (
 from safevar_sumo.study.encounters import (
     RANGES as RANGES,
     TESTS as TESTS,
-    WORST as WORST,
     AxisTable as AxisTable,
     MatrixTable as MatrixTable,
     MatrixTest as MatrixTest,

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import product
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, NamedTuple, Self
 
 from msgspec import Meta
 from msgspec.structs import asdict, replace
@@ -237,6 +237,28 @@ class MatrixTest(Table, frozen=True, kw_only=True):
         return as_axes(self.over)
 
 
+class DecidingMetric(NamedTuple):
+    """The metric whose worst value decides which test case gives the result of a vehicle.
+
+    The `aggregate` of a matrix states it as text: `drac >` if the largest value of `drac` is the
+    worst, and `ttc_min <` if the smallest value of `ttc_min` is.
+    """
+
+    name: str
+    largest_is_worst: bool
+
+    @classmethod
+    def of(cls, aggregate: str) -> Self | None:
+        """The metric that an aggregate states; None by `worst`, where the safety degree decides."""
+        if aggregate == WORST:
+            return None
+        name, direction = aggregate.split()
+        return cls(name, direction == ">")
+
+    def __str__(self) -> str:
+        return f"{self.name} {'>' if self.largest_is_worst else '<'}"
+
+
 class MatrixTable(Table, frozen=True, kw_only=True):
     """The table [matrix] has the `tests` in which every vehicle is simulated.
 
@@ -278,6 +300,11 @@ class Encounters(Table, frozen=True, kw_only=True):
     weather: Annotated[str | Weather, PART_OF_SYSTEM] = ""
     matrix: Annotated[MatrixTable | None, PART_OF_SYSTEM, OF_SCENARIO] = None
     constraints: list[Constraint] = []
+
+    @property
+    def deciding(self) -> DecidingMetric | None:
+        """The metric that `aggregate` states; None if the safety degree decides."""
+        return DecidingMetric.of(self.matrix.aggregate) if self.matrix else None
 
     def check_axes(self, characteristics: Domains) -> None:
         """Refuse axes that contradict the rest of the study.

@@ -38,7 +38,7 @@ from safevar_sumo.scenarios import (
 from safevar_sumo.scenarios.base import Quantities
 from safevar_sumo.scenarios.point import Points
 from safevar_sumo.scenarios.roads import Frame
-from safevar_sumo.study import PHASE, WORST, Domains, Study, unit_text
+from safevar_sumo.study import PHASE, Domains, Study, unit_text
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.network import networks_for
 from safevar_sumo.sumo.recording import Recording
@@ -266,11 +266,10 @@ def worst_points(system: System, at_points: Sequence[Evaluations]) -> IntArray:
     has_collided = evaluations.collided.reshape(shape).any(axis=0)
     values = safety_degrees
 
-    if system.aggregate != WORST:
-        # The aggregate is a metric and a direction, such as "drac >".
-        name, direction = system.aggregate.split()
+    if system.deciding:
+        name, largest_is_worst = system.deciding
         measures = evaluations.column(name).reshape(shape)
-        if direction == ">":
+        if largest_is_worst:
             measures = -measures
         measures = np.where(np.isnan(measures), np.inf, measures)
         # A test may allow impacts: then only the excess says how bad a collision is.

@@ -21,7 +21,8 @@ from safevar_sumo.scenarios.base import Mover, Part
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.scenarios.point import Points
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.study import WORST, MetricsTable, Study
+from safevar_sumo.study import MetricsTable, Study
+from safevar_sumo.study.encounters import DecidingMetric
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter, original_encounter
 from safevar_sumo.sumo.engine import open_world
@@ -57,8 +58,8 @@ class System:
     - `scenes` has the recorded scenes of all points. A system that is reduced to fewer points
       shares them.
     - `metrics_table` has the thresholds of the metrics in `measuring`.
-    - `aggregate` decides which point of a matrix is the worst: the point with the least safety
-      degree, or with the worst value of another measure.
+    - `deciding` is the metric that decides which point of a matrix is the worst; None if the safety
+      degree decides.
     - A simulation that takes longer than `time_limit` [s] counts as hung.
     - Settings are simulated at `points`: the points of the matrix, or the study's only scenario.
     - A user's simulator simulates each setting `repeats` times.
@@ -83,7 +84,7 @@ class System:
     time_limit: float
     sees_nobody: bool = False
     in_sumo: bool = False
-    aggregate: str
+    deciding: DecidingMetric | None
     repeats: int
     command: str
     skips_failed: bool
@@ -270,7 +271,7 @@ def _assemble(study: Study) -> System:
         source=study.source,
         scenes=Scenes(study.step_length),
         time_limit=study.search.time_limit,
-        aggregate=WORST if study.matrix is None else study.matrix.aggregate,
+        deciding=study.deciding,
         repeats=study.scenario.repeats,
         command=simulate_command(study),
         criterion=own_criterion(study),
@@ -308,9 +309,7 @@ def _check_metrics(study: Study, measuring: Measuring) -> None:
     for key in ("published", "repeatability", "model_error"):
         for name in getattr(study, key):
             check_name("", f"{key}.{name} is no metric", name, metrics)
-    if study.matrix is not None and study.matrix.aggregate != WORST:
-        aggregate = study.matrix.aggregate
-        name = aggregate.split()[0]
-        check_name(
-            "", f"matrix.aggregate = {aggregate!r}: {name} is no metric", name, metrics
-        )
+    if deciding := study.deciding:
+        name = deciding.name
+        problem = f"matrix.aggregate = {str(deciding)!r}: {name} is no metric"
+        check_name("", problem, name, metrics)

@@ -15,7 +15,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.by_criterion import STAGE, study_by
+from safevar_sumo.questions.by_criterion import SOLUTIONS_STAGE, study_by
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import Evaluations, FloatArray
 from tests.in_process import SLOW, InlinePool, json_of, numbers_of, run, searched
@@ -145,7 +145,7 @@ def test_a_pack_simulates_solutions_once_by_its_criterion_and_a_question_keeps_i
         "evidence results --out pack.zip --unsafe 'drac > 5' --ask 'rules --samples 64' "
         f"--ask 'rules --samples 32' --ask '{own}'"
     )
-    assert stages.count(STAGE) == 2, (
+    assert stages.count(SOLUTIONS_STAGE) == 2, (
         "to choose questions, and for all answers and the page"
     )
     with zipfile.ZipFile("pack.zip") as pack:
