@@ -48,7 +48,7 @@ OF_ENCOUNTER = ("test", "weather")
 LEAST_IMPACT = 1.0
 """Slowest impact that is printed [km/h]. An impact just beyond a limit is slower, and says nothing.
 """
-STAGE = "find what fails first"
+BEYOND_STAGE = "find what fails first"
 
 
 class Place(NamedTuple):
@@ -185,7 +185,7 @@ def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
         model = Model(0, evaluator, case.unsafe)
         (printed,) = values_as_printed(model, [worst.changes | worst.encounter])
         settings = case.characteristics.setting(printed, beyond=True)[np.newaxis]
-        return evaluator.evaluate(settings, STAGE)
+        return evaluator.evaluate(settings, BEYOND_STAGE)
 
 
 def limit_text(item: Characteristic, value: float) -> str:
@@ -245,12 +245,9 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     """The failures of the unsafe settings among M settings, by their row."""
     points = model.evaluator.system.points
     members = model.characteristics
-    runs = model.evaluate(settings, STAGE)
-    is_unsafe = model.evaluator.region.feasible(settings) & (
-        model.robustness_by(runs) < 0
-    )
+    runs = model.evaluate(settings, BEYOND_STAGE)
     failures = dict[int, Failure]()
-    for row in np.flatnonzero(is_unsafe).tolist():
+    for row in np.flatnonzero(model.robustness_by(runs) < 0).tolist():
         point = points[runs.points[row]]
         values = members.encounter_of(settings[row])
         scenario = encounter(point, values).scenario

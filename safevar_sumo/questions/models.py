@@ -73,24 +73,41 @@ class Model(NamedTuple):
         """The robustness of M settings (the distance to the limit of the criterion), shape (M,). A
         setting is unsafe below 0, and does not count at infinity.
         """
-        robustness = np.where(
-            self.evaluator.region.feasible(settings),
-            self.robustness_by(self.evaluate(settings, stage)),
-            np.inf,
-        )
+        robustness = self.robustness_by(self.evaluate(settings, stage))
         failing = np.flatnonzero(robustness < 0)
-        if self.new_car is not None and len(failing):
-            members = self.characteristics
-            originals = self.evaluate(
-                members.with_original_vehicle(settings[failing]), stage
-            )
-            counts = originals.valid & ~self.new_car.of(originals)
-            robustness[failing[~counts]] = np.inf
+        do_count = self.do_count(settings[failing], stage)
+        robustness[failing[~do_count]] = np.inf
         return robustness
 
-    def robustness_by(self, evaluations: Evaluations) -> FloatArray:
-        """The robustness of evaluated settings, shape (M,); infinite without a valid simulation."""
-        return np.where(evaluations.valid, self.unsafe.robustness(evaluations), np.inf)
+    def do_count(self, settings: FloatArray, stage: str) -> BoolArray:
+        """Which of M settings have an encounter that counts, shape (M,): one in which the original
+        vehicle is safe by `new_car`, else a failure says nothing about changes of the vehicle. All
+        count without `new_car`.
+        """
+        if self.new_car is None or not len(settings):
+            return np.ones(len(settings), dtype=bool)
+        settings = self.characteristics.with_original_vehicle(settings)
+        originals = self.evaluate(settings, stage)
+        return originals.valid & ~self.new_car.of(originals)
+
+    def robustness_by(
+        self, evaluations: Evaluations, failed: float = np.inf
+    ) -> FloatArray:
+        """The robustness of M evaluated settings, shape (M,): infinite where a constraint is
+        violated, `failed` where the setting could not be simulated.
+
+        Without a simulation a vehicle is neither safe nor unsafe. Each question says what it needs:
+
+        - infinity where only simulated failures count, as in a search for counterexamples;
+        - minus infinity where only simulated safety counts: each limit alone, and repairs;
+        - NaN where that is chosen later (`Oracle`).
+
+        `permit` raises an error instead, because every car of its list needs an answer.
+        """
+        robustness = self.unsafe.robustness(evaluations)
+        robustness = np.where(evaluations.valid, robustness, failed)
+        robustness[evaluations.infeasible] = np.inf
+        return robustness
 
     def are_unsafe(self, settings: FloatArray, stage: str) -> BoolArray:
         """Which of M settings are unsafe, shape (M,)."""

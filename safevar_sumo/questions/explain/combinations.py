@@ -17,6 +17,7 @@ import numpy as np
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.causes import Cause
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.models import Model
 from safevar_sumo.records import FloatArray
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -268,4 +269,4 @@ def _robustness(
         causes.append(
             Cause(changes, str(outcome), float(degree), encounter, float(of_runs))
         )
-    return np.where(runs.valid, unsafe.robustness(runs), np.inf), causes
+    return Model(0, evaluator, unsafe).robustness_by(runs), causes

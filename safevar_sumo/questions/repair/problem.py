@@ -374,15 +374,15 @@ class RepairProblem:
         self, shares: FloatArray, cases: FloatArray, stage: str
     ) -> FloatArray:
         """The robustness (distance to the limit of the criterion) of L cases with each of M
-        changes, shape (M, L). Minus infinity marks a case without a valid simulation. Infinity
-        marks a case that violates a constraint, or has no conflict.
+        changes, shape (M, L). Minus infinity marks a case without a valid simulation (see
+        `Model.robustness_by`). Infinity marks a case that violates a constraint, or has no
+        conflict.
         """
         robustness = np.zeros((len(shares), len(cases)))
         for number, rows, settings in self.oracle.in_worlds(cases):
             model = self.oracle.worlds[number].model
             runs = self.evaluate(model, shares, settings, stage)
-            of_world = np.where(runs.valid, model.unsafe.robustness(runs), -np.inf)
-            of_world[runs.infeasible] = np.inf
+            of_world = model.robustness_by(runs, failed=-np.inf)
             robustness[:, rows] = of_world.reshape(len(shares), -1)
         return robustness
 

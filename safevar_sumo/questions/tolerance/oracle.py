@@ -200,10 +200,8 @@ class Oracle:
             world = self.worlds[number]
             model = world.model
             runs = model.evaluate(settings, STAGE)
-            of_world = model.robustness_by(runs)
             # NaN marks cases that could not be simulated, until `failed` replaces it at the end.
-            of_world[~(runs.valid | runs.infeasible)] = np.nan
-            of_world[~model.evaluator.region.feasible(settings)] = np.inf
+            of_world = model.robustness_by(runs, failed=np.nan)
             unsafe = np.flatnonzero(of_world < 0)
             does_count = self._do_count(world, cases[rows[unsafe]])
             of_world[unsafe[~does_count]] = np.inf
@@ -232,11 +230,8 @@ class Oracle:
         world: CaseWorld,
         cases: FloatArray,
     ) -> BoolArray:
-        """Which of M cases of one world count, shape (M,): those in whose encounter the original
-        vehicle is safe. Otherwise a failure says nothing about changes of the vehicle.
-        """
-        new_car = world.model.new_car
-        if new_car is None or not len(cases):
+        """Which of M cases of one world count, shape (M,); see `Model.do_count`."""
+        if world.model.new_car is None or not len(cases):
             return np.ones(len(cases), dtype=bool)
         n = len(self.vehicle)
         # World and places identify an encounter: the original drives in each one only once.
@@ -245,8 +240,7 @@ class Oracle:
         if rows:
             places = cases[[*rows.values()], n + 1 :]
             originals = np.tile(self.vehicle.original, (len(rows), 1))
-            runs = world.model.evaluate(world.settings(originals, places), STAGE)
-            does_count = runs.valid & ~new_car.of(runs)
+            does_count = world.model.do_count(world.settings(originals, places), STAGE)
             self._counts |= dict(
                 zip(
                     rows,
