@@ -28,7 +28,7 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.study import Study
 
-STAGE = "check other parameter sets"
+SETS_STAGE = "check other parameter sets"
 """Phase of progress in which the vehicles are simulated with each set."""
 BY_SET, INTERVALS = "by_set", "by_set_intervals"
 """Keys of the numbers of an answer: the share with each set, and the interval of each share."""
@@ -78,11 +78,15 @@ def planned_over_sets(
     """The number of settings of each of the two phases of progress.
 
     In the phase `stage`, all `settings` are simulated with the study's own set. In the phase
-    `STAGE`, the first `VEHICLES` settings are simulated with each of the first `fits` sets (by
-    default all). The study's own set is the first one. Without other sets, `STAGE` has no settings.
+    `SETS_STAGE`, the first `VEHICLES` settings are simulated with each of the first `fits` sets (by
+    default all). The study's own set is the first one. Without other sets, `SETS_STAGE` has no
+    settings.
     """
     number = len(other_sets(study, fits))
-    return {stage: settings, STAGE: (number + bool(number)) * min(settings, VEHICLES)}
+    return {
+        stage: settings,
+        SETS_STAGE: (number + bool(number)) * min(settings, VEHICLES),
+    }
 
 
 class SharesOverSets(NamedTuple):
@@ -135,7 +139,7 @@ class SharesOverSets(NamedTuple):
         if evaluator.left is None and other_sets(evaluator.study, fits):
             models = models_of(evaluator, unsafe, fits, with_unsafe_originals=True)
             for model in models.members:
-                runs = model.evaluator.evaluate(settings[is_chosen], STAGE)
+                runs = model.evaluator.evaluate(settings[is_chosen], SETS_STAGE)
                 of_runs = unsafe.runs(runs).mean(axis=0)
                 for group in members & runs.valid:
                     count = round(float(of_runs[group].sum()), SHARE_DECIMALS)

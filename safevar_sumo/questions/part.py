@@ -14,6 +14,7 @@ import pandas as pd
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, check_name, check_text
+from safevar_sumo.questions.options import UP_TO
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import KMH_PER_MS
 from safevar_sumo.scenarios import SPEED_DIMENSION, Point, searchable_in, unit_of
@@ -24,7 +25,6 @@ from safevar_sumo.sumo.system import assemble
 
 N_SIMILAR_POINTS = 4
 """Number of similar points that the error about an unknown point lists."""
-OPTION = "up_to"
 FORM = "NAME=V: an axis of the study's encounters, and a number"
 PARTS = 5
 DECIMALS = 9
@@ -52,7 +52,7 @@ class UpperEnd(NamedTuple):
         name, _, number = map(str.strip, text.partition("="))
         value = pd.to_numeric(number, errors="coerce")
         if not (name and np.isfinite(value)):
-            raise InputError(OPTION, repr(text), FORM)
+            raise InputError(UP_TO, repr(text), FORM)
         return cls(name, float(value))
 
     def __str__(self) -> str:
@@ -149,14 +149,14 @@ def study_up_to(study: Study, end: UpperEnd) -> Study:
     problem = f"study {study.name!r} does not vary {name!r}"
     if not axes:
         in_ranges = ", with --ranges" if name in study.axes else ""
-        raise InputError(OPTION, problem, f"an axis whose values are listed{in_ranges}")
-    check_name(OPTION, problem, name, axes)
+        raise InputError(UP_TO, problem, f"an axis whose values are listed{in_ranges}")
+    check_name(UP_TO, problem, name, axes)
     domain = study.ranges.get(name)
     if domain is None:
         study = _lists_up_to(study, name, high)
     elif not domain.lower < high <= domain.upper:
         raise InputError(
-            OPTION,
+            UP_TO,
             f"{end} is outside the domain of study {study.name!r}",
             f"a value above {domain.lower:g} and up to {domain.upper:g}"
             f"{unit_text(domain.unit)}",
@@ -247,7 +247,7 @@ def _lists_up_to(study: Study, name: str, high: float) -> Study:
     highest = max(all_values)
     if not low <= high <= highest:
         raise InputError(
-            OPTION,
+            UP_TO,
             f"{name}={high:g} is not among the values that study {study.name!r} drives",
             f"a value from {low:g} to {highest:g}{unit}",
         )

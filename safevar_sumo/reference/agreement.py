@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 COLUMNS = shipped_columns("validate")["agreement"]
-STAGE = "settings"
+ROWS_STAGE = "settings"
 """The name of the phase of progress."""
 SHIPPED_AGREEMENT = Path(__file__).with_name("agreement.csv")
 """The file with the answers of `validate` for safety degrees of shipped studies and published
@@ -79,9 +79,9 @@ def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
         The CSV file.
     """
     study = evaluator.study
-    evaluator.begin({STAGE: 1})
+    evaluator.begin({ROWS_STAGE: 1})
     data = read_reference(reference, evaluator.characteristics)
-    evaluations = evaluator.evaluate(data.settings, STAGE, ignore_constraints=True)
+    evaluations = evaluator.evaluate(data.settings, ROWS_STAGE, ignore_constraints=True)
     valid = evaluations.valid
     if not valid.any():
         raise SimulationError(

@@ -267,7 +267,7 @@ def test_a_car_is_safe_with_all_values_that_its_measured_one_may_have(
     ends = np.tile(members.original, (2, 1))
     ends[:, column] = 0.75, 0.85
     found = reached(load_study("wear", encounters="ranges"), Cars.measured(*ends))
-    assert found.up_to == 20
+    assert found.safe_value == 20
     assert found.failure is not None
     assert found.failure.setting[column] == pytest.approx(unsafe_at, abs=0.01)
 
@@ -401,7 +401,7 @@ def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
     assert found.failure is not None
     assert found.failure.encounters.test == "CPLA"
     assert begin - 0.005 <= found.failure.value <= begin + 1.005
-    assert found.up_to == np.ceil(found.failure.value) - 1
+    assert found.safe_value == np.ceil(found.failure.value) - 1
 
 
 def test_where_a_test_lists_speeds_the_answer_is_one_of_them(
@@ -413,7 +413,7 @@ def test_where_a_test_lists_speeds_the_answer_is_one_of_them(
         "robustness",
         lambda one, settings, stage: np.where(one.values_in(settings) < 35, 1.0, -1.0),
     )
-    assert reached(load_study("listed.toml"), budget=0).up_to == 30
+    assert reached(load_study("listed.toml"), budget=0).safe_value == 30
 
 
 def test_all_corners_of_five_measured_values_drive_the_grid() -> None:

@@ -153,7 +153,7 @@ grip = { at_least = 5 }
 def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for module, name, number in (
         (cases, "USUAL_BUDGET", 300),
-        (survivors, "MAX_UNSAFE_SHARE", 0.01),
+        (survivors, "MAX_SHARE_REPAIRED", 0.01),
         (question, "SOBOL_VEHICLES", 32),
     ):
         monkeypatch.setattr(module, name, number)

@@ -20,7 +20,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.answer import HIGH, LOW, Answer
 from safevar_sumo.questions.indices import OUTPUTS
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.over_sets import STAGE, VEHICLES, SharesOverSets
+from safevar_sumo.questions.over_sets import SETS_STAGE, VEHICLES, SharesOverSets
 from safevar_sumo.questions.risk import influence_in_words
 from safevar_sumo.questions.rules import SAMPLED_STAGE
 from safevar_sumo.questions.sampling import clopper_pearson
@@ -384,7 +384,7 @@ def test_the_other_parameter_sets_are_planned() -> None:
     )
     expected = 26 * (100 + 12 * 100)  # at 26 points
     assert {total for phase, _, total in shown if phase == SAMPLED_STAGE} == {expected}
-    assert shown[-1][0] == STAGE
+    assert shown[-1][0] == SETS_STAGE
     assert shown[-1][1] <= expected
     bounded = risk("wear", samples=400, simulations=135_000, pool=InlinePool())
     assert "Other parameter sets (alternative calibrations) were not" in bounded.verdict

@@ -86,7 +86,7 @@ def _leading_of_study(
         largest = max(smallest.at_ends.simulated)
         yield words.NOTHING_FOUND(
             unsafe=unsafe.event,
-            up_to=_up_to(largest),
+            changes=_size_in_words(largest),
         )
         return
     fewest = table[table["size"] == table["size"].min()]
@@ -169,13 +169,13 @@ def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Iterator[Sentence]:
                 unsafe=unsafe.event,
             )
             continue
-        up_to = _up_to(largest)
+        changes = _size_in_words(largest)
         if alike[0].is_cut:
-            up_to += ", as there are too many larger ones"
+            changes += ", as there are too many larger ones"
         yield words.STEP_WITHOUT(
             shares=shares,
             tried=sum(step.tried for step in alike),
-            up_to=up_to,
+            changes=changes,
             causes=unsafe.effects[0],
         )
 
@@ -198,7 +198,7 @@ def _in_none(at_ends: Enumeration, members: CharacteristicSet) -> Iterator[Sente
     names = [item.short_name for item in members.vehicle if item.name not in changed]
     if names and changed and size:
         yield words.IN_NONE(
-            up_to=_up_to(size),
+            changes=_size_in_words(size),
             names=join_phrases(names, "or"),
         )
 
@@ -343,5 +343,5 @@ def _count(number: int) -> str:
     return NUMBERS[number] if number < len(NUMBERS) else f"{number:,}"
 
 
-def _up_to(size: int) -> str:
+def _size_in_words(size: int) -> str:
     return "one change" if size <= 1 else f"up to {_count(size)} changes"

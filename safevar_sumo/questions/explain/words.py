@@ -32,7 +32,7 @@ ON_THE_WAY = (
 """The sentence about one change, and the sentence about several changes."""
 OTHERS = answer("The table lists {causes} with the same number of changes.")
 NOTHING_FOUND = answer(
-    "The search found no cause of {unsafe} with {up_to}, each at an end of its domain (its range"
+    "The search found no cause of {unsafe} with {changes}, each at an end of its domain (its range"
     " of values)."
 )
 TOO_FEW = answer(
@@ -103,8 +103,8 @@ STEP = note(
     " domain."
 )
 STEP_WITHOUT = note(
-    "None of {tried:,} simulated combinations ({up_to}) {causes} if each change goes {shares} % of"
-    " the way to an end of its domain."
+    "None of {tried:,} simulated combinations ({changes}) {causes} if each change goes {shares} %"
+    " of the way to an end of its domain."
 )
 CONTAINING = condition(
     "The counts of combinations leave out {combinations} with a smaller cause (fewer changes that"
@@ -113,7 +113,7 @@ CONTAINING = condition(
 CURES = condition(
     "Another change prevents the failure in {count} simulated combinations with a smaller cause."
 )
-IN_NONE = condition("No cause with {up_to} includes {names}.")
+IN_NONE = condition("No cause with {changes} includes {names}.")
 SCOPE = note(
     "Valid for: the original encounter and the {number} encounters in which the original vehicle"
     " is least safe."

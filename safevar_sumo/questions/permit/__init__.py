@@ -240,7 +240,7 @@ def _drive(
     alone = evaluator.for_study(evaluator.study.all_count)
     alone.begin(phases, search.least, of_list=len(candidates) > 1)
     new_car, *permits = search.reach(cars, [-np.inf, *[None] * len(candidates)])
-    if new_car.up_to is None:
+    if new_car.safe_value is None:
         study = evaluator.study
         words = failure_columns([new_car.least.failure])[0]["because"]
         raise InputError(

@@ -197,7 +197,7 @@ class PermitAnswer:
             strict=True,
         ):
             verdict = verdict_of(
-                permit.up_to,
+                permit.safe_value,
                 new_car,
                 self.span.high,
                 self.need,
@@ -206,14 +206,14 @@ class PermitAnswer:
             event = failure["because"]
             row = {
                 "car": name,
-                "up_to": permit.up_to,
+                "up_to": permit.safe_value,
                 "new_car_up_to": new_car,
                 "unit": self.span.unit,
                 "verdict": verdict,
                 "because": self._reason(permit, event, verdict).text,
                 "parameter_set": permit.least.fit if event else None,
                 "repair_first": None if best is None else vehicle.names[best[0]],
-                "up_to_after_repair": None if best is None else best[1].up_to,
+                "up_to_after_repair": None if best is None else best[1].safe_value,
                 "assumed": assumed,
                 "assumed_matters_most": None if end is None else end.name,
             }
@@ -229,21 +229,21 @@ class PermitAnswer:
             "low": span.text(span.low),
             "name": span.title,
             "event": event,
-            "new_car": span.up_to(self.new_car.order),
+            "new_car": span.range_text(self.new_car.order),
             "need": span.text(self.need or 0.0),
         }
-        if permit.up_to is None:
+        if permit.safe_value is None:
             failure = permit.least.failure
             if failure is not None and np.isneginf(failure.encounters.low):
                 return words.IN_FIXED_TEST(**slots)
             return words.NOT_AT_ALL(**slots)
-        slots["reach"] = span.up_to(permit.up_to)
+        slots["reach"] = span.range_text(permit.safe_value)
         template = words.AS_NEW
         if not event:
             template = words.SAFE_TO_TOP
         elif verdict != DRIVE:
             template = words.UNSAFE_BEYOND
-        elif self.need is not None and permit.up_to >= self.need:
+        elif self.need is not None and permit.safe_value >= self.need:
             template = words.NEED_REACHED
         return template(**slots)
 
@@ -276,19 +276,19 @@ class PermitAnswer:
                     value=span.text(max(end.value, span.low)),
                 )
 
-    def _car(self, name: str, up_to: float) -> Sentence:
+    def _car(self, name: str, safe_value: float) -> Sentence:
         """Say how far a single car is safe; NaN means that it is not safe at the least speed."""
         car = name
         if not (self.is_box or name == THIS_CAR):
             car = words.NAMED_CAR.format(name=name)
-        if pd.isna(up_to):
+        if pd.isna(safe_value):
             return words.CAR_STOPS(
                 car=car,
                 **self._verbs,
             )
         return words.CAR(
             car=car,
-            reach=self._reach(up_to),
+            reach=self._reach(safe_value),
             **self._verbs,
         )
 
@@ -345,7 +345,7 @@ class PermitAnswer:
 
     def _reach(self, value: float) -> str:
         """The range in which cars are safe, in words that follow the verb."""
-        return self.span.up_to(value, with_low=not self._is_test)
+        return self.span.range_text(value, with_low=not self._is_test)
 
     @property
     def _is_test(self) -> bool:

@@ -71,7 +71,7 @@ class Span(NamedTuple):
         """A value of the parameter, such as `35 km/h`."""
         return f"{value:g}{unit_text(self.unit)}"
 
-    def up_to(self, value: float, *, with_low: bool = True) -> str:
+    def range_text(self, value: float, *, with_low: bool = True) -> str:
         """The range up to a value in words: `from 10 up to 35 km/h`, or `up to 35 km/h`."""
         reached = self.text(value)
         if not with_low:

@@ -84,21 +84,21 @@ def failure_columns(
 
 
 def verdict_of(
-    up_to: float | None,
+    safe_value: float | None,
     new_car: float,
     top: float,
     need: float | None,
     *,
     is_proven: bool,
 ) -> str:
-    """The verdict on a car that is safe up to the speed `up_to` (None: not even at the least one).
+    """The verdict on a car that is safe up to `safe_value` (None: not even at the least speed).
 
     `top` is the fastest driven speed, `need` the speed that the user needs, or None. `is_proven`
     says whether counterexamples were searched: otherwise no car may drive without a limit.
     """
-    if up_to is None:
+    if safe_value is None:
         return STOP
-    is_enough = up_to >= (min(top, new_car) if need is None else need)
+    is_enough = safe_value >= (min(top, new_car) if need is None else need)
     return DRIVE if is_enough and is_proven else LIMITED
 
 
@@ -107,7 +107,7 @@ def set_rows(
 ) -> list[JsonObject]:
     """The rows of the table `SETS`: a row for each car and each parameter set that was driven."""
     cells = [
-        {"car": name, **reached._asdict()}
+        {"car": name, **reached._asdict(), "up_to": reached.safe_value}
         for name, permit in zip(names, permits, strict=True)
         for reached in permit.reached
     ]

@@ -37,20 +37,20 @@ class Reached(NamedTuple):
     ----------
     fit
         The number of the parameter set.
-    up_to
+    safe_value
         The greatest value up to which the car is safe; None if it fails already at the least value.
     failure
         The failure that limits the car; None if none was found.
     """
 
     fit: int
-    up_to: float | None
+    safe_value: float | None
     failure: LimitingFailure | None
 
     @property
     def order(self) -> float:
-        """`up_to` as a number that can be compared: minus infinity stands for None."""
-        return -np.inf if self.up_to is None else self.up_to
+        """`safe_value` as a number that can be compared: minus infinity stands for None."""
+        return -np.inf if self.safe_value is None else self.safe_value
 
 
 class Permit(NamedTuple):
@@ -64,8 +64,8 @@ class Permit(NamedTuple):
         return min(self.reached, key=lambda reached: reached.order)
 
     @property
-    def up_to(self) -> float | None:
-        return self.least.up_to
+    def safe_value(self) -> float | None:
+        return self.least.safe_value
 
     @property
     def failures(self) -> list[LimitingFailure]:
@@ -122,7 +122,7 @@ class PermitSearch:
         The grid of values at which all cars are driven, in ascending order.
     listed
         The values of tests that are only driven at listed values. Nothing is known between these
-        values, so `up_to` is one of them.
+        values, so `safe_value` is one of them.
     attacked
         Number of simulations so far that searched for counterexamples.
     least
@@ -214,11 +214,11 @@ class PermitSearch:
                     search.attack(self._budget)
             self.attacked += search.attacked
             for number, car in enumerate(waiting):
-                up_to = search.up_to(number)
+                safe_value = search.safe_value(number)
                 # Between listed values nothing is known: the last safe listed value counts.
-                values = self.listed[self.listed <= (up_to or -np.inf)]
-                up_to = max(values.tolist(), default=up_to)
-                reached = Reached(model.fit, up_to, search.failures[number])
+                values = self.listed[self.listed <= (safe_value or -np.inf)]
+                safe_value = max(values.tolist(), default=safe_value)
+                reached = Reached(model.fit, safe_value, search.failures[number])
                 permits[car].reached.append(reached)
         return permits
 
@@ -234,7 +234,7 @@ class PermitSearch:
         The result is None if all values are measured, if the car is safe at no speed, or if no end
         lowers the speed on the grid.
         """
-        if permit.up_to is None or is_measured.all():
+        if permit.safe_value is None or is_measured.all():
             return None
 
         # Each vehicle has one assumed value at one end of its domain, and all other values as in
@@ -249,10 +249,14 @@ class PermitSearch:
         ]
         ranges = self._ranges[permit.least.fit]
         search = SpeedSearch(
-            [encounters for encounters in ranges if encounters.low <= permit.up_to],
+            [
+                encounters
+                for encounters in ranges
+                if encounters.low <= permit.safe_value
+            ],
             [Cars(worst, worst, np.vstack(sides))],
-            self.values[self.values <= permit.up_to],
-            [permit.up_to],
+            self.values[self.values <= permit.safe_value],
+            [permit.safe_value],
             ENDS_STAGE,
         )
         search.drive_grid()

@@ -177,7 +177,7 @@ class SpeedSearch:
         self._axes = max(map(len, members)) - self._size
         self._judged: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in cars]
 
-    def up_to(self, car: int) -> float | None:
+    def safe_value(self, car: int) -> float | None:
         """The greatest value of the grid below the limiting failure of a car, and not above its
         cap. The result is None if the car fails at the least value.
         """
@@ -310,7 +310,7 @@ class SpeedSearch:
         return [
             car
             for car in cars
-            if self.up_to(car) is not None
+            if self.safe_value(car) is not None
             and (self._axes or len(self._cars[car].vehicles) > 1)
         ]
 
@@ -318,14 +318,14 @@ class SpeedSearch:
         """The search for counterexamples to the value of a car. `attempt` counts the searches of
         the car, and is a part of the seed.
         """
-        up_to = self.up_to(car)
+        safe_value = self.safe_value(car)
         cars = self._cars[car]
-        assert up_to is not None
+        assert safe_value is not None
         # Only tests that exist at the car's value or below are searched.
-        number = sum(encounters.low <= up_to for encounters in self._ranges)
+        number = sum(encounters.low <= safe_value for encounters in self._ranges)
         ends = np.array([np.zeros(2 + self._axes), np.ones(2 + self._axes)])
         ends[:, 0] = 0, np.nextafter(number, 0)
-        ends[:, 1] = self._values[0], up_to
+        ends[:, 1] = self._values[0], safe_value
         space = Space(
             np.append(cars.lower, ends[0]), np.append(cars.upper, ends[1]), self._size
         )

@@ -26,7 +26,7 @@ OWN_SEARCHES = 4
 """Number of searches with the study's own parameter set. Each other set has a single search with
 half of the budget.
 """
-MAX_UNSAFE_SHARE = 0.001
+MAX_SHARE_REPAIRED = 0.001
 """Upper bound of the unsafe share that newly sampled vehicles must prove, at the usual effort."""
 FIRST = 1024
 """Number of the worst first cases with which the search for changes begins."""
@@ -47,7 +47,7 @@ def usual_test(problem: RepairProblem, sets: int) -> float:
 
 def unsafe_share(problem: RepairProblem) -> float:
     """The upper bound of the unsafe share that must be proved. More effort proves a lower bound."""
-    return MAX_UNSAFE_SHARE / problem.evaluator.account.effort
+    return MAX_SHARE_REPAIRED / problem.evaluator.account.effort
 
 
 def find_failures(

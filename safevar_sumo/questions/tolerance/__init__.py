@@ -203,7 +203,7 @@ def tolerance(
         is_rough=quick or is_few,
         has_scan=not is_few,
         at_tests=at_tests,
-        up_to=end,
+        upper_end=end,
         tests_left_out=names_left_out(base.study, study),
     )
     ranges = nearest = None

@@ -154,8 +154,8 @@ def _numbers(facts: Told) -> JsonObject:
         "scope": facts.scope,
         "boxes": int(facts.box is not None),
     }
-    if facts.up_to is not None:
-        numbers["up_to"] = facts.up_to.value
+    if facts.upper_end is not None:
+        numbers["up_to"] = facts.upper_end.value
     if not facts.is_safe:
         return numbers
     fits = len(facts.task.fits)

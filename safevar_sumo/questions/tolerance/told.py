@@ -67,7 +67,7 @@ class Told:
         Whether enough values were simulated to state limits alone.
     at_tests
         Whether limits cover only the listed test cases.
-    up_to, tests_left_out
+    upper_end, tests_left_out
         The value above which encounters were left out, such as a speed; None without such a value.
         The names of the tests that were left out completely.
     """
@@ -80,7 +80,7 @@ class Told:
     is_rough: bool
     has_scan: bool
     at_tests: bool
-    up_to: UpperEnd | None
+    upper_end: UpperEnd | None
     tests_left_out: Sequence[str]
 
     @property
@@ -304,7 +304,7 @@ def verdict_sentences(
         tests = join_phrases(facts.tests_left_out)
         yield words.TESTS_LEFT_OUT(
             tests=tests,
-            up_to=facts.up_to,
+            end=facts.upper_end,
         )
     if facts.at_tests:
         yield words.AT_TESTS

@@ -125,7 +125,7 @@ ALONE = condition(
 
 # Tests that were left out, and the tests of the limits.
 TESTS_LEFT_OUT = note(
-    "Some tests were left out, because all their values are above {up_to}: {tests}."
+    "Some tests were left out, because all their values are above {end}: {tests}."
 )
 AT_TESTS = note(
     "Only the listed values of the tests were simulated, and no values between those (--at-tests)."
