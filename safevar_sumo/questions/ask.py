@@ -393,8 +393,9 @@ class Question:
         words = [PROGRAM_COMMAND, self.name, *map(quote, subjects)]
         for option in self.options:
             value = values.get(option.name, option.default)
+            # A command names a file of cars, because a table does not fit into it.
             if option.metavar == CARS_FILE and not isinstance(value, str | Path | None):
-                value = CARS_FILE  # a table's contents are none of the command's
+                value = CARS_FILE
             if value == option.default:
                 continue
             if option.kind is bool or value == "":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from safevar_sumo.records import STANDSTILL, SimulationRuns
+from safevar_sumo.records import STANDSTILL, BoolArray, FloatArray, SimulationRuns
 
 CRUISE_SHARE = 0.9
 """A vehicle cruises at this share of its highest speed or more [-]."""
@@ -28,36 +28,42 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     2. otherwise the first manoeuvre after that; 3. otherwise no manoeuvre if the vehicle collides,
     and its last manoeuvre if it does not.
     """
-    # Only samples until the obstacle is nearest count.
     if runs.lacking("brake")[column]:
         return None
-    trace = runs.trace
+    # Only samples until the obstacle is nearest count.
     nearest_sample = runs.nearest(column)
-    active = trace.active[
-        : None if nearest_sample is None else nearest_sample + 1, column
-    ]
-    speed = np.where(active, trace.speed[: len(active), column], 0.0)
-    brake = np.where(speed > STANDSTILL, trace.brake[: len(active), column], 0.0)
-
+    samples = slice(None if nearest_sample is None else nearest_sample + 1)
+    trace = runs.trace
+    is_active = trace.active[samples, column]
+    speed = np.where(is_active, trace.speed[samples, column], 0.0)
+    brake = np.where(speed > STANDSTILL, trace.brake[samples, column], 0.0)
     is_braking = (brake > 0) & (brake >= REGULATION_SHARE * brake.max())
+    has_collided = bool(np.isfinite(runs.collision_speed[column]))
+    sample = find_manoeuvre(speed, is_braking, has_collided)
+    if sample is None:
+        return None
+
+    # The manoeuvre begins after the last sample in which pedals only regulate the speed.
+    is_pressed = (brake > 0) | (trace.throttle[samples, column] > 0)
+    (regulation,) = np.nonzero((is_pressed & ~is_braking)[:sample])
+    end = int(regulation[-1]) if regulation.size else 0
+    onset = end + int(is_braking[end:].argmax())
+    # The command may have begun to rise while it was still small: go back to this beginning.
+    is_rising = np.diff(brake, prepend=0.0) > 0
+    while onset > 0 and is_rising[onset - 1]:
+        onset -= 1
+    return onset
+
+
+def find_manoeuvre(
+    speed: FloatArray, is_braking: BoolArray, has_collided: bool
+) -> int | None:
+    """A sample of the braking manoeuvre that counts, as `brake_onset` defines it; None without."""
     braking_samples = np.flatnonzero(is_braking)
     last_cruise = np.flatnonzero(speed >= CRUISE_SHARE * speed.max())[-1]
     later_samples = braking_samples[braking_samples >= last_cruise]
-    if not braking_samples.size or (
-        not later_samples.size and np.isfinite(runs.collision_speed[column])
-    ):
+    if later_samples.size:
+        return int(later_samples[0])
+    if has_collided or not braking_samples.size:
         return None
-    # This sample lies in the manoeuvre that counts.
-    sample = later_samples[0] if later_samples.size else braking_samples[-1]
-
-    # The manoeuvre begins after the last sample in which pedals only regulate the speed.
-    regulation = np.flatnonzero(
-        ((trace.throttle[:sample, column] > 0) | (brake[:sample] > 0))
-        & ~is_braking[:sample]
-    )
-    end = regulation[-1] if regulation.size else 0
-    onset = int(braking_samples[braking_samples >= end][0])
-    # The command may have begun to rise while it was still small: go back to this beginning.
-    while onset > 0 and brake[onset - 1] > (brake[onset - 2] if onset > 1 else 0):
-        onset -= 1
-    return onset
+    return int(braking_samples[-1])

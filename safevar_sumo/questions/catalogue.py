@@ -164,7 +164,8 @@ def _list_characteristics(name: str | None) -> Answer:
 
 def _list_cache() -> Answer:
     """The answer with the folder of earlier simulations, and its size."""
-    from safevar_sumo.campaign import cache as simulations  # SUMO takes long to load
+    # SUMO takes long to load.
+    from safevar_sumo.campaign import cache as simulations
 
     folder = simulations.cache_folder()
     variable = simulations.FOLDER_VARIABLE
@@ -301,6 +302,8 @@ def check(
         # Raise the errors with which the command `study` would refuse the study.
         check_algorithms(study, assemble(study))
         findings = in_new_process
+    vehicle_count = sum(extent.vehicles for extent in extents)
+    point_count = sum(extent.points for extent in extents)
     rows = []
     blocks = []
     for item in findings:
@@ -319,8 +322,8 @@ def check(
         verdict=Verdict(_sentences(name, findings, extents)),
         numbers={
             "passed": not findings,
-            "vehicles": sum(extent.vehicles for extent in extents),
-            "points": sum(extent.points for extent in extents),
+            "vehicles": vehicle_count,
+            "points": point_count,
         },
         tables={
             "block": tabulate("Findings", BLOCK, blocks),

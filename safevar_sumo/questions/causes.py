@@ -7,9 +7,10 @@ inferred: all subsets are simulated, size by size, except those that contain a c
 
 from __future__ import annotations
 
+import operator
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from itertools import combinations, islice, takewhile
+from itertools import combinations, compress, islice, takewhile
 from math import comb
 from typing import NamedTuple
 
@@ -75,22 +76,19 @@ def find_minimal_causes(
     changed = [np.flatnonzero(flags).tolist() for flags in is_changed]
     originals = members.with_original_vehicle(settings)
     causes = [dict[frozenset[int], Cause]() for _ in settings]
-    complete = largest_complete(list(map(len, changed)), limit)
+    numbers = [*map(len, changed)]
+    complete = largest_complete(numbers, limit)
 
     # Simulate the subsets by size, and the subsets of all settings together. A subset that contains
     # a smaller cause cannot be minimal: it is left out.
-    expected = _count_subsets(list(map(len, changed)), complete)
-    with evaluator.phases.stage(SUBSETS, expected):
-        for size in range(max(map(len, changed), default=0) + 1):
-            number = sum(
-                comb(len(columns), size)
-                for columns, of_row in zip(changed, causes, strict=True)
-                if not of_row
-            )
+    with evaluator.phases.stage(SUBSETS, _count_subsets(numbers, complete)):
+        for size in range(max(numbers, default=0) + 1):
+            without_cause = compress(numbers, map(operator.not_, causes))
+            room = evaluator.left
             if (
                 size > complete
-                and evaluator.left is not None
-                and number > evaluator.left
+                and room is not None
+                and sum(comb(number, size) for number in without_cause) > room
             ):
                 break
             subsets = _subsets(changed, causes, size, is_complete=size <= complete)
@@ -149,16 +147,13 @@ def are_causes(
     out.
     """
     characteristics = evaluator.characteristics
+    original = characteristics.original
     groups = []
     for setting in settings_of(characteristics, causes):
-        is_changed = (setting != characteristics.original) & characteristics.of_vehicle
+        is_changed = (setting != original) & characteristics.of_vehicle
         # Each further row leaves out one of the changes.
         is_left_out = np.diag(is_changed)[is_changed]
-        groups.append(
-            np.vstack(
-                [setting, np.where(is_left_out, characteristics.original, setting)]
-            )
-        )
+        groups.append(np.vstack([setting, np.where(is_left_out, original, setting)]))
     starts = np.cumsum([0, *map(len, groups[:-1])])
     is_unsafe = unsafe.of(evaluator.evaluate(np.concatenate(groups), OTHER_SETS))
     # The first setting of a group, with all changes, is the only unsafe one.
@@ -219,7 +214,6 @@ def count_needed(
         replacement from finitely many failures), the share itself if all failures were analysed.
         Ordered by needed, in_some, changed; no rows if there is no failure.
     """
-    # Count the failures in which a characteristic is in all causes, and in at least one cause.
     names = characteristics.vehicle.names
     number = max(len(changed), 1)
     changed = changed[:, characteristics.of_vehicle]
@@ -298,7 +292,6 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     pandas.DataFrame
         Columns algorithm, run, failures (different unsafe solutions), examined and causes.
     """
-    # Take the failures of each run with the fewest and smallest changes.
     keys = ["algorithm", "run"]
     order = [F_NUM_DIFF.name, F_DIFF.name]
     names = [*evaluator.characteristics.names]
@@ -312,7 +305,6 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
         Console(stderr=True),
         f"Finding the minimal causes of {case.name} takes at most {price:,} simulations.",
     )
-
     rows = settings.to_numpy(dtype=float)
     causes = find_minimal_causes(evaluator, rows, case.unsafe, price)
     kinds = pd.Series(
@@ -323,7 +315,6 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     causes_of_solutions = examined.merge(settings.join(kinds.explode())).dropna(
         subset="kind"
     )
-
     counted = {
         "failures": failures,
         "examined": examined,

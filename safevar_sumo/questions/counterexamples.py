@@ -128,7 +128,7 @@ def describe(
     single_names
         By a setting's name, the only characteristic that is rounded.
     """
-    failures = dict[str, Failure]()
+    failures = {}
     waiting = dict(settings)
     for further in FURTHER_DIGITS:
         if not waiting:
@@ -221,23 +221,17 @@ def as_printed(
         if box is not None and box.lower[column] <= value <= box.upper[column]:
             lower = box.lower[column]
             upper = box.upper[column]
-        if value not in (item.original, lower, upper) and single_name in (
-            "",
-            item.name,
-        ):
+        is_rounded = single_name in ("", item.name)
+        if is_rounded and value not in (item.original, lower, upper):
             scale = 10.0 ** (item.digits + further)
-            round_away = (
-                np.round
-                if item.is_scenario
-                else np.ceil
-                if value > item.original
-                else np.floor
-            )
             # A value such as 0.07, scaled to 7.000000000000001, must not be rounded up to 0.08:
             # hence rounding errors are removed first.
-            printed[column] = min(
-                max(round_away(np.round(value * scale, 6)) / scale, lower), upper
+            scaled = np.round(value * scale, 6)
+            rounded_away = (
+                np.ceil(scaled) if value > item.original else np.floor(scaled)
             )
+            rounded = (np.round(scaled) if item.is_scenario else rounded_away) / scale
+            printed[column] = min(max(rounded, lower), upper)
     return printed
 
 
@@ -246,7 +240,7 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     points = model.evaluator.system.points
     members = model.characteristics
     runs = model.evaluate(settings, BEYOND_STAGE)
-    failures = dict[int, Failure]()
+    failures = {}
     for row in np.flatnonzero(model.robustness_by(runs) < 0).tolist():
         point = points[runs.points[row]]
         values = members.encounter_of(settings[row])
@@ -332,7 +326,7 @@ def place_of(
 
 def texts_of(point: Point, values: JsonObject) -> dict[str, str]:
     """The values of an encounter at a point as texts with their units, by name."""
-    texts = dict[str, str]()
+    texts = {}
     for name, value in values.items():
         texts[name] = str(value)
         if isinstance(value, int | float):

@@ -180,7 +180,7 @@ def _table(
     columns: Columns = {
         "characteristic": "characteristic of the vehicle, or of its encounter"
     }
-    values = dict[str, FloatArray]()
+    values = {}
     undefined = np.full(len(names), np.nan)
     for output, of_what in output_names.items():
         of_output = indices.get(output, {})

@@ -4,7 +4,8 @@ encounters up to a value of an axis. `scope_of` states in words which encounters
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from itertools import chain, islice
 from typing import Any, NamedTuple, Self
@@ -111,21 +112,27 @@ def at_point(study: Study, name: str) -> Study:
     # A point of the matrix is a listed encounter: the study must not vary it in ranges.
     listed = study.listed()
     points = assemble(study).matrix
-    tests_at_points = chain.from_iterable(map(listed.points_of, listed.tests))
-    for point, test in zip(points, tests_at_points, strict=True):
-        if point.name == name:
-            tests.append(test)
+    listed_tests = chain.from_iterable(map(listed.points_of, listed.tests))
+    tests = [
+        test
+        for point, test in zip(points, listed_tests, strict=True)
+        if point.name == name
+    ]
     if tests:
         return replace(listed.with_tests(tests), origin=origin)
-    named: list[Any] = [*study.tests, *points]
-    names = list(dict.fromkeys(item.name for item in named))
-    similar = [text for text in names if name in text] or get_close_matches(
-        name, names, N_SIMILAR_POINTS, 0
-    )
-    legal = (
-        f"one of {len(points)} points, such as {'; '.join(similar[:N_SIMILAR_POINTS])}"
-    )
-    raise InputError("point", repr(name), legal if points else "a study with a matrix")
+    legal = "a study with a matrix"
+    if points:
+        named: list[Any] = [*study.tests, *points]
+        similar = _similar_names(name, [item.name for item in named])
+        legal = f"one of {len(points)} points, such as {'; '.join(similar)}"
+    raise InputError("point", repr(name), legal)
+
+
+def _similar_names(name: str, names: Iterable[str]) -> list[str]:
+    """The `N_SIMILAR_POINTS` names that are most similar to a name, first those that contain it."""
+    distinct = dict.fromkeys(names)
+    similar = [text for text in distinct if name in text][:N_SIMILAR_POINTS]
+    return similar or get_close_matches(name, distinct, N_SIMILAR_POINTS, 0)
 
 
 def study_up_to(study: Study, end: UpperEnd) -> Study:
@@ -288,7 +295,7 @@ def moving_axes(
     the scenario's legal range. There are no ranges if the study itself varies encounters in ranges.
     """
     searchable = {} if study.ranges else searchable_in(points[0].scenario)
-    axes = dict[str, Domain]()
+    axes = {}
     for name, values in study.lists_of(test).items():
         legal = searchable.get(name)
         if legal is None or not are_numbers(values):
@@ -310,14 +317,14 @@ def scope_of(study: Study, *, between: bool = True) -> str:
     `between` says whether encounters between the values of a matrix were simulated, too. If not,
     the phrase lists the values.
     """
-    # Tests with the same scenario and parameters share a phrase.
     points = assemble(study).points
-    groups = dict[tuple[str, str], list[str]]()
+    # Tests with the same scenario and parameters share a phrase.
+    names = defaultdict[tuple[str, str], list[str]](list)
     for test, of_test in points_of_tests(study, points):
         model = (test and test.model) or study.scenario.model
-        key = model, _parameters_in_words(study, test, of_test, between)
-        groups.setdefault(key, []).extend([test.name] if test else [])
-    phrases = [_tests_in_words(names, *key) for key, names in groups.items()]
+        parameters = _parameters_in_words(study, test, of_test, between)
+        names[model, parameters] += [test.name] if test else []
+    phrases = [_tests_in_words(of_key, *key) for key, of_key in names.items()]
     if points[0].scenario.mover.has("weather"):
         weathers = dict.fromkeys(_weather_in_words(point.weather) for point in points)
         phrases.append(" or ".join(weathers))
@@ -348,19 +355,21 @@ def _parameters_in_words(
         unit = unit_text(unit_of(points[0].scenario, name))
         texts[name] = f"{_values_in_words(values, name in moving)}{unit}"
     for name, domain in study.ranges_of(test).items():
-        texts[name] = f"{domain.lower:g} to {domain.upper:g}{unit_text(domain.unit)}"
-
-    # If no axis is a speed, the scenario may state the speed of the vehicle.
-    speed = texts.pop(SPEED_DIMENSION, "")
-    stated = (point.scenario.test_speed for point in points)
-    speeds = sorted({value for value in stated if value is not None})
-    if speeds and not speed:
-        driven = dict.fromkeys(f"{KMH_PER_MS * value:.4g}" for value in speeds)
-        speed = f"{join_phrases(driven)} km/h"
+        ends = f"{domain.lower:g} to {domain.upper:g}"
+        texts[name] = f"{ends}{unit_text(domain.unit)}"
+    speed = texts.pop(SPEED_DIMENSION, "") or _test_speeds_in_words(points)
     phrases = [f"{name.replace('_', ' ')} {text}" for name, text in texts.items()]
     if speed:
         phrases.insert(0, f"at {speed}")
     return ", ".join(phrases)
+
+
+def _test_speeds_in_words(points: Sequence[Point]) -> str:
+    """The speeds at which scenarios are driven that have no axis of speeds; "" without any."""
+    stated = {point.scenario.test_speed for point in points}
+    speeds = sorted(value for value in stated if value is not None)
+    texts = dict.fromkeys(f"{KMH_PER_MS * value:.4g}" for value in speeds)
+    return f"{join_phrases(texts)} km/h" if texts else ""
 
 
 def _values_in_words(values: Sequence[float | str], is_range: bool) -> str:
@@ -369,9 +378,11 @@ def _values_in_words(values: Sequence[float | str], is_range: bool) -> str:
     """
     if is_range and len(values) > 1:
         return f"{min(values):g} to {max(values):g}"
-    return join_phrases(
-        f"{value:g}" if isinstance(value, float) else str(value) for value in values
-    )
+    return join_phrases(map(_value_in_words, values))
+
+
+def _value_in_words(value: float | str) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _weather_in_words(weather: Weather) -> str:

@@ -107,36 +107,30 @@ def assess_collisions(evaluator: Evaluator, collisions: Evaluations) -> pd.DataF
     system = evaluator.system
     has_lanes = any(point.scenario.border for point in system.points)
     drivers = [*TITLES, *(OF_LANES if has_lanes else ())]
-    verdicts = pd.DataFrame(
-        np.nan, index=range(len(collisions)), columns=drivers
-    ).assign(point="")
-
+    verdicts = pd.DataFrame(np.nan, range(len(collisions)), drivers).assign(point="")
     for index in np.unique(collisions.points).tolist():
         rows = np.flatnonzero(collisions.points == index)
         point = system.points[index]
-        study = (
-            at_point(evaluator.study, point.name) if system.matrix else evaluator.study
-        )
-        local_evaluator = evaluator.for_study(study)
+        local_evaluator = evaluator
+        if system.matrix:
+            local_evaluator = evaluator.for_study(at_point(evaluator.study, point.name))
         settings = local_evaluator.characteristics.of_others(
             system.characteristics, collisions.settings[rows]
         )
         verdicts.loc[rows, drivers] = _assess_at_point(
-            local_evaluator,
-            local_evaluator.system.at(local_evaluator.system.points[0]),
-            settings,
-            drivers,
+            local_evaluator, settings, drivers
         )
         verdicts.loc[rows, "point"] = point.name
     return verdicts
 
 
 def _assess_at_point(
-    evaluator: Evaluator, system: System, settings: FloatArray, drivers: Sequence[str]
+    evaluator: Evaluator, settings: FloatArray, drivers: Sequence[str]
 ) -> FloatArray:
-    """The verdicts of all drivers on M collisions at one point, shape (M, drivers): 1 if the driver
-    avoids the collision, 0 if not, NaN without a verdict.
+    """The verdicts of all drivers on M collisions at the only point of an evaluator's study, shape
+    (M, drivers): 1 if the driver avoids the collision, 0 if not, NaN without a verdict.
     """
+    system = evaluator.system.at(evaluator.system.points[0])
     approach = approach_parameters(system)
     verdicts = []
     if approach is None:

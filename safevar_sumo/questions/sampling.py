@@ -22,20 +22,30 @@ class Stream(IntEnum):
     Results depend on the numbers of the streams: a new use takes a new number.
     """
 
-    CONFIDENCE_BOUND = 1  # vehicles within joint limits, for the upper confidence bound
-    LARGER_BOXES = 2  # steps from the largest safe box that is known to larger ones
-    JOINT_LIMITS = 4  # searches for counterexamples to joint limits
-    LIMITS_ALONE = 6  # searches for counterexamples to limits alone
-    REPAIRED_BOUND = 7  # vehicles within the promised wear, for the bound of a repair
+    # Vehicles within joint limits, for the upper confidence bound.
+    CONFIDENCE_BOUND = 1
+    # Steps from the largest safe box that is known to larger ones.
+    LARGER_BOXES = 2
+    # Searches for counterexamples to joint limits.
+    JOINT_LIMITS = 4
+    # Searches for counterexamples to limits alone.
+    LIMITS_ALONE = 6
+    # Vehicles within the promised wear, for the bound of a repair.
+    REPAIRED_BOUND = 7
     # Searches for the safe value that is nearest to a specified limit that does not hold.
     NEAREST_LIMIT = 8
     # Searches for counterexamples to limits in the ranges of a study.
     WIDER_SCOPE = 9
-    EXTENSION = 10  # searches for counterexamples to joint limits with a longer side
-    SPECIFIED_BETWEEN = 11  # searches for counterexamples to specified limits
-    VALIDATION = 15  # searches that a proposed box of joint limits must pass
-    FIRST_CORNERS = 17  # corners with which the test of joint limits begins
-    PERMIT = 18  # search for counterexamples to the speed of a car
+    # Searches for counterexamples to joint limits with a longer side.
+    EXTENSION = 10
+    # Searches for counterexamples to specified limits.
+    SPECIFIED_BETWEEN = 11
+    # Searches that a proposed box of joint limits must pass.
+    VALIDATION = 15
+    # Corners with which the test of joint limits begins.
+    FIRST_CORNERS = 17
+    # Search for counterexamples to the speed of a car.
+    PERMIT = 18
 
     def generator(self, seed: int, *counts: int) -> Generator:
         """The generator of random numbers for this use. It depends on the seed of the study's
@@ -48,7 +58,8 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     """Scrambled Sobol points in the unit cube, shape (number, dimensions). They cover the cube most
     evenly if `number` is a power of two.
     """
-    import scipy  # takes longer to load than a simulation
+    # Loading takes longer than a simulation.
+    import scipy
 
     sequence = scipy.stats.qmc.Sobol(dimensions, rng=default_rng(seed))
     points: FloatArray = sequence.random_base2(max(0, math.ceil(math.log2(number))))

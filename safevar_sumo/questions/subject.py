@@ -182,7 +182,8 @@ def part_of(
     InputError
         If the study has no such part, or if results are cut in another way.
     """
-    from safevar_sumo.questions.part import part_of_study  # SUMO takes long to load
+    # SUMO takes long to load.
+    from safevar_sumo.questions.part import part_of_study
 
     if isinstance(subject, Study):
         return part_of_study(subject, ranges, point, up_to)

@@ -193,9 +193,7 @@ def cell_text(value: Any, number_format: str = ".4g") -> str:
     if value is None:
         return "-"
     if isinstance(value, bool):
-        if value:
-            return "yes"
-        return "no"
+        return "yes" if value else "no"
     if isinstance(value, float):
         text = f"{value:{number_format}}"
         if "e+" in text:
@@ -383,7 +381,8 @@ def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str
     title = table.title
     has_numbers = any(column.is_number for column in columns)
     if long_columns and len(columns) < 2 and not has_numbers:
-        yield title  # lines say it all
+        # The lines below say all that a table would say.
+        yield title
         cells = [column.texts for column in (*columns, *long_columns)]
         for label, *texts in zip(*cells, strict=True):
             yield ": ".join(filter(None, (label, " ".join(filter(None, texts)))))

@@ -33,13 +33,11 @@ class VariationModel:
             self.region: FeasibleRegion = region_of(study)
         self.characteristics = self.region.characteristics
 
-        distributions = [
-            study.variation.get(name, Uniform()) for name in self.characteristics.names
-        ]
         self._source = study.source
-        self._quantiles = list(
-            map(_quantile_function, self.characteristics, distributions)
-        )
+        self._quantiles = [
+            _quantile_function(item, study.variation.get(item.name, Uniform()))
+            for item in self.characteristics
+        ]
 
     def settings(self, probabilities: FloatArray) -> FloatArray:
         """The settings with the quantiles at N points of the unit cube, shape (N, n)."""
@@ -91,7 +89,6 @@ def _quantile_function(
     stated = stated_values(distribution)
     lower = stated.get("lower", low)
     width = stated.get("upper", high) - lower
-
     match distribution:
         case Fixed():
             return lambda p: np.full_like(p, stated.get("value", original))

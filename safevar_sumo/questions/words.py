@@ -76,11 +76,9 @@ def change_texts(
         original = item.original
         value = values.get(item.name, item.original)
         if value != original:
-            share = (
-                f" ({100 * (value - original) / abs(original):+.1f} %)"
-                if original
-                else ""
-            )
+            share = ""
+            if original:
+                share = f" ({100 * (value - original) / abs(original):+.1f} %)"
             rounded = item.text(value)
             # A value that is close to 0 in a wide domain, or close to the original, would look like
             # another value with the usual decimals.
@@ -114,12 +112,11 @@ def precise_in_words(items: Iterable[Characteristic]) -> str:
     """The characteristics for which the study states a measuring error, with this error, as a
     phrase; "" if there are none.
     """
-    phrases = [
+    return join_phrases(
         f"{item.short_name} (measured to within {item.error:g}{item.suffix})"
         for item in items
         if item.error
-    ]
-    return join_phrases(phrases) if phrases else ""
+    )
 
 
 def place_in_words(
@@ -134,7 +131,7 @@ def place_in_words(
         value = values[item.name]
         text = f"{value:{EXACT}}" if are_printed else item.text(value)
         phrases.append(f"{item.short_name} {text}{item.suffix}")
-    return join_phrases(phrases) if phrases else ""
+    return join_phrases(phrases)
 
 
 def encounter_in_words(
@@ -159,8 +156,8 @@ def replay_command(subject: str, point: str = "") -> str:
 
 
 def join_phrases(phrases: Iterable[str], conjunction: str = "and") -> str:
-    """Phrases of a sentence as a list: `a, b and c`."""
-    *beginning, ending = phrases
+    """Phrases of a sentence as a list: `a, b and c`; empty without any."""
+    *beginning, ending = [*phrases] or [""]
     return f"{', '.join(beginning)} {conjunction} {ending}" if beginning else ending
 
 
@@ -189,11 +186,9 @@ def points_in_words(
     """
     number = len(failing_points)
     if not number:
-        tests = (
-            f"none of the {point_count} test cases"
-            if point_count > 1
-            else "no test case"
-        )
+        tests = "no test case"
+        if point_count > 1:
+            tests = f"none of the {point_count} test cases"
         return f"{vehicle} fails in {tests}."
     names = "; ".join(failing_points[:MAX_POINTS_NAMED])
     if number > MAX_POINTS_NAMED:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -165,9 +166,9 @@ def compare(
     tested = _test(settings, valid)
     counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
     names = (study.name, second.study.name)
-    titles = dict(
-        zip(SIDES, ("A", "B") if names[0] == names[1] else names, strict=True)
-    )
+    if names[0] == names[1]:
+        names = ("A", "B")
+    titles = dict(zip(SIDES, names, strict=True))
 
     alone = limits_of_both(evaluators, criteria, restriction, at_tests=at_tests)
     changes = alone.frame["change"]
@@ -238,7 +239,6 @@ def _criteria(
     """The criterion of both versions, as `tolerance` would choose it. Both versions get the larger
     of their clearances to keep. Each version has the safety degree at which its bodies touch.
     """
-    # The user states a criterion, or only a clearance to keep, or nothing.
     stated = Unsafe() if unsafe is None and margin is not None else unsafe
     criterion = stated or _default_criterion(subjects, evaluators, originals)
     is_stated = unsafe is not None
@@ -258,7 +258,7 @@ def _default_criterion(
     """The criterion if the user states nothing: a collision if that is the default criterion of
     either version, else the default criterion of A.
     """
-    defaults = list[Unsafe]()
+    defaults = []
     for subject, evaluator, original in zip(
         subjects, evaluators, originals, strict=True
     ):
@@ -278,19 +278,9 @@ def _settings_frame(
     names = common.evaluators[0].characteristics.names
     frame, settings, runs = pairs
     of_pairs = table_of_pairs(frame["solution"], runs, criteria)
-    values = {name: settings[0][:, column] for column, name in enumerate(names)}
-    values_in_b = {
-        f"b_{names[column]}": settings[1][:, column]
-        for column in np.flatnonzero(common.shift).tolist()
-    }
-    return pd.concat(
-        [
-            frame.drop(columns="solution"),
-            of_pairs,
-            pd.DataFrame({**values, **values_in_b}),
-        ],
-        axis=1,
-    )
+    a, b = (pd.DataFrame(of_side, columns=names) for of_side in settings)
+    differing = b[[*compress(names, common.shift)]].add_prefix("b_")
+    return pd.concat([frame.drop(columns="solution"), of_pairs, a, differing], axis=1)
 
 
 def _table(common: CommonDomain, settings: pd.DataFrame) -> AnswerTable:
@@ -311,14 +301,9 @@ def _table(common: CommonDomain, settings: pd.DataFrame) -> AnswerTable:
         item = members[column]
         meaning = f"{item.name} in B, the same change of another original"
         columns[f"b_{item.name}"] = Column(item.unit, meaning, is_shown=False)
-    order = (
-        settings["unsafe_in"].map([*UNSAFE_IN].index).sort_values(kind="stable").index
-    )
-    return tabulate(
-        "The same changed vehicles in both versions",
-        columns,
-        settings.loc[order, [*columns]],
-    )
+    places = settings["unsafe_in"].map([*UNSAFE_IN].index)
+    rows = settings.loc[places.sort_values(kind="stable").index, [*columns]]
+    return tabulate("The same changed vehicles in both versions", columns, rows)
 
 
 class _PairedTest(NamedTuple):

@@ -142,7 +142,7 @@ def limits_of_both(
     original vehicle is unsafe has no limits.
     """
     vehicles = [side.characteristics.vehicle for side in evaluators]
-    requests = list[Asked]()
+    requests = []
     for side, unsafe, vehicle in zip(evaluators, criteria, vehicles, strict=True):
         models = Models((Model(0, side, unsafe),), ())
         columns = range(len(vehicle))
@@ -150,13 +150,11 @@ def limits_of_both(
     # The remaining simulations limit the effort. Both versions get the smaller effort: otherwise
     # different efforts might find different limits.
     effort = min(requests, key=lambda request: request.effort.cases).effort
-    alone = [_safe_alone(request._replace(effort=effort)) for request in requests]
+    alone = [
+        _safe_alone(request._replace(effort=effort), limits) for request in requests
+    ]
     rows = []
-    for a, b, *safe in zip(*vehicles, *alone, strict=True):
-        in_a, in_b = (
-            _within(interval, within(limits, a.name, side.study.domains[a.name]))
-            for interval, side in zip(safe, evaluators, strict=True)
-        )
+    for a, b, in_a, in_b in zip(*vehicles, *alone, strict=True):
         ends_in_a = (a.original, *(in_a or UNDEFINED))
         ends_in_b = (b.original, *(in_b or UNDEFINED))
         rows.append((a.name, a.unit, *ends_in_a, *ends_in_b, _change_of(in_a, in_b)))
@@ -169,9 +167,11 @@ def limits_of_both(
     )
 
 
-def _safe_alone(request: Asked) -> list[Interval | None]:
-    """The safe interval of each characteristic alone, rounded inwards; None for all characteristics
-    if the original vehicle is unsafe.
+def _safe_alone(
+    request: Asked, limits: Mapping[str, Limit]
+) -> list[Interval] | list[None]:
+    """The safe interval of each characteristic alone, rounded inwards, and within the user's
+    limits; None for all characteristics if the original vehicle is unsafe.
     """
     model = request.oracle.own
     members = request.oracle.vehicle.members
@@ -179,12 +179,12 @@ def _safe_alone(request: Asked) -> list[Interval | None]:
         return [None] * len(members)
     alone = alone_with_own_set(request, Alone(request.lower, request.upper))
     ends = zip(alone.lower.tolist(), alone.upper.tolist(), strict=True)
-    return [item.rounded_inwards(end) for item, end in zip(members, ends, strict=True)]
-
-
-def _within(safe: Interval | None, ends: Interval) -> Interval | None:
-    """The part of the safe interval that lies between the ends; None without a safe interval."""
-    return None if safe is None else (max(safe[0], ends[0]), min(safe[1], ends[1]))
+    intervals = []
+    for item, safe in zip(members, ends, strict=True):
+        low, high = item.rounded_inwards(safe)
+        lower, upper = within(limits, item.name, model.evaluator.study.domains)
+        intervals.append((max(low, lower), min(high, upper)))
+    return intervals
 
 
 def _change_of(a: Interval | None, b: Interval | None) -> str:

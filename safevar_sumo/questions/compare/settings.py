@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from safevar_sumo.questions.sampling import Interval, sobol_points
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import Limit, Study
-from safevar_sumo.study.characteristics import Domain, check_limits
+from safevar_sumo.study.characteristics import Domains, check_limits
 from safevar_sumo.study.encounters import Axes, AxisTable
 
 BOTH_STAGE = "simulate both versions"
@@ -120,14 +121,10 @@ class CommonDomain(NamedTuple):
         with about(second.source):
             check_limits(second.domains, limits, "limits: ")
         shift = np.where(a.of_vehicle, b.original - a.original, 0.0)
-        ends = np.array(
-            [
-                [within(limits, name, side.study.domains[name]) for name in a.names]
-                for side in evaluators
-            ]
-        )
-
-        common = cls(evaluators, shift, lower=ends[:, :, 0], upper=ends[:, :, 1])
+        sides = product(evaluators, a.names)
+        ends = [within(limits, name, side.study.domains) for side, name in sides]
+        lower, upper = np.reshape(ends, (2, len(a.names), 2)).T
+        common = cls(evaluators, shift, lower.T, upper.T)
         lower, upper = common.ends_in_a
         is_empty = lower > upper
         if is_empty.any():
@@ -177,13 +174,12 @@ class CommonDomain(NamedTuple):
         return [side.evaluate(of_side, BOTH_STAGE) for side, of_side in pairs]
 
 
-def within(limits: Mapping[str, Limit], name: str, domain: Domain) -> Interval:
+def within(limits: Mapping[str, Limit], name: str, domains: Domains) -> Interval:
     """The ends of the domain of the characteristic `name` within the user's limits."""
-    return (
-        limits[name].interval(domain)
-        if name in limits
-        else (domain.lower, domain.upper)
-    )
+    domain = domains[name]
+    if name in limits:
+        return limits[name].interval(domain)
+    return domain.lower, domain.upper
 
 
 def in_order_of(a: Study, b: Study) -> Study:
@@ -239,12 +235,9 @@ def pairs_of(
         if not isinstance(case, Case):
             continue
         solutions = case.solutions[names].to_numpy(float)
-        of_sides = (
-            (solutions, common.as_in_b(solutions))
-            if side == "a"
-            else (common.as_in_a(solutions), solutions)
-        )
-        settings = np.stack(of_sides)
+        in_a = solutions if side == "a" else common.as_in_a(solutions)
+        in_b = solutions if side == "b" else common.as_in_b(solutions)
+        settings = np.stack([in_a, in_b])
         is_inside = common.holds(settings)
         run_columns = [
             name for name in RUN_COLUMNS if name in case.solutions and case.has_runs
@@ -305,15 +298,11 @@ def _common_sample(common: CommonDomain, number: int) -> FloatArray:
     lower, upper = common.ends_in_a
     factor = 1
     while True:
-        settings = lower + sobol_points(number * factor, len(lower), 0) * (
-            upper - lower
-        )
-        of_sides = common.in_both(settings)
-        is_feasible = [
-            side.region.feasible(values)
-            for side, values in zip(common.evaluators, of_sides, strict=True)
-        ]
-        settings = settings[is_feasible[0] & is_feasible[1]]
+        points = sobol_points(number * factor, len(lower), 0)
+        settings = lower + points * (upper - lower)
+        sides = zip(common.evaluators, common.in_both(settings), strict=True)
+        is_feasible = [side.region.feasible(values) for side, values in sides]
+        settings = settings[np.all(is_feasible, axis=0)]
         if len(settings) >= number or factor >= MAX_FACTOR:
             return settings[:number]
         factor *= 2

@@ -202,15 +202,13 @@ def explain(
         ),
         **statistics_tables(necessity, len(sample), verdicts, collisions, distinct),
     }
-    numbers = {
-        **_counts(population, subject, len(sample), len(solutions)),
-        **_collision_numbers(verdicts, collisions if has_drivers else None),
-        **(smallest.numbers if smallest is not None else {}),
-    }
+    numbers = _counts(population, subject, len(sample), len(solutions))
+    numbers |= _collision_numbers(verdicts, collisions if has_drivers else None)
     leading = failure_sentences(
         evaluator, population, tables["causes"].frame, len(sample)
     )
     if smallest is not None:
+        numbers |= smallest.numbers
         leading = smallest_sentences(smallest, evaluator, population.unsafe)
     notes = other_sentences(study, population, complete, verdicts)
     return Answer(

@@ -5,7 +5,6 @@ domain at which the changes are a cause.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain, repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -63,12 +62,11 @@ def find_beginnings(
     is left out, unless both are minimal at the ends.
     """
     members = evaluator.characteristics
-    pending, *nearer_steps = (
-        [*zip(step.causes, repeat(step.share), strict=False)] for step in steps
-    )
-    nearer = [*chain.from_iterable(nearer_steps)]
-    pending += _smallest(members, steps[0].causes, nearer)
-    beginnings = list[Beginning]()
+    placed = [(cause, step.share) for step in steps for cause in step.causes]
+    at_ends = steps[0].causes
+    pending = placed[: len(at_ends)]
+    pending += _smallest(members, at_ends, placed[len(at_ends) :])
+    beginnings = []
     while pending:
         new_beginnings, smaller = _begin(evaluator, unsafe, pending)
         beginnings += new_beginnings
@@ -86,7 +84,7 @@ def _smallest(
     contains another cause if it has all its changes, in the same directions.
     """
     kinds = [{*directions(members, cause.changes)} for cause in references]
-    smallest = list[PlacedCause]()
+    smallest = []
     for placed in sorted(candidates, key=lambda placed: len(placed[0].changes)):
         kind = {*directions(members, placed[0].changes)}
         if not any(smaller_kind <= kind for smaller_kind in kinds):
@@ -106,10 +104,11 @@ def _begin(
     causes = [cause for cause, _ in placed]
     prices = np.cumsum([steps + 2 ** len(cause.changes) for cause in causes])
     number = int(np.count_nonzero(prices <= evaluator.at_most(int(prices[-1]), 2)))
-    beginnings = [
-        Beginning(cause, share if share < 1 else np.nan, cause.changes, np.nan)
-        for cause, share in placed
-    ]
+    beginnings = []
+    for cause, share in placed:
+        # At the ends, nobody knows where a cause begins.
+        begins_at = share if share < 1 else np.nan
+        beginnings.append(Beginning(cause, begins_at, cause.changes, np.nan))
     if not number:
         return beginnings, []
 
@@ -138,7 +137,7 @@ def _begin(
     # minimal there: it begins at a larger share.
     first_unsafe = is_unsafe.argmax(axis=1)
     groups = smaller_causes(settings[range(number), first_unsafe])
-    smaller = list[PlacedCause]()
+    smaller = []
     for row, (group, at) in enumerate(zip(groups, first_unsafe.tolist(), strict=True)):
         smaller += [(cause, float(shares[at])) for cause in group]
         if group and not is_free:
@@ -147,7 +146,6 @@ def _begin(
             (unsafe_at,) = np.nonzero(is_unsafe[row])
             subcauses = smaller_causes(settings[row, unsafe_at])
             at = unsafe_at[subcauses.index([])]
-
         cause = causes[row]
         named = members.named(settings[row, at])
         # Twelve digits are enough: further digits are rounding errors of the share.

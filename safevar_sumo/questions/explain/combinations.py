@@ -116,7 +116,7 @@ def enumerate_causes(
     effects = dict.fromkeys(changes, np.inf)
     causes = list[Cause]()
     simulated, existing = dict[int, int](), dict[int, int]()
-    containing = dict[int, list[Combination]]()
+    containing = {}
     unsafe_ones = list[Combination]()
     is_cut = False
 
@@ -167,7 +167,7 @@ def count_cures(
     """By size, the number of combinations that contain a smaller cause, but are safe. Only sizes
     are simulated that can be simulated completely, with at most `limit` settings altogether.
     """
-    cures = dict[int, int]()
+    cures = {}
     room = limit // (1 + len(evaluator.critical_encounters))
     for size, containing in enumeration.containing.items():
         room -= len(containing)
@@ -216,7 +216,7 @@ def _changes(members: CharacteristicSet, share: float) -> list[Change]:
     """All single changes: each characteristic at a `share` of the way to each end of its domain. An
     end that is the original value is no change.
     """
-    changes = list[Change]()
+    changes = []
     for column, item in enumerate(members.vehicle):
         for end in (item.lower, item.upper):
             value = end

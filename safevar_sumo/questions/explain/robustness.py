@@ -36,13 +36,10 @@ def draw_neighbours(
     A neighbour differs from its setting by at most the filter's threshold in each value.
     """
     n = len(characteristics)
-    offsets = (
-        np.random.default_rng(seed).uniform(-1, 1, (count, n))
-        * characteristics.threshold
-    )
-    return np.clip(
-        settings[:, np.newaxis] + offsets, characteristics.lower, characteristics.upper
-    ).reshape(-1, n)
+    shares = np.random.default_rng(seed).uniform(-1, 1, (count, n))
+    neighbours = settings[:, np.newaxis] + shares * characteristics.threshold
+    within_domain = np.clip(neighbours, characteristics.lower, characteristics.upper)
+    return within_domain.reshape(-1, n)
 
 
 def robust_shares(
@@ -71,16 +68,14 @@ def robust_shares(
     if evaluator.system.mover.has_own_step:
         factors = (1.0,)
 
+    step_evaluator = evaluator
     with evaluator.phases.stage(NEIGHBOURS, len(neighbours) * len(factors)):
         for factor in factors:
-            step_evaluator = (
-                evaluator if factor == 1 else evaluator.with_step(step * factor)
-            )
+            if factor != 1:
+                step_evaluator = evaluator.with_step(step * factor)
             evaluations = step_evaluator.evaluate(neighbours, NEIGHBOURS)
-            unsafe_shares, is_valid = (
-                flags.reshape(len(settings), count)
-                for flags in (unsafe.runs(evaluations).mean(axis=0), evaluations.valid)
-            )
+            is_valid = evaluations.valid.reshape(-1, count)
+            unsafe_shares = unsafe.runs(evaluations).mean(axis=0).reshape(-1, count)
             failing = (unsafe_shares * is_valid).sum(axis=1)
             shares.append(failing / np.maximum(is_valid.sum(axis=1), 1))
     return np.transpose(shares)

@@ -5,6 +5,7 @@ drivers that would have avoided them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 import pandas as pd
@@ -70,28 +71,28 @@ def failures_frame(
     """
     if not reasons:
         return pd.DataFrame(columns=[*SOLUTION_COLUMNS])
+
     failures = population.evaluations.take(list(reasons))
     settings = failures.settings
     unsafe = population.unsafe
-
-    comparisons = compare_at_points(evaluator.system, settings, unsafe)
-    is_assessed = failures.collided & has_reference_drivers(evaluator)
-    assessed = iter(
-        assess_collisions(evaluator, failures.take(is_assessed)).to_dict("records")
+    sentences, points = zip(
+        *compare_at_points(evaluator.system, settings, unsafe), strict=True
     )
+    is_assessed = failures.collided & has_reference_drivers(evaluator)
+    verdicts = assess_collisions(evaluator, failures.take(is_assessed))
+    drivers = np.full(len(failures), None)
+    drivers[is_assessed] = [*map(avoided_by, verdicts.to_dict("records"))]
     columns = {
-        "solution": [population.names[row] for row in reasons],
+        "solution": [*map(population.names.__getitem__, reasons)],
         "reason": [*reasons.values()],
         "outcome": failures.outcome,
         "safety_degree": failures.f_safe,
         "changed": failures.f_num_diff.astype(int),
         "largest_change": failures.f_diff,
         "unsafe_neighbours": robust_shares(evaluator, settings, unsafe).mean(axis=1),
-        "ends": [sentence for sentence, _ in comparisons],
-        "points": [list(points) for _, points in comparisons],
-        "avoided_by": [
-            avoided_by(next(assessed)) if flag else None for flag in is_assessed
-        ],
+        "ends": sentences,
+        "points": [*map(list, points)],
+        "avoided_by": drivers,
     }
     return pd.DataFrame(columns)
 
@@ -121,7 +122,7 @@ def causes_table(
     study = evaluator.study
     unsafe = population.unsafe
 
-    causes = [cause for group in causes_of for cause in group]
+    causes = [*chain.from_iterable(causes_of)]
     robust, holds, number_of_sets = sureness(evaluator, causes, unsafe, fits)
 
     limits = find_cause_limits(evaluator, causes, unsafe)
@@ -136,7 +137,8 @@ def causes_table(
 
     share_of = dict(zip(distinct["cause"], distinct["share"], strict=True))
     kinds = [directions(evaluator.characteristics, cause.changes) for cause in causes]
-    default_share = 0.0 if share_of else np.nan  # without a sample, no share is known
+    # Without a sample, no share is known.
+    default_share = 0.0 if share_of else np.nan
     shares = [share_of.get(kind, default_share) for kind in kinds]
     is_robust = robust >= MIN_ROBUST_SHARE
     order = np.lexsort([-robust, -np.where(is_robust, shares, 0.0), ~is_robust])
@@ -186,15 +188,13 @@ def printed_limits(
         [members.setting(values, beyond=True) for values in full_changes]
     )
     is_unsafe = model.are_unsafe(settings.reshape(-1, len(members)), BOUNDARIES)
-    printed = [
-        rounded if fails else rounded | values
-        for rounded, values, fails in zip(printed, exact, is_unsafe, strict=True)
-    ]
+    for row in np.flatnonzero(~is_unsafe):
+        printed[row] |= exact[row]
 
     # Round the boundary of each change alone: the other changes are whole, and the encounter is the
     # printed one.
-    alone = list[NamedValues]()
-    names = list[str]()
+    alone = []
+    names = []
     for values, (cause, limit) in zip(printed, pairs, strict=True):
         for name, value in limit.single_boundary.items():
             alone.append(values | cause.changes | {name: value})
@@ -203,13 +203,10 @@ def printed_limits(
     columns = []
     for values, cause in zip(printed, causes, strict=True):
         single_boundary = {name: next(single_values)[name] for name in cause.changes}
-        columns.append(
-            {
-                "encounter": {name: values[name] for name in cause.encounter},
-                "boundary": {name: values[name] for name in cause.changes},
-                "single_boundary": single_boundary,
-            }
-        )
+        cells = {"single_boundary": single_boundary}
+        cells["encounter"] = {name: values[name] for name in cause.encounter}
+        cells["boundary"] = {name: values[name] for name in cause.changes}
+        columns.append(cells)
     return columns
 
 

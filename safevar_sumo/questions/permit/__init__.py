@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import compress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -253,16 +254,8 @@ def _drive(
     if not with_repairs or evaluator.left is not None:
         return new_car, permits, [None] * len(permits)
     worn = fleet.measured & (fleet.settings != members.original)
-    return (
-        new_car,
-        permits,
-        search.repair_first(
-            candidates,
-            worn,
-            members.original,
-            permits,
-        ),
-    )
+    repaired = search.repair_first(candidates, worn, members.original, permits)
+    return new_car, permits, repaired
 
 
 def read_cars(
@@ -309,15 +302,8 @@ def _check_forms(
     """Refuse a call that gives cars in several ways, or in none. Also refuse an output file that is
     the list of cars itself, or that would hold a rough answer.
     """
-    forms = [
-        flag
-        for flag, value in (
-            ("--cars", cars is not None),
-            ("--set", values),
-            ("--limits", limits),
-        )
-        if value
-    ]
+    is_given = (cars is not None, values, limits)
+    forms = [*compress(("--cars", "--set", "--limits"), is_given)]
     if len(forms) != 1:
         raise InputError(
             "permit",
@@ -393,9 +379,8 @@ def _cars_within(
     """
     lower = setting.copy()
     upper = setting.copy()
-    for name, limit in limits_of(limits, study.vehicle.characteristics).items():
+    domains = study.vehicle.characteristics
+    for name, limit in limits_of(limits, domains).items():
         column = members.names.index(name)
-        item = members.members[column]
-        lower[column] = item.lower if limit.at_least is None else limit.at_least
-        upper[column] = item.upper if limit.at_most is None else limit.at_most
+        lower[column], upper[column] = limit.interval(domains[name])
     return Cars.within(lower, upper, study.search.seed)

@@ -118,7 +118,7 @@ class PermitAnswer:
             claim = study_up_to(claim, UpperEnd(span.name, span.high))
         scope = scope_of(claim)
         unsafe = self.models.own.unsafe
-        failures = list[str]()
+        failures = []
         sentences = [*self._sentences(cars, counts)]
         if self.need is not None:
             is_slow = ~(cars["up_to"].astype(float) >= self.need)
@@ -211,13 +211,17 @@ class PermitAnswer:
                 "unit": self.span.unit,
                 "verdict": verdict,
                 "because": self._reason(permit, event, verdict).text,
-                "parameter_set": permit.least.fit if event else None,
-                "repair_first": None if best is None else vehicle.names[best[0]],
-                "up_to_after_repair": None if best is None else best[1].safe_value,
                 "assumed": assumed,
-                "assumed_matters_most": None if end is None else end.name,
             }
-            rows.append(failure | row | of_all)
+            if event:
+                row["parameter_set"] = permit.least.fit
+            if best is not None:
+                column, repaired = best
+                row["repair_first"] = vehicle.names[column]
+                row["up_to_after_repair"] = repaired.safe_value
+            if end is not None:
+                row["assumed_matters_most"] = end.name
+            rows.append(dict.fromkeys(CARS) | failure | row | of_all)
         return rows
 
     def _reason(self, permit: Permit, event: str, verdict: str) -> Sentence:

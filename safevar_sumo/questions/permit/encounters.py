@@ -200,22 +200,20 @@ def span_of(study: Study, by: str | None) -> Span:
     # Only speeds are offered. A parameter without a unit may be a speed, too: parameters of a
     # simulator or of a scenario's file have no unit.
     units = {name: domain.unit for name, domain in study.ranges.items()}
-    ends: dict[str, dict[str, tuple[float, float]]] = {}
+    name = by or SPEED_DIMENSION
+    ends = {}
     for test, (point, *_) in tests:
         searchable = searchable_in(point.scenario)
-        domains = study.ranges_of(test)
-        of_test = {
-            axis: (domain.lower, domain.upper) for axis, domain in domains.items()
-        }
-        for axis, values in study.lists_of(test).items():
-            if are_numbers(values):
-                of_test[axis] = (float(min(values)), float(max(values)))
-                if axis in searchable or SPEED_DIMENSION in axis:
-                    units[axis] = unit_of(point.scenario, axis)
-        for axis, limits in of_test.items():
-            ends.setdefault(axis, {})["" if test is None else test.name] = limits
+        lists = study.lists_of(test)
+        for axis in filter(lambda axis: are_numbers(lists[axis]), lists):
+            if axis in searchable or SPEED_DIMENSION in axis:
+                units[axis] = unit_of(point.scenario, axis)
+        values = lists.get(name, ())
+        if domain := study.ranges_of(test).get(name):
+            values = [domain.lower, domain.upper]
+        if values and are_numbers(values):
+            ends["" if test is None else test.name] = min(values), max(values)
     speeds = [name for name, unit in units.items() if unit in SPEED_UNITS]
-    name = by or SPEED_DIMENSION
     problem = (
         f"study {study.name!r} varies no {'speed' if by is None or not speeds else by}"
     )
@@ -224,18 +222,20 @@ def span_of(study: Study, by: str | None) -> Span:
         raise InputError("permit", problem, "a study that varies a speed")
     check_name("by", problem, name, speeds)
 
+    names = np.array([*ends])
+    lows, tops = np.transpose([*ends.values()]).astype(float)
     # The range ends where the first test ends.
-    high = min(top for _, top in ends[name].values())
-    goes_on = any(top > high for _, top in ends[name].values())
+    high = tops.min()
+    goes_on = tops.max() > high
+    ending = names[goes_on & (tops == high)]
+    tests_above = names[lows > high]
     return Span(
         name=name,
         unit=units[name],
-        low=min(low for low, _ in ends[name].values()),
-        high=high,
-        ending=tuple(
-            test for test, (_, top) in ends[name].items() if goes_on and top == high
-        ),
-        tests_above=tuple(test for test, (low, _) in ends[name].items() if low > high),
+        low=float(lows.min()),
+        high=float(high),
+        ending=tuple(ending.tolist()),
+        tests_above=tuple(tests_above.tolist()),
     )
 
 
@@ -243,7 +243,7 @@ def encounters_of(model: Model, span: Span) -> list[EncounterRange]:
     """The encounters of each test of a model, up to the end of `span`. Tests that begin above this
     end are left out.
     """
-    ranges = list[EncounterRange]()
+    ranges = []
     for test, alone, fixed in _tests_alone(
         with_ranges(model.evaluator.study).all_count, span.name
     ):

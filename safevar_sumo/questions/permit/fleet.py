@@ -11,7 +11,7 @@ import re
 import unicodedata
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from itertools import compress
+from itertools import chain, compress
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -180,7 +180,7 @@ def list_without_names(path: Path, ignore: Collection[str]) -> bytes:
     writer = csv.writer(text, "unix", delimiter=cells.separator)
     writer.writerow(cells.header)
     for number, row in enumerate(cells.rows, 1):
-        texts = [text if read else "" for text, read in zip(row, is_read, strict=True)]
+        texts = np.where(is_read, row, "").tolist()
         if any(is_read):
             texts[is_read.index(True)] = f"{CAR} {number}"
         writer.writerow(texts)
@@ -222,7 +222,7 @@ def _cells_of_file(path: Path) -> _Cells:
 
     # A record with a line break in a cell has several lines: its place is its first line.
     reader = csv.reader(lines, delimiter=separator, strict=True)
-    records = list[tuple[int, list[str]]]()
+    records = []
     start = 0
     try:
         for record in reader:
@@ -265,12 +265,13 @@ def _cells_of_mapping(cars: Mapping[Any, Any], place: str) -> _Cells:
             raise InputError(
                 place, f"{car!r}: {values!r}", "a mapping of values by characteristic"
             )
-    columns = dict.fromkeys(name for values in cars.values() for name in values)
+    columns = dict.fromkeys(chain.from_iterable(cars.values()))
     rows = [
-        [_text(car), *(_text(values.get(name)) for name in columns)]
-        for car, values in cars.items()
+        [*map(_text, (car, *map(values.get, columns)))] for car, values in cars.items()
     ]
-    places = [place if place == TYPED else f"{place}, {car!r}" for car in cars]
+    places = [f"{place}, {car!r}" for car in cars]
+    if place == TYPED:
+        places = [place]
     return _Cells(place, [CAR, *map(str, columns)], places, rows)
 
 
@@ -297,11 +298,10 @@ def _columns(
         header = [text.strip() for text in cells.header]
         for name in ignore:
             check_name("", f"--ignore {name}: there is no such column", name, header)
-        names = [
-            text if text in ignore else text.partition("[")[0].strip()
-            for text in header
-        ]
         read = [column for column, text in enumerate(header) if text not in ignore]
+        names = [*header]
+        for column in read:
+            names[column] = header[column].partition("[")[0].strip()
         naming = read[0] if read else 0
         is_one = names[naming] in vehicle.names
         looks = "" if is_one else did_you_mean(names[naming], vehicle.names)
@@ -389,7 +389,7 @@ def _values(
     mark = ";" if cells.separator == ";" else "."
     mark = "," if ";" in cells.separator and has_commas else mark
     settings = np.full((len(cells.rows), len(vehicle)), np.nan)
-    faults = list[InputError]()
+    faults = []
     for setting, row, place in zip(settings, cells.rows, cells.places, strict=True):
         for column, number in columns.items():
             if text := row[column].strip():

@@ -20,7 +20,7 @@ from safevar_sumo.questions.permit.fleet import Fleet
 from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSearch
 from safevar_sumo.questions.words import EXACT
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 REPAIR_STAGE = "cars with one part as new"
 ENDS_STAGE = "cars with assumed values at ends of their domains"
@@ -189,8 +189,8 @@ class PermitSearch:
         top = float(self.values[-1])
         for model in self._models_in_order:
             # The cars that are still of interest, and the greatest value that is of interest.
-            waiting = list[int]()
-            caps = list[float]()
+            waiting = []
+            caps = []
             for car, (permit, floor) in enumerate(zip(permits, floors, strict=True)):
                 cap = permit.order if permit.reached and floor is not None else top
                 if floor is None or not permit.reached or cap > floor:
@@ -234,7 +234,8 @@ class PermitSearch:
         The result is None if all values are measured, if the car is safe at no speed, or if no end
         lowers the speed on the grid.
         """
-        if permit.safe_value is None or is_measured.all():
+        top = permit.safe_value
+        if top is None or is_measured.all():
             return None
 
         # Each vehicle has one assumed value at one end of its domain, and all other values as in
@@ -244,19 +245,14 @@ class PermitSearch:
         limiting = permit.least.failure
         worst = car.lower if limiting is None else limiting.setting[: len(vehicle)]
         is_assumed = np.eye(len(vehicle), dtype=bool)[~is_measured]
-        sides = [
-            np.where(is_assumed, end, worst) for end in (vehicle.lower, vehicle.upper)
-        ]
+        at_lower = np.where(is_assumed, vehicle.lower, worst)
+        at_upper = np.where(is_assumed, vehicle.upper, worst)
         ranges = self._ranges[permit.least.fit]
         search = SpeedSearch(
-            [
-                encounters
-                for encounters in ranges
-                if encounters.low <= permit.safe_value
-            ],
-            [Cars(worst, worst, np.vstack(sides))],
-            self.values[self.values <= permit.safe_value],
-            [permit.safe_value],
+            [encounters for encounters in ranges if encounters.low <= top],
+            [Cars(worst, worst, np.vstack([at_lower, at_upper]))],
+            self.values[self.values <= top],
+            [top],
             ENDS_STAGE,
         )
         search.drive_grid()
@@ -289,8 +285,8 @@ class PermitSearch:
         limiting = Counter(permit.least.fit for permit in permits)
         self._models_in_order.sort(key=lambda model: -limiting[model.fit])
         top = float(self.values[-1])
-        bounds = list[dict[int, float]]()
-        failures = list[list[LimitingFailure]]()
+        bounds = []
+        failures = []
         best = list[Repaired]([None] * len(cars))
         # The speed of each car with its best repair so far; at first, the speed without a repair.
         orders = [permit.order for permit in permits]
@@ -309,7 +305,7 @@ class PermitSearch:
                 )
                 # Choose the repair with the largest bound for each car, and drop all repairs that
                 # cannot be better than the best one so far.
-                chosen = dict[int, int]()
+                chosen = {}
                 for row, of_car in enumerate(bounds):
                     promising = {
                         column: bound
@@ -367,13 +363,9 @@ class PermitSearch:
 
 def cars_of(vehicle: CharacteristicSet, fleet: Fleet) -> list[Cars]:
     """The cars of a list. A measured value becomes the range of values that it may really have."""
-    ends = np.array(
-        [
-            [item.measured(value) for item, value in zip(vehicle, setting, strict=True)]
-            for setting in fleet.settings
-        ]
-    )
-    ends = np.where(
-        fleet.measured[..., np.newaxis], ends, fleet.settings[..., np.newaxis]
-    )
-    return [Cars.measured(*car.T) for car in ends]
+    cars = []
+    for setting, is_measured in zip(fleet.settings, fleet.measured, strict=True):
+        ends = [*map(Characteristic.measured, vehicle, setting)]
+        lower, upper = np.where(is_measured, np.transpose(ends), setting)
+        cars.append(Cars.measured(lower, upper))
+    return cars

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.metrics import F_SAFE, Unsafe
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.between import remark_on_phases
 from safevar_sumo.questions.box import Proof
@@ -53,25 +53,16 @@ def answer_of(
         The causes of failures that no driving system can avoid: values by name.
     """
     unsafe = problem.unsafe
-    worst = float(
-        worst_today.column(unsafe.bound.measure if unsafe.bound else F_SAFE.name)[0]
-    )
+    worst = float(worst_today.column(unsafe.measure)[0])
     kept_today = any(
         not problem.changed_values(change) for change, _ in survivors.changes
     )
-    repairs = list[JsonObject]()
+    repairs = []
     if not kept_today:
-        rows = [
-            _row(
-                problem,
-                change,
-                proof,
-                survivors.fits,
-            )
-            for change, proof in survivors.changes
-        ]
+        rows = [_row(problem, *change, survivors.fits) for change in survivors.changes]
         repairs = sorted(rows, key=_cost_of)
     tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
+    worlds = problem.oracle.worlds
     numbers = {
         "unsafe": str(unsafe),
         "margin": unsafe.keep if unsafe.is_collision else None,
@@ -80,10 +71,8 @@ def answer_of(
         "kept_today": kept_today,
         "repairs": len(repairs),
         "not_repairable": not_repairable,
-        "simulations": sum(
-            world.model.evaluator.simulated for world in problem.oracle.worlds
-        ),
-        "fits": survivors.fits if survivors.changes else 0,
+        "simulations": sum(world.model.evaluator.simulated for world in worlds),
+        "fits": survivors.fits * bool(survivors.changes),
         "fits_tried": len(models.members),
     }
     ending = f"has a safety degree of {distance_in_words(worst, unsafe.contact)}"
@@ -95,7 +84,7 @@ def answer_of(
         sentences = [necessary, words.WORST(ending=ending)]
     else:
         sentences = [*_repair(problem, repairs)]
-    tested = list[Sentence]()
+    tested = []
     if survivors.changes:
         proof = repairs[0] if repairs else _columns_of(survivors.changes[0][1])
         tested = [*_tested(models, survivors, proof)]
@@ -201,7 +190,7 @@ def _row(
     ]
     return {
         "parameters": values,
-        "change": join_phrases(texts) if texts else "",
+        "change": join_phrases(texts),
         "changed": len(values),
         "largest_change": float(np.max(np.abs(change - problem.today))),
         "fits": fits,
@@ -230,7 +219,7 @@ def _limits_in_words(problem: RepairProblem, part: NamedValues) -> str:
     its encounter.
     """
     characteristics = problem.promise.region.characteristics
-    limits = list[str]()
+    limits = []
     for member in characteristics.vehicle:
         if member.name in part:
             value = part[member.name]

@@ -13,7 +13,6 @@ from msgspec.structs import replace as replace_in
 from safevar_sumo.campaign.evaluation import with_parameters
 from safevar_sumo.plugins import user_errors
 from safevar_sumo.questions.braking import brake_onset
-from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.records import FloatArray, JsonObject, NamedValues
 from safevar_sumo.scenarios import Point
 from safevar_sumo.study import MatrixTable, Study
@@ -51,10 +50,14 @@ def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonO
         point = today.points[row // len(encounters)].name or None
         earlier = (metres[row], np.mean(metres[braked]), seconds[row])
         price = dict(zip(OF_BRAKING, (*map(float, earlier), point), strict=True))
+    count = count_today = None
+    if needless:
+        count = sum(needless)
+        count_today = sum(needless_today)
     return price | {
         "largest_deceleration": deceleration,
-        "needless_braking": sum(needless) if needless else None,
-        "needless_braking_today": sum(needless_today) if needless else None,
+        "needless_braking": count,
+        "needless_braking_today": count_today,
         "benign_scenes": len(needless),
     }
 
@@ -64,22 +67,20 @@ def drive_new_cars(system: System, encounters: FloatArray) -> tuple[FloatArray, 
     in each of K encounters, shape (2, N K), NaN if it does not brake; and its largest deceleration
     [m/s^2].
     """
-    onsets = list[Interval]()
+    onsets = []
     deceleration = 0.0
     for result, row in product(
         simulate_all_points(system, encounters), range(len(encounters))
     ):
         trace = result.runs.trace
         step = brake_onset(result.runs, row)
-        onsets.append(
-            (np.nan, np.nan)
-            if step is None
-            else (trace.position[step, row], trace.time[step])
-        )
+        onset = np.nan, np.nan
+        if step is not None:
+            onset = trace.position[step, row], trace.time[step]
+        onsets.append(onset)
         speed = trace.speed[trace.active[:, row], row]
-        deceleration = max(
-            deceleration, float(np.max(-np.diff(speed) / trace.step, initial=0.0))
-        )
+        decelerations = -np.diff(speed) / trace.step
+        deceleration = max(deceleration, float(np.max(decelerations, initial=0.0)))
     return np.transpose(onsets), deceleration
 
 
@@ -90,21 +91,14 @@ def benign_scenes(study: Study, system: System) -> list[Point]:
     study may have no benign scene.
     """
     if study.repair.benign:
-        return list(
-            assemble(
-                replace_in(study, matrix=MatrixTable(tests=study.repair.benign))
-            ).matrix
-        )
+        matrix = MatrixTable(tests=study.repair.benign)
+        return [*assemble(replace_in(study, matrix=matrix)).matrix]
     searched = system.characteristics.scenario
-    ends = [
-        dict(zip(searched.names, end.tolist(), strict=True))
-        for end in (searched.original, searched.lower, searched.upper)
-    ]
+    ends = [searched.original, searched.lower, searched.upper]
     scenes = dict[str, Point]()
     with user_errors(system.source):
-        for point in (
-            encounter(point, values) for values in ends for point in system.points
-        ):
+        for values, listed_point in product(map(searched.named, ends), system.points):
+            point = encounter(listed_point, values)
             for description, scenario in point.scenario.benign():
                 name = f"{description}, {point.weather.name}"
                 scenes.setdefault(name, Point(scenario, point.weather, name))
@@ -115,24 +109,16 @@ def needless_braking(system: System, benign: list[Point]) -> list[bool]:
     """Whether the new vehicle brakes in each scene: in each benign scene and, for each speed of
     these scenes, on a road on which the vehicle sees nobody.
     """
-    one_per_speed = {point.scenario.test_speed: point for point in benign}.values()
+    if not benign:
+        return []
     vehicle = system.characteristics.vehicle
-    return [
-        bool(
-            (
-                np.where(result.runs.trace.active, result.runs.trace.brake, 0.0)
-                > NEEDLESS_BRAKE
-            ).any()
-        )
-        for points, sees_nobody in ((benign, False), (one_per_speed, True))
-        if points
-        for result in simulate_all_points(
-            replace(
-                system,
-                points=tuple(points),
-                sees_nobody=sees_nobody,
-                characteristics=vehicle,
-            ),
-            vehicle.original[np.newaxis],
-        )
-    ]
+    with_scenes = replace(system, points=tuple(benign), characteristics=vehicle)
+    one_per_speed = {point.scenario.test_speed: point for point in benign}.values()
+    without_actors = replace(with_scenes, points=tuple(one_per_speed), sees_nobody=True)
+    brakes = []
+    for variant in (with_scenes, without_actors):
+        for result in simulate_all_points(variant, vehicle.original[np.newaxis]):
+            trace = result.runs.trace
+            is_braking = trace.active & (trace.brake > NEEDLESS_BRAKE)
+            brakes.append(bool(is_braking.any()))
+    return brakes

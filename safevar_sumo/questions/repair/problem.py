@@ -150,37 +150,30 @@ class Promise(Box):
         characteristics that must be as new, and the encounters.
         """
         ends = self.to_dict()
-        characteristics = self.region.characteristics
-        whole_domain = all(
-            ends.get(member.name) == [member.lower, member.upper]
-            for member in characteristics.vehicle
-        )
-        worn = ", ".join(
-            f"{member.name} {sign} {end:.5g}{member.suffix}"
-            for member in characteristics.vehicle
-            if member.name in ends
-            for sign, end in zip((">=", "<="), ends[member.name], strict=True)
-            if end != member.original
-        )
-        worn = "the whole domain" if whole_domain else worn
-        as_new = [
-            f"{member.name} {member.original:.5g}{member.suffix}"
-            for member in characteristics.vehicle
-            if member.name not in ends
-        ]
+        limits = []
+        as_new = []
+        encounters = []
+        is_whole = True
+        for member in self.region.characteristics:
+            low, high = ends.get(member.name, [member.original, member.original])
+            if member.is_scenario:
+                range_text = f"{low:.5g} to {high:.5g}{member.suffix}"
+                encounters.append(f"{member.name} {range_text}")
+                continue
+            is_whole &= (low, high) == (member.lower, member.upper)
+            if low == high:
+                as_new.append(f"{member.name} {low:.5g}{member.suffix}")
+                continue
+            for sign, end in ((">=", low), ("<=", high)):
+                if end != member.original:
+                    limits.append(f"{member.name} {sign} {end:.5g}{member.suffix}")
+        text = "the whole domain" if is_whole else ", ".join(limits)
         if as_new:
-            worn += f"; all others as in the original: {', '.join(as_new)}"
-        encounters = [
-            f"{member.name} {ends[member.name][0]:.5g} to {ends[member.name][1]:.5g}{member.suffix}"
-            for member in characteristics.scenario
-            if member.name in ends
-        ]
-        where = (
-            f", in the encounters with {join_phrases(encounters)} that a new vehicle survives"
-            if encounters
-            else ""
-        )
-        return worn + where
+            text += f"; all others as in the original: {', '.join(as_new)}"
+        if encounters:
+            places = join_phrases(encounters)
+            text += f", in the encounters with {places} that a new vehicle survives"
+        return text
 
 
 def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:

@@ -109,7 +109,7 @@ def prove_change(
         The number of this proof, from 1 on: the more attempts, the stricter a proof must be.
     """
     rng = Stream.REPAIRED_BOUND.generator(problem.study.search.seed, number)
-    unsafe = list[FloatArray]()
+    unsafe = []
 
     def drive(vehicles: FloatArray, sets: IntArray) -> FloatArray:
         """The robustness of M vehicles, each with its parameter set, in the E listed encounters,

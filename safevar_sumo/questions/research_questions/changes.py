@@ -7,9 +7,8 @@ raises it if the solutions belong to no run.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
-from itertools import product
+from itertools import compress, product
 
 import numpy as np
 import pandas as pd
@@ -89,7 +88,8 @@ def _means_by_change_count(
     change_counts = count_changes(case)
     rows = []
     for (key, column), j in product(values, (*change_numbers(case), ANY)):
-        sample = column[~np.isnan(column) & ((j == ANY) | (change_counts == j))]
+        has_number = (j == ANY) | (change_counts == j)
+        sample = column[has_number & ~np.isnan(column)]
         mean = np.mean(sample) if sample.size else np.nan
         rows.append((*key, j, mean, sample.size))
     return pd.DataFrame(rows, columns=[*labels, "j", name, "n"])
@@ -180,8 +180,9 @@ def rq33_safety(case: Case) -> pd.DataFrame:
     }
     frame = _means_by_change_count(case, ["quantity"], "value", values.items())
 
-    scales = frame["quantity"].map(SAFETY_SCALES).map(original)
-    frame["percent"] = 100 * frame["value"] / scales.abs().replace(0.0, np.nan)
+    metrics = frame["quantity"].map(SAFETY_SCALES)
+    scales = metrics.map(original).abs().replace(0.0, np.nan)
+    frame["percent"] = 100 * frame["value"] / scales
     return frame
 
 
@@ -195,12 +196,12 @@ def count_collisions(case: Case) -> pd.DataFrame:
         If no run is finished.
     """
     case.require_solutions()
-    collisions = are_collisions(case.solutions).groupby(case.solutions["algorithm"])
-    counts = collisions.agg(solutions="size", collisions="sum").reindex(
-        list(case.algorithms), fill_value=0
-    )
-    shares = counts.assign(share=counts["collisions"] / counts["solutions"])
-    return pd.DataFrame(shares.rename_axis("algorithm").reset_index())
+    has_collided = are_collisions(case.solutions)
+    groups = has_collided.groupby(case.solutions["algorithm"])
+    counts = groups.agg(solutions="size", collisions="sum")
+    counts = counts.reindex(list(case.algorithms), fill_value=0)
+    counts["share"] = counts["collisions"] / counts["solutions"]
+    return pd.DataFrame(counts.rename_axis("algorithm").reset_index())
 
 
 def frequent_combinations(case: Case) -> pd.DataFrame:
@@ -213,14 +214,15 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     """
     is_changed = changes_of(case) != 0
     masks = is_changed[np.count_nonzero(is_changed, axis=1) == COMBINATION_SIZE]
-    counts = Counter(tuple(np.flatnonzero(mask)) for mask in masks)
-    in_order = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
-
+    combinations, counts = np.unique(masks, axis=0, return_counts=True)
+    # The reversed order begins with the earliest characteristics.
+    combinations = combinations[::-1]
+    counts = counts[::-1]
     names = case.characteristics.vehicle.names
-    numbers = np.array(list(counts.values()))
     rows = []
-    for indices, number in in_order[:COMBINATIONS_SHOWN]:
-        rank = 1 + np.count_nonzero(numbers > number)
-        combination = [names[index] for index in indices]
-        rows.append((rank, combination, 100 * number / len(masks)))
+    for row in np.argsort(-counts, kind="stable")[:COMBINATIONS_SHOWN]:
+        count = counts[row]
+        rank = 1 + np.count_nonzero(counts > count)
+        combination = [*compress(names, combinations[row])]
+        rows.append((rank, combination, 100 * count / len(masks)))
     return pd.DataFrame(rows, columns=["rank", "characteristics", "percent"])

@@ -228,14 +228,11 @@ def why_few_evaluations(case: Case) -> str:
     """
     if not case.has_runs or case.evaluations.empty or not case.finished_runs:
         return ""
-
     counts = count_evaluations(case)
-    sums = counts.groupby("algorithm", sort=False)[["simulated", "budget"]].transform(
-        "sum"
-    )
-    is_few = (sums["simulated"] < USUAL_SHARE * sums["budget"]) & ~counts[
-        "algorithm"
-    ].isin(list(case.stop_by_themselves))
+    algorithms = counts["algorithm"]
+    sums = counts.groupby(algorithms)[["simulated", "budget"]].transform("sum")
+    is_few = sums["simulated"] < USUAL_SHARE * sums["budget"]
+    is_few &= ~algorithms.isin(list(case.stop_by_themselves))
     if not is_few.any():
         return ""
     texts = describe_evaluations(case, counts[is_few])
@@ -283,12 +280,8 @@ def summarise_convergence(case: Case) -> pd.DataFrame:
     """The median and the quartiles of `compute_convergence` over the runs. The columns are
     algorithm, evaluations, hypervolume (the median), low and high (the quartiles).
     """
-    growth = compute_convergence(case).groupby(
-        ["algorithm", "evaluations"], sort=False
-    )["hypervolume"]
-    quartiles = {
-        "hypervolume": growth.quantile(0.5),
-        "low": growth.quantile(0.25),
-        "high": growth.quantile(0.75),
-    }
+    growth = compute_convergence(case)
+    volumes = growth.groupby(["algorithm", "evaluations"], sort=False)["hypervolume"]
+    shares = {"hypervolume": 0.5, "low": 0.25, "high": 0.75}
+    quartiles = {name: volumes.quantile(share) for name, share in shares.items()}
     return pd.DataFrame(quartiles).reset_index()

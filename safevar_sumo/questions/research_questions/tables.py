@@ -49,12 +49,9 @@ class PaperTable(NamedTuple):
         """The table `name` as tables.toml declares it."""
         table = DATA["tables"][name]
         definitions = DATA["columns"] | table.get("own", {})
-        return cls(
-            table["title"],
-            compute,
-            columns_from({key: definitions[key] for key in table["columns"]}),
-            Wide(**table["wide"]) if "wide" in table else None,
-        )
+        columns = columns_from({key: definitions[key] for key in table["columns"]})
+        wide = Wide(**table["wide"]) if "wide" in table else None
+        return cls(table["title"], compute, columns, wide)
 
 
 DATA = shipped_table("questions/research_questions/tables.toml")

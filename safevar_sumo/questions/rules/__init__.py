@@ -136,13 +136,8 @@ def rules(
     rows = []
     for number, box in enumerate(boxes, 1):
         own_shares = shares(box, testing.settings, unsafe_in_test)
-        rows.append(
-            (
-                conditions(box, characteristics),
-                *own_shares,
-                *over_sets.ends(number, own_shares[:3]),
-            )
-        )
+        ends = over_sets.ends(number, own_shares[:3])
+        rows.append((conditions(box, characteristics), *own_shares, *ends))
     frame = pd.DataFrame(rows, columns=[*COLUMNS])
     frame = frame.sort_values("coverage", ascending=False, kind="stable")
     title = "Regions in which many vehicles are unsafe"
@@ -220,7 +215,7 @@ def conditions(
             texts.append(f"{name} above {low:g}{item.suffix}")
         elif high < np.inf:
             texts.append(f"{name} below {high:g}{item.suffix}")
-    return join_phrases(texts) if texts else "everywhere"
+    return join_phrases(texts) or "everywhere"
 
 
 def shares(
@@ -288,10 +283,8 @@ def _fit_pruned_tree(inputs: FloatArray, is_unsafe: BoolArray) -> Any:
     """The smallest classification tree whose cross-validated Brier score is within a standard error
     of the best score. `inputs` are settings that are scaled to the domain, shape (M, n).
     """
-    from sklearn.model_selection import (  # takes a second to load
-        GridSearchCV,
-        StratifiedKFold,
-    )
+    # Loading takes a second.
+    from sklearn.model_selection import GridSearchCV, StratifiedKFold
     from sklearn.tree import DecisionTreeClassifier
 
     def smallest_good_enough(results: Any) -> int:

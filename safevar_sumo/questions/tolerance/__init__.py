@@ -18,7 +18,6 @@ from safevar_sumo.questions.answer import Answer, contents
 from safevar_sumo.questions.ask import Criterion, question
 from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.case import Subject
-from safevar_sumo.questions.cases import Counterexamples
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import limit_criterion, models_of
@@ -310,7 +309,7 @@ def _in_ranges(
     unsafe = limit_criterion(wider, study, request.stated, request.margin, original)
     task = _asked_of(request._replace(unsafe=unsafe, subject=study, base=wider), wider)
     space = task.boxes(task.domain).cases_in(sides)
-    attacks = dict[int, Counterexamples]()
+    attacks = {}
     with evaluator.phases.stage(RANGES_STAGE):
         for fit in task.fits:
             search = task.search(Stream.WIDER_SCOPE, fit)

@@ -85,7 +85,7 @@ def answer_limits(
     nearest_rows = _nearest_rows(facts, nearest)
     if nearest_rows:
         tables["nearest"] = tabulate("Limits that would do", NEAREST, nearest_rows)
-    in_ranges = list[Sentence]()
+    in_ranges = []
     if ranges is not None:
         sentence, row = _told_in_ranges(facts, ranges)
         in_ranges = [sentence]
@@ -312,7 +312,8 @@ def _fit_rows(facts: Told) -> Rows:
     value that was found in it; NaN if it was not searched.
     """
     broken = facts.limits.broken
-    states = {fit: "not kept" if fit in broken else "kept" for fit in facts.task.fits}
+    states = dict.fromkeys(facts.task.fits, "kept")
+    states |= dict.fromkeys(broken, "not kept")
     states |= {model.fit: "left out" for model in facts.task.exclusions}
     values = dict.fromkeys(states, np.nan)
     if facts.box is not None:

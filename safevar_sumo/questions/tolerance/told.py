@@ -161,7 +161,7 @@ class Told:
         breaches = self.limits.breaches
         if self.box is None:
             breaches = self.limits.alone.breaches
-        failures = dict[int, Failure]()
+        failures = {}
         for (_, column), case in sorted(breaches.items(), key=self._change):
             if column in failures:
                 continue
@@ -331,7 +331,7 @@ def _broken(facts: Told) -> Iterator[Sentence]:
 
 def _together(facts: Told) -> Sentence:
     """Say that all specified limits together do not hold."""
-    values = list[str]()
+    values = []
     for column in facts.broken:
         item = facts.members[column]
         for end in facts.specified(column):
