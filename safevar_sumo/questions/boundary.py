@@ -225,7 +225,6 @@ def search_alone(
 ) -> Alone:
     """Move the known limits of a star inwards, until a search finds no unsafe case within them."""
     start = star.lower[np.newaxis][:0]
-    unsafe = start
     for _ in range(MOST_SEARCHES):
         space = star.of_vehicles(limits.lower, limits.upper)
         unsafe = search(space, start).unsafe

@@ -203,6 +203,8 @@ class Evaluator:
         simulator's class. `questions` questions share the time. A quick question searches less.
         """
         seconds = sum(np.max(point.scenario.duration) for point in self.system.points)
+        if self.study.ranges:
+            seconds *= ENCOUNTERS
         self.account.effort = 1.0
         if quick:
             self.account.effort = float(np.clip(QUICK_SECONDS / seconds, *QUICK))

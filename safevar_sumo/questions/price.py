@@ -7,6 +7,7 @@ from __future__ import annotations
 import sys
 import time
 from dataclasses import dataclass
+from datetime import timedelta
 
 import numpy as np
 from rich.console import Console
@@ -45,8 +46,8 @@ suffices for one box.
 """
 QUICK_SECONDS = 25.0
 """The effort of a quick answer is this number divided by the seconds that a vehicle drives at all
-points, within `QUICK`. The longer a vehicle drives, the more a simulation costs, and the fewer
-simulations are done.
+points, in all critical encounters if these are ranges, within `QUICK`. The longer a vehicle drives,
+the more a simulation costs, and the fewer simulations are done.
 """
 MOST_EFFORT = 8.0
 """Largest effort if the user allows more simulations than are usual."""
@@ -240,10 +241,5 @@ def _timed(task: Task, settings: FloatArray, pool: Pool) -> tuple[Evaluations, f
 
 def _price(simulations: float, seconds: float) -> str:
     """Words for a number of simulations and for their duration. One takes `seconds`."""
-    return f"about {simulations:,.0f} simulations, about {_duration(simulations * seconds)}"
-
-
-def _duration(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{seconds:02}"
+    duration = timedelta(seconds=round(simulations * seconds))
+    return f"about {simulations:,.0f} simulations, about {duration}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from safevar_sumo.terminal import Progress
@@ -11,11 +11,9 @@ OVERRUN = 0.18
 """In a phase with an unknown number of rounds, at least this share of its simulations so far is
 expected to follow, because nobody knows whether a round is the last.
 """
-
-
 LEAST_SHARE = 0.06
-"""In a phase that states how many simulations follow, at least this share of its simulations so far
-is expected to follow.
+"""In a stage, at least this share of its simulations so far is expected to follow, because a failure
+may make more simulations necessary.
 """
 
 
@@ -49,7 +47,9 @@ class Phases:
         setting is simulated at `points` points.
         """
         self._points = points
-        self._later = {name: points * number for name, number in settings.items()}
+        self._later = {
+            name: points * number for name, number in settings.items() if number
+        }
 
     def begin_part(self, part: str, simulations: int) -> None:
         """Begin a part of `simulations` simulations, which may be a phase or belong to a phase."""
@@ -69,21 +69,18 @@ class Phases:
         self._show_whole(text, *self._counts())
 
     @contextmanager
-    def stage(
-        self, name: str, settings: float | None = None
-    ) -> Iterator[Callable[[float], None]]:
+    def stage(self, name: str, settings: float | None = None) -> Iterator[None]:
         """Count all parts within the block in one phase, of about `settings` settings, by default
-        as planned. A stage within a stage belongs to the outer stage. The context manager yields a
-        function, which takes a better estimate of the number of settings that follow.
+        as planned. A stage within a stage belongs to the outer stage.
         """
         if self._is_stage:
-            yield lambda number: None
+            yield
             return
         self._begin(name, settings)
         self._is_stage = True
         self._show()
         try:
-            yield self.expect
+            yield
         finally:
             self._is_stage = False
 
@@ -108,10 +105,8 @@ class Phases:
         if name not in self._later and self._name:
             return
         planned = 0.0
-        for earlier in list(self._later):
-            if name not in self._later:
-                break
-            planned = self._later.pop(earlier)
+        while name in self._later:
+            planned = self._later.pop(next(iter(self._later)))
         self._name, self._round = name, ""
         self._planned_round = 0.0
         self._before = self._done
@@ -119,13 +114,8 @@ class Phases:
         self._expected = planned if settings is None else self._points * settings
 
     def expect(self, settings: float) -> None:
-        """Expect that `settings` settings follow in the present phase, but at least `LEAST_SHARE`
-        of those so far: a failure may make more settings necessary.
-        """
-        simulations = self._done - self._before
-        self._expected = simulations + max(
-            self._points * settings, LEAST_SHARE * simulations
-        )
+        """Expect that `settings` settings follow in the present phase."""
+        self._expected = self._done - self._before + self._points * settings
 
     def _show(self) -> None:
         """Show the present phase and the numbers of simulations."""
@@ -133,5 +123,7 @@ class Phases:
 
     def _counts(self) -> tuple[int, int]:
         """The number of simulations that are done, and the expected total."""
-        remainder = max(self._before + self._expected - self._done, self._waiting)
+        simulations = self._done - self._before
+        minimum = self._is_stage * LEAST_SHARE * simulations
+        remainder = max(self._expected - simulations, self._waiting, minimum)
         return self._done, round(self._done + remainder + sum(self._later.values()))

@@ -294,9 +294,10 @@ class PermitSearch:
             columns = np.flatnonzero(worn[row] & (permit.order < top)).tolist()
             bounds.append(dict.fromkeys(columns, np.inf))
             failures.append(permit.limiting)
-        with self._models.own.evaluator.phases.stage(REPAIR_STAGE) as expect:
+        phases = self._models.own.evaluator.phases
+        with phases.stage(REPAIR_STAGE):
             while any(bounds):
-                expect(self._usual * sum(map(len, bounds)))
+                phases.expect(self._usual * sum(map(len, bounds)))
                 self._lower(
                     bounds,
                     failures,

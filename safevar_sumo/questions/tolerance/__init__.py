@@ -36,6 +36,7 @@ from safevar_sumo.questions.tolerance.asked import (
     USUAL,
     Asked,
     asked_of,
+    cases_of_setting,
     columns_of,
     specified_limits,
     usual_alone,
@@ -225,15 +226,15 @@ def _usual_settings(
 ) -> dict[str, float]:
     """The phases of progress, each with the number of settings that it usually simulates."""
     study = evaluator.study
-    points = len(evaluator.system.points)
+    cases = cases_of_setting(evaluator)
     sets = len(other_sets(study, fits))
     scaled = evaluator.scaled
     phases = {
-        OWN_SET_STAGE: usual_alone(evaluator, columns) + scaled(CASES) / points,
-        OTHER_SETS_STAGE: scaled(CASES_OF_SET * sets) / points,
+        OWN_SET_STAGE: usual_alone(evaluator, columns) + scaled(CASES) / cases,
+        OTHER_SETS_STAGE: scaled(CASES_OF_SET * sets) / cases,
     }
     if study.states_ranges and not study.ranges:
-        phases[RANGES_STAGE] = scaled(USUAL.cases + USUAL.cases_of_set * sets) / points
+        phases[RANGES_STAGE] = scaled(USUAL.cases + USUAL.cases_of_set * sets) / cases
     return phases
 
 

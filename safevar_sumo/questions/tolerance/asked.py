@@ -258,7 +258,14 @@ def usual_alone(evaluator: Evaluator, columns: int | None = None) -> float:
     default of all.
     """
     number = len(evaluator.characteristics.vehicle) if columns is None else columns
-    return evaluator.scaled(CASES_ALONE * number) / len(evaluator.system.points)
+    return evaluator.scaled(CASES_ALONE * number) / cases_of_setting(evaluator)
+
+
+def cases_of_setting(evaluator: Evaluator) -> int:
+    """The number of cases that cost as much as a setting: where encounters are ranges, each case
+    drives at all points, too.
+    """
+    return 1 if evaluator.study.ranges else len(evaluator.system.points)
 
 
 def effort_of(evaluator: Evaluator, cases: float, varied: int) -> Effort:
@@ -271,9 +278,11 @@ def effort_of(evaluator: Evaluator, cases: float, varied: int) -> Effort:
     if evaluator.study.ranges:
         scaled["cases_of_set"] *= OF_RANGES
     growths = evaluator.scaled(USUAL.box.growths)
-    share = USUAL.share / evaluator.account.effort
-    box = USUAL.box._replace(growths=growths)
-    return USUAL._replace(**scaled, share=share, box=box)
+    explorations = evaluator.scaled(USUAL.box.explored)
+    box = USUAL.box._replace(growths=growths, explored=explorations)
+    return USUAL._replace(
+        **scaled, share=USUAL.share / evaluator.account.effort, box=box
+    )
 
 
 def _effort_of_few(cases: int, varied: int) -> Effort:

@@ -441,7 +441,8 @@ def _breaches(
     """
     boxes = limits.boxes
     failures = limits.failures
-    search = task.search(Stream.EXTENSION, 0, QUICK * task.effort.generation)
+    budget = min(QUICK * task.effort.generation, task.effort.cases)
+    search = task.search(Stream.EXTENSION, 0, budget)
     breaches = dict[Side, FloatArray]()
     for side, column in np.argwhere(sides < task.domain).tolist():
         item = task.oracle.vehicle.members[column]
