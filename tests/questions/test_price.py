@@ -147,7 +147,6 @@ def test_a_quick_explanation_announces_an_eighth_of_a_whole_one(
 def test_more_simulations_than_are_planned_are_a_bound_too() -> None:
     account = Account(Phases(show_no_progress), allowance=120)
     account.open(100, None)
-    assert account.limit is None
     account.spend(120)
     with pytest.raises(InputError, match="120 do not suffice: 121"):
         account.spend(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -76,8 +77,8 @@ def test_any_order_of_parts_is_counted_without_a_way_back(
 
 
 def test_a_shorter_phase_shortens_the_total_and_rounds_are_foreseen() -> None:
-    """At 2 points, phases of 10, 20 and 60 settings are planned: the first takes 5. Of unknown
-    rounds at least 18 % of what they took so far follow. Each of 3 known rounds takes the
+    """At 2 points, phases of 10, 20 and 60 settings are planned: the first takes 5. At least 6 % of
+    what a stage took so far follow, and 18 % in unknown rounds. Each of 3 known rounds takes the
     mean of the rounds so far and of one as planned.
     """
     shown = Shown()
@@ -89,6 +90,7 @@ def test_a_shorter_phase_shortens_the_total_and_rounds_are_foreseen() -> None:
         assert shown[-1] == ("open", 10, 10 + 40 + 120)
         phases.begin_part("a part of it", 80)
         phases.add(80)
+        assert shown[-1] == ("open", 90, 90 + 5 + 120)
         phases.begin_round(2, 150)
         assert shown[-1] == ("open, round 2 of at most 150", 90, 90 + 14 + 120)
     with phases.stage("sets"):
@@ -113,16 +115,11 @@ def test_parts_weigh_at_least_what_is_expected_of_them() -> None:
     ]
 
 
-def recorded() -> dict[str, list[tuple[float, int, int]]]:
-    with RECORDED.open(encoding="utf-8", newline="") as file:
-        rows = [
-            (row[0], float(row[1]), int(row[2]), int(row[3]))
-            for row in csv.reader(file)
-        ]
-    return {
-        command: [row[1:] for row in of_command]
-        for command, of_command in groupby(rows, key=lambda row: row[0])
-    }
+def recorded() -> dict[str, list[list[float]]]:
+    rows = defaultdict[str, list[list[float]]](list)
+    for command, *numbers in csv.reader(RECORDED.read_text("utf-8").splitlines()):
+        rows[command].append([*map(float, numbers)])
+    return rows
 
 
 @pytest.mark.parametrize("command", recorded())

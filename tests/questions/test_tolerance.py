@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy
 
-from safevar_sumo import tolerance
+from safevar_sumo import load_study, tolerance
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
@@ -27,9 +27,10 @@ from safevar_sumo.questions.tolerance.search import find_limits
 from safevar_sumo.questions.tolerance.told import worst_of
 from safevar_sumo.questions.words import bound_in_words
 from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles import region_of
-from tests.in_process import rows_of
+from tests.in_process import InlinePool, rows_of
 from tests.made_up import case_of
 from tests.questions.conftest import (
     Plant,
@@ -274,11 +275,13 @@ def test_few_simulations_are_shared_between_limits_alone_and_the_box() -> None:
     assert effort.box.retreat == pytest.approx(0.5 + 200 / 3000)
     assert effort_of(evaluator, 200, 4).values == 3
     assert usual_alone(evaluator) == 4 * usual_alone(evaluator, 1) == 4 * 5000
-    evaluator.account.effort = 1 / 8
-    quick = effort_of(evaluator, np.inf, 4)
-    assert (quick.values, quick.cases, quick.cases_of_set) == (12, 625, 125)
-    evaluator.account.effort = 1 / 64
-    assert effort_of(evaluator, np.inf, 4).values == 8, "fewer show no limit"
+    # In ranges, a vehicle drives at all 6 points in 16 critical encounters, for 960 s. So the
+    # effort is 25 / 960. Fewer than 8 values show no limit.
+    evaluator = Evaluator(with_ranges(load_study("r152")), InlinePool())
+    evaluator.limit(None, 1, quick=True)
+    quick = effort_of(evaluator, np.inf, 1)
+    assert (quick.values, quick.cases, quick.box.explored) == (8, 130, 0)
+    assert (quick.cases_of_set, usual_alone(evaluator, 1)) == (78, 130)
 
 
 @pytest.mark.parametrize(("limit", "kept"), [("a <= 6", None), ("a <= 7.5", False)])

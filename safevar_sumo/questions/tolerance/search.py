@@ -114,9 +114,9 @@ def find_limits(task: Asked, wider: FoundLimits | None = None) -> FoundLimits:
                     sides=None, failures=Failures(nothing, nothing)
                 )
                 break
-    if limits.sides is None or task.effort.share >= 1:
-        return limits
-    return limits._replace(breaches=_breaches(task, limits, limits.sides))
+        if limits.sides is None or task.effort.share >= 1:
+            return limits
+        return limits._replace(breaches=_breaches(task, limits, limits.sides))
 
 
 def no_limits(task: Asked) -> FoundLimits:
