@@ -275,11 +275,11 @@ def effort_of(evaluator: Evaluator, cases: float, varied: int) -> Effort:
     names = ("values", "alone", "cases", "cases_of_set", "corners", "confirmations")
     scaled = {name: evaluator.scaled(getattr(USUAL, name)) for name in names}
     scaled["values"] = max(scaled["values"], LEAST_VALUES)
+    box = USUAL.box._replace(growths=evaluator.scaled(USUAL.box.growths))
     if evaluator.study.ranges:
         scaled["cases_of_set"] *= OF_RANGES
-    growths = evaluator.scaled(USUAL.box.growths)
-    explorations = evaluator.scaled(USUAL.box.explored)
-    box = USUAL.box._replace(growths=growths, explored=explorations)
+        # A small batch costs almost as much as a large one: each box drives at all points.
+        box = box._replace(explored=evaluator.scaled(box.explored))
     return USUAL._replace(
         **scaled, share=USUAL.share / evaluator.account.effort, box=box
     )
