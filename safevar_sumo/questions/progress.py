@@ -12,8 +12,8 @@ OVERRUN = 0.18
 expected to follow, because nobody knows whether a round is the last.
 """
 LEAST_SHARE = 0.06
-"""In a stage, at least this share of its simulations so far is expected to follow, because a failure
-may make more simulations necessary.
+"""In a stage, at least this share of its simulations so far is expected to follow: a failure may
+make more simulations necessary.
 """
 
 
