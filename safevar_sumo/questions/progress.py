@@ -124,6 +124,9 @@ class Phases:
     def _counts(self) -> tuple[int, int]:
         """The number of simulations that are done, and the expected total."""
         simulations = self._done - self._before
-        minimum = self._is_stage * LEAST_SHARE * simulations
-        remainder = max(self._expected - simulations, self._waiting, minimum)
+        remainder = max(self._expected - simulations, self._waiting)
+        if self._is_stage:
+            # The more a stage exceeds its plan, the more is expected to follow.
+            excess = simulations - self._expected
+            remainder = max(remainder, excess, LEAST_SHARE * simulations)
         return self._done, round(self._done + remainder + sum(self._later.values()))

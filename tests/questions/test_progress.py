@@ -77,9 +77,9 @@ def test_any_order_of_parts_is_counted_without_a_way_back(
 
 
 def test_a_shorter_phase_shortens_the_total_and_rounds_are_foreseen() -> None:
-    """At 2 points, phases of 10, 20 and 60 settings are planned: the first takes 5. At least 6 % of
-    what a stage took so far follow, and 18 % in unknown rounds. Each of 3 known rounds takes the
-    mean of the rounds so far and of one as planned.
+    """At 2 points, phases of 10, 20 and 60 settings are planned: the first takes 5. As much as a
+    stage exceeds its plan follows, or 18 % before an unknown round. Each of 3 known rounds takes
+    the mean of the rounds so far and of one as planned.
     """
     shown = Shown()
     phases = Phases(lambda *one: shown.append(one))
@@ -90,7 +90,7 @@ def test_a_shorter_phase_shortens_the_total_and_rounds_are_foreseen() -> None:
         assert shown[-1] == ("open", 10, 10 + 40 + 120)
         phases.begin_part("a part of it", 80)
         phases.add(80)
-        assert shown[-1] == ("open", 90, 90 + 5 + 120)
+        assert shown[-1] == ("open", 90, 90 + 40 + 120)
         phases.begin_round(2, 150)
         assert shown[-1] == ("open, round 2 of at most 150", 90, 90 + 14 + 120)
     with phases.stage("sets"):
