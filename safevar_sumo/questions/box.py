@@ -132,10 +132,10 @@ def prove(
     A later test has a smaller alpha_k, and therefore draws more settings: the bound is `share`
     again if all settings are safe.
 
-    If all settings of the first test are safe, its bound is computed at the confidence
-    `CONFIDENCE`, and not at 1 - alpha_1. This bound is smaller than `share`. A later test never
-    claims this smaller bound: a box whose unsafe share lies between the smaller bound and `share`
-    passes no later test wrongly, because a later test claims only `share`.
+    If all settings of the first test are safe, its bound is the usual one of a single test: it is
+    computed at the confidence `CONFIDENCE`, and not at 1 - alpha_1, and is smaller than `share`.
+    The probability that the bound of any test is wrong is then at most 1.5 alpha: alpha for the
+    first test, and alpha / 2 for all later tests.
     """
     # scipy takes longer to load than a simulation takes: only a test loads it.
     import scipy
