@@ -6,9 +6,7 @@ from safevar_sumo.study.characteristics import (
     Domain as Domain,
     Domains as Domains,
     Interval as Interval,
-    Limit as Limit,
     Precision as Precision,
-    limits_of as limits_of,
     unit_text as unit_text,
 )
 from safevar_sumo.study.encounters import (
@@ -32,6 +30,7 @@ from safevar_sumo.study.file import (
     study_names as study_names,
     write_study as write_study,
 )
+from safevar_sumo.study.limits import Limit as Limit, limits_of as limits_of
 from safevar_sumo.study.marks import (
     WHOLE as WHOLE,
     WITHOUT_EFFECT as WITHOUT_EFFECT,

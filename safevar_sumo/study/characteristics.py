@@ -1,13 +1,12 @@
 """The tables of a study about its characteristics, and the checks of these tables: domains,
-variation between vehicles, constraints on several characteristics, and limits. A user states limits
-under [limits], or on the command line as `NAME >= X` and `NAME <= X`.
+variation between vehicles, and constraints on several characteristics. Limits are in `limits.py`.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import starmap
 from typing import Annotated, Any
 
@@ -105,12 +104,12 @@ def unit_text(unit: str) -> str:
     return f" {unit}"
 
 
-def _number_within(lower: float, upper: float, row: Domain) -> str:
+def number_within(lower: float, upper: float, row: Domain) -> str:
     """The legal values of a characteristic, in the words of an error."""
     return f"a number in [{lower:g}, {upper:g}]{unit_text(row.unit)}"
 
 
-def _check_characteristic(key: str, name: str, rows: Domains) -> None:
+def check_characteristic(key: str, name: str, rows: Domains) -> None:
     check_name("", f"{key}{name}: there is no such characteristic", name, rows)
 
 
@@ -170,7 +169,7 @@ Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
 def check_variation(rows: Domains, variation: Mapping[str, Distribution]) -> None:
     """Refuse distributions that do not fit the characteristics' domains."""
     for name, distribution in variation.items():
-        _check_characteristic("variation.", name, rows)
+        check_characteristic("variation.", name, rows)
         _check_distribution(f"variation.{name}", rows[name], distribution)
 
 
@@ -191,16 +190,14 @@ def _check_distribution(key: str, row: Domain, distribution: Distribution) -> No
             raise InputError(
                 "",
                 f"{key}.{field} = {value:g}",
-                _number_within(row.lower, row.upper, row),
+                number_within(row.lower, row.upper, row),
             )
     if lower >= upper:
         raise InputError(
             "", f"{key}: lower = {lower:g} and upper = {upper:g}", "lower < upper"
         )
     if isinstance(distribution, Triangular) and not lower <= mode <= upper:
-        raise InputError(
-            "", f"{key}.mode = {mode:g}", _number_within(lower, upper, row)
-        )
+        raise InputError("", f"{key}.mode = {mode:g}", number_within(lower, upper, row))
     if isinstance(distribution, Lognormal) and row.lower <= 0:
         raise InputError(
             "",
@@ -297,7 +294,7 @@ def check_constraints(rows: Domains, constraints: Sequence[Constraint]) -> None:
     for index, constraint in enumerate(constraints):
         key = f"constraints[{index}]"
         for name in constraint.sum:
-            _check_characteristic(f"{key}.sum.", name, rows)
+            check_characteristic(f"{key}.sum.", name, rows)
         units = {rows[name].unit for name in constraint.sum}
         is_mixed = len(units) > 1
         legal_units = units | {"-"}
@@ -314,40 +311,6 @@ def check_constraints(rows: Domains, constraints: Sequence[Constraint]) -> None:
             )
 
 
-LIMIT_FORM = re.compile(
-    r"\s*([^<>=]*[^\s<>=])\s*(>=|<=)\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*"
-)
-SIDES = {">=": "at_least", "<=": "at_most"}
-FORMS = (
-    '"NAME >= X" or "NAME <= X" with a number in the unit of the characteristic, such as'
-    ' "treadDepth >= 3"'
-)
-
-
-class Limit(Table, frozen=True, kw_only=True):
-    """A limit states which values a characteristic may take, in its unit: `at_least`, `at_most`, or
-    both. `source` says who demands this limit.
-    """
-
-    at_least: float | None = None
-    at_most: float | None = None
-    source: LongText = ""
-
-    def __post_init__(self) -> None:
-        check_bounds(self.at_least, self.at_most)
-
-    def interval(self, row: Domain) -> Interval:
-        """The allowed interval of a characteristic [its unit]. A side without limit ends with the
-        domain.
-        """
-        low, high = self.at_least, self.at_most
-        if low is None:
-            low = row.lower
-        if high is None:
-            high = row.upper
-        return low, high
-
-
 class UnmeasuredValue(Table, frozen=True, kw_only=True):
     """The `value`, in its unit, that `permit` assumes of a characteristic that nobody measured in a
     car. `source` says where this value comes from, or that it is an assumption.
@@ -360,70 +323,11 @@ class UnmeasuredValue(Table, frozen=True, kw_only=True):
 def check_unmeasured(rows: Domains, values: Mapping[str, float]) -> None:
     """Refuse values of unknown characteristics, or outside of their domains."""
     for name, value in values.items():
-        _check_characteristic("unmeasured.", name, rows)
+        check_characteristic("unmeasured.", name, rows)
         row = rows[name]
         if not row.lower <= value <= row.upper:
             raise InputError(
                 "",
                 f"unmeasured.{name} = {value:g} is outside its domain",
-                _number_within(row.lower, row.upper, row),
+                number_within(row.lower, row.upper, row),
             )
-
-
-def limits_of(
-    texts: Iterable[str],
-    rows: Domains,
-    stated: Mapping[str, Limit] | None = None,
-) -> dict[str, Limit]:
-    """Combine typed and stated limits into one limit for each characteristic, in the order of
-    `rows`. A limit that is typed (in `texts`, such as `treadDepth >= 3`) replaces the limit that is
-    `stated` in a study.
-
-    Raises
-    ------
-    InputError
-        If a text is no limit, its characteristic is unknown, a limit is given twice, two limits of
-        one characteristic cross, or a limit is outside the domain or excludes the original.
-    """
-    sides: dict[str, dict[str, Any]] = {}
-    for text in texts:
-        match = LIMIT_FORM.fullmatch(text)
-        if match is None:
-            raise InputError("", repr(text), FORMS)
-        name = match[1]
-        side = SIDES[match[2]]
-        if side in sides.setdefault(name, {}):
-            raise InputError("", f"{name} {match[2]} is given twice", "each limit once")
-        sides[name][side] = float(match[3])
-    try:
-        typed = {name: Limit(**limit) for name, limit in sides.items()}
-    except ValueError as error:
-        problem, _, legal = str(error).partition("\n")
-        raise InputError("", f"{', '.join(texts)}: {problem}", legal) from None
-
-    # A typed limit replaces the stated limit of the same characteristic, with both of its sides.
-    check_limits(rows, typed)
-    limits = {**(stated or {}), **typed}
-    return {name: limits[name] for name in rows if name in limits}
-
-
-def check_limits(rows: Domains, limits: Mapping[str, Limit], table: str = "") -> None:
-    """Refuse limits of unknown characteristics, limits outside the domain, and limits that exclude
-    the original value. `table` is the prefix of names in errors.
-    """
-    for name, limit in limits.items():
-        _check_characteristic(table, name, rows)
-        row = rows[name]
-        for side, opposite, lower, upper in (
-            ("at_least", "<=", row.lower, row.original),
-            ("at_most", ">=", row.original, row.upper),
-        ):
-            value = getattr(limit, side)
-            if value is not None and not lower <= value <= upper:
-                why = " is outside its domain"
-                legal = _number_within(lower, upper, row)
-                if row.lower <= value <= row.upper:
-                    original = f"{row.original:g}{unit_text(row.unit)}"
-                    why = f": the original, {original}, does not keep it"
-                    legal += f"; did you mean {opposite} {value:g}?"
-                raise InputError("", f"{table}{name}.{side} = {value:g}{why}", legal)

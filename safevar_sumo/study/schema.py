@@ -16,15 +16,14 @@ from safevar_sumo.study.characteristics import (
     Constraint,
     Distribution,
     Domains,
-    Limit,
     PositiveNumber,
     UnmeasuredValue,
-    check_limits,
     check_unmeasured,
     check_variation,
     mistake,
 )
 from safevar_sumo.study.encounters import Encounters, MatrixTest, ModelTable, Parameters
+from safevar_sumo.study.limits import Limit, check_limits
 from safevar_sumo.study.marks import (
     OF_STUDY,
     OF_SYSTEM,

@@ -15,8 +15,8 @@ from hypothesis import given, strategies as st
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
+from safevar_sumo.questions.permit.permits import cars_of
 from safevar_sumo.questions.permit.rows import assumed_cells, assumed_sentences
-from safevar_sumo.questions.permit.search import cars_of
 from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Study

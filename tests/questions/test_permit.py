@@ -25,9 +25,9 @@ from safevar_sumo.questions.permit.encounters import (
     encounters_of,
     span_of,
 )
+from safevar_sumo.questions.permit.permits import PermitSearch, Reached
 from safevar_sumo.questions.permit.rows import verdict_of
-from safevar_sumo.questions.permit.search import PermitSearch, Reached
-from safevar_sumo.questions.permit.speeds import Cars
+from safevar_sumo.questions.permit.speed_search import Cars
 from safevar_sumo.questions.permit.words import ROUGH_NEED
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study

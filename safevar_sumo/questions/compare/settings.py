@@ -21,8 +21,9 @@ from safevar_sumo.questions.sampling import Interval, sobol_points
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.results import handles_of
 from safevar_sumo.study import Limit, Study
-from safevar_sumo.study.characteristics import Domains, check_limits
+from safevar_sumo.study.characteristics import Domains
 from safevar_sumo.study.encounters import Axes, AxisTable
+from safevar_sumo.study.limits import check_limits
 
 BOTH_STAGE = "simulate both versions"
 """The phase of progress in which settings are simulated in both versions."""

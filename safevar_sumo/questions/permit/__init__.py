@@ -33,14 +33,14 @@ from safevar_sumo.questions.options import (
 from safevar_sumo.questions.permit.answer import DIGEST, PermitAnswer
 from safevar_sumo.questions.permit.encounters import Span, span_of
 from safevar_sumo.questions.permit.fleet import Fleet, read_fleet
-from safevar_sumo.questions.permit.rows import CARS, SETS, failure_columns
-from safevar_sumo.questions.permit.search import (
+from safevar_sumo.questions.permit.permits import (
     Permit,
     PermitSearch,
     Repaired,
     cars_of,
 )
-from safevar_sumo.questions.permit.speeds import Cars
+from safevar_sumo.questions.permit.rows import CARS, SETS, failure_columns
+from safevar_sumo.questions.permit.speed_search import Cars
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios.declared import with_ranges

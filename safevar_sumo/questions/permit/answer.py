@@ -20,6 +20,12 @@ from safevar_sumo.questions.part import UpperEnd, scope_of, study_up_to
 from safevar_sumo.questions.permit import words
 from safevar_sumo.questions.permit.encounters import Span
 from safevar_sumo.questions.permit.fleet import ROUGH, THIS_CAR, YES, Fleet
+from safevar_sumo.questions.permit.permits import (
+    Permit,
+    PermitSearch,
+    Repaired,
+    WorstEnd,
+)
 from safevar_sumo.questions.permit.rows import (
     CARS,
     DRIVE,
@@ -31,12 +37,6 @@ from safevar_sumo.questions.permit.rows import (
     failure_columns,
     set_rows,
     verdict_of,
-)
-from safevar_sumo.questions.permit.search import (
-    Permit,
-    PermitSearch,
-    Repaired,
-    WorstEnd,
 )
 from safevar_sumo.questions.sentence import Sentence, Verdict, answer, condition
 from safevar_sumo.questions.tables import Column, tabulate

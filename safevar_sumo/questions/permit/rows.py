@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from safevar_sumo.questions.counterexamples import OF_ENCOUNTER, failures_at, texts_of
 from safevar_sumo.questions.permit import words
 from safevar_sumo.questions.permit.fleet import Fleet
-from safevar_sumo.questions.permit.search import Permit
-from safevar_sumo.questions.permit.speeds import LimitingFailure
+from safevar_sumo.questions.permit.permits import Permit
+from safevar_sumo.questions.permit.speed_search import LimitingFailure
 from safevar_sumo.questions.sentence import Sentence
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import EXACT, change_texts, join_phrases

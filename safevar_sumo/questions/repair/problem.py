@@ -36,7 +36,7 @@ from safevar_sumo.records import (
     differences,
 )
 from safevar_sumo.study import PHASE, FreeParameter, ModelTable, Study, limits_of
-from safevar_sumo.study.characteristics import check_limits
+from safevar_sumo.study.limits import check_limits
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import FeasibleRegion
 

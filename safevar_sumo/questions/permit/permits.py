@@ -17,7 +17,11 @@ import numpy as np
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit.encounters import Span, encounters_of
 from safevar_sumo.questions.permit.fleet import Fleet
-from safevar_sumo.questions.permit.speeds import Cars, LimitingFailure, SpeedSearch
+from safevar_sumo.questions.permit.speed_search import (
+    Cars,
+    LimitingFailure,
+    SpeedSearch,
+)
 from safevar_sumo.questions.words import EXACT
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
