@@ -1,6 +1,4 @@
-"""The tables of answers: data frames with the unit and the meaning of each column. Readers see a
-table as text on the terminal, as HTML or as LaTeX.
-"""
+"""The tables of answers: data frames with units and meanings, as text, as HTML or as LaTeX."""
 
 from __future__ import annotations
 
@@ -126,9 +124,7 @@ class AnswerTable:
 
 
 class Frames(dict[str, pd.DataFrame]):
-    """The data frames of an answer's tables by name. `records` holds the `AnswerTable` objects,
-    also those of tables that were given as data frames.
-    """
+    """The data frames of an answer's tables by name; `records` holds the `AnswerTable` objects."""
 
     def __init__(self, tables: Mapping[str, AnswerTable | pd.DataFrame]) -> None:
         self.records = dict[str, AnswerTable]()
