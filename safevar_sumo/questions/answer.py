@@ -318,10 +318,11 @@ def _draw_intervals(answer: Answer) -> Figure:
     )
 
     frame = answer.table()
-    names = []
-    for name in map(str, frame):
-        if f"{name}{LOW}" in frame and frame[name].notna().any():
-            names.append(name)
+    names = [
+        name
+        for name in map(str, frame)
+        if f"{name}{LOW}" in frame and frame[name].notna().any()
+    ]
     if not names or frame.empty:
         raise InputError(
             "plot", "the answer has nothing to draw", "the answer as a table"

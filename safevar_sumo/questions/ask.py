@@ -434,15 +434,15 @@ def find_question(name: str) -> Question:
         If there is no such question.
     """
     legal = f"{', '.join(QUESTIONS)}, or module:name of a function with @question"
-    if not (":" in name or name in QUESTIONS):
-        raise InputError("question", f"there is no {name!r}", legal)
     if ":" in name:
         module, _, function = name.partition(":")
         # The user's module may be in the working directory, which is not on the path of an
         # installed program.
         add_import_folders(())
-    else:
+    elif name in QUESTIONS:
         module, function = QUESTIONS[name], name
+    else:
+        raise InputError("question", f"there is no {name!r}", legal)
     # Python's caches of folders would hide a module that was written a moment ago.
     invalidate_caches()
 

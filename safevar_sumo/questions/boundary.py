@@ -70,7 +70,7 @@ def find_boundaries(
         Share of each line at which the search begins, shape (K,) or a number.
     """
     lines = np.arange(len(starts))
-    low = np.broadcast_to(np.asarray(lowest, dtype=float), lines.shape)
+    low = np.full(len(lines), lowest, dtype=float)
     high = np.ones(len(lines))
     for number in parts:
         # Divide the piece from `low` to `high` of each line: shares of the bounds between the

@@ -131,7 +131,7 @@ class Case:
         )
         for name, values in columns.items():
             solutions[name] = values[1:]
-        original = NamedValues()
+        original = {}
         for metric in scoring.metrics:
             original[metric.name] = float(evaluations.metrics[metric.name][0])
         return replace(
@@ -247,10 +247,11 @@ class Case:
         """
         finished = self.run_counts
         planned = self.study.search.runs
-        unfinished = []
-        for name in self.study.search.labels:
-            if finished[name] < planned:
-                unfinished.append(f"{finished[name]} of {planned} runs of {name}")
+        unfinished = [
+            f"{finished[name]} of {planned} runs of {name}"
+            for name in self.study.search.labels
+            if finished[name] < planned
+        ]
         if not (self.has_runs and unfinished):
             return ""
         return (
@@ -365,7 +366,7 @@ def build_case(
     Frames get a column of NaN for each metric and objective that they lack. `facts` are further
     attributes of `Case`.
     """
-    metrics = NamedValues()
+    metrics = {}
     for metric in scoring.metrics:
         value = original.get(metric.name)
         metrics[metric.name] = np.nan if value is None else float(value)

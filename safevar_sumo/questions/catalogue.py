@@ -96,8 +96,8 @@ def list_models(kind: str | None = None, study: str | None = None) -> Answer:
         scenarios = {kind: named.target}
         kind = "scenarios"
     weathers = pd.DataFrame(map(msgspec.to_builtins, WEATHERS.values()))
-    has_effect = ~np.array(list(map(equals_clear, WEATHERS.values())))
-    weathers["effect"] = np.where(has_effect, "yes", "none")
+    are_clear = list(map(equals_clear, WEATHERS.values()))
+    weathers["effect"] = np.where(are_clear, "none", "yes")
     metrics = {**METRICS, **OPTIONAL_METRICS}.items()
     described_metrics = [(name, metric.description) for name, metric in metrics]
 

@@ -77,10 +77,7 @@ def find_cause_limits(
     is_changed = settings != original
     # A cause has several lines: first a line on which all its changes are scaled, then, for each
     # change, a line on which only this change is scaled.
-    groups = [
-        np.vstack([flags, np.eye(len(flags), dtype=bool)[flags]])
-        for flags in is_changed
-    ]
+    groups = [np.vstack([flags, np.diag(flags)[flags]]) for flags in is_changed]
     line_counts = list(map(len, groups))
     is_scaled = np.concatenate(groups)
     ends = np.repeat(settings, line_counts, axis=0)

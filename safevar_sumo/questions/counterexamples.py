@@ -261,26 +261,22 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
             place_of(points, point, scenario, values, model.fit),
             dict(point.parameters),
             breach,
-            _command(model, settings[row], point, values),
+            _command(model, settings[row], point),
         )
     return failures
 
 
-def _command(
-    model: Model, setting: FloatArray, point: Point, values: Mapping[str, float]
-) -> str:
+def _command(model: Model, setting: FloatArray, point: Point) -> str:
     """The command that simulates a setting, shape (n,). It sets the parameters of the point that
     the command `simulate` can set. `values` are the searched parameters of the encounter.
     """
     system = model.evaluator.system
     members = model.evaluator.characteristics
-    axes = {
-        name: value
-        for name, value in point.parameters
-        if name in searchable_in(point.scenario) and isinstance(value, int | float)
-    }
     words = [system.command, members.options(setting)]
-    words += [f"--set {name}={value!r}" for name, value in axes.items()]
+    searchable = searchable_in(point.scenario)
+    for name, value in point.parameters:
+        if name in searchable and isinstance(value, int | float):
+            words.append(f"--set {name}={value!r}")
     words += [f"--fit {model.fit}"] * (model.fit > 0)
     return " ".join(filter(None, words))
 

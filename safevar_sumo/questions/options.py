@@ -196,7 +196,7 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
     is_repeated = any(get_origin(kind) is tuple for kind in hints)
     kind: type = str
     if not is_repeated:
-        kind = next((kind for kind in (bool, int, float, Path) if kind in hints), str)
+        kind = next(filter(hints.__contains__, (bool, int, float, Path)), str)
     choices = ()
     if get_origin(hint) is Literal:
         choices = get_args(hint)

@@ -79,7 +79,7 @@ def part_of_study(
     InputError
         If the study has no such part.
     """
-    if ranges and study.encounters != RANGES:
+    if ranges:
         study = with_ranges(study)
         if study.encounters != RANGES:
             raise InputError(

@@ -72,16 +72,17 @@ def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
     simulated. `verdicts` and `collisions` are the results of `assess_sample`.
     """
     rows = []
-    drivers = [*TITLES, *(name for name in OF_LANES if name in verdicts)]
+    drivers = [*TITLES, *filter(verdicts.__contains__, OF_LANES)]
     for driver in drivers if len(verdicts) else ():
-        number = int(verdicts[driver].count())
-        avoided = int(verdicts[driver].sum())
+        of_driver = verdicts[driver]
+        number = int(of_driver.count())
+        avoided = int(of_driver.sum())
         share, low, high = share_with_interval(avoided, number)
         if len(verdicts) == collisions:
             low = high = share
-        points = list(filter(None, verdicts["point"][verdicts[driver].isna()].unique()))
+        points = verdicts["point"][of_driver.isna()].unique()
         counts = (driver, avoided, number - avoided, len(verdicts) - number)
-        rows.append((*counts, share, low, high, points))
+        rows.append((*counts, share, low, high, [*filter(None, points)]))
     shares = dict.fromkeys(("share", "share_low", "share_high"), float)
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype(shares)
 

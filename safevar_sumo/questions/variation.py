@@ -46,7 +46,7 @@ class VariationModel:
             for quantile, column in zip(self._quantiles, probabilities.T, strict=True)
         ]
         return np.clip(
-            np.stack(columns, axis=1),
+            np.column_stack(columns),
             self.characteristics.lower,
             self.characteristics.upper,
         )

@@ -242,7 +242,7 @@ def notes_on(unsafe: Unsafe, *texts: str) -> list[Sentence]:
     """Notes with the given texts and the criterion's remark. A last note says what unsafe means, if
     that is not only a collision.
     """
-    notes = [note(text) for text in (*texts, unsafe.remark)]
+    notes = [*map(note, (*texts, unsafe.remark))]
     if not unsafe.is_collision:
         notes.append(UNSAFE_MEANS(description=unsafe.description))
     return notes

@@ -92,12 +92,10 @@ def _missing_cases(side: Evaluator, reference: Evaluator) -> Iterator[str]:
     tests, _, cases = zip(*cases_of(side), strict=True)
     weathers = {case.weather for case in cases}
     for test, point, case in cases_of(reference):
-        in_weathers = (case._replace(weather=weather) for weather in weathers)
         if case in cases:
             continue
-        if case.weather not in weathers and any(
-            variant in cases for variant in in_weathers
-        ):
+        variants = [case._replace(weather=weather) for weather in weathers]
+        if case.weather not in weathers and any(map(cases.__contains__, variants)):
             yield f"the weather {case.weather.name}"
         elif test in tests and point.name:
             yield f"the test case ({point.name})"

@@ -178,7 +178,7 @@ def _safe_alone(
     if model.are_unsafe(model.characteristics.original_settings, "original vehicle")[0]:
         return [None] * len(members)
     alone = alone_with_own_set(request, Alone(request.lower, request.upper))
-    ends = zip(alone.lower.tolist(), alone.upper.tolist(), strict=True)
+    ends = np.column_stack([alone.lower, alone.upper]).tolist()
     intervals = []
     for item, safe in zip(members, ends, strict=True):
         low, high = item.rounded_inwards(safe)

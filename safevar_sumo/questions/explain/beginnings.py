@@ -37,7 +37,7 @@ class Beginning(NamedTuple):
     cause
         The cause, with its values at the ends of the domain or, if these are safe, nearer to the
         original.
-    share
+    begins_at
         The smallest share of the way to the ends at which it was found to be a cause; NaN if the
         values are at the ends and others were not simulated.
     boundary
@@ -47,7 +47,7 @@ class Beginning(NamedTuple):
     """
 
     cause: Cause
-    share: float
+    begins_at: float
     boundary: NamedValues
     safe_again: float
 

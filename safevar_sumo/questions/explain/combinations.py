@@ -115,7 +115,8 @@ def enumerate_causes(
     # The robustness of the vehicle with each single change. It orders larger combinations.
     effects = dict.fromkeys(changes, np.inf)
     causes = list[Cause]()
-    simulated, existing = dict[int, int](), dict[int, int]()
+    simulated = {}
+    existing = {}
     containing = {}
     unsafe_ones = list[Combination]()
     is_cut = False
@@ -142,7 +143,7 @@ def enumerate_causes(
 
         # The combinations whose single changes are worst in sum come first.
         candidates.sort(
-            key=lambda combination: sum(effects[change] for change in combination)
+            key=lambda combination: sum(map(effects.__getitem__, combination))
         )
         chosen = candidates[:room]
         room -= len(chosen)

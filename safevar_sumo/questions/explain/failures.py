@@ -142,9 +142,9 @@ def gather_failures(
     over_sets = None
     if isinstance(subject, Study):
         omissions = int(evaluations.infeasible.sum())
-        counts = np.flatnonzero(~evaluations.infeasible)
-        evaluations = evaluations.take(counts)
-        names = [names[row] for row in counts]
+        is_met = ~evaluations.infeasible
+        evaluations = evaluations.take(is_met)
+        names = [*compress(names, is_met)]
         vehicles = VariationModel(subject).draw(
             VEHICLES, default_rng(subject.search.seed)
         )

@@ -184,11 +184,9 @@ def _table(
     rows = [
         {
             **beginning.cause._asdict(),
+            **beginning._asdict(),
             "causes": beginning.cause.changes,
             "size": len(beginning.cause.changes),
-            "begins_at": beginning.share,
-            "boundary": beginning.boundary,
-            "safe_again": beginning.safe_again,
             "holds": sets_with_cause,
             "fits": number_of_sets,
             "robust_share": share,

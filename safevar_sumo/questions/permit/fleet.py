@@ -210,7 +210,7 @@ def _cells_of_file(path: Path) -> _Cells:
     skipped = 1 if stated else 0
     head = re.sub('"[^"]*"', "", lines.readline())
     lines.seek(0)
-    separator = next((mark for mark in SEPARATORS if mark in head), "")
+    separator = next(filter(head.__contains__, SEPARATORS), "")
     separator = stated[1] if stated else separator
     place = f"{path}, line {skipped + 1}"
     if separator not in SEPARATORS or separator not in head:
@@ -226,7 +226,7 @@ def _cells_of_file(path: Path) -> _Cells:
     start = 0
     try:
         for record in reader:
-            records.append((skipped + start + 1, record))
+            records.append((f"{path}, line {skipped + start + 1}", record))
             start = reader.line_num
     except csv.Error as error:
         raise InputError(
@@ -234,18 +234,16 @@ def _cells_of_file(path: Path) -> _Cells:
         ) from None
     while len(records) > 1 and not any(cell.strip() for cell in records[-1][1]):
         records.pop()
-    header = records[0][1]
-    for line, record in records:
-        if len(record) != len(header):
+    places, rows = zip(*records, strict=True)
+    number = len(rows[0])
+    for row_place, row in records:
+        if len(row) != number:
             raise InputError(
-                f"{path}, line {line}",
-                number_of(len(record), "field"),
-                f"{len(header)} fields with a {SEPARATORS[separator]} between them",
+                row_place,
+                number_of(len(row), "field"),
+                f"{number} fields with a {SEPARATORS[separator]} between them",
             )
-    places = [f"{path}, line {line}" for line, _ in records[1:]]
-    return _Cells(
-        place, header, places, [record for _, record in records[1:]], separator
-    )
+    return _Cells(place, rows[0], [*places[1:]], [*rows[1:]], separator)
 
 
 def _cells_of_frame(frame: pd.DataFrame) -> _Cells:
@@ -253,7 +251,7 @@ def _cells_of_frame(frame: pd.DataFrame) -> _Cells:
     present = frame.astype(object).where(frame.notna(), None)
     rows = [[*map(_text, row)] for row in present.itertuples(index=False, name=None)]
     places = [f"cars, row {label}" for label in frame.index]
-    return _Cells("cars", [str(name) for name in frame.columns], places, rows)
+    return _Cells("cars", [*map(str, frame.columns)], places, rows)
 
 
 def _cells_of_mapping(cars: Mapping[Any, Any], place: str) -> _Cells:

@@ -144,7 +144,7 @@ class PermitSearch:
         ranges = encounters_of(models.own, span)
         self._ranges = {models.own.fit: ranges}
         fixed = [encounters.low for encounters in ranges if encounters.column is None]
-        self.listed = np.unique([value for value in fixed if np.isfinite(value)])
+        self.listed = np.unique([*filter(np.isfinite, fixed)])
         is_moved = len(fixed) < len(ranges)
         self.values = np.union1d(values, self.listed) if is_moved else self.listed
         self._models_in_order = [*models.members]
@@ -193,23 +193,21 @@ class PermitSearch:
         top = float(self.values[-1])
         for model in self._models_in_order:
             # The cars that are still of interest, and the greatest value that is of interest.
-            waiting = []
-            caps = []
+            caps = {}
             for car, (permit, floor) in enumerate(zip(permits, floors, strict=True)):
                 cap = permit.order if permit.reached and floor is not None else top
                 if floor is None or not permit.reached or cap > floor:
-                    waiting.append(car)
-                    caps.append(cap)
-            if not waiting:
+                    caps[car] = cap
+            if not caps:
                 break
             if model.fit not in self._ranges:
                 self._ranges[model.fit] = encounters_of(model, self.span)
             name = stage or self._stage(model.fit)
             search = SpeedSearch(
                 self._ranges[model.fit],
-                [cars[car] for car in waiting],
+                [cars[car] for car in caps],
                 self.values,
-                caps,
+                [*caps.values()],
                 name,
             )
             with model.evaluator.phases.stage(name):
@@ -217,7 +215,7 @@ class PermitSearch:
                 if self._budget:
                     search.attack(self._budget)
             self.attacked += search.attacked
-            for number, car in enumerate(waiting):
+            for number, car in enumerate(caps):
                 safe_value = search.safe_value(number)
                 # Between listed values nothing is known: the last safe listed value counts.
                 values = self.listed[self.listed <= (safe_value or -np.inf)]
@@ -248,7 +246,7 @@ class PermitSearch:
         # a failure in one set is enough.
         limiting = permit.least.failure
         worst = car.lower if limiting is None else limiting.setting[: len(vehicle)]
-        is_assumed = np.eye(len(vehicle), dtype=bool)[~is_measured]
+        is_assumed = np.diag(~is_measured)[~is_measured]
         at_lower = np.where(is_assumed, vehicle.lower, worst)
         at_upper = np.where(is_assumed, vehicle.upper, worst)
         ranges = self._ranges[permit.least.fit]
@@ -290,14 +288,13 @@ class PermitSearch:
         self._models_in_order.sort(key=lambda model: -limiting[model.fit])
         top = float(self.values[-1])
         bounds = []
-        failures = []
+        failures = [permit.limiting for permit in permits]
         best = list[Repaired]([None] * len(cars))
         # The speed of each car with its best repair so far; at first, the speed without a repair.
         orders = [permit.order for permit in permits]
         for row, permit in enumerate(permits):
             columns = np.flatnonzero(worn[row] & (permit.order < top)).tolist()
             bounds.append(dict.fromkeys(columns, np.inf))
-            failures.append(permit.limiting)
         phases = self._models.own.evaluator.phases
         with phases.stage(REPAIR_STAGE):
             while any(bounds):

@@ -58,9 +58,7 @@ def failure_columns(
             failed = described[row]
             event = failed.words.partition(" (parameter set")[0]
             if with_car:
-                values = dict(
-                    zip(members.vehicle.names, settings[row].tolist(), strict=False)
-                )
+                values = members.vehicle.named(settings[row, members.of_vehicle])
                 changes = change_texts(members.vehicle, values, are_printed=True)
                 phrases = join_phrases(changes or ["no change"])
                 event = words.WITH_CHANGES.format(changes=phrases, event=event)

@@ -74,9 +74,8 @@ class Cars(NamedTuple):
         at an end) drive in the grid: all corners, or up to `SPREAD` of them if there are more.
         """
         corners = np.round(sobol_points(SPREAD, len(lower), seed=0))
-        return cls(
-            lower, upper, np.unique(np.where(corners == 0, lower, upper), axis=0)
-        )
+        vehicles = np.where(corners == 0, lower, upper)
+        return cls(lower, upper, np.unique(vehicles, axis=0))
 
     @classmethod
     def within(cls, lower: FloatArray, upper: FloatArray, seed: int) -> Cars:
@@ -85,7 +84,8 @@ class Cars(NamedTuple):
         """
         points = sobol_points(SPREAD, len(lower), seed)
         points = np.concatenate([np.round(points), points])
-        return cls(lower, upper, np.unique(lower + points * (upper - lower), axis=0))
+        vehicles = lower + points * (upper - lower)
+        return cls(lower, upper, np.unique(vehicles, axis=0))
 
     def with_value_of(self, column: int, model: FloatArray) -> Cars:
         """The same car, with the value of one column as in the `model` vehicle, shape (n,)."""
@@ -111,9 +111,8 @@ class Cars(NamedTuple):
         is_corner = np.isin(vehicles, [self.lower, self.upper]).all(axis=1)
         corners = vehicles[is_corner]
         half = self.together // 2
-        return np.vstack([corners[:half], vehicles[~is_corner], corners[half:]])[
-            : self.together
-        ]
+        ordered = np.vstack([corners[:half], vehicles[~is_corner], corners[half:]])
+        return ordered[: self.together]
 
     @property
     def number(self) -> int:
@@ -241,7 +240,7 @@ class SpeedSearch:
         car. The result has shape (P * together, n + 2 + k).
         """
         cars = self._cars[car]
-        vehicles = np.concatenate([cars.at(place) for place in places])
+        vehicles = np.concatenate([*map(cars.at, places)])
         return np.hstack([vehicles, np.repeat(places, cars.together, axis=0)])
 
     def _judge(self, cases: FloatArray) -> FloatArray:
@@ -323,12 +322,12 @@ class SpeedSearch:
         assert safe_value is not None
         # Only tests that exist at the car's value or below are searched.
         number = sum(encounters.low <= safe_value for encounters in self._ranges)
-        ends = np.array([np.zeros(2 + self._axes), np.ones(2 + self._axes)])
-        ends[:, 0] = 0, np.nextafter(number, 0)
-        ends[:, 1] = self._values[0], safe_value
-        space = Space(
-            np.append(cars.lower, ends[0]), np.append(cars.upper, ends[1]), self._size
-        )
+        shares = np.zeros(self._axes)
+        first_place = [0.0, self._values[0]]
+        last_place = [np.nextafter(number, 0), safe_value]
+        lower = np.concatenate([cars.lower, first_place, shares])
+        upper = np.concatenate([cars.upper, last_place, shares + 1])
+        space = Space(lower, upper, self._size)
 
         # The search begins with the worst cases so far that are in the searched space.
         cases, robustness = map(np.concatenate, zip(*self._judged[car], strict=True))

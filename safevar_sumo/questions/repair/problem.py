@@ -292,7 +292,7 @@ class RepairProblem:
                 self.parameters, shares.T, self.today, strict=True
             )
         ]
-        return np.stack(columns, axis=1)
+        return np.column_stack(columns)
 
     def changed_values(self, change: FloatArray) -> NamedValues:
         """The new values, by name, of the parameters that a change, shape (P,), changes."""

@@ -173,7 +173,7 @@ def find_survivors(
             for change, _ in changes
         )
 
-    broken = tuple(fit for fit in fits[1:] if breaks_one(fit))
+    broken = tuple(filter(breaks_one, fits[1:]))
     return Survivors(changes, len(fits) - len(broken), broken)
 
 

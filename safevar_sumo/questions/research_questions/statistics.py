@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable
 from decimal import Decimal
 from itertools import count
+from operator import sub
 from typing import NamedTuple
 
 import numpy as np
@@ -140,8 +141,8 @@ def signed_rank_test(x: ArrayLike, y: ArrayLike = 0.0) -> TwoSampleTest:
     The test drops differences of 0, as Wilcoxon did. The effect size counts them by half.
     """
     # Differences of decimal numbers have no rounding errors.
-    pairs = zip(_decimals(x), _decimals(np.broadcast_to(y, np.shape(x))), strict=True)
-    differences = np.array([value - baseline for value, baseline in pairs], float)
+    baselines = _decimals(np.broadcast_to(y, np.shape(x)))
+    differences = np.array([*map(sub, _decimals(x), baselines)], float)
 
     if not differences.size or np.isnan(differences).any():
         return TwoSampleTest(np.nan, np.nan, None, differences.size, 0, None)

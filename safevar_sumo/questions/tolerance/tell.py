@@ -193,10 +193,9 @@ def _limits_table(facts: Told) -> AnswerTable:
     # If there are joint limits, one screen shows them without the limits alone.
     end = LIMITS["alone_low"]._replace(is_detail=facts.box is not None)
     columns = {**LIMITS, "alone_low": end}
-    texts = [text for row in rows if (text := row["fails_first"])]
+    frame = pd.DataFrame(rows, columns=list(columns))
+    texts = frame["fails_first"].dropna()
     events = {text: text.removeprefix("the vehicle ") for text in texts}
-    cells = [[*row.values()] for row in rows]
-    frame = pd.DataFrame(cells, columns=list(columns))
     members = [facts.members[column] for column in facts.columns]
     domains = [(item.lower, item.upper) for item in members]
     joint = frame[["together_low", "together_high"]].to_numpy(float)
@@ -374,7 +373,7 @@ def _slowest_failure(facts: Told, oracle: Oracle, unsafe: FloatArray) -> Failure
     axes = members.scenario.names
     axis = SPEED_DIMENSION if SPEED_DIMENSION in axes else axes[0]
     column = members.names.index(axis)
-    settings = [oracle.setting(case) for case in unsafe]
+    settings = map(oracle.setting, unsafe)
     model, setting = min(settings, key=lambda pair: float(pair[1][column]))
     limits = facts.box or facts.box_of(facts.limits.specified)
     box = limits.in_encounters_of(model.evaluator.region)

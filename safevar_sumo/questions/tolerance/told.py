@@ -222,7 +222,7 @@ class Told:
         """
         if self.limits.broken or not self.is_safe:
             return self.stated
-        return [column for column in self.stated if self._is_broken(column)]
+        return [*filter(self._is_broken, self.stated)]
 
     def _is_broken(self, column: int) -> bool:
         """Whether a specified limit is beyond the limit alone. A rough search leaves a wide gap
@@ -272,7 +272,7 @@ def worst_of(
     """The worst value that searches found, by parameter set; None without a finite value."""
     pairs = attacks.items()
     values = [value_in(unsafe, fit, attack.least) for fit, attack in pairs]
-    finite = [value for value in values if np.isfinite(value)]
+    finite = [*filter(np.isfinite, values)]
     return float(unsafe.worst(finite)) if finite else None
 
 
