@@ -34,7 +34,7 @@ def read_changes(
         domain.
     """
     switch = "" if beyond is None else "--beyond"
-    values = NamedValues()
+    values = {}
 
     for change in changes:
         name, equals, text = (text.strip() for text in change.partition("="))

@@ -37,7 +37,7 @@ from safevar_sumo.questions.between import in_phases
 from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.price import (
     MEASURED,
-    QUICK,
+    QUICK_EFFORTS,
     QUICK_SECONDS,
     Account,
     print_price_of_list,
@@ -207,7 +207,9 @@ class Evaluator:
             seconds *= ENCOUNTERS
         self.account.effort = 1.0
         if quick:
-            self.account.effort = float(np.clip(QUICK_SECONDS / seconds, *QUICK))
+            self.account.effort = float(
+                np.clip(QUICK_SECONDS / seconds, *QUICK_EFFORTS)
+            )
         self.account.allowance = self.account.limit = simulations
         self.account.questions = questions
         self.account.is_question = True

@@ -89,9 +89,9 @@ def draw_pairs(answer: Answer, titles: Sequence[str]) -> Figure:
         )
 
     axis.axline((0, 0), slope=1, color="black", linewidth=0.6)
-    labels = [
+    label_of_a, label_of_b = (
         escape_dollars(f"safety degree in {name} [m, below 0: -m/s]") for name in titles
-    ]
-    axis.set(xlabel=labels[0], ylabel=labels[1])
+    )
+    axis.set(xlabel=label_of_a, ylabel=label_of_b)
     axis.legend(title="unsafe in version", fontsize=FONT_SIZE - 1)
     return figure

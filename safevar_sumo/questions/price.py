@@ -39,15 +39,15 @@ BATCH = 512
 """Number of vehicles in the batch that measures how long a vehicle of a list takes."""
 LEAST_SETTINGS = 3
 """Fewest settings with which a question that samples settings gives an answer."""
-QUICK = 1 / 40, 1 / 8
+QUICK_EFFORTS = 1 / 40, 1 / 8
 """Least and largest effort of a quick answer. (The effort is the amount of search, as a share of
 the usual amount.) Usually a question proposes up to 40 boxes of joint limits: the least effort
 suffices for one box.
 """
 QUICK_SECONDS = 25.0
 """The effort of a quick answer is this number divided by the seconds that a vehicle drives at all
-points, in all critical encounters if these are ranges, within `QUICK`. The longer a vehicle drives,
-the more a simulation costs, and the fewer simulations are done.
+points, in all critical encounters if these are ranges, within `QUICK_EFFORTS`. The longer a vehicle
+drives, the more a simulation costs, and the fewer simulations are done.
 """
 MOST_EFFORT = 8.0
 """Largest effort if the user allows more simulations than are usual."""

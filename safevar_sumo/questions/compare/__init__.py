@@ -71,7 +71,7 @@ from safevar_sumo.questions.sentence import Sentence, Verdict, answer, note
 from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.tolerance.asked import usual_alone
-from safevar_sumo.questions.tolerance.oracle import STAGE
+from safevar_sumo.questions.tolerance.oracle import LIMITS_STAGE
 from safevar_sumo.questions.words import UNSAFE_MEANS, counted_in_words, join_phrases
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.study import limits_of
@@ -147,7 +147,7 @@ def compare(
         listed values.
     """
     study = evaluator.study
-    evaluator.begin({BOTH_STAGE: 2 * samples, STAGE: 2 * usual_alone(evaluator)})
+    evaluator.begin({BOTH_STAGE: 2 * samples, LIMITS_STAGE: 2 * usual_alone(evaluator)})
     second = evaluator.for_study(in_order_of(study, study_in(other)))
     evaluators = (evaluator, second)
     with about("limits"):

@@ -136,14 +136,13 @@ def draw_staircase(answer: Answer) -> Figure:
 
     title = f"{answer.study.name}: how many changes are enough for an unsafe vehicle"
     figure, ((axis,),) = new_figure(title, 1, 1, (6.4, 3.6))
-    rows = answer.tables["staircase"].iloc[::-1].to_dict("records")
-    stairs = [row for row in rows if row["causes"]]
-    fewest = [row["fewest"] for row in stairs]
-    shares = [100 * row["share"] for row in stairs]
-    axis.step(shares, fewest, "o-", where="post", color=BLUE)
+    rows = answer.tables["staircase"].iloc[::-1]
+    stairs = rows[rows["causes"].map(len) > 0]
+    fewest = stairs["fewest"].astype(int)
+    axis.step(100 * stairs["share"], fewest, "o-", where="post", color=BLUE)
     size = FONT_SIZE - 2
     named = ""
-    for row in rows:
+    for row in rows.to_dict("records"):
         share = 100 * row["share"]
         if not row["causes"]:
             text = f"none of {row['tried']:,}\ncombinations\nis unsafe"

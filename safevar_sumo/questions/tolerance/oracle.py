@@ -32,7 +32,7 @@ from safevar_sumo.study import PHASE, MatrixTest
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import assemble
 
-STAGE = "limits"
+LIMITS_STAGE = "limits"
 
 
 class Exhausted(InputError):
@@ -199,7 +199,7 @@ class Oracle:
         for number, rows, settings in self.in_worlds(cases):
             world = self.worlds[number]
             model = world.model
-            runs = model.evaluate(settings, STAGE)
+            runs = model.evaluate(settings, LIMITS_STAGE)
             # NaN marks cases that could not be simulated, until `failed` replaces it at the end.
             of_world = model.robustness_by(runs, failed=np.nan)
             unsafe = np.flatnonzero(of_world < 0)
@@ -240,7 +240,9 @@ class Oracle:
         if rows:
             places = cases[[*rows.values()], n + 1 :]
             originals = np.tile(self.vehicle.original, (len(rows), 1))
-            does_count = world.model.do_count(world.settings(originals, places), STAGE)
+            does_count = world.model.do_count(
+                world.settings(originals, places), LIMITS_STAGE
+            )
             self._counts |= dict(
                 zip(
                     rows,

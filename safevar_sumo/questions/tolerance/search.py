@@ -43,7 +43,7 @@ MOST_PROOFS = 20
 """Largest number of boxes that are tested with randomly drawn vehicles."""
 NEAR = 0.05
 """`BoxEffort.retreat` of the search for the nearest values with which the specified limits hold."""
-QUICK = 2
+QUICK_GENERATIONS = 2
 """Number of generations of a search that only shows where failures are."""
 OWN_SET_STAGE = "limits with the study's own parameter set"
 OTHER_SETS_STAGE = "limits in each further parameter set"
@@ -224,7 +224,7 @@ def _with_largest_box(task: Asked, limits: FoundLimits) -> FoundLimits:
     boxes = limits.boxes
     settled = Settled(boxes.longest, limits.failures)
     if boxes.effort.explored:
-        budgets = QUICK * effort.generation, effort.cases
+        budgets = QUICK_GENERATIONS * effort.generation, effort.cases
         quick, thorough = task.searches(
             Stream.JOINT_LIMITS,
             0,
@@ -441,7 +441,7 @@ def _breaches(
     """
     boxes = limits.boxes
     failures = limits.failures
-    budget = min(QUICK * task.effort.generation, task.effort.cases)
+    budget = min(QUICK_GENERATIONS * task.effort.generation, task.effort.cases)
     search = task.search(Stream.EXTENSION, 0, budget)
     breaches = dict[Side, FloatArray]()
     for side, column in np.argwhere(sides < task.domain).tolist():
