@@ -262,9 +262,7 @@ class Case:
     @property
     def remarks(self) -> list[str]:
         """Notes for the readers of every table of this case."""
-        remarks = []
-        if self.shortfall:
-            remarks.append(self.shortfall)
+        remarks = [self.shortfall] if self.shortfall else []
         if not self.has_runs:
             remarks.append(
                 f"The solutions of {self.name} are imported and belong to no run. The metrics of"

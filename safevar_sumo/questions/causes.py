@@ -76,7 +76,7 @@ def find_minimal_causes(
     changed = [np.flatnonzero(flags).tolist() for flags in is_changed]
     originals = members.with_original_vehicle(settings)
     causes = [dict[frozenset[int], Cause]() for _ in settings]
-    numbers = [*map(len, changed)]
+    numbers = list(map(len, changed))
     complete = largest_complete(numbers, limit)
 
     # Simulate the subsets by size, and the subsets of all settings together. A subset that contains

@@ -182,9 +182,7 @@ class Evaluator:
             elif of_list and self.left is None:
                 simulations = expected * len(self.system.points)
                 print_price_of_list(self.study, self.system, self._pool, simulations)
-        share = 1.0
-        if self.left is not None:
-            share = self.left / expected
+        share = 1.0 if self.left is None else self.left / expected
         planned = {name: share * number for name, number in settings.items()}
         self.phases.plan(planned, len(self.system.points))
 
@@ -205,14 +203,13 @@ class Evaluator:
         seconds = sum(np.max(point.scenario.duration) for point in self.system.points)
         if self.study.ranges:
             seconds *= ENCOUNTERS
-        self.account.effort = 1.0
+        account = self.account
+        account.effort = 1.0
         if quick:
-            self.account.effort = float(
-                np.clip(QUICK_SECONDS / seconds, *QUICK_EFFORTS)
-            )
-        self.account.allowance = self.account.limit = simulations
-        self.account.questions = questions
-        self.account.is_question = True
+            account.effort = float(np.clip(QUICK_SECONDS / seconds, *QUICK_EFFORTS))
+        account.allowance = account.limit = simulations
+        account.questions = questions
+        account.is_question = True
         self._pool.spare = None
         if simulations is not None and self.system.mover.takes_long:
             self._pool.spare = spare(simulations, 0)
