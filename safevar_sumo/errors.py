@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 import signal
+import threading
 import warnings
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
@@ -19,6 +20,13 @@ INTERRUPT_EXIT_CODE = 130
 """Exit code after Ctrl-C: 128 plus the number of the signal, as in shells."""
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 """Signals that end the program like Ctrl-C."""
+
+
+def in_main_thread() -> bool:
+    """Whether this is the main thread, which alone may set handlers of signals."""
+    return threading.current_thread() is threading.main_thread()
+
+
 CONTROLS = re.compile(
     r"[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )

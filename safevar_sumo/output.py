@@ -23,10 +23,10 @@ from safevar_sumo.errors import InputError
 ALONE = portalocker.LOCK_EX | portalocker.LOCK_NB
 SETTLING_TIME = 0.1
 """Time within which a process locks a temporary file that it has created [s]."""
-PREFIX, LOCK = "safevar-", "lock"
-"""The prefix of the names of temporary folders, and the name of the file in such a folder that its
-process locks.
-"""
+PREFIX = "safevar-"
+"""Beginning of the names of temporary folders."""
+LOCK = "lock"
+"""Name of the file in a temporary folder that the folder's process has locked."""
 MAX_INPUT = 100_000_000
 """Largest size of an input file [bytes]."""
 MAX_UNPACKED = 1_000_000_000

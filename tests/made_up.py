@@ -46,7 +46,7 @@ def case_of(study: Study, original: Evaluations, solutions: Evaluations) -> Case
     frame = solutions_frame(
         CharacteristicSet.of(study).names, [(("nsga2", 0), solutions)]
     )
-    return build_case(study, record(original, 0), frame, frame.iloc[:0], [("nsga2", 0)])
+    return build_case(study, record(original), frame, frame.iloc[:0], [("nsga2", 0)])
 
 
 def made_up_runs(

@@ -241,7 +241,7 @@ class Simulation:
         gap = finite_or_none(self.gap)
         return {
             "driven": not self.no_verdict,
-            **record(self.evaluation, row=0),
+            **record(self.evaluation),
             "gap": gap,
         }
 

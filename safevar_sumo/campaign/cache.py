@@ -55,16 +55,16 @@ DIGEST_SIZE = 32
 """Size of the digest at the beginning of an entry [bytes]."""
 FAST = 1
 """The level of zlib's compression. Compressed results take a sixth of their size, at 100 MB/s."""
-COMMANDS, DAY = "commands", 86_400.0
-"""The name of the folder for simulations of commands with user code, and the time within which an
-interrupted command can be continued [s].
-"""
+COMMANDS = "commands"
+"""Name of the folder for simulations of commands with user code."""
+DAY = 86_400.0
+"""Time within which an interrupted command can be continued [s]."""
 NUMBER = b"number"
 """The key of the entry that counts the settings whose results a cache has."""
-METRIC, POINTS = "metric ", "worst_points"
-"""The prefix of the names of an entry's arrays with metrics, and the name of the array with the
-worst points.
-"""
+METRIC = "metric "
+"""Beginning of the name of an entry's array with the values of a metric."""
+POINTS = "worst_points"
+"""Name of an entry's array with the worst points."""
 UNUSABLE = (OSError, sqlite3.Error, diskcache.Timeout)
 """The exceptions of a cache that cannot be read or written."""
 

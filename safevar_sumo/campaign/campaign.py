@@ -57,7 +57,9 @@ SUMO_COST = 60
 """Number of simulations in recorded scenes that take as long as a simulation in SUMO, roughly."""
 SETTINGS_PER_JOB = 150
 """Largest number of settings that a worker simulates again in SUMO in one job."""
-RECORDED, SUMO = ENGINES = "recorded", "sumo"
+RECORDED = "recorded"
+SUMO = "sumo"
+ENGINES = RECORDED, SUMO
 """The engines that a command may name."""
 
 

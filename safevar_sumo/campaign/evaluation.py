@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import msgspec
@@ -47,7 +47,7 @@ KNOWN_SYSTEMS = 64
 """Number of systems that a process keeps. Questions alternate between the parameter sets of a
 vehicle model, and each set has a system of its own.
 """
-_first_batches = dict[bytes, tuple["Task", FloatArray, Evaluations]]()
+_first_batches: dict[bytes, tuple[Task, FloatArray, Evaluations]] = {}
 """For each study with user code (packed): the first batch that this process has simulated."""
 
 
@@ -131,23 +131,19 @@ def carry_out(
     """
     try:
         return pool.map(function, jobs, look)
-
     except WorkerLostError as error:
         task, *arguments = jobs[error.job]
-        names = user_code_names(task.study)
-        argument = next(iter(arguments), None)
         work = "the check of user code"
-        if argument is not None:
-            work = str(argument)
-        if isinstance(argument, np.ndarray):
-            work = f"{len(argument)} settings"
+        if arguments:
+            work = str(arguments[0])
+            if isinstance(arguments[0], np.ndarray):
+                work = f"{len(arguments[0])} settings"
         problem = f"two workers were lost at the same work, {work}: {error}"
-        if names:
-            where = f", probably in {' and '.join(names)}"
-            raise UserCodeError(
-                f"study {task.study.name!r}", f"{problem}{where}"
-            ) from None
-        raise SafevarError(f"study {task.study.name!r}: {problem}") from None
+        source = f"study {task.study.name!r}"
+        if names := user_code_names(task.study):
+            problem += f", probably in {' and '.join(names)}"
+            raise UserCodeError(source, problem) from None
+        raise SafevarError(f"{source}: {problem}") from None
 
 
 def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
@@ -166,9 +162,8 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
     """
     if len(rows) > task.batch_size:
         batches = np.array_split(rows, math.ceil(len(rows) / task.batch_size))
-        return Evaluations.concatenate(
-            [evaluate_settings(task, batch) for batch in batches]
-        )
+        evaluate = partial(evaluate_settings, task)
+        return Evaluations.concatenate(list(map(evaluate, batches)))
     try:
         return evaluate_batch(task, rows)
     except (SimulationError, UserCodeError) as error:
@@ -259,12 +254,10 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
 
     # If the ADS can take an array for each parameter, it drives all rows at once.
     if selection.arrays:
-        system = replace(
-            system, ads=VariedAds(system.ads, selection.parameters, values)
-        )
-        return replace(
-            drive_and_score(system, settings, with_originals=False), settings=rows
-        )
+        ads = VariedAds(system.ads, selection.parameters, values)
+        varied = replace(system, ads=ads)
+        evaluations = drive_and_score(varied, settings, with_originals=False)
+        return replace(evaluations, settings=rows)
 
     # Any other ADS drives once for each set of values, with all rows that have this set.
     parameter_sets, set_of_row = np.unique(values, axis=0, return_inverse=True)
@@ -272,17 +265,15 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     rows_of_groups = []
     for number, parameter_set in enumerate(parameter_sets.tolist()):
         group = np.flatnonzero(set_of_row.ravel() == number)
-        study = with_parameters(
-            task.study, dict(zip(selection.parameters, parameter_set, strict=True))
-        )
+        parameters = dict(zip(selection.parameters, parameter_set, strict=True))
+        study = with_parameters(task.study, parameters)
         driven = replace(system, ads=assemble(study).ads)
         evaluations = drive_and_score(driven, settings[group], with_originals=False)
         groups.append(replace(evaluations, settings=rows[group]))
         rows_of_groups.append(group)
     # The groups are in the order of their sets of values: the result gets the order of the rows.
-    return Evaluations.concatenate(groups).take(
-        np.argsort(np.concatenate(rows_of_groups))
-    )
+    order = np.argsort(np.concatenate(rows_of_groups))
+    return Evaluations.concatenate(groups).take(order)
 
 
 def with_parameters(study: Study, values: NamedValues) -> Study:

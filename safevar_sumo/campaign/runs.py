@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import zlib
+from itertools import product, starmap
 from typing import NamedTuple
 
 import numpy as np
@@ -28,10 +29,12 @@ from safevar_sumo.search import (
 from safevar_sumo.study import PYMOO, SearchTable, Study, label_of
 from safevar_sumo.sumo.system import System
 
-REPEATED, MAX_REPEATED = 10, 300
-"""After a search, SUMO simulates at most one in `REPEATED` of the simulations again, and at most
-`MAX_REPEATED` settings. (The unsafe solutions come in addition.)
+REPEATED = 10
+"""After a search, SUMO simulates at most one in so many of the simulations again. (The unsafe
+solutions come in addition.)
 """
+MAX_REPEATED = 300
+"""Largest number of settings that SUMO simulates again."""
 
 
 class RunKey(NamedTuple):
@@ -66,11 +69,8 @@ class RunResult(NamedTuple):
 
 def all_runs(study: Study) -> list[RunKey]:
     """The keys of all runs of a study."""
-    return [
-        RunKey(label, run)
-        for label in study.search.labels
-        for run in range(study.search.runs)
-    ]
+    search = study.search
+    return list(starmap(RunKey, product(search.labels, range(search.runs))))
 
 
 def algorithm_of(label: str, study: Study) -> Algorithm:
@@ -253,9 +253,7 @@ class Run:
 
     def receive(self, evaluations: Evaluations) -> None:
         """Write the evaluations of missing settings to the journal, and keep them."""
-        positions = [
-            self._missing.pop(setting.tobytes()) for setting in evaluations.settings
-        ]
+        positions = list(map(self._missing.pop, map(bytes, evaluations.settings)))
         if not self._journaled.isdisjoint(positions):
             raise InputError(
                 self._journal.path,

@@ -43,20 +43,26 @@ LEAST_SIMULATED = 3
 """Least number of settings, however slow the code is: the original and two corners of the
 domains.
 """
-FEW_UNUSED, MANY_UNUSED = 5, 20
+MANY_UNUSED = 20
 """Number of settings in which a metric must be defined at least once, and each characteristic must
-be read. `FEW_UNUSED` holds if simulations take long: the original and four corners of the domains.
+be read.
 """
-TIMED, RUNS_OF_ALL = 5, 5
-"""Number of settings whose time is measured, and the approximate number of runs of all settings."""
+FEW_UNUSED = 5
+"""The same number for simulations that take long: the original and four corners of the domains."""
+TIMED = 5
+"""Number of settings whose time is taken."""
+RUNS_OF_ALL = 5
+"""Approximate number of times that all checks together simulate each setting."""
 SMALLER_BATCHES = 4
 """Number of parts into which the settings are divided for the check `alone`."""
 MATRIX_POINTS = 2
 """Approximate number of a study's points that are simulated."""
 TRIED_VALUES = np.nan, 0.0, -1e6, 1e6
 """Values that replace a quantity at all samples. If a metric changes, it reads this quantity."""
-MAX_EVALUATIONS, MAX_POPULATION = 57, 20
-"""Largest number of evaluations, and largest population, in a run of an algorithm."""
+MAX_EVALUATIONS = 57
+"""Largest number of evaluations of an algorithm's run."""
+MAX_POPULATION = 20
+"""Largest population of an algorithm's run."""
 _Rows = IntArray
 
 
@@ -209,7 +215,9 @@ def try_original(system: System, runs: SimulationRuns) -> Findings:
             continue
         with user_errors(system.source):
             values = measure.of_runs(runs, system.metrics_table)
-        for quantity in (name for name in QUANTITIES if name not in measure.quantities):
+        for quantity in QUANTITIES:
+            if quantity in measure.quantities:
+                continue
             variants = (runs.with_all(quantity, value) for value in TRIED_VALUES)
             try:
                 with user_errors(system.source):

@@ -8,7 +8,6 @@ import os
 import re
 import signal
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -24,6 +23,7 @@ from safevar_sumo.errors import (
     InputError,
     SafevarError,
     did_you_mean,
+    in_main_thread,
     printable,
 )
 from safevar_sumo.shipped import PROGRAM, PROGRAM_COMMAND
@@ -208,7 +208,7 @@ def run_command_line() -> None:
     warnings.showwarning = lambda message, *_, **__: click.echo(
         f"warning: {printable(str(message))}", err=True
     )
-    if threading.current_thread() is threading.main_thread():
+    if in_main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     # After a crash of compiled code, Python prints the line of the crash. This fails if standard
     # error is no file.
@@ -258,7 +258,7 @@ def _exit_on_interrupt() -> Iterator[None]:
         os._exit(INTERRUPT_EXIT_CODE)
 
     handlers = {}
-    if threading.current_thread() is threading.main_thread():
+    if in_main_thread():
         for interrupt in INTERRUPTS:
             handlers[interrupt] = signal.signal(interrupt, exit_at_once)
     try:

@@ -41,16 +41,12 @@ def stopping_distance(runs: SimulationRuns, thresholds: MetricsTable) -> FloatAr
     # part of the first command in this step, and the whole command in the next step: then the share
     # is part / full. Where tyres limit the force, the ratio of the losses of speed is larger than
     # part / full, and says more.
-    first_command = trace.brake[
-        np.argmax(trace.brake > pedal[0] + PEDAL_ROUNDING, axis=0), vehicles
-    ]
+    first_sample = np.argmax(trace.brake > pedal[0] + PEDAL_ROUNDING, axis=0)
+    first_command = trace.brake[first_sample, vehicles]
     _, part, full = pedal[samples, vehicles]
     loss, later_loss = -np.diff(trace.speed[samples, vehicles], axis=0)
-    is_part = (
-        (part < full)
-        & (np.abs(full - first_command) <= PEDAL_ROUNDING)
-        & (later_loss > 0)
-    )
+    is_whole_command = np.abs(full - first_command) <= PEDAL_ROUNDING
+    is_part = (part < full) & is_whole_command & (later_loss > 0)
     shares = np.maximum(part / full, loss / later_loss)
     share = np.where(is_part, np.minimum(shares, 1.0), 1.0)
 
@@ -76,9 +72,8 @@ def _of_stops(runs: SimulationRuns, values: FloatArray) -> FloatArray:
     """The values of vehicles, shape (N,), with NaN for a vehicle that has not stopped or has
     collided.
     """
-    return mask_collisions(
-        runs, np.where(runs.trace.speed[-1] <= STANDSTILL, values, np.nan)
-    )
+    has_stopped = runs.trace.speed[-1] <= STANDSTILL
+    return mask_collisions(runs, np.where(has_stopped, values, np.nan))
 
 
 def stop_from_pedal(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:

@@ -37,13 +37,11 @@ def safety_degree(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     Shape (N,); NaN without an encounter and without a collision.
     """
     is_counted = runs.trace.active & runs.encounter.in_conflict
-    least_separation = np.min(
-        np.where(is_counted, runs.encounter.separation, np.inf), axis=0
-    )
-    least_separation = np.where(np.isfinite(least_separation), least_separation, np.nan)
-    return np.where(
-        np.isnan(runs.collision_speed), least_separation, -runs.closing_speed
-    )
+    separation = np.where(is_counted, runs.encounter.separation, np.inf)
+    least_separation = np.min(separation, axis=0)
+    least_separation[np.isinf(least_separation)] = np.nan
+    is_safe = np.isnan(runs.collision_speed)
+    return np.where(is_safe, least_separation, -runs.closing_speed)
 
 
 SAFETY_DEGREE_METRIC = Measure(
@@ -65,13 +63,8 @@ def time_exposed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     Shape (N,); NaN after a collision. TTC* is the study's threshold `ttc_threshold`.
     """
     critical_ttc, interval = _critical_ttc(runs, thresholds)
-    return mask_collisions(
-        runs,
-        np.round(
-            np.count_nonzero(np.isfinite(critical_ttc), axis=0) * interval,
-            TIME_DECIMALS,
-        ),
-    )
+    n_critical = np.count_nonzero(np.isfinite(critical_ttc), axis=0)
+    return mask_collisions(runs, np.round(n_critical * interval, TIME_DECIMALS))
 
 
 def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
@@ -80,9 +73,8 @@ def time_integrated(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArra
     Shape (N,); NaN after a collision. TTC* is the study's threshold `ttc_threshold`.
     """
     critical_ttc, interval = _critical_ttc(runs, thresholds)
-    deficit = np.where(
-        np.isfinite(critical_ttc), thresholds.ttc_threshold - critical_ttc, 0.0
-    )
+    # An infinite TTC has no deficit.
+    deficit = np.maximum(thresholds.ttc_threshold - critical_ttc, 0.0)
     return mask_collisions(runs, sum_in_order(deficit) * interval)
 
 
@@ -94,9 +86,8 @@ def _critical_ttc(
     """
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
     ttc = runs.time_to_collision[::stride]
-    return np.where(
-        ttc <= thresholds.ttc_threshold, ttc, np.inf
-    ), stride * runs.trace.step
+    critical_ttc = np.where(ttc <= thresholds.ttc_threshold, ttc, np.inf)
+    return critical_ttc, stride * runs.trace.step
 
 
 TET = Measure(
@@ -144,24 +135,20 @@ def conflict(runs: SimulationRuns) -> tuple[FloatArray, FloatArray]:
 
     # The time in which the vehicle reaches the body; then the body's place at that time.
     closing_speed = trace.speed - trace.obstacle_speed
-    is_counted = (
-        runs.is_approach
-        & (closing_speed > 0)
-        & (trace.gap >= 0)
-        & np.isfinite(trace.gap)
-    )
-    ttc = np.divide(
-        trace.gap, closing_speed, out=np.zeros_like(trace.gap), where=is_counted
-    )
-    is_met = is_in_path | (np.abs(trace.lateral + trace.lateral_speed * ttc) <= reach)
+    has_gap = (trace.gap >= 0) & np.isfinite(trace.gap)
+    is_counted = runs.is_approach & (closing_speed > 0) & has_gap
+    ttc = np.zeros_like(trace.gap)
+    np.divide(trace.gap, closing_speed, out=ttc, where=is_counted)
+    lateral_at_arrival = trace.lateral + trace.lateral_speed * ttc
+    is_met = is_in_path | (np.abs(lateral_at_arrival) <= reach)
     ttc = np.where(is_counted & is_met, ttc, np.inf)
 
     # If the encounter's distance is the gap, as behind a leader, TTC_p(t) must equal TTC(t) to the
     # bit.
     is_led = ~(runs.is_approach & ~is_in_path).any(axis=0)
-    is_one = is_led | (runs.encounter.distance == trace.gap)
-    closing_speed = np.where(is_one, runs.encounter.closing_speed, closing_speed)
-    return closing_speed, np.where(is_one, runs.time_to_collision, ttc)
+    is_ttc = is_led | (runs.encounter.distance == trace.gap)
+    closing_speed = np.where(is_ttc, runs.encounter.closing_speed, closing_speed)
+    return closing_speed, np.where(is_ttc, runs.time_to_collision, ttc)
 
 
 def least_time_to_collision(
@@ -191,10 +178,9 @@ def largest_deceleration_rate(
     """
     closing_speed, ttc = conflict(runs)
     is_counted = np.isfinite(ttc) & (ttc > 0)
-    rate = np.divide(
-        closing_speed, 2 * ttc, out=np.full_like(ttc, np.nan), where=is_counted
-    )
-    largest = np.max(np.where(is_counted, rate, 0.0), axis=0, initial=0.0)
+    rate = np.zeros_like(ttc)
+    np.divide(closing_speed, 2 * ttc, out=rate, where=is_counted)
+    largest = np.max(rate, axis=0, initial=0.0)
     return mask_collisions(runs, np.where(is_counted.any(axis=0), largest, np.nan))
 
 
@@ -238,7 +224,6 @@ def post_encroachment_time(
     shorter, because lanes are wider than bodies.
     """
     trace = runs.trace
-
     number = np.count_nonzero(trace.active, axis=0)
     at_end = np.minimum(number, len(trace.time) - 1), np.arange(len(number))
     speed, gap, lateral, lateral_speed, obstacle_width = (
@@ -255,15 +240,14 @@ def post_encroachment_time(
     # Either the body has left the vehicle's path (`leaves`), or the vehicle has passed the body
     # (`comes`). The way is the distance of the second road user from the shared place.
     lateral_gap = np.abs(lateral) - (trace.vehicle_width + obstacle_width) / 2
-    crossing = np.abs(lateral_speed)
-    leaves = (lateral * lateral_speed > 0) & (gap > 0)
-    comes = (lateral * lateral_speed < 0) & (gap <= 0)
-    way = np.where(leaves, gap, lateral_gap)
-    rate = np.where(leaves, speed, crossing)
+    body_is_first = (lateral * lateral_speed > 0) & (gap > 0)
+    vehicle_is_first = (lateral * lateral_speed < 0) & (gap <= 0)
+    way = np.where(body_is_first, gap, lateral_gap)
+    rate = np.where(body_is_first, speed, np.abs(lateral_speed))
     passes = (runs.outcome == Outcome.PASSED) & (lateral_gap >= 0)
-    is_defined = passes & (leaves | comes) & (rate > STANDSTILL)
+    passes = passes & (body_is_first | vehicle_is_first)
     times = nans(way.shape)
-    np.divide(way, rate, out=times, where=is_defined)
+    np.divide(way, rate, out=times, where=passes & (rate > STANDSTILL))
     return times
 
 
@@ -280,9 +264,8 @@ def reaction_time(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     has_seen = np.logical_or.accumulate(visible, axis=0)
     brakes = trace.active & has_seen & (trace.brake > 0)
     steps = np.argmax(brakes, axis=0) - first_sight
-    return np.where(
-        brakes.any(axis=0), np.round(steps * trace.step, TIME_DECIMALS), np.nan
-    )
+    times = np.round(steps * trace.step, TIME_DECIMALS)
+    return np.where(brakes.any(axis=0), times, np.nan)
 
 
 PET = Measure(
@@ -316,12 +299,9 @@ def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> Floa
     """
     stride = sampling_stride(runs.trace.step, thresholds.sampling_interval)
     speed = runs.trace.speed[::stride]
-    active = runs.trace.active[::stride]
-    is_braking = (
-        active & (runs.trace.brake[::stride] > 0) & (np.abs(speed) > STANDSTILL)
-    )
+    is_braking = runs.trace.active[::stride] & (runs.trace.brake[::stride] > 0)
+    is_counted = (is_braking & (np.abs(speed) > STANDSTILL))[1:]
     decelerations = (speed[:-1] - speed[1:]) / (stride * runs.trace.step)
-    is_counted = is_braking[1:]
     sample_count = np.count_nonzero(is_counted, axis=0)
     deceleration_sum = sum_in_order(np.where(is_counted, decelerations, 0.0))
     means = np.full_like(deceleration_sum, np.nan)

@@ -42,10 +42,10 @@ CRITERIA = (
     ' number, such as "drac > 6"'
 )
 COLLISION = str(Outcome.COLLISION)
-DEGREE_SHARE, LIMIT_DIGITS = 0.5, 6
-"""Default limit if nothing collides: this share of the original vehicle's safety degree, rounded to
-`LIMIT_DIGITS` significant digits.
-"""
+DEGREE_SHARE = 0.5
+"""The default limit if nothing collides, as a share of the original's safety degree."""
+LIMIT_DIGITS = 6
+"""Number of significant digits of this limit."""
 SHARE_DECIMALS = 9
 """Decimals to which a sum of shares is rounded, so that three thirds are 1."""
 LEAST = 1e-9
@@ -270,7 +270,8 @@ class Unsafe:
             with suppress(ValueError):
                 limit = float(parts[3])
         if parts and math.isfinite(limit):
-            quantity, comparison = parts[1], parts[2]
+            quantity = parts[1]
+            comparison = parts[2]
             if (quantity, comparison) == (SAFETY_DEGREE, "<"):
                 return cls(degree=limit)
             if (quantity, comparison) == ("below", "="):

@@ -43,10 +43,10 @@ UserValue = Any
 INFINITY = float("inf")
 ABSTRACT = "__isabstractmethod__"
 """The attribute that Python sets on abstract methods."""
-MAX_QUOTED_ELEMENTS, MAX_QUOTE = 4, 80
-"""Largest size of an array, and of the text of any other value [characters], that an error
-quotes.
-"""
+MAX_QUOTED_ELEMENTS = 4
+"""Largest number of elements of an array that an error quotes."""
+MAX_QUOTE = 80
+"""Largest length of the text of any other value that an error quotes [characters]."""
 _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 """Which of N runs have not ended yet, shape (N,); None outside of a simulation."""
 
@@ -167,12 +167,10 @@ class Legal(NamedTuple):
         return is_legal | (self.undefined & np.isnan(numbers))
 
 
-FINITE, POSITIVE, SHARE, TRUTH = (
-    Legal(),
-    Legal(0.0, is_open=True),
-    Legal(0.0, 1.0),
-    Legal(kinds="b"),
-)
+FINITE = Legal()
+POSITIVE = Legal(0.0, is_open=True)
+SHARE = Legal(0.0, 1.0)
+TRUTH = Legal(kinds="b")
 
 
 class UserCode(NamedTuple):

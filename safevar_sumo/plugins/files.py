@@ -24,7 +24,7 @@ CACHE = "__pycache__"
 """The name of Python's folders for compiled files."""
 HIDDEN = re.compile(rf"(^|/)(\.|{CACHE}(/|\Z))")
 """Matches the path of a hidden file or folder, or of a folder with compiled files."""
-LIBRARY_FOLDERS = ("site-packages", "dist-packages")
+LIBRARY_FOLDERS = {"site-packages", "dist-packages"}
 """Names of folders with installed libraries. Such folders may be anywhere."""
 KNOWN_FOLDERS = tuple(
     f"{folder}{os.sep}"
@@ -41,10 +41,9 @@ def is_user_file(path: str) -> bool:
     """Return whether a file belongs to the user: neither to Python, nor to an installed library,
     nor to this package.
     """
-    is_in_library = any(name in Path(path).parts for name in LIBRARY_FOLDERS)
-    return (
-        os.path.isabs(path) and not path.startswith(KNOWN_FOLDERS) and not is_in_library
-    )
+    is_known = path.startswith(KNOWN_FOLDERS)
+    is_in_library = not LIBRARY_FOLDERS.isdisjoint(Path(path).parts)
+    return os.path.isabs(path) and not is_known and not is_in_library
 
 
 def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
@@ -77,8 +76,9 @@ def _files_of_module(path: Path) -> set[Path]:
     """The file of a module, or all files of a package. `path` is the path without the ending; the
     set is empty if no such module exists.
     """
-    if path.with_suffix(".py").is_file():
-        return {path.with_suffix(".py")}
+    module = path.with_suffix(".py")
+    if module.is_file():
+        return {module}
     if any(path.rglob("*.py")):
         return set(files_in(path))
     return set()
@@ -90,7 +90,8 @@ def _imported_modules(path: Path) -> Iterator[str]:
     """
     for node in ast.walk(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            for alias in node.names:
+                yield alias.name
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             yield node.module
 

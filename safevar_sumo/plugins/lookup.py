@@ -96,11 +96,9 @@ class Lookup:
         """
         if name in shipped:
             return Member(shipped[name])
-        expected = (
-            f"{one_of(shipped)}, or package.module:Name"
-            if shipped
-            else "package.module:Name"
-        )
+        expected = "package.module:Name"
+        if shipped:
+            expected = f"{one_of(shipped)}, or {expected}"
 
         module_name, colon, attribute = name.partition(":")
         if colon and module_name.endswith(".py"):
@@ -110,14 +108,9 @@ class Lookup:
                 f"{key} = {name!r} names a file",
                 f"its module: '{dotted}:{attribute}'",
             )
-        if not (
-            colon
-            and attribute.isidentifier()
-            and all(part.isidentifier() for part in module_name.split("."))
-        ):
-            raise InputError(
-                "", f"{key} = {name!r}{did_you_mean(name, shipped)}", expected
-            )
+        if not all(map(str.isidentifier, [attribute, *module_name.split(".")])):
+            problem = f"{key} = {name!r}{did_you_mean(name, shipped)}"
+            raise InputError("", problem, expected)
 
         code = UserCode(f"{key} = {name!r}")
         module = self._import(module_name, code.name)
@@ -234,11 +227,9 @@ class Lookup:
             ):
                 return _import_beside(name, folders) or importlib.import_module(name)
         except (ModuleNotFoundError, UserCodeError) as error:
-            problem = (
-                error.problem
-                if isinstance(error, UserCodeError)
-                else describe_error(error)
-            )
+            problem = describe_error(error)
+            if isinstance(error, UserCodeError):
+                problem = error.problem
             raise UserCodeError(
                 "",
                 f"{key} cannot be imported: {problem}",
@@ -344,24 +335,21 @@ def only_from(folder: str) -> Iterator[None]:
     same.
     """
     path = ImportPath.here()
-    modules = dict(sys.modules)
-    users = {
-        name
-        for name in modules
-        if name != "__main__" and is_user_file(file_of_module(name))
-    }
-    for name in users:
-        del sys.modules[name]
+    names = {*sys.modules}
+    user_modules = {}
+    for name in names - {"__main__"}:
+        if is_user_file(file_of_module(name)):
+            user_modules[name] = sys.modules.pop(name)
     ImportPath([*filter(_is_of_libraries, path.folders), folder], []).inherit()
     try:
         with chdir(folder):
             yield
     finally:
         path.inherit()
-        for name in sys.modules.keys() - modules.keys():
+        for name in sys.modules.keys() - names:
             if is_user_file(file_of_module(name)):
                 del sys.modules[name]
-        sys.modules.update({name: modules[name] for name in users})
+        sys.modules.update(user_modules)
 
 
 def _is_of_libraries(entry: str) -> bool:

@@ -7,7 +7,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
@@ -19,7 +18,7 @@ from uuid import uuid4
 
 import platformdirs
 
-from safevar_sumo.errors import INTERRUPTS
+from safevar_sumo.errors import INTERRUPTS, in_main_thread
 from safevar_sumo.plugins.files import CACHE, is_user_file, name_of_file
 from safevar_sumo.shipped import PACKAGE
 
@@ -182,9 +181,8 @@ def mark_interrupts() -> Iterator[None]:
             raise Interrupt from None
 
     # Python interrupts only the main thread, and only the main thread may set handlers.
-    is_main = threading.current_thread() is threading.main_thread()
-    handlers = dict[int, Any]()
-    for number in INTERRUPTS if is_main else ():
+    handlers: dict[int, Any] = {}
+    for number in INTERRUPTS if in_main_thread() else ():
         if callable(handler := signal.getsignal(number)):
             handlers[number] = handler
             signal.signal(number, interrupt)
@@ -202,10 +200,9 @@ def defer_interrupts() -> Iterator[None]:
     """Within the block, Ctrl-C and similar signals wait until the end of the block. Otherwise a
     compiler would print the exception, and go on.
     """
-    waiting = list[int]()
-    is_main = threading.current_thread() is threading.main_thread()
+    waiting: list[int] = []
     handlers = {}
-    for interrupt in INTERRUPTS if is_main else ():
+    for interrupt in INTERRUPTS if in_main_thread() else ():
         # A handler that Python has not set (None) could not be set again.
         if signal.getsignal(interrupt) is not None:
             handlers[interrupt] = signal.signal(

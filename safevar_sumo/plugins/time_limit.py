@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import faulthandler
 import signal
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import IO
 
-from safevar_sumo.errors import SimulationError, UserCodeError
+from safevar_sumo.errors import SimulationError, UserCodeError, in_main_thread
 from safevar_sumo.plugins.files import is_user_file
 from safevar_sumo.plugins.process import Interrupt, this_process
 
@@ -42,10 +41,7 @@ def end_if_longer(time_limit: float, name: str = "a simulation") -> Iterator[Non
     SimulationError
         If other code took too long.
     """
-    has_timer = (
-        hasattr(signal, "setitimer")
-        and threading.current_thread() is threading.main_thread()
-    )
+    has_timer = hasattr(signal, "setitimer") and in_main_thread()
     words = this_process.last_words
     if this_process.is_limited or not (has_timer or words is not None):
         yield

@@ -384,9 +384,7 @@ class Evaluator:
             jobs = [(Task(study=study), self.characteristics.original_settings)]
             self.account.spend(self._each)
             (evaluations,) = carry_out(evaluate_settings, jobs, self._pool)
-            refuse_other_original(
-                Path(case.name), case.original, record(evaluations, 0)
-            )
+            refuse_other_original(Path(case.name), case.original, record(evaluations))
 
     @cached_property
     def no_verdict(self) -> str:

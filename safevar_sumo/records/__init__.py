@@ -24,6 +24,7 @@ from safevar_sumo.records.driving import (
     PedalTables as PedalTables,
     Quantity as Quantity,
     TextArray as TextArray,
+    clip_to_share as clip_to_share,
     finite_or_none as finite_or_none,
     nans as nans,
 )

@@ -59,6 +59,11 @@ def nans(shape: int | tuple[int, ...]) -> FloatArray:
     return np.full(shape, np.nan)
 
 
+def clip_to_share(values: FloatOrArray) -> FloatArray:
+    """Values that are limited to the range of a share: from 0 to 1 [-]."""
+    return np.minimum(np.maximum(values, 0.0), 1.0)
+
+
 def finite_or_none(value: float) -> float | None:
     """Convert a number for JSON. JSON has neither NaN nor infinities: these become None."""
     if not np.isfinite(value):

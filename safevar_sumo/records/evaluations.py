@@ -161,7 +161,7 @@ class Evaluations:
         """The metrics of the first setting, by name."""
         return {name: float(values[0]) for name, values in self.metrics.items()}
 
-    def take(self, rows: Sequence[int] | IntArray | BoolArray) -> Evaluations:
+    def take(self, rows: Sequence[int] | IntArray | BoolArray | slice) -> Evaluations:
         """The evaluations of `rows`, in this order."""
         columns = {name: getattr(self, name)[rows] for name in COLUMNS}
         columns["metrics"] = {

@@ -28,16 +28,25 @@ if TYPE_CHECKING:
     from matplotlib.patches import Patch
     from matplotlib.transforms import Affine2D
 
-WIDTH, PANEL_HEIGHT = 8.8, 0.62
-"""Width of a frame, and height of the panel with texts above the road [inches]."""
-DPI, PAGE_DPI = 100, 75
-"""Resolution of a single animation, and of an animation on a page of a report [pixels per inch]."""
-MAX_FRAMES, MAX_PAGE_FRAMES = 100, 40
-"""Largest number of frames of a single animation, and of an animation on a page of a report."""
+WIDTH = 8.8
+"""Width of a frame [inches]."""
+PANEL_HEIGHT = 0.62
+"""Height of the panel with texts above the road [inches]."""
+DPI = 100
+"""Resolution of an animation [pixels per inch]."""
+PAGE_DPI = 75
+"""Resolution of an animation on a page with other animations [pixels per inch]."""
+MAX_FRAMES = 100
+"""Largest number of frames of an animation."""
+MAX_PAGE_FRAMES = 40
+"""Largest number of frames of an animation on a page with other animations."""
 PALETTE = 32
 """Number of colours to which the frames of a player are reduced."""
-GROUND_COLOUR, TEXT_COLOUR, PALE_TEXT_COLOUR = "#eef0ec", "#1d2329", "#5d666f"
-ACTOR_COLOUR, IMPACT_COLOUR = "#3f464d", "#ffd400"
+GROUND_COLOUR = "#eef0ec"
+TEXT_COLOUR = "#1d2329"
+PALE_TEXT_COLOUR = "#5d666f"
+ACTOR_COLOUR = "#3f464d"
+IMPACT_COLOUR = "#ffd400"
 SEAM_WIDTH = 0.12
 """Width of the line between two lanes [m]."""
 LAYERS = {

@@ -68,8 +68,9 @@ class Moments(NamedTuple):
         return self.nearest
 
 
-ORIGINAL, CHANGED = 0, 1
-"""Rows of a comparison: of the original and of the changed vehicle."""
+# Rows of a comparison.
+ORIGINAL = 0
+CHANGED = 1
 COLOURS = {ORIGINAL: "#0072b2", CHANGED: "#d55e00"}
 """Colours of the vehicles by row: blue and vermillion of the palette by Okabe and Ito, which
 colour-blind people can tell apart.
@@ -188,10 +189,14 @@ class Comparison:
         return ", ".join([ending, *texts])
 
 
-BODY_LENGTH, BODY_WIDTH, LANE_WIDTH = 4.5, 1.8, 3.5
-"""Sizes of bodies and lane in pictures of a user's simulator, which states no sizes [m]."""
-ROAD_BEHIND, ROAD_AHEAD = 20.0, 100.0
-"""Lengths of lane behind and ahead of all positions of the vehicles in such pictures [m]."""
+# A simulator of the user's own states no sizes: these sizes are drawn [m].
+BODY_LENGTH = 4.5
+BODY_WIDTH = 1.8
+LANE_WIDTH = 3.5
+ROAD_BEHIND = 20.0
+"""How far the lane is drawn behind the vehicle of such a simulator [m]."""
+ROAD_AHEAD = 100.0
+"""How far the lane is drawn ahead of the vehicle of such a simulator [m]."""
 
 
 def films_along(trace: Trace) -> dict[str, Film]:

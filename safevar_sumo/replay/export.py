@@ -32,12 +32,10 @@ from safevar_sumo.sumo.network import (
 )
 from safevar_sumo.sumo.system import assemble
 
-ROAD, SCENARIO, SCRIPT, VEHICLE = (
-    "road.xodr",
-    "scenario.xosc",
-    "run_in_carla.py",
-    "vehicle.json",
-)
+ROAD = "road.xodr"
+SCENARIO = "scenario.xosc"
+SCRIPT = "run_in_carla.py"
+VEHICLE = "vehicle.json"
 BLUEPRINT = "vehicle.lincoln.mkz*2017"
 """The Lincoln MKZ of CARLA 0.9.10 (`mkz2017`) and of later versions (`mkz_2017`)."""
 CARLA_PHYSICS = {

@@ -14,7 +14,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-BRAKING_MARK, NEAREST_MARK, IMPACT_MARK = "v", "o", "X"
+BRAKING_MARK = "v"
+NEAREST_MARK = "o"
+IMPACT_MARK = "X"
 LINES = ("-", "--")
 """Line styles of the original and of the changed vehicle."""
 MAX_TTC = 6.0

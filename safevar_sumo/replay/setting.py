@@ -205,7 +205,8 @@ def _safety_comparison(simulation: Simulation) -> Sentence:
     """A sentence that compares the stopping distances of both vehicles, or else their safety
     degrees.
     """
-    changed, original = simulation.metrics, simulation.original.metrics
+    changed = simulation.metrics
+    original = simulation.original.metrics
     stop, original_stop = (
         metrics.get(STOPPING_DISTANCE.name, np.nan) for metrics in (changed, original)
     )

@@ -9,10 +9,10 @@ from safevar_sumo.questions.options import SIMULATIONS
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System
 
-REPLAYS, SPEED = "replays", "speed"
-"""Names of parts of the simulations: of the replays, and of the question about the greatest speed
-on the sheet.
-"""
+REPLAYS = "replays"
+"""Name of the part of the simulations that is for the replays."""
+SPEED = "speed"
+"""Name of the part for the question about the speed of a sheet."""
 PART_OF_REPLAYS = 10
 """Replays in a simulator that takes long get 1 / `PART_OF_REPLAYS` of all simulations."""
 ONE_SAMPLE = ("risk", "rules")

@@ -71,12 +71,20 @@ from safevar_sumo.study import (
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Parts, Progress
 
-STUDY, ANSWERS, PAGE, CODE = "study.toml", "answers.json", "report.html", "code"
-"""Files of a study in a pack, and the folder of the user's code and files."""
+# Files of a study in a pack beside manifest and solutions, and the folder of the user's files.
+STUDY = "study.toml"
+ANSWERS = "answers.json"
+PAGE = "report.html"
+CODE = "code"
 FILES = {MANIFEST, SOLUTIONS, STUDY, ANSWERS, PAGE}
-LISTS, CARS = "lists", "cars"
-"""The folder of lists of cars in a pack, and the option of a question that names such a list."""
-SAME, DIFFERS, CANNOT, UNCHECKED = "same", "differs", "cannot be run", "unchecked"
+LISTS = "lists"
+"""The folder of the lists of cars in a pack."""
+CARS = "cars"
+"""The option of a question that names a list of cars."""
+SAME = "same"
+DIFFERS = "differs"
+CANNOT = "cannot be run"
+UNCHECKED = "unchecked"
 VERDICTS = SAME, DIFFERS, CANNOT, UNCHECKED
 MAX_ASKED = 1_000_000
 """Largest sum of all numbers, such as numbers of vehicles, that the questions of a study state."""
@@ -93,9 +101,10 @@ MALFORMED = (
 SURPLUS = 10
 """A pack that claims more than this multiple of the evaluations that its runs may have is damaged.
 """
-CONTEXT, SHOWN = 40, 200
-"""Numbers of characters that a row shows of a long line: before the first difference, and in all.
-"""
+SHOWN = 200
+"""Largest number of characters of a line that a report shows."""
+CONTEXT = 40
+"""Number of characters that are shown before the first character that differs."""
 
 
 WHOLE_NUMBER = re.compile(r"[+-]?\d[\d_]*")
@@ -137,9 +146,8 @@ class Packed:
         with about(MANIFEST):
             manifest = convert_table(self.manifest, PackedManifest)
         study = manifest.study
-        for key, _, _ in changed_values(
-            self.manifest["study"], tables_of(study), "study"
-        ):
+        stated_tables = self.manifest["study"]
+        for key, _, _ in changed_values(stated_tables, tables_of(study), "study"):
             raise ValueError(
                 f"{MANIFEST}: {key} is not as the command `study` writes it"
             )
@@ -148,12 +156,10 @@ class Packed:
         solutions = read_table(files[SOLUTIONS])
         self._check_solutions(study, solutions)
         outcomes = packed.outcomes
-        codes = np.repeat(
-            np.arange(len(outcomes), dtype=np.int8), list(outcomes.values())
-        )
-        evaluations = pd.DataFrame(
-            {"outcome": pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))}
-        )
+        numbers = np.arange(len(outcomes), dtype=np.int8)
+        codes = np.repeat(numbers, list(outcomes.values()))
+        column = pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))
+        evaluations = pd.DataFrame({"outcome": column})
         original = self.manifest["original"]
         scoring = manifest.scoring or PUBLISHED_SCORING
         self.case = build_case(
@@ -176,7 +182,7 @@ class Packed:
                 f"{total:,} evaluations are far more than {number_of(len(runs), 'run')} may have"
             )
 
-        # Questions of a pack must not write files, nor take too long.
+        # A question must neither write a file nor take for ever.
         words = split(" ".join(self.packed.questions).replace("=", " "))
         numbers = [int(word) for word in words if WHOLE_NUMBER.fullmatch(word.strip())]
         total = sum(map(abs, [*numbers, *self.packed.simulations.values()]))
@@ -191,7 +197,6 @@ class Packed:
                 raise InputError(
                     "ask", f"{text!r} writes a file", "a question without --out"
                 )
-
         named = [*filter(None, map(list_in, self.packed.questions))]
         packed = [name for name in self.files if name.startswith(f"{LISTS}/")]
         if sorted(named) != sorted(packed):
@@ -203,10 +208,8 @@ class Packed:
         """Refuse a table of solutions with missing, unknown or repeated columns, or whose numbers
         of rows contradict the description of the pack.
         """
-        expected = {"algorithm", "run", *study.domains, *self.manifest["original"]} - {
-            "collision",
-            "collision_speed",
-        }
+        columns = {"algorithm", "run", *study.domains, *self.manifest["original"]}
+        expected = columns - {"collision", "collision_speed"}
         # If two columns are called x, pandas calls the second one "x.1".
         if wrong := expected ^ {*solutions}:
             raise ValueError(
@@ -322,7 +325,7 @@ class Packed:
             names, [(("", 0), evaluations.take(range(1, len(settings))))]
         )
         frame[["algorithm", "run"]] = solutions[["algorithm", "run"]].to_numpy()
-        return json_bytes(record(evaluations, row=0)), csv_of(in_order(frame, names))
+        return json_bytes(record(evaluations)), csv_of(in_order(frame, names))
 
     @cached_property
     def searched(self) -> tuple[bytes, bytes]:
@@ -423,10 +426,8 @@ def read_table(content: bytes) -> pd.DataFrame:
     cell is no number, or a column is missing.
     """
     frame = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False)
-    numbers = [name for name in frame if name not in ("algorithm", "outcome")]
-    frame = frame.replace({name: {"": "nan"} for name in numbers}).astype(
-        dict.fromkeys(numbers, float)
-    )
+    numbers = frame.columns.difference(["algorithm", "outcome"], sort=False)
+    frame[numbers] = frame[numbers].replace("", "nan").astype(float)
     return frame.astype({"run": int, "f_num_diff": int})
 
 
@@ -447,10 +448,8 @@ def count_outcomes(case: Case) -> dict[str, int]:
     """The number of evaluations of all finished runs, by outcome."""
     runs = pd.MultiIndex.from_frame(case.evaluations[["algorithm", "run"]])
     outcomes = case.evaluations["outcome"][runs.isin(case.finished_runs)]
-    return {
-        str(outcome): int(count)
-        for outcome, count in outcomes.value_counts(sort=False).sort_index().items()
-    }
+    counts = outcomes.value_counts(sort=False).sort_index()
+    return dict(zip(map(str, counts.index), counts.tolist(), strict=True))
 
 
 def count_solutions(solutions: pd.DataFrame, runs: Sequence[RunName]) -> list[int]:
@@ -458,11 +457,8 @@ def count_solutions(solutions: pd.DataFrame, runs: Sequence[RunName]) -> list[in
     a setting twice).
     """
     counts = Counter(zip(solutions["algorithm"], solutions["run"], strict=True))
-    return [
-        *(counts[run] for run in runs),
-        len(solutions),
-        len(solutions.drop_duplicates()),
-    ]
+    distinct = solutions.drop_duplicates()
+    return [*map(counts.__getitem__, runs), len(solutions), len(distinct)]
 
 
 def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
@@ -478,19 +474,23 @@ def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:
     if claim.packed == computed:
         return study, claim.name, SAME, "", ""
 
+    packed_lines = [*claim.packed.decode().splitlines(keepends=True), "nothing"]
+    lines = [*computed.decode().splitlines(keepends=True), "nothing"]
+    number = _first_difference(packed_lines, lines)
+    packed_line = _shown(packed_lines[number], lines[number])
+    line = _shown(lines[number], packed_lines[number])
     # Lines may be long: only the text around the first character that differs is shown.
-    lines = claim.packed.decode().splitlines(keepends=True)
-    pairs = zip_longest(
-        lines, computed.decode().splitlines(keepends=True), fillvalue="nothing"
-    )
-    pair = next(pair for pair in pairs if len(set(pair)) > 1)
-    line = _shown(*pair)
-    counterpart = _shown(*pair[::-1])
-    letters = enumerate(zip_longest(line, counterpart))
-    index = next(index for index, pair in letters if len(set(pair)) > 1)
-    start = max(index - CONTEXT, 0) if max(len(line), len(counterpart)) > SHOWN else 0
+    start = 0
+    if max(len(packed_line), len(line)) > SHOWN:
+        start = max(_first_difference(packed_line, line) - CONTEXT, 0)
     part = slice(start, start + SHOWN)
-    return study, claim.name, DIFFERS, line[part], counterpart[part]
+    return study, claim.name, DIFFERS, packed_line[part], line[part]
+
+
+def _first_difference(sequence: Sequence[str], counterpart: Sequence[str]) -> int:
+    """The index of the first elements in which two sequences differ."""
+    pairs = enumerate(zip_longest(sequence, counterpart))
+    return next(index for index, pair in pairs if pair[0] != pair[1])
 
 
 def _shown(line: str, counterpart: str) -> str:

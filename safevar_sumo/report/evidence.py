@@ -140,7 +140,7 @@ def evidence(
     check_writable(out, "out", (".zip",))
 
     command = f"evidence {results} {ask} {unsafe}"
-    how = {"jobs": jobs, "cluster": cluster}
+    workers = {"jobs": jobs, "cluster": cluster}
     directories = dict.fromkeys(map(Path, results))
     studies = []
     files = {}
@@ -148,7 +148,7 @@ def evidence(
         for number, directory in enumerate(directories, 1):
             part = simulations and simulations // len(directories)
             described, study_files = _pack_study(
-                number, directory, ask, unsafe, how, show, part
+                number, directory, ask, unsafe, workers, show, part
             )
             studies.append(described)
             for name, content in study_files.items():
@@ -165,7 +165,7 @@ def _pack_study(
     directory: Path,
     ask: Sequence[str],
     unsafe: Unsafe | None,
-    how: JsonObject,
+    workers: JsonObject,
     progress: Progress,
     simulations: int | None,
 ) -> tuple[PackedStudy, FileContents]:
@@ -189,7 +189,7 @@ def _pack_study(
         if name in stored
     }
 
-    (judged,) = cases_by([case], unsafe, progress=show_no_progress, **how)
+    (judged,) = cases_by([case], unsafe, progress=show_no_progress, **workers)
     questions, lists = _with_lists(list(dict.fromkeys(ask or usual_questions(judged))))
     folder = f"{number}-{study.name}"
     runs = list(case.finished_runs)
@@ -222,10 +222,10 @@ def _pack_study(
         **code,
     }
     show_part = Parts(progress).begin(study.name)
-    with open_pool(**how) as pool:
+    with open_pool(**workers) as pool:
         pool.shared = {} if simulations and assemble(study).mover.takes_long else None
         packed = Packed(
-            described, files, study.origin.places, how["jobs"], show_part, pool
+            described, files, study.origin.places, workers["jobs"], show_part, pool
         )
         answers = json_bytes([packed_answer(packed.answer(text)) for text in questions])
         packed.ask_speed()

@@ -33,10 +33,11 @@ FileContents = dict[str, bytes]
 """Contents of files, by their names."""
 MAX_FILES = 10_000
 MAX_EVALUATIONS = 100_000_000
-MORE_IN_DIRECTORY, DIRECTORY_END = 16, 22
-"""Sizes in the directory of a zip archive [bytes]: the difference between an entry and the header
-of its file, and the end of the directory.
+MORE_IN_DIRECTORY = 16
+"""Difference between an entry in the directory of a zip archive and the header of its file [bytes].
 """
+DIRECTORY_END = 22
+"""Size of the end of the directory of a zip archive [bytes]."""
 UNIX_MODE_SHIFT = 16
 """Number of bits below the file's mode in the attributes of a zip entry."""
 PACK = "a file that the command `evidence` has written, unchanged"

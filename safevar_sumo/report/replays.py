@@ -25,11 +25,12 @@ from safevar_sumo.terminal import Progress
 
 MAX_CAUSES = 6
 """Largest number of replays of settings that stand in tables of answers."""
-CHANGES, ENCOUNTER = "changes", "encounter"
-"""Columns of an answer's table that has settings to replay: the changed values by characteristic
-(all others are those of the original vehicle), and the values of the encounter, in a study whose
-encounters are ranges.
+CHANGES = "changes"
+"""A table's column of settings to replay: values by characteristic, all others as in the original
+vehicle.
 """
+ENCOUNTER = "encounter"
+"""A table's column of the encounters of these settings, where encounters are ranges."""
 
 
 def replays(

@@ -107,11 +107,13 @@ class ReportedStudy:
         solution is unsafe, only the most severe one is selected.
         """
         solutions = self.case.solutions
-        chosen = dict[str, list[str]]()
         if solutions.empty:
             return {}
-        has_failures = self.case.unsafe.rows(solutions).any()
-        for name in FIRST_CHOICES if has_failures else FIRST_CHOICES[-1:]:
+        names: Sequence[str] = FIRST_CHOICES
+        if not self.case.unsafe.rows(solutions).any():
+            names = FIRST_CHOICES[-1:]
+        chosen: dict[str, list[str]] = {}
+        for name in names:
             handle = choose_handle(solutions, self.case.unsafe, name)
             chosen.setdefault(str(handle), []).append(REASONS[name])
         return {handle: ", ".join(reasons) for handle, reasons in chosen.items()}
@@ -132,9 +134,8 @@ class ReportedStudy:
     @property
     def chosen_settings(self) -> FloatArray:
         """The settings of the M solutions in `choices`, shape (M, n)."""
-        return self.chosen_solutions[list(self.case.characteristics.names)].to_numpy(
-            float
-        )
+        names = list(self.case.characteristics.names)
+        return self.chosen_solutions[names].to_numpy(float)
 
 
 def tested(study: ReportedStudy) -> Answer:
@@ -150,7 +151,7 @@ def tested(study: ReportedStudy) -> Answer:
     ]
 
     facts = attrgetter(
-        *("name", "unit", "original", "lower", "upper", "threshold", "words")
+        "name", "unit", "original", "lower", "upper", "threshold", "words"
     )
     rows = map(facts, case.characteristics)
     remarks = [*case.remarks, *vehicle_remarks(study.system)]

@@ -34,8 +34,13 @@ PATIENCE = 2.0
 """Longest time to wait for a lock [s]: workers of a killed process hold locks until they end."""
 SECONDS_BETWEEN_ATTEMPTS = 0.05
 """Time between two attempts to lock a journal [s]."""
-POSITION, OUTCOME, REASON, POINT = "evaluation", "outcome", "reason", "point"
-SOLUTIONS, CHECKSUM = "solutions", "crc32"
+# Keys of a line.
+POSITION = "evaluation"
+OUTCOME = "outcome"
+REASON = "reason"
+POINT = "point"
+SOLUTIONS = "solutions"
+CHECKSUM = "crc32"
 CHECKSUM_MARK = f',"{CHECKSUM}":'.encode()
 OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
+from itertools import starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -117,7 +118,7 @@ def load_runs(directory: str | Path) -> StoredResults:
         manifest,
         frame,
         solutions_frame(characteristics, solutions_of_runs),
-        tuple(run_key for run_key, _ in solutions_of_runs),
+        tuple(dict(solutions_of_runs)),
         tuple(failures),
     )
 
@@ -164,10 +165,8 @@ def handles_of(solutions: pd.DataFrame) -> list[SolutionId]:
 
     runs = solutions.get("run", pd.Series(0, index=solutions.index))
     rows = solutions.groupby([solutions["algorithm"], runs], sort=False).cumcount()
-    return [
-        SolutionId(str(algorithm), int(run), int(row))
-        for algorithm, run, row in zip(solutions["algorithm"], runs, rows, strict=True)
-    ]
+    columns = map(str, solutions["algorithm"]), runs, rows
+    return list(starmap(SolutionId, zip(*columns, strict=True)))
 
 
 def row_of_handle(solutions: pd.DataFrame, handle: SolutionId) -> int:

@@ -18,7 +18,9 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.results.identity import FORMAT
 from safevar_sumo.study import Study, convert_table
 
-MANIFEST, SOLUTIONS, RUNS = "manifest.json", "solutions.csv", "runs"
+MANIFEST = "manifest.json"
+SOLUTIONS = "solutions.csv"
+RUNS = "runs"
 FILES = (
     (
         MANIFEST,

@@ -10,7 +10,7 @@ from importlib.metadata import version
 from io import BytesIO
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 import numpy as np
@@ -113,25 +113,24 @@ class ResultsDirectory:
         """
         # Another process may have written results since the directory was opened.
         earlier_manifest = self._earlier_manifest()
-        now = record(original, row=0)
+        now = record(original)
         manifest = {**self.manifest, "original": now}
         if self._study.scenario.repeats == 1:
             refuse_other_original(self.path, earlier_manifest.get("original", {}), now)
         write_manifest(self.path, manifest)
-        if earlier_manifest and search_extent_of(earlier_manifest) != search_extent_of(
-            manifest
-        ):
-            with disk_errors(self.path / SOLUTIONS, "removed"):
-                (self.path / SOLUTIONS).unlink(missing_ok=True)
+        extent = search_extent_of(manifest)
+        if earlier_manifest and search_extent_of(earlier_manifest) != extent:
+            file = self.path / SOLUTIONS
+            with disk_errors(file, "removed"):
+                file.unlink(missing_ok=True)
 
     def finish(self, solutions: Mapping[RunKeyT, Evaluations]) -> None:
         """Write the table of the solutions of all runs; `solutions` has the solutions of each run,
         by its algorithm and number.
         """
         frame = solutions_frame(self._study.domains, solutions.items())
-        write_whole(
-            self.path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n")
-        )
+        text = frame.to_csv(index=False, lineterminator="\n")
+        write_whole(self.path / SOLUTIONS, text)
 
     def extent_remarks(self, names: Collection[str]) -> list[str]:
         """Remarks on earlier results in the directory: their runs had another number of
@@ -139,7 +138,6 @@ class ResultsDirectory:
         """
         earlier_manifest = self._earlier_manifest()
         remarks = []
-
         if not earlier_manifest:
             return []
         *_, budget = search_extent_of(self.manifest)
@@ -223,9 +221,9 @@ def evaluations_frame(
     import pandas as pd
 
     all_runs = list(runs)
-    metrics = dict[str, Any](METRICS)
+    metrics = [*METRICS]
     for _, evaluations in all_runs:
-        metrics |= evaluations.metrics
+        metrics += evaluations.metrics
     # Without runs the frame has all columns, too.
     empty = ("", 0), Evaluations.none(len(characteristics), metrics)
     frames = [
@@ -246,25 +244,23 @@ def evaluations_frame(
     return pd.concat(frames, ignore_index=True)
 
 
-def record(evaluations: Evaluations, row: int) -> JsonObject:
+def record(evaluations: Evaluations) -> JsonObject:
     """The evaluation in one row, as plain values by name; an undefined value is None."""
     numbers = {
-        "collision_speed": evaluations.collision_speed[row],
-        **{name: values[row] for name, values in evaluations.metrics.items()},
-        "f_safe": evaluations.f_safe[row],
-        "f_diff": evaluations.f_diff[row],
+        "collision_speed": evaluations.collision_speed[0],
+        **evaluations.first_metrics,
+        "f_safe": evaluations.f_safe[0],
+        "f_diff": evaluations.f_diff[0],
     }
     return {
-        "outcome": str(evaluations.outcome[row]),
-        "collision": bool(evaluations.collided[row]),
+        "outcome": str(evaluations.outcome[0]),
+        "collision": bool(evaluations.collided[0]),
         **{name: finite_or_none(value) for name, value in numbers.items()},
-        "f_num_diff": int(evaluations.f_num_diff[row]),
+        "f_num_diff": int(evaluations.f_num_diff[0]),
     }
 
 
-def refuse_other_original(
-    directory: Path, stored: Mapping[str, Any], now: Mapping[str, Any]
-) -> None:
+def refuse_other_original(directory: Path, stored: JsonObject, now: JsonObject) -> None:
     """Refuse to continue results if the simulator drives the original vehicle in another way now.
     `stored` and `now` are results of the original vehicle, as of `record`.
 
@@ -278,10 +274,10 @@ def refuse_other_original(
         if isinstance(old, str) or isinstance(new, str):
             is_same = old == new
         else:
-            # A value that is undefined, None, becomes NaN.
-            pair = np.array([old, new], float)
-            is_same = bool(
-                np.isclose(pair[0], pair[1], ROUNDING, ROUNDING, equal_nan=True)
+            # An undefined value is None, which becomes NaN.
+            values = np.array([old, new], float)
+            is_same = np.allclose(
+                values[0], values[1], ROUNDING, ROUNDING, equal_nan=True
             )
         if not is_same:
             raise InputError(

@@ -6,7 +6,9 @@ from safevar_sumo.study.characteristics import (
     Domain as Domain,
     Domains as Domains,
     Interval as Interval,
+    PositiveProportion as PositiveProportion,
     Precision as Precision,
+    Proportion as Proportion,
     unit_text as unit_text,
 )
 from safevar_sumo.study.encounters import (

@@ -17,6 +17,10 @@ from safevar_sumo.errors import InputError, check_name, one_of
 from safevar_sumo.study.marks import WITHOUT_EFFECT, Table
 
 PositiveNumber = Annotated[float, Meta(gt=0, le=1e6)]
+Proportion = Annotated[float, Meta(ge=0, le=1)]
+"""A part of a whole [-]."""
+PositiveProportion = Annotated[float, Meta(gt=0, le=1)]
+"""A part of a whole that is not 0 [-]."""
 ShortText = Annotated[str, Meta(max_length=200), WITHOUT_EFFECT]
 LongText = Annotated[str, Meta(max_length=400)]
 MAX_MAGNITUDE = 1e12

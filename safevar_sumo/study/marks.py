@@ -63,14 +63,15 @@ def with_effect(value: Any, kind: Any) -> Any:
     """A value as plain tables, without the keys that change no evaluation. If the order of a
     table's keys changes results, the order is added. `kind` is the type of the value.
     """
+    origin = get_origin(kind)
     inner_kinds = get_args(kind)
-    if get_origin(kind) is Annotated:
+    if origin is Annotated:
         return with_effect(value, inner_kinds[0])
-    if get_origin(kind) is dict:
+    if origin is dict:
         return {name: with_effect(item, inner_kinds[1]) for name, item in value.items()}
-    if get_origin(kind) is list:
+    if origin is list:
         return [with_effect(item, inner_kinds[0]) for item in value]
-    if get_origin(kind) in (Union, UnionType) and isinstance(value, dict):
+    if origin in (Union, UnionType) and isinstance(value, dict):
         records = (member for member in inner_kinds if isinstance(member, type))
         return with_effect(value, next(records, None))
     if not (isinstance(kind, type) and issubclass(kind, Table)):

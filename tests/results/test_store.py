@@ -102,7 +102,7 @@ def test_solutions_have_the_promised_columns_in_a_fixed_order() -> None:
 
 
 def test_undefined_values_stay_undefined() -> None:
-    assert record(evaluations(-1.5), 0) == {
+    assert record(evaluations(-1.5)) == {
         "outcome": "collision",
         "collision": True,
         "collision_speed": 1.5,
