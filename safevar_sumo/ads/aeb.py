@@ -7,10 +7,9 @@ published formula and parameters, and with the deceleration of its stop operator
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from msgspec import Meta
 
 from safevar_sumo.ads.base import (
     CORRIDOR,
@@ -32,12 +31,14 @@ from safevar_sumo.records import (
     Nominal,
     Observation,
 )
-from safevar_sumo.study import Table
+from safevar_sumo.study import PositiveProportion, Proportion, Table
 
 LEAST_DECELERATION = 0.5
 """Least deceleration of an obstacle that counts as braking [m/s^2]."""
-NO_BRAKING, PARTIAL_BRAKING, FULL_BRAKING = 0.0, 1.0, 2.0
-"""The numbers of the braking stages of `Aeb`."""
+# The braking stages of `Aeb`.
+NO_BRAKING = 0.0
+PARTIAL_BRAKING = 1.0
+FULL_BRAKING = 2.0
 
 
 class _Memory(NamedTuple):
@@ -114,9 +115,9 @@ class Aeb(Ads, Table, frozen=True, kw_only=True):
     cruise_speed: PositiveParameter | None = None
     cruise_gain: PositiveParameter = 1.0
     response_time: NonNegativeParameter = 0.15
-    braking_share: Annotated[float, Meta(gt=0, le=1)] = 0.95
+    braking_share: PositiveProportion = 0.95
     margin: NonNegativeParameter = 0.5
-    partial_share: Annotated[float, Meta(ge=0, le=1)] = 0.4
+    partial_share: Proportion = 0.4
     partial_time: NonNegativeParameter = 0.15
     corridor: PositiveParameter = CORRIDOR
     reach: PositiveParameter = 100.0
@@ -151,14 +152,11 @@ class Aeb(Ads, Table, frozen=True, kw_only=True):
         has_intervened = memory.intervened | (stage > NO_BRAKING)
         cruising = self.cruise_gain * (cruise_speed - observation.speed)
         pedals = self.pedals(cruising, observation.speed, nominal, cruise_trim)
-        throttle, cruise_brake = (
-            np.where(has_intervened, 0.0, pedal) for pedal in pedals
-        )
-
+        throttle = np.where(has_intervened, 0.0, pedals.throttle)
+        cruise_brake = np.where(has_intervened, 0.0, pedals.brake)
         stage_brake = np.where(stage == FULL_BRAKING, 1.0, self.partial_share)
-        command = Command(
-            throttle, np.where(stage > NO_BRAKING, stage_brake, cruise_brake)
-        )
+        brake = np.where(stage > NO_BRAKING, stage_brake, cruise_brake)
+        command = Command(throttle, brake)
 
         # The system warns earlier than it brakes.
         warns = is_threatened & (time_to_reach(observation) < self.warning_time)
@@ -187,12 +185,9 @@ class Aeb(Ads, Table, frozen=True, kw_only=True):
         # The deceleration of the obstacle since the last step. A new obstacle has lost no speed
         # yet.
         deceleration = self.braking_share * memory.nominal.decel
-        lost_speed = np.where(
-            observation.obstacle == memory.obstacle,
-            memory.obstacle_speed - obstacle_speed,
-            0.0,
-        )
-        obstacle_deceleration = lost_speed / memory.step
+        is_same = observation.obstacle == memory.obstacle
+        lost_speed = memory.obstacle_speed - obstacle_speed
+        obstacle_deceleration = np.where(is_same, lost_speed, 0.0) / memory.step
 
         # The distance that the vehicle loses until both speeds are equal, or until both vehicles
         # stand.
@@ -211,22 +206,16 @@ class Aeb(Ads, Table, frozen=True, kw_only=True):
         # A braking stage begins when the gap is less than the stage's distance.
         full_gap = speed * self.response_time + braking_distance + self.margin
         partial_gap = full_gap + speed * self.partial_time
-        stage_at_gap = np.where(
-            observation.gap < full_gap,
-            FULL_BRAKING,
-            np.where(observation.gap < partial_gap, PARTIAL_BRAKING, NO_BRAKING),
-        )
+        gap = observation.gap
+        stage_at_gap = np.where(gap < partial_gap, PARTIAL_BRAKING, NO_BRAKING)
+        stage_at_gap = np.where(gap < full_gap, FULL_BRAKING, stage_at_gap)
         stage = np.where(is_threatened, stage_at_gap, NO_BRAKING)
 
         # A stage ends when nobody who blocks the way comes nearer any more.
-        still_blocks = (
-            is_ahead(observation)
-            & (closing_speed > 0)
-            & blocks_the_way(observation, self.corridor)
-        )
-        return np.where(
-            still_blocks | (speed <= 0), np.maximum(stage, memory.stage), stage
-        )
+        comes_nearer = is_ahead(observation) & (closing_speed > 0)
+        still_blocks = comes_nearer & blocks_the_way(observation, self.corridor)
+        stays = still_blocks | (speed <= 0)
+        return np.where(stays, np.maximum(stage, memory.stage), stage)
 
 
 class _AutowareMemory(NamedTuple):
@@ -304,21 +293,17 @@ class AutowareAeb(Ads, Table, frozen=True, kw_only=True):
         distance = self.distance(observation.speed, observation.obstacle_speed)
         is_blocked = is_in_the_way(observation, self.corridor)
         is_near = is_blocked & (observation.gap < distance)
-        decision_time = np.where(
-            decision_time >= 0, decision_time + step, np.where(is_near, 0.0, -1.0)
-        )
+        new_time = np.where(is_near, 0.0, -1.0)
+        old_time = decision_time + step
+        decision_time = np.where(decision_time >= 0, old_time, new_time)
         # The command holds for the whole step: it gets the mean over the step, at half of the step.
-        ramp = self.target_jerk * np.maximum(
-            decision_time + step / 2 - self.command_delay, 0.0
-        )
-        is_braking = (decision_time >= 0) & (
-            decision_time + TIME_ROUNDING >= self.command_delay
-        )
-        acceleration = np.where(
-            is_braking,
-            -np.minimum(ramp, self.target_acceleration),
-            self.cruise_gain * (cruise_speed - observation.speed),
-        )
+        ramp_time = decision_time + step / 2 - self.command_delay
+        ramp = self.target_jerk * np.maximum(ramp_time, 0.0)
+        is_due = decision_time + TIME_ROUNDING >= self.command_delay
+        is_braking = (decision_time >= 0) & is_due
+        braking = -np.minimum(ramp, self.target_acceleration)
+        cruising = self.cruise_gain * (cruise_speed - observation.speed)
+        acceleration = np.where(is_braking, braking, cruising)
         pedals = self.pedals(acceleration, observation.speed, nominal, cruise_trim)
         return pedals, _AutowareMemory(nominal, step, cruise, decision_time)
 

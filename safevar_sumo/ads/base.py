@@ -31,6 +31,7 @@ from safevar_sumo.records import (
     Nominal,
     Observation,
     Quantity,
+    clip_to_share,
 )
 
 PositiveParameter = Annotated[float, Meta(gt=0, le=1e3)]
@@ -238,10 +239,12 @@ def pedal_tables_at(nominal: Nominal, speed: Quantity) -> list[FloatArray]:
     position = np.minimum(speed / tables.speeds[1], len(tables.speeds) - 1.001)
     row = position.astype(np.intp)
     share = position - row
-    next_row = row + 1
-    columns = tables.coasting, tables.full_throttle
-    values = ((table[row], table[next_row]) for table in columns)
-    return [low + (high - low) * share for low, high in values]
+
+    def interpolate(table: FloatArray) -> FloatArray:
+        low = table[row]
+        return np.asarray(low + (table[row + 1] - low) * share)
+
+    return [interpolate(tables.coasting), interpolate(tables.full_throttle)]
 
 
 STEP_DECIMALS = 6
@@ -283,15 +286,16 @@ class DelayLine(NamedTuple):
         past = (*(self.past[1:] or (values,) * (self.steps + 1)), values)
         older = past[0]
         newer = past[1]
+        delayed = newer
         if np.ndim(self.fraction) or self.fraction:
             # infinity - infinity is NaN: such values are replaced below.
             with np.errstate(invalid="ignore"):
-                mixture = newer + (older - newer) * self.fraction
-            if not (is_defined := np.isfinite(mixture)).all():
+                delayed = newer + (older - newer) * self.fraction
+            is_defined = np.isfinite(delayed)
+            if not is_defined.all():
                 earlier = np.where(np.equal(self.fraction, 0), newer, older)
-                mixture = np.where(is_defined, mixture, earlier)
-            newer = mixture
-        return newer, DelayLine(self.steps, self.fraction, past)
+                delayed = np.where(is_defined, delayed, earlier)
+        return delayed, DelayLine(self.steps, self.fraction, past)
 
 
 class Trim(NamedTuple):
@@ -312,16 +316,14 @@ def trim_at(nominal: Nominal, observation: Observation) -> Trim:
     standstill.
     """
     is_rolling = observation.speed > 0
+    is_braking = is_rolling & (observation.brake > 0)
     coasting, full_throttle = pedal_tables_at(nominal, observation.speed)
     holding_throttle = coasting / (full_throttle + coasting)
     # A negative brake would push the vehicle: without pedals, the vehicle slows down by `coasting`.
     holding_brake = -coasting / nominal.braking
-    throttle = np.where(is_rolling, observation.throttle - holding_throttle, 0.0)
     return Trim(
-        throttle,
-        np.where(
-            is_rolling & (observation.brake > 0), observation.brake - holding_brake, 0.0
-        ),
+        throttle=np.where(is_rolling, observation.throttle - holding_throttle, 0.0),
+        brake=np.where(is_braking, observation.brake - holding_brake, 0.0),
     )
 
 
@@ -331,9 +333,9 @@ def cruise_at(
     """The speed that a cruise control holds [m/s], and its trim. If `speed` is None, the cruise
     control holds the present speed.
     """
-    speeds = (
-        observation.speed if speed is None else np.full_like(observation.speed, speed)
-    )
+    speeds = observation.speed
+    if speed is not None:
+        speeds = np.full_like(speeds, speed)
     return speeds, trim_at(nominal, observation)
 
 
@@ -344,14 +346,12 @@ def pedals_for(
     original vehicle. `pedal_trim` is added to the pedals.
     """
     coasting, full_throttle = pedal_tables_at(nominal, speed)
-    excess = acceleration + coasting - nominal.braking * pedal_trim.brake
-    brake = np.minimum(np.maximum(-excess / nominal.braking, 0.0), 1.0)
-    throttle = (acceleration + coasting) / (
-        full_throttle + coasting
-    ) + pedal_trim.throttle
-    return Command(
-        np.where(excess < 0, 0.0, np.minimum(np.maximum(throttle, 0.0), 1.0)), brake
-    )
+    push = acceleration + coasting
+    excess = push - nominal.braking * pedal_trim.brake
+    brake = clip_to_share(-excess / nominal.braking)
+    throttle = push / (full_throttle + coasting) + pedal_trim.throttle
+    throttle = clip_to_share(throttle)
+    return Command(np.where(excess < 0, 0.0, throttle), brake)
 
 
 CORRIDOR = 1.15
@@ -374,11 +374,9 @@ def time_to_reach(observation: Observation) -> FloatArray:
     the gap does not shrink.
     """
     gap = np.minimum(np.maximum(observation.gap, 0.0), LARGEST_GAP)
-    return np.where(
-        observation.closing_speed > 0,
-        gap / np.maximum(observation.closing_speed, LEAST_CLOSING_SPEED),
-        LARGEST_GAP,
-    )
+    closing_speed = observation.closing_speed
+    time = gap / np.maximum(closing_speed, LEAST_CLOSING_SPEED)
+    return np.where(closing_speed > 0, time, LARGEST_GAP)
 
 
 def is_in_the_way(
@@ -399,15 +397,12 @@ def depth_in_the_way(
     or when the vehicle reaches the obstacle. The distance is below 0 outside of the corridor, and
     `-LARGEST_GAP` without an obstacle.
     """
-    is_detected = is_ahead(observation) & (
-        observation.gap <= reach * observation.visibility
-    )
+    is_in_reach = observation.gap <= reach * observation.visibility
+    is_detected = is_ahead(observation) & is_in_reach
     lateral = np.where(is_detected, observation.lateral, LARGEST_GAP)
-    lateral_at_arrival = lateral + observation.lateral_speed * time_to_reach(
-        observation
-    )
+    way = observation.lateral_speed * time_to_reach(observation)
+    nearest = np.minimum(np.abs(lateral), np.abs(lateral + way))
     watched = corridor + observation.obstacle_width / 2
-    nearest = np.minimum(np.abs(lateral), np.abs(lateral_at_arrival))
     return np.where(is_detected, watched - nearest, -LARGEST_GAP)
 
 
@@ -425,6 +420,6 @@ def blocks_the_way(observation: Observation, corridor: float) -> BoolArray:
     """Return whether an obstacle has a side within `corridor` of the lane's middle [m], or moves
     towards the middle.
     """
-    return (
-        np.abs(observation.lateral) <= corridor + observation.obstacle_width / 2
-    ) | moves_inwards(observation)
+    reach = corridor + observation.obstacle_width / 2
+    is_inside = np.abs(observation.lateral) <= reach
+    return is_inside | moves_inwards(observation)

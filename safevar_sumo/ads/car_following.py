@@ -20,8 +20,14 @@ from safevar_sumo.ads.base import (
     is_in_the_way,
     trim_at,
 )
-from safevar_sumo.records import Command, FloatArray, Nominal, Observation
-from safevar_sumo.study import Table
+from safevar_sumo.records import (
+    Command,
+    FloatArray,
+    Nominal,
+    Observation,
+    clip_to_share,
+)
+from safevar_sumo.study import PositiveProportion, Table
 
 # Defaults of SUMO's class MSCFModel_ACC. The mode that holds a speed has one gain, of the speed
 # error [1/s]. Each other mode has two gains: of the relative speed [1/s], and of the error of the
@@ -31,8 +37,9 @@ CLOSING_GAINS = 0.8, 0.04
 KEEPING_GAINS = 0.07, 0.23
 AVOIDING_GAINS = 0.23, 0.8
 FOLLOWING_GAP = 100.0  # m, largest gap at which the vehicle follows a leader
-# m, m/s: below both errors the mode that keeps the gap applies.
-GAP_TOLERANCE, SPEED_TOLERANCE = 0.2, 0.1
+# Below both errors the mode that keeps the gap applies.
+GAP_TOLERANCE = 0.2  # m
+SPEED_TOLERANCE = 0.1  # m/s
 LEAST_GAP = 0.001  # m; NUMERICAL_EPS of SUMO
 # m/s^2, an assumption: a vehicle that drives at v_safe approaches the standing gap ever more
 # slowly, and never stops. With this deceleration the vehicle stops.
@@ -188,7 +195,7 @@ class Krauss(Ads, Table, frozen=True, kw_only=True):
     tau_parameter = "reaction_time"
     cruise_speed: PositiveParameter = 13.89
     standing_gap: NonNegativeParameter = 2.5
-    braking_share: Annotated[float, Meta(gt=0, le=1)] = 0.6
+    braking_share: PositiveProportion = 0.6
     reaction_time: NonNegativeParameter = 1.0
 
     def start(self, n: int, nominal: Nominal, step: float) -> tuple[Nominal, float]:
@@ -216,6 +223,6 @@ class Krauss(Ads, Table, frozen=True, kw_only=True):
         safe_speed = np.maximum(safe_speed, np.sqrt(2 * LAST_DECELERATION * gap))
         speed_change = np.minimum(safe_speed, self.cruise_speed) - observation.speed
         acceleration = speed_change / (step + nominal.actuator_lag)
-        throttle = np.minimum(np.maximum(acceleration / nominal.accel, 0.0), 1.0)
-        brake = np.minimum(np.maximum(-acceleration / nominal.decel, 0.0), 1.0)
+        throttle = clip_to_share(acceleration / nominal.accel)
+        brake = clip_to_share(-acceleration / nominal.decel)
         return Command(throttle, brake), memory

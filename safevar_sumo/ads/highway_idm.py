@@ -38,9 +38,8 @@ class HighwayIdm(ScalarAds):
             1, length=ROAD_LENGTH, speed_limit=None
         )
         road = roads.Road(network, record_history=False)
-        self._me, self._front = (
-            vehicles.IDMVehicle(road, [0.0, 0.0]) for _ in range(2)
-        )
+        self._me = vehicles.IDMVehicle(road, [0.0, 0.0])
+        self._front = vehicles.IDMVehicle(road, [0.0, 0.0])
 
     def drive(self, observation: Observation) -> tuple[float, float]:
         me = self._me
@@ -49,12 +48,12 @@ class HighwayIdm(ScalarAds):
         if self.target_speed is None:
             self.target_speed = me.speed
         me.target_speed = self.target_speed
-        is_led = bool(is_in_the_way(observation, self.corridor))
+        leader = None
         # Distances of the library are between the middles of its own vehicles.
-        if is_led:
+        if is_in_the_way(observation, self.corridor):
             front.position[0] = observation.gap + (me.LENGTH + front.LENGTH) / 2
             front.speed = float(observation.obstacle_speed)
-        wish = me.acceleration(me, front if is_led else None)
-        return self.pedals(
-            min(max(float(wish), -me.ACC_MAX), me.ACC_MAX), observation.speed
-        )
+            leader = front
+        wish = float(me.acceleration(me, leader))
+        acceleration = min(max(wish, -me.ACC_MAX), me.ACC_MAX)
+        return self.pedals(acceleration, observation.speed)

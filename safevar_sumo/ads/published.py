@@ -128,8 +128,9 @@ class Apollo(Ads, Table, frozen=True, kw_only=True):
             np.where(is_waiting, old, new)
             for old, new in zip(old_arrays, new_arrays, strict=True)
         )
-        pedals = (np.where(is_waiting, 0.0, pedal) for pedal in command)
-        return Command(*pedals), _ApolloMemory(nominal, step, *arrays)
+        throttle = np.where(is_waiting, 0.0, command.throttle)
+        brake = np.where(is_waiting, 0.0, command.brake)
+        return Command(throttle, brake), _ApolloMemory(nominal, step, *arrays)
 
     def _plan(self, observation: Observation, memory: _ApolloMemory) -> _ApolloMemory:
         """Plan an acceleration: cruise, then brake with v^2 / (2 d) to stop within the distance d,

@@ -4,10 +4,9 @@ reaction time, and does not accelerate again while the cause of the danger block
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from msgspec import Meta
 
 from safevar_sumo.ads.base import (
     CORRIDOR,
@@ -29,7 +28,7 @@ from safevar_sumo.records import (
     Nominal,
     Observation,
 )
-from safevar_sumo.study import Table
+from safevar_sumo.study import Proportion, Table
 
 HARDEST_BRAKING = 0.774 * GRAVITY
 """Deceleration of the competent and careful driver [m/s^2] (UN R157, annex 4, appendix 3)."""
@@ -43,7 +42,7 @@ CRUISE_GAIN = 1.0
 """Acceleration per speed error [1/s]."""
 LEAST_DIVISOR = 1e-9
 """Lower bound of an acceleration [m/s^2] or of a ramp's width [m] that is a divisor."""
-StartThrottle = tuple[Annotated[float, Meta(ge=0, le=1)], ...]
+StartThrottle = tuple[Proportion, ...]
 """Throttle in the run's first steps, one value per step [-], with which the run starts as it does
 with another driver.
 """

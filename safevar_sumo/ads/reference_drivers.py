@@ -25,7 +25,7 @@ from safevar_sumo.ads.reaction import (
     ReferenceDriver,
     StartThrottle,
 )
-from safevar_sumo.records import KMH_PER_MS, FloatArray, Observation
+from safevar_sumo.records import KMH_PER_MS, FloatArray, Observation, clip_to_share
 
 UNLIMITED_BRAKING = 1e6
 """A deceleration that no brake reaches [m/s^2]: a driver who wants it presses the pedal fully."""
@@ -261,21 +261,17 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
         speed_after_reaction = v + self.reaction_time * acceleration
         # The gap that is lost in the reaction time. If the vehicle is slower than the leader then,
         # the gap that is lost until the speeds are equal.
-        loss_in_reaction = (
-            v + acceleration * self.reaction_time / 2 - u
-        ) * self.reaction_time
-        loss_to_leader_speed = (
-            (v - u) * (v - u) / (2 * np.maximum(np.abs(acceleration), LEAST_DIVISOR))
-        )
-        square = (speed_after_reaction - u) * (speed_after_reaction - u)
-        unsafe_distance, safe_distance = (
-            loss_in_reaction + square / (2 * b)
-            for b in (self.hardest, self.comfortable)
-        )
+        mean_speed = v + acceleration * self.reaction_time / 2
+        loss_in_reaction = (mean_speed - u) * self.reaction_time
+        divisor = 2 * np.maximum(np.abs(acceleration), LEAST_DIVISOR)
+        loss_to_leader_speed = (v - u) * (v - u) / divisor
+        excess = speed_after_reaction - u
+        square = excess * excess
+        unsafe_distance = loss_in_reaction + square / (2 * self.hardest)
+        safe_distance = loss_in_reaction + square / (2 * self.comfortable)
         cfs_still_faster = _falling_ramp(gap, unsafe_distance, safe_distance)
-        cfs = np.where(
-            speed_after_reaction < u, gap < loss_to_leader_speed, cfs_still_faster
-        )
+        is_too_near = gap < loss_to_leader_speed
+        cfs = np.where(speed_after_reaction < u, is_too_near, cfs_still_faster)
         return np.where(v <= u, 0.0, cfs)
 
 
@@ -285,4 +281,4 @@ def _falling_ramp(gap: FloatArray, low: FloatArray, high: FloatArray) -> FloatAr
     """
     width = np.maximum(high - low, LEAST_DIVISOR)
     finite_gap = np.minimum(gap, high + width)
-    return np.minimum(np.maximum((high - finite_gap) / width, 0.0), 1.0)
+    return clip_to_share((high - finite_gap) / width)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -58,9 +59,9 @@ class VariedAds(Ads):
                     setattr(driver, name, value)
             return varied, drivers
         # Frozen records refuse new values of their fields, unless msgspec sets the values.
-        set_field = (
-            force_setattr if isinstance(varied, msgspec.Struct) else object.__setattr__
-        )
+        set_field: Callable[..., None] = object.__setattr__
+        if isinstance(varied, msgspec.Struct):
+            set_field = force_setattr
         for name, column in zip(self._names, columns, strict=True):
             set_field(varied, name, column)
         return varied, varied.start(n, nominal, step)
@@ -84,7 +85,6 @@ def with_tau(ads: Ads, tau: FloatArray | None) -> Ads:
         return ads
     if not isinstance(ads, VariedAds):
         return VariedAds(ads, (ads.tau_parameter,), tau[:, None])
+    names = (*ads._names, ads.tau_parameter)
     values = np.tile(ads._values, (len(tau) // len(ads._values), 1))
-    return VariedAds(
-        ads._ads, (*ads._names, ads.tau_parameter), np.column_stack([values, tau])
-    )
+    return VariedAds(ads._ads, names, np.column_stack([values, tau]))

@@ -35,7 +35,7 @@ def manifest_now(study: Study, system: System, used: Iterable[str] = ()) -> Json
     }
     versions = {}
     libraries = set()
-    for scenario in (point.scenario for point in system.points):
+    for scenario in system.scenarios:
         if scenario.version:
             versions[f"version of {type(scenario).__name__}"] = str(scenario.version)
         for name in scenario.LIBRARIES:
@@ -70,8 +70,7 @@ def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
     networks, user code, FMUs and data files, and the files with the names `used` that exist.
     """
     places = study.origin.places
-    networks = {point.scenario.network for point in system.points} - {""}
-    opened = list(map(open_network, sorted(networks)))
+    opened = list(map(open_network, filter(None, sorted(system.networks))))
     network_files = {
         network.path(name) for network in opened for name, _ in network.digests
     }

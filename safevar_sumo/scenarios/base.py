@@ -35,10 +35,10 @@ the value has attributes to set, or is None to remove the element.
 """
 
 
-PEDESTRIAN, CROSSING_LANE = "pedestrian", ":crossing_c0_0"
-"""The id of a person who walks across the road, and the lane on which the person walks, in every
-network with such a person.
-"""
+PEDESTRIAN = "pedestrian"
+"""Id of a person who walks across the road, in every network with such a person."""
+CROSSING_LANE = ":crossing_c0_0"
+"""Id of the lane on which this person walks across the road."""
 
 
 class Scene(NamedTuple):

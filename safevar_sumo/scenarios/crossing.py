@@ -36,16 +36,18 @@ from safevar_sumo.scenarios.tracks import (
     Speed,
     Track,
 )
-from safevar_sumo.study import searched
+from safevar_sumo.study import PositiveProportion, searched
 
 PARKED_GAP = 1.0
 """Three gaps with the same value [m]: between the side of the vehicle and the parked cars; between
 the target's path and the front of the parked car that is nearer to it; between both parked cars.
 """
-PARKED_LENGTHS, PARKED_WIDTH = {"parked_small": 4.25, "parked_large": 4.5}, 1.8
-"""Lengths of the two parked cars, and their width [m]. The small car is nearer to the target. The
-lengths are the middles of the protocol's ranges: 4.1 to 4.4 m and 4.3 to 4.7 m.
+PARKED_LENGTHS = {"parked_small": 4.25, "parked_large": 4.5}
+"""Lengths of the two parked cars [m]. The small car is nearer to the target. The lengths are the
+middles of the protocol's ranges: 4.1 to 4.4 m and 4.3 to 4.7 m.
 """
+PARKED_WIDTH = 1.8
+"""Width of the two parked cars [m]."""
 ROW_LENGTH = 1000.0
 """Length of a body that stands for a row of parked cars [m]. The body only hides what is behind it:
 the vehicle can hit the two parked cars, but not see past the row.
@@ -113,9 +115,11 @@ class _Start(NamedTuple):
         """
         lateral_start = test.parameter("lateral_start")
         speed = test.parameter("target_speed") * KMH
-        side, direction = -1.0, FROM_LEFT
+        side = -1.0
+        direction = FROM_LEFT
         if test.parameter("side") == "near":
-            side, direction = 1.0, FROM_RIGHT
+            side = 1.0
+            direction = FROM_RIGHT
         direction = direction.turned(test.heading)
         impact_lateral = lateral_offset(test.impact_location, test.vut_width)
         if lateral_start is None:
@@ -238,7 +242,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True):
     acceleration_distance: Metres | None = None
     short: Metres | None = None
     lead: Annotated[float, Meta(ge=0, le=10)] = 0.0
-    start_share: Annotated[float, Meta(gt=0, le=1)] = 1.0
+    start_share: PositiveProportion = 1.0
     heading: Heading = 0.0
     hidden: bool | None = None
     sensor_setback: Metres = 0.0

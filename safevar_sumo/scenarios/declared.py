@@ -67,8 +67,9 @@ def with_ranges(study: Study) -> Study:
     tables = _with_declared(
         {**tables_of(study), "encounters": RANGES}, study.origin.places
     )
-    places = [tables["scenario"], *tables.get("matrix", {}).get("tests", [])]
-    axes = [axis for place in places for axis in place.get("over", {}).values()]
+    axes: list[Any] = []
+    for place in (tables["scenario"], *tables.get("matrix", {}).get("tests", [])):
+        axes += place.get("over", {}).values()
     if not any(isinstance(axis, dict) and "lower" in axis for axis in axes):
         return study
     origin = msgspec.structs.replace(study.origin, ranges=True)

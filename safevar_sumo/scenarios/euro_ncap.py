@@ -41,7 +41,8 @@ class Direction(NamedTuple):
         Sine and cosine are rounded, because their last bits differ between machines.
         """
         angle = math.radians(heading)
-        cosine, sine = round(math.cos(angle), 12), round(math.sin(angle), 12)
+        cosine = round(math.cos(angle), 12)
+        sine = round(math.sin(angle), 12)
         return Direction(
             self.along * cosine - self.left * sine,
             self.left * cosine + self.along * sine,
@@ -49,18 +50,17 @@ class Direction(NamedTuple):
 
     def extent(self, body: BodySize) -> BodySize:
         """The size of a body that faces in this direction, along the lane and across it [m]."""
-        cosine, sine = abs(self.along), abs(self.left)
+        cosine = abs(self.along)
+        sine = abs(self.left)
         return BodySize(
             body.length * cosine + body.width * sine,
             body.length * sine + body.width * cosine,
         )
 
 
-SAME_DIRECTION, FROM_RIGHT, FROM_LEFT = (
-    Direction(1.0, 0.0),
-    Direction(0.0, 1.0),
-    Direction(0.0, -1.0),
-)
+SAME_DIRECTION = Direction(1.0, 0.0)
+FROM_RIGHT = Direction(0.0, 1.0)
+FROM_LEFT = Direction(0.0, -1.0)
 
 
 class TestRow(Struct, frozen=True, forbid_unknown_fields=True):

@@ -41,13 +41,14 @@ from safevar_sumo.study import Table, searched
 _Positive = Annotated[float, Meta(gt=0, le=3600)]
 ROUNDING = 1e-6
 """How far a pedestrian may get beyond the place of the turn by rounding errors [m]."""
-VUT_LANE, FOOTPATH_LANE = "approach_0", "footpath_0"
-WALKING_SPEED, LATERAL_START = 1.8, 5.16
-"""The pedestrian's speed [m/s], and start to the right of the lane's middle [m], as the traffic
-file states them.
-"""
-
-
+VUT_LANE = "approach_0"
+"""Id of the lane of the vehicle under test before the crossing."""
+FOOTPATH_LANE = "footpath_0"
+"""Id of the lane on which the pedestrian starts."""
+WALKING_SPEED = 1.8
+"""The pedestrian's speed in the traffic file [m/s]."""
+LATERAL_START = 5.16
+"""The pedestrian's start in the traffic file, to the right of the lane's middle [m]."""
 SLOW_SPEEDS = (10.0, 15.0, 20.0)
 """Speeds of benign scenes, near which vehicles reach the pedestrian [km/h]."""
 CITY_SPEEDS = (20.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
@@ -199,7 +200,8 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
         times = np.arange(samples)[:, None]
-        speed, start = self.walking_speed, self.lateral_start
+        speed = self.walking_speed
+        start = self.lateral_start
         if speed is None:
             speed = WALKING_SPEED
         if start is None:
@@ -291,11 +293,14 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
         )
 
 
-PARKED_VEHICLE, PARKED_POSITION, VUT_FRONT = "parked_ahead", 85.0, 20.0
-"""Id of the parked vehicle ahead, and the positions of the fronts of the parked vehicle and of the
-tested vehicle in the traffic file [m].
-"""
+PARKED_VEHICLE = "parked_ahead"
+"""Id of the parked vehicle ahead."""
+PARKED_POSITION = 85.0
+"""Position of the front of the parked vehicle in the traffic file [m]."""
 PARKED_LENGTH = 4.7
+"""Length of the parked vehicle in the traffic file [m]."""
+VUT_FRONT = 20.0
+"""Position of the front of the vehicle under test in the traffic file [m]."""
 
 
 class _Parked(NamedTuple):

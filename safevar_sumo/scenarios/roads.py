@@ -34,15 +34,18 @@ class Lane(NamedTuple):
 def lane_through(name: str, points: Sequence[Coordinates]) -> Lane:
     """Make the lane `name` from the points of its centre line [m]."""
     x, y = points[0]
-    to_x, to_y = points[-1]
-    length = math.hypot(to_x - x, to_y - y)
+    lane_dx = points[-1][0] - x
+    lane_dy = points[-1][1] - y
+    length = math.hypot(lane_dx, lane_dy)
     bend = 0.0
     for at_x, at_y in points:
-        deviation = math.hypot(at_x - x, at_y - y)
+        dx = at_x - x
+        dy = at_y - y
+        deviation = math.hypot(dx, dy)
         # A lane that ends at its beginning has no line through both points: the distance counts
         # instead.
         if length:
-            deviation = abs((to_x - x) * (at_y - y) - (to_y - y) * (at_x - x)) / length
+            deviation = abs(lane_dx * dy - lane_dy * dx) / length
         bend = max(bend, deviation)
     flaw = ""
     if bend > MAX_BEND:
@@ -70,9 +73,10 @@ class Frame(NamedTuple):
         if lane.flaw:
             raise InputError(NETWORK_KEY, lane.flaw, "a straight lane")
         x, y = lane.start
-        to_x, to_y = lane.end
-        length = math.sqrt((to_x - x) * (to_x - x) + (to_y - y) * (to_y - y))
-        return cls(lane.start, ((to_x - x) / length, (to_y - y) / length))
+        dx = lane.end[0] - x
+        dy = lane.end[1] - y
+        length = math.sqrt(dx * dx + dy * dy)
+        return cls(lane.start, (dx / length, dy / length))
 
     @classmethod
     def through_origin(cls, lane: Lane) -> Frame:
@@ -125,10 +129,9 @@ class Frame(NamedTuple):
         """The point at these distances along the lane and to its left [m], or several points."""
         x, y = self.origin
         dir_x, dir_y = self.direction
-        return (
-            x + along * dir_x - sideways * dir_y,
-            y + along * dir_y + sideways * dir_x,
-        )
+        point_x = x + along * dir_x - sideways * dir_y
+        point_y = y + along * dir_y + sideways * dir_x
+        return point_x, point_y
 
 
 class Roads(Protocol):

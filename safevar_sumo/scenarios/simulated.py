@@ -35,12 +35,10 @@ OWN_SIMULATOR = Mover(
 `Simulator`.
 """
 SPEED = Legal(0.0, 1000.0)
-TIME, OUTCOME, IMPACT_SPEED, STRUCK_SPEED = (
-    "time",
-    "outcome",
-    "impact_speed",
-    "struck_speed",
-)
+TIME = "time"
+OUTCOME = "outcome"
+IMPACT_SPEED = "impact_speed"
+STRUCK_SPEED = "struck_speed"
 SAMPLED = {TIME: Legal(0.0), "speed": SPEED, "separation": Legal(0.0, infinite=True)}
 """Columns that a trace must have, with a value for each sample."""
 ALSO_SAMPLED = {
@@ -63,10 +61,10 @@ MOST_DECELERATION = 20.0
 """Largest deceleration that a trace may show in any case [m/s^2]. A trace with a harder braking may
 show this braking, too.
 """
-SLACK, CREEPS = 0.1, 1.0
-"""`SLACK` is the largest rounding error of distances [m] and of speeds [m/s]. A vehicle that is
-slower than `CREEPS` [m/s] has stopped.
-"""
+SLACK = 0.1
+"""Largest rounding error of distances [m] and of speeds [m/s]."""
+CREEPS = 1.0
+"""Speed below which a vehicle has stopped [m/s]."""
 FACTOR = 1.5
 """A ratio between the way from speeds and the way from positions is a mistake in units from this
 number on. Smaller ratios may come from sampling.
@@ -170,7 +168,8 @@ def _contradiction(
     """The contradiction between the stated end of a run and its samples, in words; "" if they
     agree. Within one step [s], samples may change as fast as anywhere in the trace.
     """
-    speed, separation = columns["speed"], columns["separation"]
+    speed = columns["speed"]
+    separation = columns["separation"]
     braked = max(float(np.abs(np.diff(speed)).max()), MOST_DECELERATION * step)
     if outcome == Outcome.COLLISION:
         # The struck body may be as fast as any obstacle in the trace.
@@ -199,14 +198,14 @@ def unit_contradiction(trace: Trace) -> str:
     active = trace.active[:, 0]
     if active.sum() < 2:
         return ""
-    speed, gap = trace.speed[active, 0], trace.gap[active, 0]
-    position, obstacle_speed = (
-        trace.position[active, 0],
-        trace.obstacle_speed[active, 0],
-    )
+    speed = trace.speed[active, 0]
+    gap = trace.gap[active, 0]
+    position = trace.position[active, 0]
+    obstacle_speed = trace.obstacle_speed[active, 0]
     # The gap is infinite while no obstacle is in sight: such samples do not count.
     gap = np.where(np.isfinite(gap), gap, np.nan)
-    driven = float(np.sum(speed[1:] + speed[:-1]) * trace.step / 2)
+    double_speeds = speed[1:] + speed[:-1]
+    driven = np.sum(double_speeds) * trace.step / 2
     ways = {"position": np.ptp(position)}
     if (obstacle_speed == 0).all() and (np.diff(gap) <= 0).all():
         ways["gap"] = np.ptp(gap)
@@ -219,7 +218,8 @@ def unit_contradiction(trace: Trace) -> str:
     # factor.
     closing = speed - obstacle_speed
     for name, rate, column in (("position", speed, position), ("gap", closing, -gap)):
-        (way,), (low, *_, high) = np.diff(column[:2]), np.sort(rate[:2]) * trace.step
+        way = column[1] - column[0]
+        low, high = np.sort(rate[:2]) * trace.step
         slack = (FACTOR - 1) * max(abs(low), abs(high)) + FIRST_SLACK
         if way < low - slack or way > high + slack:
             return f"speed and {name} disagree in the first step: {high:.3g} m and {way:.3g} m"

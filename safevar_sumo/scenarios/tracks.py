@@ -31,8 +31,10 @@ from safevar_sumo.study import PHASE, Table, free_parameters
 
 KMH = 1 / KMH_PER_MS
 """m/s per km/h."""
-VUT_LENGTH, VUT_WIDTH = 4.9016, 2.1284
-"""Bounding box of CARLA's vehicle.lincoln.mkz2017 [m]."""
+VUT_LENGTH = 4.9016
+"""Length of CARLA's vehicle.lincoln.mkz2017 [m]."""
+VUT_WIDTH = 2.1284
+"""Width of CARLA's vehicle.lincoln.mkz2017 [m]."""
 Speed = Annotated[float, Meta(gt=0, le=250)]
 """Speed of the vehicle under test [km/h]."""
 
@@ -133,10 +135,10 @@ def travelled(speeds: Quantity, times: FloatArray) -> FloatArray:
     the speed changes linearly.
     """
     at_times = speeds + np.zeros_like(times)
-    covered = (at_times[1:] + at_times[:-1]) / 2 * (times[1:] - times[:-1])
-    return np.concatenate(
-        [np.zeros_like(at_times[:1]), np.add.accumulate(covered, axis=0)]
-    )
+    mean_speeds = (at_times[1:] + at_times[:-1]) / 2
+    ways = mean_speeds * (times[1:] - times[:-1])
+    start = np.zeros_like(at_times[:1])
+    return np.concatenate([start, np.add.accumulate(ways, axis=0)])
 
 
 def first_in_strip(body: Track, half_width: float) -> Quantity:
@@ -151,24 +153,27 @@ def first_in_strip(body: Track, half_width: float) -> Quantity:
         for side in (-half_width, half_width):
             crosses = (np.minimum(y, to_y) < side) & (side < np.maximum(y, to_y))
             share = (side - y) / np.where(crosses, to_y - y, 1.0)
-            first_x = np.where(
-                crosses, np.minimum(first_x, x + (to_x - x) * share), first_x
-            )
+            crossing_x = x + (to_x - x) * share
+            first_x = np.where(crosses, np.minimum(first_x, crossing_x), first_x)
     beside = np.minimum.reduce(np.broadcast_arrays(*(x for x, _ in corners)))
     return np.where(np.isinf(first_x), beside, first_x)[()]
 
 
+CORNERS = (1, 1), (1, -1), (-1, -1), (-1, 1)
+"""The corners of a rectangle, once around it: 1 is the front or the left, -1 the rear or the right.
+"""
+
+
 def corners_of(body: Track) -> list[tuple[Quantity, Quantity]]:
     """The four corners of a body [m], in order around the body."""
-    half_length = body.length / 2
-    half_width = body.width / 2
-    return [
-        (
-            body.x + end * half_length * body.along - side * half_width * body.left,
-            body.y + end * half_length * body.left + side * half_width * body.along,
-        )
-        for end, side in ((1, 1), (1, -1), (-1, -1), (-1, 1))
-    ]
+    corners = []
+    for end, side in CORNERS:
+        lengthwise = end * body.length / 2
+        across = side * body.width / 2
+        x = body.x + lengthwise * body.along - across * body.left
+        y = body.y + lengthwise * body.left + across * body.along
+        corners.append((x, y))
+    return corners
 
 
 def check_tracks(

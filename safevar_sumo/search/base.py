@@ -120,7 +120,7 @@ def check_search(
                 return _checked_result(code, end.value, yielded, problem)
         settings = _checked_settings(code, output, problem, budget)
         budget -= len(settings)
-        yielded.update(setting.tobytes() for setting in settings)
+        yielded.update(map(bytes, settings))
         answer = read_only((yield settings))
 
 
@@ -179,8 +179,8 @@ def _checked_result(
             "no settings",
             f"a generator that yields from 1 to {problem.evaluations} settings",
         )
-    if not isinstance(result, Evaluations) or any(
-        setting.tobytes() not in yielded for setting in result.settings
+    if not isinstance(result, Evaluations) or not yielded.issuperset(
+        map(bytes, result.settings)
     ):
         raise code.wrong(
             "search",

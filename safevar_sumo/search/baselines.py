@@ -23,15 +23,13 @@ class RandomSearch(Algorithm, Table, frozen=True, kw_only=True):
     """
 
     def search(self, problem: Problem, rng: Generator) -> Search:
-        settings = problem.characteristics.filter(
-            problem.uniform(problem.evaluations, rng)
-        )
+        unfiltered = problem.uniform(problem.evaluations, rng)
+        settings = problem.characteristics.filter(unfiltered)
         archive = problem.original.take([])
         for start in range(0, len(settings), problem.population):
             evaluated = yield settings[start : start + problem.population]
-            archive = problem.nondominated(
-                Evaluations.concatenate([archive, evaluated])
-            )
+            candidates = Evaluations.concatenate([archive, evaluated])
+            archive = problem.nondominated(candidates)
         return archive
 
 
@@ -75,36 +73,31 @@ class SafeFuzzer(Algorithm, Table, frozen=True, kw_only=True):
         generations = []
         scores = []
         lowest_score = np.inf
-        used = unimproved = last_update = 0
-        while (
-            used < problem.evaluations
-            and unimproved < self.generations_without_improvement
-        ):
-            evaluated = yield ranges.draw(
-                min(self.generation, problem.evaluations - used), rng
-            )
-            used += len(evaluated)
+        budget = problem.evaluations
+        used = n_unimproved = window_start = 0
+        while used < budget and n_unimproved < self.generations_without_improvement:
+            size = min(self.generation, budget - used)
+            evaluated = yield ranges.draw(size, rng)
+            used += size
             generations.append(evaluated)
 
             # The search ends when its lowest score has not fallen for some generations.
             scores.append(_scores(evaluated, problem.scoring, self.safety_weight))
             lowest_in_generation = np.nanmin(scores[-1], initial=np.inf)
             is_improved = lowest_in_generation < lowest_score or used <= self.warm_up
-            unimproved += 1
+            n_unimproved += 1
             if is_improved:
-                unimproved = 0
+                n_unimproved = 0
             lowest_score = min(lowest_score, lowest_in_generation)
 
-            # The ranges follow the less safe settings of the generations since the last update.
-            if (
-                used >= self.warm_up
-                and len(generations) % self.generations_between_updates == 0
-            ):
-                ranges.narrow(Evaluations.concatenate(generations[last_update:]))
-                last_update = len(generations)
-        best = np.argsort(np.concatenate(scores), kind="stable")[: self.kept]
-        solutions = Evaluations.concatenate(generations).take(best)
-        return solutions.take(problem.scoring.valid(solutions))
+            # Ranges narrow to the less safe settings of the generations since the last update.
+            is_due = len(generations) % self.generations_between_updates == 0
+            if used >= self.warm_up and is_due:
+                ranges.narrow(Evaluations.concatenate(generations[window_start:]))
+                window_start = len(generations)
+        ranking = np.argsort(np.concatenate(scores), kind="stable")
+        best = Evaluations.concatenate(generations).take(ranking[: self.kept])
+        return best.take(problem.scoring.valid(best))
 
 
 class Ranges:
@@ -125,9 +118,8 @@ class Ranges:
         """Draw filtered settings, shape (number, n). Each setting changes k characteristics; k is
         drawn uniformly from 1 to `max_changes`. The encounter is drawn uniformly from its ranges.
         """
-        return self._characteristics.filter(
-            np.stack([self._draw_feasible_setting(rng) for _ in range(number)])
-        )
+        settings = [self._draw_feasible_setting(rng) for _ in range(number)]
+        return self._characteristics.filter(np.stack(settings))
 
     def _draw_feasible_setting(self, rng: Generator) -> FloatArray:
         """Draw a feasible setting. If `MAX_REDRAWS` further draws are infeasible, too, the last
@@ -135,19 +127,19 @@ class Ranges:
         """
         for _ in range(1 + MAX_REDRAWS):
             setting = self._draw_setting(rng)
-            if self._problem.feasible(setting[None])[0]:
+            if self._problem.feasible(setting[np.newaxis])[0]:
                 return setting
-        return np.asarray(self._problem.repaired(setting[None])[0])
+        return np.asarray(self._problem.repaired(setting[np.newaxis])[0])
 
     def _draw_setting(self, rng: Generator) -> FloatArray:
         """Draw a setting with changes of some characteristics, which may violate constraints."""
         setting = self._characteristics.original.copy()
-        count = len(self._characteristics.vehicle)
-        for i in rng.choice(
-            count, size=rng.integers(1, self.max_changes, endpoint=True), replace=False
-        ):
+        # The characteristics of the vehicle come first, then the parameters of the encounter.
+        n_vehicle = len(self._characteristics.vehicle)
+        n_changes = rng.integers(1, self.max_changes, endpoint=True)
+        for i in rng.choice(n_vehicle, n_changes, replace=False):
             setting[i] = self._draw_value(i, rng)
-        for i in range(count, len(setting)):
+        for i in range(n_vehicle, len(setting)):
             setting[i] = self._draw_value(i, rng)
         return setting
 
@@ -173,7 +165,8 @@ class Ranges:
         """Set the ends of each range to the mean of the increased values and the mean of the
         decreased values. Only settings of `window` count that are less safe than the original.
         """
-        is_less_safe = self._scoring.values(window)[:, 0] < self._originals(window)
+        objectives = self._scoring.values(window)[:, 0]
+        is_less_safe = objectives < self._original_objectives(window)
         less_safe = window.take(self._scoring.valid(window) & is_less_safe)
         if not len(less_safe):
             return
@@ -184,18 +177,17 @@ class Ranges:
                 self.upper[i] = np.mean(values[values > original])
             if np.any(values < original):
                 self.lower[i] = np.mean(values[values < original])
-        # Halves are rounded upwards. Python's `round` would round halves to even numbers.
-        self.max_changes = max(1, int(np.floor(np.mean(less_safe.f_num_diff) + 0.5)))
+        # Python's `round` takes halves to even numbers, not upwards.
+        rounded_mean = np.floor(np.mean(less_safe.f_num_diff) + 0.5)
+        self.max_changes = max(1, int(rounded_mean))
 
-    def _originals(self, window: Evaluations) -> FloatArray:
+    def _original_objectives(self, window: Evaluations) -> FloatArray:
         """The first objective of the original vehicle, for each setting of `window`. If the
         objective is a safety degree and encounters are ranges, the original vehicle drives in the
         encounter of the setting.
         """
-        if (
-            self._scoring.safe_original is not None
-            and self._scoring.objectives[0] == F_SAFE
-        ):
+        has_own_degrees = self._scoring.safe_original is not None
+        if has_own_degrees and self._scoring.objectives[0] == F_SAFE:
             return window.column(ORIGINAL_DEGREE)
         return np.full(len(window), self._original_objective)
 
@@ -211,22 +203,24 @@ def _scores(
     characteristics. In a study with other objectives, the first objective replaces the safety
     degree. Further objectives are scaled to [0, 1], too.
     """
-    values = np.where(
-        scoring.valid(evaluations)[:, None], scoring.values(evaluations), np.nan
-    )
+    is_valid = scoring.valid(evaluations)[:, np.newaxis]
+    values = np.where(is_valid, scoring.values(evaluations), np.nan)
+    max_further_changes = max(evaluations.settings.shape[1] - 1, 1)
     score = safety_weight * _normalise(values[:, 0])
     for objective, column in zip(scoring.objectives[1:], values[:, 1:].T, strict=True):
+        term = _normalise(column)
         if objective.name == F_DIFF.name:
-            score = score + column
+            term = column
         elif objective.name == F_NUM_DIFF.name:
-            score = score + (column - 1) / max(evaluations.settings.shape[1] - 1, 1)
-        else:
-            score = score + _normalise(column)
+            term = (column - 1) / max_further_changes
+        score = score + term
     return score / (safety_weight + len(scoring.objectives) - 1)
 
 
 def _normalise(values: FloatArray) -> FloatArray:
-    """Scale values to [0, 1] by their minimum and maximum; NaN stays NaN."""
+    """Scale values to [0, 1] by their minimum and maximum; equal values become 0, and NaN stays
+    NaN.
+    """
     if np.all(np.isnan(values)):
         return values
     minimum = np.nanmin(values)

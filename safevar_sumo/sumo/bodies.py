@@ -21,12 +21,13 @@ from safevar_sumo.records import (
     IntArray,
     Quantity,
     TextArray,
+    clip_to_share,
     nans,
 )
 from safevar_sumo.scenarios import Scene, Track, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.scenarios.roads import NETWORK_KEY, Frame, World
-from safevar_sumo.scenarios.tracks import corners_of
+from safevar_sumo.scenarios.tracks import CORNERS, corners_of
 from safevar_sumo.vehicles import SumoType
 
 Hits = dict[int, float]
@@ -189,7 +190,11 @@ TOUCH = 1e-3
 """Overlap up to which bodies only touch, without an impact [m], as in SUMO. An impact that is due
 exactly at a sample must not depend on the last bit of a position.
 """
-FRONT, LEFT, RIGHT, REAR = "front", "left", "right", "rear"
+# Sides of a vehicle.
+FRONT = "front"
+LEFT = "left"
+RIGHT = "right"
+REAR = "rear"
 COSINE_DECIMALS = 9
 """Decimals of a cosine between two directions: SUMO states directions in degrees, and converting
 them makes rounding errors.
@@ -241,14 +246,14 @@ class FirstContacts:
         InputError
             The error states the time [s].
         """
-        # Candidates are in a body since this sample, and have had no contact that SUMO reported.
+        # These vehicles enter a body although SUMO has reported no contact.
         is_inside = scene.gap < -TOUCH_OVERLAP
         enters = is_inside & ~self._was_inside & is_open & (self.first.side == "")
         self._was_inside = is_inside
         if not np.count_nonzero(enters):
             return
 
-        # `scene.gap` does not say which side overlaps: the rectangles of the bodies do.
+        # Only the front counts, because SUMO reports no other contacts.
         around = world.bodies_around(np.flatnonzero(enters).tolist())
         if not len(around.vehicles):
             return
@@ -270,19 +275,16 @@ class FirstContacts:
         """Note side, place and speed of the first contact of each pair."""
         copies, body, obstacle = pairs
         touches = find_touches(body, obstacle)
-        lateral_speed = np.broadcast_to(scene.lateral_speed, scene.lateral.shape)[
-            copies
-        ]
-        lateral = scene.lateral[copies] - lateral_speed * touches.age
+        lateral_speeds = np.broadcast_to(scene.lateral_speed, scene.lateral.shape)
+        lateral = scene.lateral[copies] - lateral_speeds[copies] * touches.age
         is_at_end = (touches.side == FRONT) | (touches.side == REAR)
-        share = np.where(
-            is_at_end, lateral / body.width + 0.5, touches.behind_front / body.length
-        )
+        share_across = lateral / body.width + 0.5
+        share_along = touches.behind_front / body.length
+        share = np.where(is_at_end, share_across, share_along)
+        cosine = (body.along * obstacle.along).sum(axis=1)
         self.first.side[copies] = touches.side
-        self.first.speed[copies] = obstacle.speed * np.round(
-            (body.along * obstacle.along).sum(axis=1), COSINE_DECIMALS
-        )
-        self.first.place[copies] = 100 * np.minimum(np.maximum(share, 0.0), 1.0)
+        self.first.speed[copies] = obstacle.speed * np.round(cosine, COSINE_DECIMALS)
+        self.first.place[copies] = 100 * clip_to_share(share)
 
 
 def distance_between(
@@ -301,26 +303,25 @@ def distance_between(
     x = middle - body.x
     lengthwise = x * body.along - body.y * body.left
     across = -x * body.left - body.y * body.along
-    for end, side in (
-        (length / 2, width / 2),
-        (length / 2, -width / 2),
-        (-length / 2, width / 2),
-        (-length / 2, -width / 2),
-    ):
-        dx = end * body.along + side * body.left
-        dy = side * body.along - end * body.left
-        squares.append(
-            _square_outside(lengthwise + dx, across + dy, body.length, body.width)
-        )
+    for end, side in CORNERS:
+        dx = end * length / 2
+        dy = side * width / 2
+        x_in_body = lengthwise + (dx * body.along + dy * body.left)
+        y_in_body = across + (dy * body.along - dx * body.left)
+        squares.append(_square_outside(x_in_body, y_in_body, body.length, body.width))
     cosine = np.abs(body.along)
     sine = np.abs(body.left)
     # Two rectangles that cross like an X overlap, but neither has a corner in the other: the
     # extents along all four axes decide (separating axis test).
+    extent_x = length + body.length * cosine + body.width * sine
+    extent_y = width + body.length * sine + body.width * cosine
+    extent_along = body.length + length * cosine + width * sine
+    extent_across = body.width + length * sine + width * cosine
     overlaps = (
-        (np.abs(x) < (length + body.length * cosine + body.width * sine) / 2)
-        & (np.abs(body.y) < (width + body.length * sine + body.width * cosine) / 2)
-        & (np.abs(lengthwise) < (body.length + length * cosine + width * sine) / 2)
-        & (np.abs(across) < (body.width + length * sine + width * cosine) / 2)
+        (np.abs(x) < extent_x / 2)
+        & (np.abs(body.y) < extent_y / 2)
+        & (np.abs(lengthwise) < extent_along / 2)
+        & (np.abs(across) < extent_across / 2)
     )
     return np.where(overlaps, 0.0, np.sqrt(reduce(np.minimum, squares)))
 
@@ -364,19 +365,16 @@ def find_touches(body: Body, obstacle: Body) -> Touches:
     is_closing = closing_speed > 0
 
     # In a direction without approach the bodies were never apart: the overlap is infinitely old.
-    ages = np.where(
-        is_closing,
-        np.maximum(overlap, 0.0) / np.where(is_closing, closing_speed, 1.0),
-        np.inf,
-    )
+    ages = np.full_like(overlap, np.inf)
+    np.divide(np.maximum(overlap, 0.0), closing_speed, out=ages, where=is_closing)
     approaches = is_closing.any(axis=0)
     is_lengthwise = np.where(approaches, ages[0] < ages[1], overlap[0] < overlap[1])
     age = np.where(approaches, np.min(ages, axis=0), 0.0)
 
     is_ahead, is_left = distance > 0
-    side = np.where(
-        is_lengthwise, np.where(is_ahead, FRONT, REAR), np.where(is_left, LEFT, RIGHT)
-    )
+    end = np.where(is_ahead, FRONT, REAR)
+    flank = np.where(is_left, LEFT, RIGHT)
+    side = np.where(is_lengthwise, end, flank)
     return Touches(side, age, body.length / 2 - (distance[0] + age * speed[0]))
 
 

@@ -69,26 +69,30 @@ def drive(
     vehicle = system.vehicle
     step = world.step_length
     n = len(settings)
-    size = n // len(points)
+    group_size = n // len(points)
 
     prepared, ads, motion = enter(system, settings, world)
     state = vehicle.at_start(prepared, motion.speeds)
-    length, width = float(world.vehicle_length(VUT)), float(world.vehicle_width)
-    memory = ads.start(n, system.nominal._replace(length=length, width=width), step)
-    perception = Perception([point.weather for point in points], step, size)
+    length = float(world.vehicle_length(VUT))
+    nominal = system.nominal._replace(length=length, width=float(world.vehicle_width))
+    memory = ads.start(n, nominal, step)
+    weathers = [point.weather for point in points]
+    perception = Perception(weathers, step, group_size)
     robot = DrivingRobot(points, vehicle, prepared, state, step)
     is_tested = np.zeros(n, bool)
     may_go_on = np.zeros(n, bool)
     last_sample = np.zeros(n, int)
     for k, point in enumerate(points):
-        group = slice(k * size, (k + 1) * size)
+        group = slice(k * group_size, (k + 1) * group_size)
         is_tested[group] = point.scenario.is_hit_in_front
         may_go_on[group] = point.scenario.goes_on
         last_sample[group] = np.round(last_sample_of(point, step))
     contacts = FirstContacts(n, is_tested)
     outcomes = _Outcomes(n)
-    most_overtime = round(may_go_on.any() * OVERTIME / step)
-    log = _Log(world, int(last_sample.max()) + 1 + most_overtime)
+    n_samples = int(last_sample.max()) + 1
+    if may_go_on.any():
+        n_samples += round(OVERTIME / step)
+    log = _Log(world, n_samples)
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.capacity):
             time = sample * step
@@ -96,9 +100,8 @@ def drive(
             scene = observer.observe(motion)
             # An ADS that sees nobody would drive on: a run ends when the vehicle reaches the body.
             if system.sees_nobody:
-                scene = scene._replace(
-                    visible=np.array(False), over=scene.over | (scene.gap <= 0)
-                )
+                over = scene.over | (scene.gap <= 0)
+                scene = scene._replace(visible=np.array(False), over=over)
             collisions = contacts.count(world, motion.hits, scene)
             # SUMO misses contacts in some places, such as between lanes. Contacts with bodies on
             # tracks follow from their geometry, and need no check.
@@ -109,7 +112,7 @@ def drive(
             if isinstance(observer, Traffic):
                 ends = may_go_on & outcomes.is_open & (sample == last_sample)
                 if ends.any():
-                    may_go_on &= ~_go_on(observer, motion, ends, last_sample)
+                    may_go_on &= ~_extend_runs(observer, motion, ends, last_sample)
             is_last = sample >= last_sample
             active = outcomes.note_sample(speed, scene.over, collisions, is_last)
 
@@ -121,14 +124,16 @@ def drive(
             command, memory = ads.drive(observation, memory)
             outcomes.note_warnings(ads.warns(memory), speed, scene)
             command, state = robot.drive(command, state, outcomes.is_open)
-            values = {
-                "speed": speed,
-                "gear": state.gear,
-                "active": active,
-                "pedal": state.brake,
-            }
-            log.write(motion.fronts, scene, command, **values)
-            if not np.count_nonzero(outcomes.is_open):
+            log.write(
+                motion.fronts,
+                scene,
+                command,
+                speed=speed,
+                gear=state.gear,
+                active=active,
+                pedal=state.brake,
+            )
+            if not outcomes.is_open.any():
                 break
 
             np.copyto(outcomes.is_checked, outcomes.is_open)
@@ -146,15 +151,15 @@ def drive(
         test_speed_error=robot.error,
         warning_ttc=outcomes.warning_ttc,
         centre_to_centre=points[0].scenario.centre_to_centre,
-        allowed_impact_speed=np.asarray(per_vehicle(allowed_impacts, size)),
+        allowed_impact_speed=np.asarray(per_vehicle(allowed_impacts, group_size)),
     )
 
 
-def _go_on(
+def _extend_runs(
     traffic: Traffic, motion: VehicleStates, ends: BoolArray, last_sample: IntArray
 ) -> BoolArray:
-    """Extend runs that end at this sample (`ends`) if their vehicles close in on a body: their
-    `last_sample` grows by `OVERTIME`. Returns whether each run is extended, shape (N,).
+    """Extend those of the runs that end at this sample (`ends`) whose vehicles close in on a body:
+    `last_sample` grows by `OVERTIME`. Returns the extended runs, shape (N,).
     """
     goes_on = ends & traffic.are_closing(motion)
     last_sample[goes_on] += round(OVERTIME / traffic.step)
@@ -225,15 +230,17 @@ def _roads(points: Sequence[Point], n: int, step: float) -> tuple[Quantity, ...]
     slope and the water. Slope and water are left out if no road has a slope or water.
     """
     size = n // len(points)
-    friction = per_vehicle([point.weather.road_friction for point in points], size)
+    frictions = [point.weather.road_friction for point in points]
     grades = [point.scenario.grade for point in points]
     water = [point.weather.water for point in points]
-    slope = slope_of(np.repeat(grades, size)) if any(grades) else LEVEL
-    if any(water):
-        return friction, step, slope, np.repeat(water, size)
+    roads: tuple[Quantity, ...] = (per_vehicle(frictions, size), step)
     if any(grades):
-        return (friction, step, slope)
-    return (friction, step)
+        roads += (slope_of(np.repeat(grades, size)),)
+    elif any(water):
+        roads += (LEVEL,)
+    if any(water):
+        roads += (np.repeat(water, size),)
+    return roads
 
 
 def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:

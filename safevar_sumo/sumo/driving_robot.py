@@ -8,20 +8,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from safevar_sumo.records import BoolArray, Command
+from safevar_sumo.records import BoolArray, Command, clip_to_share
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.vehicles import Vehicle, VehicleState
 from safevar_sumo.vehicles.base import Prepared, State
 
-MAX_ERROR, MIN_ERROR = 1.0 * KMH, -0.5 * KMH
-"""Tolerance of the test speed until the system brakes [m/s]: +1.0 and -0.5 km/h (Euro NCAP, AEB
-test protocols, "test execution").
-"""
-PROPORTIONAL_GAIN, INTEGRAL_GAIN = 1.0, 1.0
-"""Gains of the robot [pedal per m/s, pedal per m]. With these gains the vehicle `carla` is within
-0.1 km/h of its test speed 3 s after a pedal error of 0.15.
-"""
+# Tolerances of the test speed until the system brakes [m/s]: +1.0 and -0.5 km/h (Euro NCAP, AEB
+# test protocols, "test execution").
+MAX_ERROR = 1.0 * KMH
+MIN_ERROR = -0.5 * KMH
+# With these gains `carla` is within 0.1 km/h 3 s after a pedal error of 0.15.
+PROPORTIONAL_GAIN = 1.0  # pedal per m/s
+INTEGRAL_GAIN = 1.0  # pedal per m
 ACTION_THRESHOLD = 0.03
 """Change of the pedal towards braking by which the system acts [-]: it changes the acceleration by
 about 0.3 m/s^2, at which Euro NCAP sees the onset of an AEB.
@@ -129,12 +128,12 @@ class DrivingRobot:
         robot_command = Command(
             np.where(
                 self._is_driving,
-                np.minimum(np.maximum(pedal, 0.0), 1.0),
+                clip_to_share(pedal),
                 command.throttle,
             ),
             np.where(
                 self._is_driving,
-                np.minimum(np.maximum(-pedal, 0.0), 1.0),
+                clip_to_share(-pedal),
                 command.brake,
             ),
         )

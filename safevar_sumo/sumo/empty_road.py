@@ -124,7 +124,8 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     if (is_slower & (brake > MIN_PEDAL)).any():
         return EmptyRoadFault(Reason.BRAKES, "brakes without an obstacle")
 
-    last_gap, last_speed = gap[-1], speed[-1]
+    last_gap = gap[-1]
+    last_speed = speed[-1]
     approach = last_speed - obstacle_speed[-1]
     is_alone = not np.isfinite(last_gap) or approach < SLOW_APPROACH
     keeps_speed = test_speed is not None and last_speed > test_speed - MIN_SLOWDOWN

@@ -52,13 +52,10 @@ OWN_OPTIONS = {
 decides how far a vehicle moves at its speeds and what a collision is, and SUMO never removes or
 teleports an actor that collides or waits.
 """
-OUTPUT, NO_FILE = (
-    re.compile(r"(.+[.-])?output|netstate-dump|((error|message)-)?log"),
-    "NUL",
-)
-"""SUMO's options that name a file to write: such files would grow beside the user's network. And
-the name with which SUMO writes no file.
-"""
+OUTPUT = re.compile(r"(.+[.-])?output|netstate-dump|((error|message)-)?log")
+"""SUMO's options that name a file to write, which would grow beside the user's network."""
+NO_FILE = "NUL"
+"""SUMO's name of no file."""
 STEP_LENGTH = 0.05
 """Time step if neither the study nor its network's file states one [s]. SUMO's default, 1 s, is too
 long for braking.
@@ -216,4 +213,7 @@ def step_of(stated: Mapping[str, str]) -> float:
 
 def as_arguments(options: Mapping[str, str]) -> list[str]:
     """Options as arguments of SUMO."""
-    return [text for name, value in options.items() for text in (f"--{name}", value)]
+    arguments = []
+    for name, value in options.items():
+        arguments += [f"--{name}", value]
+    return arguments

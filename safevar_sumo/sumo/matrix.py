@@ -91,11 +91,11 @@ def point_record(result: PointResult) -> JsonObject:
 
 
 def vehicle_remarks(system: System) -> list[str]:
-    """Remarks for the user on a vehicle that is tested at higher speeds than its model was fitted
-    to.
+    """Remarks for the user on a vehicle that is tested at higher speeds than the speeds to which
+    its model was fitted.
     """
     fitted_speed = system.vehicle.FITTED_UP_TO
-    test_speed = max(point.scenario.test_speed or 0.0 for point in system.points)
+    test_speed = max(scenario.test_speed or 0.0 for scenario in system.scenarios)
     if test_speed <= fitted_speed:
         return []
 
@@ -172,7 +172,8 @@ def _beside(
         return np.concatenate([settings, distinct]), np.arange(n), n + np.ravel(number)
     # In recorded scenes a setting and its original are neighbours, because a pair shares a scene.
     vehicles = np.stack([settings, originals], axis=1).reshape(-1, settings.shape[1])
-    return vehicles, np.arange(0, 2 * n, 2), np.arange(1, 2 * n, 2)
+    rows = np.arange(0, 2 * n, 2)
+    return vehicles, rows, rows + 1
 
 
 def evaluate_matrix(system: System, settings: FloatArray) -> Evaluations:
@@ -212,7 +213,7 @@ def largest_batch(system: System) -> int:
     """Largest number of vehicles in one batch. Long runs, and an ADS that is an FMU for each
     vehicle, make it smaller.
     """
-    longest = max(float(np.max(point.scenario.duration)) for point in system.points)
+    longest = max(float(np.max(scenario.duration)) for scenario in system.scenarios)
     in_memory = round(MAX_VEHICLES * min(LONG_RUN / longest, 1.0))
     return min(in_memory, system.ads.max_vehicles or in_memory)
 
@@ -225,8 +226,7 @@ def batch_size(system: System) -> int:
         return 1
     if not reason_against_scenes(system):
         return largest_batch(system)
-    networks = {point.scenario.network for point in system.points}
-    lanes = max(map(number_of_lanes, map(open_network, networks)))
+    lanes = max(map(number_of_lanes, map(open_network, system.networks)))
     return min(max(MAX_LANES // max(lanes, 1), 1), MAX_COPIES, largest_batch(system))
 
 
@@ -269,18 +269,16 @@ def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResul
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
         if not is_met.all():
             evaluations = evaluations.where(is_met, Outcome.INFEASIBLE)
-        rows = np.arange(n)
         for k, point in enumerate(points):
-            start = k * n
-            at_point = evaluations.take(start + rows)
-            yield PointResult(point, at_point, runs.of(slice(start, start + n)))
+            rows = slice(k * n, (k + 1) * n)
+            yield PointResult(point, evaluations.take(rows), runs.of(rows))
 
 
 def worst_point(system: System, setting: FloatArray) -> Point:
     """The worst point of a setting, shape (n,); see `worst_points`."""
     if not system.matrix:
         return system.points[0]
-    at_points = evaluate_points(system, setting[None])
+    at_points = evaluate_points(system, setting[np.newaxis])
     return system.points[int(worst_points(system, at_points)[0])]
 
 

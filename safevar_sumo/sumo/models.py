@@ -143,7 +143,8 @@ def _points_of(
     """
     model = test.model or study.scenario.model
     shared = study.scenario.parameters if model == study.scenario.model else {}
-    lists, ranges = study.lists_of(test), study.ranges_of(test)
+    lists = study.lists_of(test)
+    ranges = study.ranges_of(test)
     constraints = tuple(
         constraint
         for constraint in of_tests

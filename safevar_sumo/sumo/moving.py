@@ -27,10 +27,10 @@ NOBODY = Track("", SCREEN, 0.0, 0.0, 1e6, 1e6, 1.0, 0.0, 0.0)
 this scenario lacks.
 """
 Sampled = TypeVar("Sampled", FloatArray, BoolArray)
-BESIDE, IN_PATH = 1, 2
-"""Levels of a body that moves beside the vehicle's path, and of a body that is ever in the path.
-Scenery, which stands beside the path, has the level 0.
-"""
+BESIDE = 1
+"""Level of a body that moves beside the vehicle's path; the level of scenery is 0."""
+IN_PATH = 2
+"""Level of a body that is ever in the vehicle's path."""
 
 
 class Moving(NamedTuple):
@@ -94,13 +94,11 @@ class Moving(NamedTuple):
 
         # The rear corner of a rotated body may be beside the path: the vehicle then touches the
         # body's first point within the path.
-        rear = track.x - half_length
-        edge = rear
+        edge = track.x - half_length
         is_lengthwise = _rotated(track) & (cosine > sine)
         if is_lengthwise.any():
-            edge = np.where(
-                is_lengthwise, first_in_strip(track, vehicle_width / 2), rear
-            )
+            first_in_path = first_in_strip(track, vehicle_width / 2)
+            edge = np.where(is_lengthwise, first_in_path, edge)
 
         vx = slim(track.speed * track.along)
         vy = slim(np.diff(track.y, axis=0, prepend=track.y[:1]) / step)
@@ -114,7 +112,9 @@ class Moving(NamedTuple):
         # With this sign `lateral` rises while a body crosses, from whichever side it comes.
         sign = np.where((vy > 0).any(axis=0), 1.0, -1.0)
         moves = (is_there & (track.speed > 0)).any(axis=0)
-        level = np.where(is_in_path.any(axis=0), IN_PATH, np.where(moves, BESIDE, 0))
+        level = np.where(is_in_path.any(axis=0), IN_PATH, BESIDE * moves)
+        if track.kind == SCREEN:
+            level = np.full_like(level, -1)
         return cls(
             track=track,
             edge=edge,
@@ -131,7 +131,7 @@ class Moving(NamedTuple):
             is_in_path=is_in_path,
             is_cleared=slim((has_entered & ~will_touch) | is_gone),
             is_avoidable=slim(has_entered & is_in_path[-1]),
-            level=np.full_like(level, -1) if track.kind == SCREEN else level,
+            level=level,
             is_rotated=bool(_rotated(track).any()),
             faces_along=bool((cosine == 1).all()),
         )
@@ -170,11 +170,13 @@ def slim(column: Sampled) -> Sampled:
     return column
 
 
-def row(column: Sampled, sample: int, group: IntArray | None) -> Sampled:
+def at_sample(column: Sampled, sample: int, group: IntArray | None) -> Sampled:
     """The values of a column at a sample: one for all vehicles, or one for each vehicle. `group`,
     shape (N,), has the number of each vehicle's encounter; None if columns need no index.
     """
-    values: Sampled = column[sample if len(column) > 1 else 0]
+    if len(column) == 1:
+        sample = 0
+    values: Sampled = column[sample]
     if group is not None and len(values) > 1:
         return values[group]
     return values
@@ -196,7 +198,7 @@ def tracks_of(
         If a body cannot move as its track says, or touches the vehicle at the start.
     """
     tracks_of_scenarios = [
-        point.scenario.tracks_begun(times, np.asarray(point.phase) * step)
+        point.scenario.tracks_begun(times, point.phase * step)
         for point in points
         if isinstance(point.scenario, TrackScenario)
     ]

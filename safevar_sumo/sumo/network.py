@@ -36,12 +36,11 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo import copies
 from safevar_sumo.sumo.copies import ensure_cached, parse_xml, write_demand, write_roads
 
-TRAFFIC_FILE, OPTIONS_FILE, NETWORK_FILE = (
-    "traffic.rou.xml",
-    "scenario.sumocfg",
-    "network.net.xml",
-)
-NETWORK_ENDING, RECIPE_ENDING = ".net.xml", ".netccfg"
+TRAFFIC_FILE = "traffic.rou.xml"
+OPTIONS_FILE = "scenario.sumocfg"
+NETWORK_FILE = "network.net.xml"
+NETWORK_ENDING = ".net.xml"
+RECIPE_ENDING = ".netccfg"
 LEGAL_FOLDERS = (
     f"a folder with a recipe of netconvert (*{RECIPE_ENDING}) or a *{NETWORK_ENDING}, "
     f"beside {TRAFFIC_FILE} and {OPTIONS_FILE}"
@@ -54,8 +53,10 @@ SOURCE_OPTION = re.compile(
 """Options that name files to read: all such options of netconvert, and those of SUMO except the
 network and its traffic.
 """
-DIGEST_LENGTH, MESSAGE_LENGTH = 16, 500
-"""Numbers of characters to which a digest and a program's message are cut."""
+DIGEST_LENGTH = 16
+"""Number of characters of a digest that are used."""
+MESSAGE_LENGTH = 500
+"""Number of characters of a program's message that are used."""
 Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]
 """The same as `XmlChanges`, as tuples, which can be hashed: paths of elements, and their new
 attributes, or None for an element that is removed.
@@ -104,9 +105,11 @@ def open_network(network: str) -> NetworkFiles:
             f"there is no network {network!r}{did_you_mean(network, names)}",
             f"one of {', '.join(names)}, or {LEGAL_FOLDERS}",
         )
-    folder, roads_file = path.parent, path.name
+    folder = path.parent
+    roads_file = path.name
     if path.is_dir():
-        folder, roads_file = path, _roads_in(path)
+        folder = path
+        roads_file = _roads_in(path)
 
     names = [roads_file, *_sources_of(folder / roads_file), TRAFFIC_FILE, OPTIONS_FILE]
     if (folder / OPTIONS_FILE).is_file():

@@ -38,8 +38,10 @@ from safevar_sumo.sumo.network import (
     run_program,
 )
 
-SHORTEST_STEP, LONGEST_STEP = 0.001, 1.0
-"""SUMO's shortest time step, and the longest step with which a vehicle can react in time [s]."""
+SHORTEST_STEP = 0.001
+"""SUMO's shortest time step [s]."""
+LONGEST_STEP = 1.0
+"""Longest time step in which a vehicle can still react in time [s]."""
 MAX_SLOPE = 0.005
 """Largest difference in height over the length of a lane that counts as level [-]."""
 N_STEPS = 600
@@ -91,11 +93,10 @@ NO_EFFECT = {"sigma": "0", "speedDev": "0", "speedFactor": "1"}
 """Values that attributes of SUMO's own driver would have anyway: no remark mentions them."""
 EXACT_MODELS = ("Krauss", "KraussOrig1", "IDM", "ACC", "CACC")
 """Car-following models with which SUMO's driver under a controller drives exactly as in SUMO."""
-SIGMA_MODELS, DETERMINISTIC_MODELS = (
-    ("Krauss", "KraussOrig1", "KraussPS"),
-    ("IDM", "IDMM", "ACC", "CACC"),
-)
-"""Car-following models that are random unless sigma is 0, and models that are never random."""
+SIGMA_MODELS = ("Krauss", "KraussOrig1", "KraussPS")
+"""Car-following models that are random unless sigma is 0."""
+DETERMINISTIC_MODELS = ("IDM", "IDMM", "ACC", "CACC")
+"""Car-following models that are never random."""
 DEFAULT_OPTIONS = {"step-method.ballistic": "false"}
 """SUMO's default of an option that every study overrules, and that changes how all actors move."""
 SWITCHED_OFF = "-1"

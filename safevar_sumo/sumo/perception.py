@@ -51,10 +51,8 @@ class Perception:
     """
 
     def __init__(self, weathers: Sequence[Weather], step: float, size: int) -> None:
-        self._visibility = per_vehicle(
-            [weather.visibility for weather in weathers], size
-        )
-
+        visibilities = [weather.visibility for weather in weathers]
+        self._visibility = per_vehicle(visibilities, size)
         delays = per_vehicle([weather.recognition_delay for weather in weathers], size)
         self._lines: list[tuple[IntArray | slice, DelayLine]] = []
         # With equal delays, one delay line without indices for all vehicles is the fastest way.

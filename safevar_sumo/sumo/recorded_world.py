@@ -61,31 +61,27 @@ class RecordedWorld:
         self._size = size
         self._scene = recording
         self._is_person = np.array([film.is_person for film in films], bool)
-        self._sizes = np.array([(film.length, film.width) for film in films]).reshape(
-            -1, 2
-        )
+        sizes = np.array([(film.length, film.width) for film in films])
+        self._sizes = sizes.reshape(-1, 2)
         self._motion = nans((n_samples, n_scenes, len(films), 5))
         for actor, film in enumerate(films):
-            self._motion[: len(film.motion), :, actor] = film.motion.reshape(
-                len(film.motion), -1, 5
-            )
+            length = len(film.motion)
+            self._motion[:length, :, actor] = film.motion.reshape(length, -1, 5)
 
-        self._middles = self._motion[..., :2] - self._motion[..., 2:4] * (
-            self._sizes[:, :1] / 2
-        )
-        self._reach = (
-            np.add.outer((recording.length, recording.width), np.hypot(*self._sizes.T))
-            / 2
-        )
+        fronts = self._motion[..., :2]
+        directions = self._motion[..., 2:4]
+        self._middles = fronts - directions * (self._sizes[:, :1] / 2)
+        diagonals = np.hypot(*self._sizes.T)
+        vehicle_size = recording.length, recording.width
+        self._reach = np.add.outer(vehicle_size, diagonals) / 2
         """Largest distances between the middles of a vehicle and an actor that touch, along and
         across the way, shape (2, A) [m].
         """
-        begins = (self._middles @ recording.along - self._reach[0]).reshape(
-            n_samples, -1
+        begins = self._middles @ recording.along - self._reach[0]
+        first_begins = np.fmin.reduce(
+            begins.reshape(n_samples, -1), axis=1, initial=np.inf
         )
-        self._begins = (
-            np.fmin.reduce(begins, axis=1, initial=np.inf) + recording.length / 2
-        )
+        self._begins = first_begins + recording.length / 2
         """Position along the way that a front must have reached to touch somebody, at every sample
         [m]; infinite without actors.
         """
@@ -126,25 +122,22 @@ class RecordedWorld:
         self.sample += 1
 
         # A fast vehicle may pass several lanes in a step.
-        while np.count_nonzero(is_beyond := self._lane_position > self._lanes.end):
-            if (self._lane_number[is_beyond] == len(self._scene.way.end) - 1).any():
+        last_lane = len(self._scene.way.end) - 1
+        while np.count_nonzero(is_past := self._lane_position > self._lanes.end):
+            if (self._lane_number[is_past] == last_lane).any():
                 raise SimulationError(
                     "SUMO failed: a vehicle under test drives beyond the end of its route"
                 )
-            self._lane_position = np.where(
-                is_beyond, self._lane_position - self._lanes.end, self._lane_position
-            )
-            self._lane_number = self._lane_number + is_beyond
+            rest_of_way = self._lane_position - self._lanes.end
+            self._lane_position = np.where(is_past, rest_of_way, self._lane_position)
+            self._lane_number = self._lane_number + is_past
             self._lanes = self._scene.way.at(self._lane_number)
         self._now = self._moment(speeds)
         return self._moved(is_open)
 
     def _moment(self, speeds: FloatArray) -> _Moment:
-        return _Moment(
-            self._lanes.positions(self._lane_position),
-            speeds,
-            self._lanes.meets_persons != 0,
-        )
+        fronts = self._lanes.positions(self._lane_position)
+        return _Moment(fronts, speeds, self._lanes.meets_persons != 0)
 
     def _moved(self, is_open: BoolArray) -> VehicleStates:
         return VehicleStates(self._now.fronts, self._now.speeds, self._hits(is_open))
@@ -207,48 +200,40 @@ class RecordedWorld:
         self._struck = {}
         if (self._now.fronts @ self._scene.along).max() < self._at_sample(self._begins):
             return {}
-        vehicles, actors = np.nonzero(self._is_near() & is_open[:, None])
+        vehicles, actors = np.nonzero(self._is_near() & is_open[:, np.newaxis])
         if not len(vehicles):
             return {}
 
         # `early` is before vehicles move, `late` is after; other vehicles are hit only late.
-        persons = self._is_person[actors]
-        early = self._overlaps(
-            self._before,
-            vehicles,
-            actors,
-            persons & self._before.meets_persons[vehicles],
-        )
-        late = self._overlaps(
-            self._now, vehicles, actors, ~persons | self._now.meets_persons[vehicles]
-        )
+        is_person = self._is_person[actors]
+        is_checked = is_person & self._before.meets_persons[vehicles]
+        early = self._overlaps(self._before, vehicles, actors, is_checked)
+        is_checked = ~is_person | self._now.meets_persons[vehicles]
+        late = self._overlaps(self._now, vehicles, actors, is_checked)
 
         pairs = np.flatnonzero(early | late)
-        struck, rows = np.unique(vehicles[pairs], return_index=True)
+        colliding, rows = np.unique(vehicles[pairs], return_index=True)
         pairs = pairs[rows]
-        speeds = np.where(
-            early[pairs], self._before.speeds[struck], self._now.speeds[struck]
-        )
-        self._struck = dict(zip(struck.tolist(), actors[pairs].tolist(), strict=True))
-        return dict(zip(struck.tolist(), speeds.tolist(), strict=True))
+        early_speeds = self._before.speeds[colliding]
+        speeds = np.where(early[pairs], early_speeds, self._now.speeds[colliding])
+        numbers = colliding.tolist()
+        self._struck = dict(zip(numbers, actors[pairs].tolist(), strict=True))
+        return dict(zip(numbers, speeds.tolist(), strict=True))
 
     def _is_near(self) -> BoolArray:
         """Whether each vehicle may have touched each of the A actors since the last step, shape
         (N, A).
         """
         middles = self._now.fronts - self._scene.along * (self._scene.length / 2)
-        offsets = (
-            middles.reshape(-1, self._size, 1, 2)
-            - self._at_sample(self._middles)[:, None]
-        )
+        middles_of_scenes = middles.reshape(-1, self._size, 1, 2)
+        offsets = middles_of_scenes - self._at_sample(self._middles)[:, np.newaxis]
         dx, dy = offsets.reshape(self.n, -1, 2).transpose(2, 0, 1)
         east, north = self._scene.along
         along = np.abs(dx * east + dy * north)
         across = np.abs(dy * east - dx * north)
         covered = np.maximum(self._before.speeds, self._now.speeds) * self.step_length
-        return np.asarray(
-            (across < self._reach[1]) & (along < self._reach[0] + covered[:, None])
-        )
+        is_near_along = along < self._reach[0] + covered[:, np.newaxis]
+        return np.asarray(is_near_along & (across < self._reach[1]))
 
     def _overlaps(
         self,
@@ -262,36 +247,29 @@ class RecordedWorld:
         millimetre (SUMO, `MSLane::detectCollisionBetween`).
         """
         overlaps = np.zeros(len(vehicles), bool)
-        (pairs,) = np.nonzero(is_checked)
+        pairs = np.flatnonzero(is_checked)
         if len(pairs):
+            bodies = self._vehicle_body(moment, vehicles[pairs])
             obstacles = self._actors(vehicles[pairs], actors[pairs])
             is_parallel = np.abs(obstacles.along @ self._scene.along) >= PARALLEL_COSINE
-            tolerance = np.where(
-                is_parallel & ~self._is_person[actors[pairs]], NUMERICAL_EPS, 0.0
-            )
-            overlaps[pairs] = (
-                find_overlaps(self._vehicle_body(moment, vehicles[pairs]), obstacles)
-                > tolerance
-            )
+            has_tolerance = is_parallel & ~self._is_person[actors[pairs]]
+            tolerance = NUMERICAL_EPS * has_tolerance
+            overlaps[pairs] = find_overlaps(bodies, obstacles) > tolerance
         return overlaps
 
     def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
-        numbers = np.asarray(vehicles)
         struck = np.array([self._struck[vehicle] for vehicle in vehicles])
-        return BodyPairs(
-            numbers,
-            self._vehicle_body(self._now, numbers),
-            self._actors(numbers, struck),
-        )
+        return self._pairs(np.asarray(vehicles), struck)
 
     def bodies_around(self, vehicles: Sequence[int]) -> BodyPairs:
-        numbers = np.repeat(vehicles, len(self._sizes))
-        actors = np.tile(np.arange(len(self._sizes)), len(vehicles))
-        return BodyPairs(
-            numbers,
-            self._vehicle_body(self._now, numbers),
-            self._actors(numbers, actors),
-        )
+        n_actors = len(self._sizes)
+        actors = np.tile(np.arange(n_actors), len(vehicles))
+        return self._pairs(np.repeat(vehicles, n_actors), actors)
+
+    def _pairs(self, vehicles: IntArray, actors: IntArray) -> BodyPairs:
+        """Vehicles, shape (M,), each with an actor at this sample."""
+        body = self._vehicle_body(self._now, vehicles)
+        return BodyPairs(vehicles, body, self._actors(vehicles, actors))
 
     def _at_sample(self, motion: FloatArray) -> FloatArray:
         """The row of `motion` at the current sample; without actors there is only one row."""
@@ -301,8 +279,9 @@ class RecordedWorld:
     def _actors(self, vehicles: IntArray, actors: IntArray) -> Body:
         """The bodies of actors at the current sample, each in the scene of its vehicle."""
         motion = self._at_sample(self._motion)[vehicles // self._size, actors]
+        front, along, speed = np.split(motion, (2, 4), axis=1)
         length, width = self._sizes[actors].T
-        return Body.behind(motion[:, :2], motion[:, 2:4], length, width, motion[:, 4])
+        return Body.behind(front, along, length, width, speed[:, 0])
 
     def _vehicle_body(self, moment: _Moment, vehicles: IntArray) -> Body:
         scene = self._scene

@@ -46,10 +46,10 @@ STRAIGHTNESS = 1e-6
 """Largest difference between lanes that form a straight line: between components of their
 directions [-], or between the end of a lane and the start of the next lane [m].
 """
-NEXT_LANE, INTERNAL_LANE = 0, 4
-"""Indices in a link that `getLinks` returns: of the lane to which the link leads, and of the lane
-on the junction between both lanes ("" if there is no such lane).
-"""
+NEXT_LANE = 0
+"""Position in a link of `getLinks` of the lane to which the link leads."""
+INTERNAL_LANE = 4
+"""Position in a link of `getLinks` of the lane on the junction, which is "" without such a lane."""
 NOT_STRAIGHT = (
     "the vehicle under test does not depart in the middle of a lane and"
     " drive straight on"

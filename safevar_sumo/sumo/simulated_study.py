@@ -88,7 +88,8 @@ def check_matrix(scenario: Scenario, matrix: Sequence[Point]) -> None:
         About the first such test.
     """
     for point in matrix:
-        kind, study_kind = point.scenario.mover.kind, scenario.mover.kind
+        kind = point.scenario.mover.kind
+        study_kind = scenario.mover.kind
         if kind != study_kind:
             raise InputError(
                 "",

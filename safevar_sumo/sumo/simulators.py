@@ -80,10 +80,8 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
     """
     (point,) = system.points
     vehicles, encounters = system.split(settings)
-    names, searched = (
-        system.characteristics.vehicle.names,
-        system.characteristics.scenario.names,
-    )
+    names = system.characteristics.vehicle.names
+    searched = system.characteristics.scenario.names
     results = []
     for vehicle, values, row in zip(
         vehicles.tolist(), encounters.tolist(), settings, strict=True
@@ -278,7 +276,8 @@ def _runs_of(
     trace.
     """
     # Metrics of a result with a trace follow from the trace; other results state their metrics.
-    traces, rigs = list[StatedRun](), list[StatedRun]()
+    traces: list[StatedRun] = []
+    rigs: list[StatedRun] = []
     for result in results:
         has_trace = TIME in result
         traces.append(result if has_trace else {})
@@ -298,9 +297,9 @@ def _runs_of(
                 values[:, row] = trace[name][np.minimum(samples, lengths[row] - 1)]
         return values
 
-    def number(name: str, of: Sequence[StatedRun] = results) -> FloatArray:
-        """The number that each result states under a name, shape (N,); NaN without it."""
-        return np.array([result.get(name, np.nan) for result in of], float)
+    def number(name: str, records: Sequence[StatedRun] = results) -> FloatArray:
+        """The number that each record states under a name, shape (N,); NaN without it."""
+        return np.array([record.get(name, np.nan) for record in records], float)
 
     def is_missing(name: str) -> BoolArray:
         return np.array([name not in trace for trace in traces])

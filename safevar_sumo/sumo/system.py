@@ -16,7 +16,14 @@ from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
 from safevar_sumo.records import FloatArray, Nominal
-from safevar_sumo.scenarios import VUT, Point, TrackScenario, WorldScenario, weather_of
+from safevar_sumo.scenarios import (
+    VUT,
+    Point,
+    Scenario,
+    TrackScenario,
+    WorldScenario,
+    weather_of,
+)
 from safevar_sumo.scenarios.base import Mover, Part
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.scenarios.point import Points
@@ -96,9 +103,19 @@ class System:
         return tuple(point for point in self.points if point.name)
 
     @property
+    def scenarios(self) -> list[Scenario]:
+        """The scenario of each point."""
+        return [point.scenario for point in self.points]
+
+    @property
+    def networks(self) -> list[str]:
+        """The different networks of the points, in their order."""
+        return list(dict.fromkeys(scenario.network for scenario in self.scenarios))
+
+    @property
     def has_tracks(self) -> bool:
         """Whether vehicles drive among bodies on tracks, at all points."""
-        return all(isinstance(point.scenario, TrackScenario) for point in self.points)
+        return all(isinstance(scenario, TrackScenario) for scenario in self.scenarios)
 
     @property
     def mover(self) -> Mover:
@@ -123,7 +140,7 @@ class System:
     @property
     def meets_nobody(self) -> bool:
         """Whether nobody else is on the road at any point, so that nothing can collide."""
-        return all(point.scenario.brakes_fully for point in self.points)
+        return all(scenario.brakes_fully for scenario in self.scenarios)
 
     @property
     def step(self) -> float:

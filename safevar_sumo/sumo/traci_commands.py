@@ -174,12 +174,10 @@ class CommandedSpeed:
     over.
     """
 
-    LIMIT_TO_SAFE_SPEED, LIMIT_ACCELERATION, LIMIT_DECELERATION, DEFAULT_MODE = (
-        1,
-        2,
-        4,
-        31,
-    )
+    LIMIT_TO_SAFE_SPEED = 1
+    LIMIT_ACCELERATION = 2
+    LIMIT_DECELERATION = 4
+    DEFAULT_MODE = 31
     BEYOND_LIMIT = 64
 
     def __init__(self, step: float) -> None:

@@ -31,7 +31,7 @@ from safevar_sumo.sumo.bodies import (
     distance_between,
     find_overlaps,
 )
-from safevar_sumo.sumo.moving import TIE, Moving, Sampled, row, tracks_of
+from safevar_sumo.sumo.moving import TIE, Moving, Sampled, at_sample, tracks_of
 
 APPROACH_SPEED = 0.5
 """Closing speed above which a vehicle approaches a body ahead [m/s]. A vehicle has avoided a body
@@ -51,11 +51,12 @@ BLOCK = 16_384
 """Number of distances that are computed at once: as many as fit into a processor's cache."""
 NOBODY = -1
 """Number that stands for "the vehicle has struck no body"."""
-OFF_THE_WAY, HIDDEN, PASSED, NOT_MET = 1e4, 1e5, 1e6, 1e7
-"""Penalties on the gap of a body that is beside the vehicle's way, hidden, passed, or scenery [m].
-The vehicle sees the body with the least gap and penalty, so that such a body is seen only if there
-is no better one.
-"""
+# Penalties on the gap of a body that is beside the vehicle's way, hidden, passed, or scenery [m].
+# The vehicle sees the body with the least gap and penalty.
+OFF_THE_WAY = 1e4
+HIDDEN = 1e5
+PASSED = 1e6
+NOT_MET = 1e7
 
 
 class Traffic:
@@ -81,7 +82,7 @@ class Traffic:
         n_groups = int(group.max()) + 1
         self.n = len(group)
         self.step = step
-        # None means that columns need no index: all vehicles share a column, or have one each.
+        # None if all vehicles share a column, or each has its own: then no index is needed.
         self.group = group if 1 < n_groups < self.n else None
         self._points = points
         self._n_encounters = n_encounters
@@ -89,8 +90,8 @@ class Traffic:
         self._struck = np.full(self.n, NOBODY)
         self._place(n_samples)
         self._ended = np.zeros((len(self._bodies), n_samples, self.n), dtype=bool)
-        # A body that comes into the path later counts as approached from the moment it does.
-        self._approached = [~self._row(body.is_in_path) for body in self._bodies]
+        # A body outside the path at the start counts as approached when it comes into the path.
+        self._approached = [~self._at_sample(body.is_in_path) for body in self._bodies]
 
     def _place(self, n_samples: int) -> None:
         """Compute the bodies' positions at this number of samples."""
@@ -102,31 +103,34 @@ class Traffic:
         bodies = [Moving.of(track, self.step, self.width) for track in self.tracks]
         levels = np.broadcast_arrays(*(body.level for body in bodies))
         highest_level = np.maximum.reduce(levels)
-        self._counts = [np.atleast_2d(body.level == highest_level) for body in bodies]
-        self._is_avoidable = [bool(body.is_avoidable.any()) for body in bodies]
+        self._is_counted: list[BoolArray] = [
+            np.atleast_2d(level == highest_level) for level in levels
+        ]
+        self._is_avoidable = [body.is_avoidable.any() for body in bodies]
         screens = [body for body in bodies if body.track.kind == SCREEN]
-        self._encountered = []
-        self._hides = list[int]()
-        for k, body in enumerate(bodies):
-            # Bodies that only stand beside the path (level 0) are met only if there is no other.
+        self._encountered: list[int] = []
+        self._hiders: list[int] = []
+        for number, body in enumerate(bodies):
+            # The ADS observes scenery only where no other body is.
             if body.level.max() >= min(highest_level.max(), 1):
-                self._encountered.append(k)
+                self._encountered.append(number)
             if not any(screen.covers(body) for screen in screens):
-                self._hides.append(k)
+                self._hiders.append(number)
         self._bodies = bodies
 
     def are_closing(self, motion: VehicleStates) -> BoolArray:
         """Whether each vehicle would touch a body within `OVERTIME` if its closing speed stayed as
         at the current sample (the sample of the last `hits`); shape (N,).
         """
-        front = motion.fronts[None, :, 0]
-        speed = motion.speeds[None]
+        front = motion.fronts[np.newaxis, :, 0]
+        speed = motion.speeds[np.newaxis]
         samples = slice(self._sample, self._sample + 1)
-        closes = np.zeros(self.n, bool)
-        for k in self._encountered:
-            distance, rate, counts = self._approach(k, samples, front, speed)
-            closes |= (counts & (rate > STEADY) & (distance < OVERTIME * rate))[0]
-        return closes
+        are_closing = np.zeros(self.n, bool)
+        for number in self._encountered:
+            distance, rate, is_counted = self._approach(number, samples, front, speed)
+            will_touch = (rate > STEADY) & (distance < OVERTIME * rate)
+            are_closing |= (is_counted & will_touch)[0]
+        return are_closing
 
     def place_until(self, n_samples: int) -> None:
         """Compute the bodies' positions up to this number of samples, if there are fewer."""
@@ -135,9 +139,9 @@ class Traffic:
             self._place(n_samples)
             self._ended = np.pad(self._ended, ((0, 0), (0, shortage), (0, 0)))
 
-    def _row(self, column: Sampled) -> Sampled:
-        """The values of a column at the current sample; see `row`."""
-        return row(column, self._sample, self.group)
+    def _at_sample(self, column: Sampled) -> Sampled:
+        """A column at this sample."""
+        return at_sample(column, self._sample, self.group)
 
     def observe(self, motion: VehicleStates) -> Scene:
         """The scene at the sample of the last `hits`. Call this method at every sample, after
@@ -147,22 +151,27 @@ class Traffic:
         speed = motion.speeds
         over = ALL_TRUE
         views = []
-        for k in self._encountered:
-            body = self._bodies[k]
-            gap = self._row(body.edge) - front
-            closing = speed - self._row(body.vx)
-            is_behind = self._row(body.far_end) < front - self.length
-            is_passed = is_behind & (speed >= self._row(body.most_vx))
-            ended = np.asarray(is_passed | self._row(body.is_cleared))
-            if self._is_avoidable[k]:
-                self._approached[k] = self._approached[k] | (closing > APPROACH_SPEED)
-                is_never_faster = (gap > 0) & (speed <= self._row(body.least_vx))
-                is_avoidable = self._approached[k] & self._row(body.is_avoidable)
+        for number in self._encountered:
+            body = self._bodies[number]
+            gap = self._at_sample(body.edge) - front
+            closing = speed - self._at_sample(body.vx)
+            is_behind = self._at_sample(body.far_end) < front - self.length
+            is_passed = is_behind & (speed >= self._at_sample(body.most_vx))
+            ended = is_passed | self._at_sample(body.is_cleared)
+            if self._is_avoidable[number]:
+                self._approached[number] = self._approached[number] | (
+                    closing > APPROACH_SPEED
+                )
+                is_never_faster = (gap > 0) & (speed <= self._at_sample(body.least_vx))
+                is_avoidable = self._approached[number] & self._at_sample(
+                    body.is_avoidable
+                )
                 ended = ended | (is_avoidable & is_never_faster)
-            self._ended[k, self._sample] = ended
-            counts: BoolArray = self._row(self._counts[k])
-            over = over & (ended | ~counts)
-            views.append(_View(k, gap, closing, is_passed, self._is_visible(k, front)))
+            self._ended[number, self._sample] = ended
+            over = over & (ended | ~self._at_sample(self._is_counted[number]))
+            views.append(
+                _View(number, gap, closing, is_passed, self._is_visible(number, front))
+            )
 
         if len(views) == 1:
             return self._scene_of(views[0], over)
@@ -172,13 +181,14 @@ class Traffic:
         """Whether a body exists at this sample and no other body is on the line from a vehicle's
         sensors to its middle; shape (N,) or ().
         """
-        track = self._bodies[number].track
-        visible = self._row(self._bodies[number].is_there)
-        for k in self._hides:
-            if k != number:
-                x, y = self._row(track.x), self._row(track.y)
-                blocks = self._blocks(self._bodies[k], front - self.setback, x, y)
-                visible = visible & ~blocks
+        body = self._bodies[number]
+        x = self._at_sample(body.track.x)
+        y = self._at_sample(body.track.y)
+        visible = self._at_sample(body.is_there)
+        for hider_number in self._hiders:
+            if hider_number != number:
+                hider = self._bodies[hider_number]
+                visible = visible & ~self._blocks(hider, front - self.setback, x, y)
         return visible
 
     def _blocks(
@@ -187,45 +197,47 @@ class Traffic:
         """Whether a body is on the line from a vehicle's sensors, in the middle of the lane, to the
         point x, y: the slab test in the body's own axes.
         """
+        track = body.track
         dx = x - sensors
         dy = y
-        rx = sensors - self._row(body.track.x)
-        ry = 0.0 - self._row(body.track.y)
+        start_x = sensors - self._at_sample(track.x)
+        start_y = 0.0 - self._at_sample(track.y)
         if not body.faces_along:
-            cosine = self._row(body.track.along)
-            sine = self._row(body.track.left)
+            cosine = self._at_sample(track.along)
+            sine = self._at_sample(track.left)
             dx, dy = dx * cosine + dy * sine, dy * cosine - dx * sine
-            rx, ry = rx * cosine + ry * sine, ry * cosine - rx * sine
+            start_x, start_y = (
+                start_x * cosine + start_y * sine,
+                start_y * cosine - start_x * sine,
+            )
 
         # Where the line enters and leaves the body, in shares: 0 at the sensors, 1 at the point.
         enter: Quantity = -np.inf
         leave: Quantity = np.inf
-        for position, change, size in (
-            (rx, dx, body.track.length),
-            (ry, dy, body.track.width),
-        ):
-            half = self._row(size) / 2 + TIE
+        axes = ((start_x, dx, track.length), (start_y, dy, track.width))
+        for start, change, size in axes:
+            half = self._at_sample(size) / 2 + TIE
             # A line along the body divides by 0: infinite shares give the right answer.
-            to_rear = (-half - position) / change
-            to_front = (half - position) / change
+            to_rear = (-half - start) / change
+            to_front = (half - start) / change
             enter = np.maximum(enter, np.minimum(to_rear, to_front))
             leave = np.minimum(leave, np.maximum(to_rear, to_front))
         blocks = (enter < leave) & (leave > 0) & (enter < 1)
-        return np.asarray(blocks & self._row(body.is_there))
+        return np.asarray(blocks & self._at_sample(body.is_there))
 
     def _scene_of(self, view: _View, over: BoolArray) -> Scene:
         """The scene with the body of a view as the obstacle of all vehicles."""
         body = self._bodies[view.body]
         zeros = np.zeros(self.n)
         return Scene(
-            gap=np.where(self._row(body.is_there), view.gap, np.inf),
-            lateral=zeros + self._row(body.lateral),
-            lateral_speed=zeros + self._row(body.lateral_speed),
+            gap=np.where(self._at_sample(body.is_there), view.gap, np.inf),
+            lateral=zeros + self._at_sample(body.lateral),
+            lateral_speed=zeros + self._at_sample(body.lateral_speed),
             over=np.broadcast_to(over, self.n),
-            obstacle_speed=zeros + self._row(body.vx),
+            obstacle_speed=zeros + self._at_sample(body.vx),
             visible=view.visible,
-            obstacle_length=zeros + 2 * self._row(body.half_length),
-            obstacle_width=zeros + 2 * self._row(body.half_width),
+            obstacle_length=zeros + 2 * self._at_sample(body.half_length),
+            obstacle_width=zeros + 2 * self._at_sample(body.half_width),
             obstacle=zeros + view.body,
         )
 
@@ -234,42 +246,44 @@ class Traffic:
         such a body, the scene of the nearest other body (see `OFF_THE_WAY`).
         """
         ranks = []
-
         for view in views:
-            body = self._bodies[view.body]
-            counts: BoolArray = self._row(self._counts[view.body])
-            closing = np.maximum(view.closing, LEAST_CLOSING_SPEED)
-            time_to_arrival = np.maximum(view.gap, 0.0) / closing
-            lateral = self._row(body.track.y)
-            drift = self._row(body.vy)
-            is_closing = view.closing > 0
-            lateral_at_arrival = lateral + drift * np.where(
-                is_closing, time_to_arrival, 0.0
-            )
-            reach = self.width / 2 + self._row(body.half_width)
-            comes = is_closing & (np.abs(lateral_at_arrival) < reach)
-            # A leader who makes way, at about the vehicle's speed, is no reason to brake.
-            makes_way = np.sign(lateral) * drift > 0
-            leaves = makes_way & (view.closing <= APPROACH_SPEED)
-            is_in_way = (self._row(body.is_in_path) & ~leaves) | comes
+            is_counted = self._at_sample(self._is_counted[view.body])
             rank = (
                 view.gap
-                + OFF_THE_WAY * ~is_in_way
+                + OFF_THE_WAY * ~self._is_in_way(view)
                 + HIDDEN * ~view.visible
                 + PASSED * view.is_passed
-                + NOT_MET * ~counts
+                + NOT_MET * ~is_counted
             )
             ranks.append(np.where(self._struck == view.body, -np.inf, rank))
 
-        # Scenes are computed only of bodies that are nearest to some vehicle: most are not.
-        chosen = np.argmin(np.stack(ranks), axis=0)
-        numbers = np.flatnonzero(np.bincount(chosen))
+        # Most bodies are nearest to no vehicle: their scenes are not computed.
+        nearest = np.argmin(np.stack(ranks), axis=0)
+        numbers = np.unique(nearest)
         scene = self._scene_of(views[numbers[0]], over)
         for number in numbers[1:]:
-            is_chosen = chosen == number
             columns = zip(self._scene_of(views[number], over), scene, strict=True)
-            scene = Scene(*(np.where(is_chosen, new, old) for new, old in columns))
+            is_nearest = nearest == number
+            scene = Scene(*(np.where(is_nearest, new, old) for new, old in columns))
         return scene
+
+    def _is_in_way(self, view: _View) -> BoolArray:
+        """Whether a body is in the path of each vehicle and stays there, or will be there when the
+        vehicle arrives; shape (N,) or (1,).
+        """
+        body = self._bodies[view.body]
+        lateral = self._at_sample(body.track.y)
+        drift = self._at_sample(body.vy)
+        closing = np.maximum(view.closing, LEAST_CLOSING_SPEED)
+        time_to_arrival = np.maximum(view.gap, 0.0) / closing
+        lateral_at_arrival = lateral + drift * time_to_arrival
+        reach = self.width / 2 + self._at_sample(body.half_width)
+        will_be_in_path = (view.closing > 0) & (np.abs(lateral_at_arrival) < reach)
+        # A leader at the vehicle's speed who makes way is nobody to brake for.
+        makes_way = np.sign(lateral) * drift > 0
+        leaves = makes_way & (view.closing <= APPROACH_SPEED)
+        stays = self._at_sample(body.is_in_path) & ~leaves
+        return np.asarray(stays | will_be_in_path)
 
     def hits(
         self, sample: int, front: FloatArray, speed: FloatArray, is_open: BoolArray
@@ -281,20 +295,19 @@ class Traffic:
         self._struck = np.full(self.n, NOBODY)
         foremost = front.max()
         rear = front - self.length
-        for k in self._encountered:
-            body = self._bodies[k]
-            if foremost <= row(body.edge, sample, None).min():
+        for number in self._encountered:
+            body = self._bodies[number]
+            if foremost <= at_sample(body.edge, sample, None).min():
                 continue
-            is_beside = (
-                (front > self._row(body.edge))
-                & (rear < self._row(body.far_end))
-                & self._row(body.is_in_path)
+            is_level = (front > self._at_sample(body.edge)) & (
+                rear < self._at_sample(body.far_end)
             )
-            vehicles = np.flatnonzero(is_beside & is_open & (self._struck == NOBODY))
+            may_touch = is_level & self._at_sample(body.is_in_path)
+            vehicles = np.flatnonzero(may_touch & is_open & (self._struck == NOBODY))
             if vehicles.size:
                 vehicle = self._vehicle_body(front[vehicles], speed[vehicles])
-                overlaps = find_overlaps(vehicle, self._body(k, vehicles))
-                self._struck[vehicles[overlaps > TOUCH]] = k
+                overlaps = find_overlaps(vehicle, self._body(number, vehicles))
+                self._struck[vehicles[overlaps > TOUCH]] = number
 
         touched = np.flatnonzero(self._struck != NOBODY)
         return dict(zip(touched.tolist(), speed[touched].tolist(), strict=True))
@@ -304,14 +317,12 @@ class Traffic:
     ) -> BodyPairs:
         """Pairs of each given vehicle and the body that it touches, in lane coordinates."""
         numbers = np.asarray(vehicles)
-        bodies = [self._body(k, numbers) for k in range(len(self._bodies))]
-        columns = (
-            np.stack(column)[self._struck[numbers], np.arange(len(numbers))]
-            for column in zip(*bodies, strict=True)
-        )
-        return BodyPairs(
-            numbers, self._vehicle_body(front[numbers], speed[numbers]), Body(*columns)
-        )
+        bodies = [self._body(number, numbers) for number in range(len(self._bodies))]
+        cells = self._struck[numbers], np.arange(len(numbers))
+        columns = zip(*bodies, strict=True)
+        struck = Body(*(np.stack(column)[cells] for column in columns))
+        touching = self._vehicle_body(front[numbers], speed[numbers])
+        return BodyPairs(numbers, touching, struck)
 
     def _vehicle_body(self, front: FloatArray, speed: FloatArray) -> Body:
         return Body.behind(
@@ -328,9 +339,9 @@ class Traffic:
         group = vehicles
         if self.group is not None:
             group = self.group[vehicles]
-        # If a column has one value for all encounters, "clip" takes it for each of them.
+        # Scenes are computed only of bodies that are nearest to some vehicle: most are not.
         length, width, x, y, cosine, sine, speed, drift = (
-            row(column, self._sample, None).take(group, mode="clip")
+            at_sample(column, self._sample, None).take(group, mode="clip")
             for column in (*body.track[2:], body.vy)
         )
         if not body.faces_along:
@@ -349,15 +360,18 @@ class Traffic:
         in_conflict = np.zeros(shape, bool)
         for start in range(0, shape[0], n_rows):
             samples = slice(start, min(start + n_rows, shape[0]))
-            front, speed = trace.position[samples], trace.speed[samples]
-            for k in self._encountered:
-                separation, rate, counts = self._approach(k, samples, front, speed)
-                is_nearer = counts
+            front = trace.position[samples]
+            speed = trace.speed[samples]
+            for number in self._encountered:
+                separation, rate, is_counted = self._approach(
+                    number, samples, front, speed
+                )
+                is_nearer = is_counted
                 if len(self._encountered) > 1:
-                    is_nearer = counts & (separation < distance[samples])
+                    is_nearer = is_counted & (separation < distance[samples])
                 np.copyto(distance[samples], separation, where=is_nearer)
                 np.copyto(closing[samples], rate, where=is_nearer)
-                in_conflict[samples] |= counts
+                in_conflict[samples] |= is_counted
         return Encounter(
             separation=distance,
             distance=distance,
@@ -372,38 +386,32 @@ class Traffic:
         shrink [m/s], and whether the body counts (the encounter with it has not ended).
         """
         body = self._bodies[number]
-        edge, far_end, vx, vy, y, half_width = (
-            self._table(column, samples)
-            for column in (
-                body.edge,
-                body.far_end,
-                body.vx,
-                body.vy,
-                body.track.y,
-                body.half_width,
-            )
-        )
-        gap_ahead = edge - front
-        gap_behind = front - self.length - far_end
+        gap_ahead = self._at_samples(body.edge, samples) - front
+        gap_behind = front - self.length - self._at_samples(body.far_end, samples)
         dx = np.maximum(np.maximum(gap_ahead, gap_behind), 0.0)
+        closing = speed - self._at_samples(body.vx, samples)
+        closing_along = closing * np.where(gap_ahead > gap_behind, dx, -dx)
+        y = self._at_samples(body.track.y, samples)
+        half_width = self._at_samples(body.half_width, samples)
         dy = np.maximum(np.abs(y) - self.width / 2 - half_width, 0.0)
-        separation = np.sqrt(dx * dx + dy * dy) if dy.any() else dx
-        approach = (speed - vx) * np.where(gap_ahead > gap_behind, dx, -dx) - np.sign(
-            y
-        ) * vy * dy
-        rate = approach / np.maximum(separation, LEAST_DISTANCE)
+        parting_across = np.sign(y) * self._at_samples(body.vy, samples) * dy
+        separation = dx
+        if dy.any():
+            separation = np.sqrt(dx * dx + dy * dy)
+        # If a column has one value for all encounters, "clip" takes it for each of them.
+        divisor = np.maximum(separation, LEAST_DISTANCE)
+        rate = (closing_along - parting_across) / divisor
         if body.is_rotated:
-            columns = (self._table(column, samples) for column in body.track[2:])
+            columns = (self._at_samples(column, samples) for column in body.track[2:])
             track = Track(*body.track[:2], *columns)
-            separation = distance_between(
-                track, front - self.length / 2, self.length, self.width
-            )
-        counts = self._table(body.is_there & self._counts[number], samples)
-        counts = counts & ~self._ended[number, samples]
-        return separation, rate, counts
+            middle = front - self.length / 2
+            separation = distance_between(track, middle, self.length, self.width)
+        is_met = body.is_there & self._is_counted[number]
+        is_counted = self._at_samples(is_met, samples) & ~self._ended[number, samples]
+        return separation, rate, is_counted
 
-    def _table(self, column: Sampled, samples: slice) -> Sampled:
-        """The values of a column at some samples: a value for each vehicle, or one for all."""
+    def _at_samples(self, column: Sampled, samples: slice) -> Sampled:
+        """A column at some samples, for each vehicle or for all of them."""
         if len(column) > 1:
             column = column[samples]
         if self.group is None or column.shape[1] == 1:

@@ -21,7 +21,7 @@ from safevar_sumo.scenarios.tracks import PERSONS, SCREEN
 from safevar_sumo.sumo.bodies import BodyPairs, Films, Hits, VehicleStates
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.lane_world import LaneWorld
-from safevar_sumo.sumo.moving import Sampled, row
+from safevar_sumo.sumo.moving import Sampled, at_sample
 from safevar_sumo.sumo.network import NetworkFiles, copied_network
 from safevar_sumo.sumo.traffic import Traffic
 from safevar_sumo.sumo.world import SPEED_MODE, Api, SumoWorld, function_of
@@ -31,11 +31,13 @@ PLACE_TOLERANCE = 1e-6
 """Largest distance in SUMO of an actor from its track, and of a vehicle under test from its
 position on the lane [m].
 """
-ANY_PLACE, ANY_LANE = 1 + 2 + 4, -1
-"""Arguments `keepRoute` and `laneIndex` of `moveToXY`: SUMO looks for the lane on the actor's own
-route only, ignores who may use this lane, and allows places beside every road. Without these values
-SUMO would look at the lanes of all copies, which are in the same place.
+ANY_PLACE = 1 + 2 + 4
+"""Argument `keepRoute` of `moveToXY`: SUMO looks for the lane on the actor's own route only,
+ignores who may use this lane, and allows places beside every road. Without this value SUMO would
+look at the lanes of all copies, which are in the same place.
 """
+ANY_LANE = -1
+"""Argument `laneIndex` of `moveToXY`: SUMO chooses the lane."""
 SHAPES = {
     "adult": "pedestrian",
     "child": "pedestrian",
@@ -207,7 +209,7 @@ class TrafficWorld(SumoWorld):
         return values
 
     def _at_copies(self, column: Sampled) -> Sampled:
-        values = row(column, self._sample, self._traffic.group)
+        values = at_sample(column, self._sample, self._traffic.group)
         if len(values) == self.n:
             return values
         return np.repeat(values, self.n)

@@ -57,12 +57,11 @@ def check_units(study: Study, vehicle: Vehicle) -> None:
             )
         if entry.unit != units[name]:
             raise InputError("", f"{key}.unit = {entry.unit!r}", repr(units[name]))
-    for name in units:
-        if name not in table and name not in vehicle.OPTIONAL:
-            names = ", ".join(name for name in units if name not in vehicle.OPTIONAL)
-            raise InputError(
-                "", f"vehicle.characteristics.{name} is missing", f"all of {names}"
-            )
+    required = [name for name in units if name not in vehicle.OPTIONAL]
+    for name in required:
+        if name not in table:
+            problem = f"vehicle.characteristics.{name} is missing"
+            raise InputError("", problem, f"all of {', '.join(required)}")
 
 
 def check_plausible(study: Study, vehicle: Vehicle) -> None:

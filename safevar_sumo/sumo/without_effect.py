@@ -39,14 +39,13 @@ def without_effect(system: System) -> list[str]:
         if _has_tau(system):
             acting.remove("tau")
     remarks = []
-    for network in dict.fromkeys(point.scenario.network for point in system.points):
+    for network in system.networks:
         remarks += network_remarks(network, acting)
     remarks += system.vehicle.remarks
     remarks += _remarks_on_driver(system)
     remarks += _remarks_on_grip(system)
-    for weather in {
-        point.weather.name: point.weather for point in system.points
-    }.values():
+    weathers = {point.weather.name: point.weather for point in system.points}
+    for weather in weathers.values():
         if weather.visibility != 1 and uses_traci and not _has_limited_range(system):
             remarks.append(
                 f"weather {weather.name!r}: visibility = {weather.visibility:g} has no effect:"

@@ -29,10 +29,10 @@ MAX_DEPARTURE_SPEED = 200.0
 SPEED_MODE = 32
 # TraCI "set lane change mode": the vehicle never changes lanes.
 LANE_CHANGE_MODE = 0
-CUT_SHAPE, FULL_SHAPE = "passenger", "evehicle"
-"""Shapes of vehicles that SUMO draws alike. SUMO cuts the front corners off vehicles of the first
-shape, also when it looks for collisions.
-"""
+CUT_SHAPE = "passenger"
+"""Shape of a vehicle whose front corners SUMO cuts off, also when it looks for collisions."""
+FULL_SHAPE = "evehicle"
+"""Shape of a vehicle that SUMO draws alike, with all corners."""
 
 Api = Any
 """The module libsumo or traci, which have the same functions."""

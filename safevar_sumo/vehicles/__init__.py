@@ -39,7 +39,8 @@ VEHICLES: Mapping[str, type[Any]] = {
     "worn": WornVehicle,
 }
 
-DRY_ROAD_FRICTION, STEP = 1.0, 0.1  # -, s
+DRY_ROAD_FRICTION = 1.0  # -
+STEP = 0.1  # s
 SPEEDS = np.arange(0.0, 20.5, 0.5)  # m/s, of the tables
 LONGEST_DRIVE = 60.0  # s
 LIGHT_BRAKE = 0.1  # pedal position while braking, far from the limit of the tyres

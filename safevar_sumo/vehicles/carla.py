@@ -23,7 +23,9 @@ from safevar_sumo.records import (
     FloatArray,
     FloatOrArray,
     Observation,
+    clip_to_share,
 )
+from safevar_sumo.study import PositiveProportion
 from safevar_sumo.vehicles.base import (
     LEVEL,
     MASS,
@@ -40,14 +42,16 @@ from safevar_sumo.vehicles.base import (
 if TYPE_CHECKING:
     from safevar_sumo.vehicles.carla_step import Car, CarlaState, Law
 
-_Share = Annotated[float, Meta(gt=0, le=1)]
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
 # Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) in r/min and N m. The
 # curve is stretched over max_rpm of the vehicle.
-TORQUE_IDLE, TORQUE_PEAK, TORQUE_END = 400.0, 500.0, 400.0  # N m
+TORQUE_IDLE = 400.0  # N m
+TORQUE_PEAK = 500.0  # N m
+TORQUE_END = 400.0  # N m
 # Engine speeds of peak and end over the maximum engine speed. The falling line extends to 1.
-PEAK_SPEED, END_SPEED = 1890 / 5800, 5730 / 5800
+PEAK_SPEED = 1890 / 5800
+END_SPEED = 5730 / 5800
 TORQUE_RISE = (TORQUE_PEAK - TORQUE_IDLE) / PEAK_SPEED
 TORQUE_FALL = (TORQUE_PEAK - TORQUE_END) / (END_SPEED - PEAK_SPEED)
 # Neutral first; blueprint of the LincolnMkz2017.
@@ -149,8 +153,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     throttle_fall: Positive = 10.0
     brake_rise: Positive = 6.0
     brake_fall: Positive = 10.0
-    shift_up: _Share = 0.65
-    shift_down: _Share = 0.5
+    shift_up: PositiveProportion = 0.65
+    shift_down: PositiveProportion = 0.5
     shift_latency: Positive = 2.0
     camera_height: Annotated[float, Meta(ge=0.1, le=10)]
     camera_design_radius: Annotated[float, Meta(ge=0.1, le=1)] = 0.355
@@ -300,7 +304,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             gear += engine_speed > self.shift_up * p.engine_limit
         ratios = np.take(OVERALL_RATIOS, gear.astype(np.intp))
         clutch_torque, brake_torque, engine_speed = engine_in(ratios)
-        brake = np.minimum(np.maximum(brake_torque / p.brake_torque, 0.0), 1.0)
+        brake = clip_to_share(brake_torque / p.brake_torque)
         throttle_torque = (
             full_torque(p, prepared.law, engine_speed)
             - (p.damping_full - p.damping_engaged) * engine_speed

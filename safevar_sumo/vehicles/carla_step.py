@@ -21,8 +21,11 @@ processor's first cache.
 """
 TYRE_STEPS = 3
 """Tyre steps in a substep, at every speed; PhysX's number below 5 m/s (setSubStepCount)."""
-NEUTRAL, FIRST_GEAR, TOP_GEAR = 0.0, 1.0, 4.0
-"""Numbers of neutral, of the first gear, and of the highest gear."""
+NEUTRAL = 0.0
+FIRST_GEAR = 1.0
+"""The lowest forward gear."""
+TOP_GEAR = 4.0
+"""The highest forward gear."""
 
 
 class Car(NamedTuple):
@@ -274,20 +277,22 @@ def move(
 
 
 @equation
-def car_in(t: FloatArray, i: int) -> Car:
-    """The vehicle in column i of a block."""
+def car_in(column: FloatArray) -> Car:
+    """The vehicle in a column of a block."""
     return Car(
-        t[0, i], t[1, i], t[2, i], t[3, i], t[4, i], t[5, i], t[6, i], t[7, i],
-        t[8, i], t[9, i], t[10, i], t[11, i], t[12, i], t[13, i], t[14, i], t[15, i],
+        column[0], column[1], column[2], column[3], column[4], column[5], column[6],
+        column[7], column[8], column[9], column[10], column[11], column[12], column[13],
+        column[14], column[15],
     )  # fmt: skip
 
 
 @equation
-def state_in(t: FloatArray, i: int) -> CarlaState:
-    """The state in column i of a block."""
+def state_in(column: FloatArray) -> CarlaState:
+    """The state in a column of a block."""
     return CarlaState(
-        t[16, i], t[17, i], t[18, i], t[19, i], t[20, i], t[21, i], t[22, i], t[23, i]
-    )
+        column[16], column[17], column[18], column[19],
+        column[20], column[21], column[22], column[23],
+    )  # fmt: skip
 
 
 @compiled
@@ -302,28 +307,30 @@ def advance(
     n = states.shape[1]
     # A block has 16 rows of `Car`, 8 of `CarlaState` and 2 of commands. Columns without a vehicle
     # are 1, so that no equation divides by 0.
-    t = np.ones((26, BLOCK))
+    block = np.ones((26, BLOCK))
     for start in range(0, n, BLOCK):
         count = min(BLOCK, n - start)
-        t[:16, :count] = cars[:, start : start + count]
-        t[16:24, :count] = states[:, start : start + count]
-        t[24:, :count] = commands[:, start : start + count]
+        block[:16, :count] = cars[:, start : start + count]
+        block[16:24, :count] = states[:, start : start + count]
+        block[24:, :count] = commands[:, start : start + count]
         for _ in range(substeps):
             # All columns are computed, even without a vehicle: a fixed number is faster.
             for i in range(BLOCK):
-                s = move(car_in(t, i), law, state_in(t, i), t[24, i], t[25, i])
-                t[16, i] = s.speed
-                t[17, i] = s.wheel_speed
-                t[18, i] = s.engine_speed
-                t[19, i] = s.gear
-                t[20, i] = s.target_gear
-                t[21, i] = s.since_shift
-                t[22, i] = s.throttle
-                t[23, i] = s.brake
+                column = block[:, i]
+                car = car_in(column)
+                s = move(car, law, state_in(column), column[24], column[25])
+                column[16] = s.speed
+                column[17] = s.wheel_speed
+                column[18] = s.engine_speed
+                column[19] = s.gear
+                column[20] = s.target_gear
+                column[21] = s.since_shift
+                column[22] = s.throttle
+                column[23] = s.brake
 
         # A braked vehicle stands if it is slower than the speed at which a slope moves its wheels.
         for i in range(count):
-            if t[23, i] > 0.0 and t[16, i] < t[15, i]:
-                t[16, i] = 0.0
-                t[17, i] = 0.0
-        states[:, start : start + count] = t[16:24, :count]
+            if block[23, i] > 0.0 and block[16, i] < block[15, i]:
+                block[16, i] = 0.0
+                block[17, i] = 0.0
+        states[:, start : start + count] = block[16:24, :count]

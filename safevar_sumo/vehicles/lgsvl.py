@@ -14,6 +14,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from safevar_sumo.records import Command, FloatArray, FloatOrArray, Observation
+from safevar_sumo.study import Proportion
 from safevar_sumo.vehicles.base import (
     LEVEL,
     MASS,
@@ -60,13 +61,11 @@ HOLD_SPEED = np.array(0.05)
 WHEELBASE = np.array(2.85)  # m
 # Errors at the start that the lane keeping corrects (assumption): without them the steering angle
 # would have no effect.
-LATERAL_ERROR, HEADING_ERROR = 0.10, 0.01  # m, rad
+LATERAL_ERROR = 0.10  # m
+HEADING_ERROR = 0.01  # rad
 LATERAL_GAIN, HEADING_GAIN = map(np.array, (0.02, 0.35))  # rad/m, rad/rad
 TORQUE_IDLE, TORQUE_BEND = map(np.array, (0.4, 2.4))  # of maxMotorTorque (assumption)
 SUBSTEPS = 2
-
-
-_Share = Annotated[float, Meta(ge=0, le=1)]
 
 
 class _Prepared(NamedTuple):
@@ -165,8 +164,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     }
 
     pedal_lag: Annotated[float, Meta(ge=0)]
-    wheel_mass_share: _Share
-    wheel_damping_share: _Share
+    wheel_mass_share: Proportion
+    wheel_damping_share: Proportion
     steering_design_angle: Annotated[float, Meta(gt=0, lt=90)] = 39.4
 
     def prepare(

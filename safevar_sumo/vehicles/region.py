@@ -23,10 +23,10 @@ REJECTIONS = 1000
 """Largest number of draws for each feasible setting that is wanted."""
 LARGEST_DRAW = 10_000
 """Largest number of settings that are drawn at once, unless more are missing."""
-N_PROBES, LEAST_SHARE = 10_000, 0.002
-"""Number of random settings that test a region, and the share of them that has to be feasible: a
-search draws its first settings at random.
-"""
+N_PROBES = 10_000
+"""Number of random settings that show whether random settings can be drawn."""
+LEAST_SHARE = 0.002
+"""Share of these settings that has to be feasible."""
 
 
 class _Bounds(NamedTuple):

@@ -139,8 +139,9 @@ class SumoVehicle(
 
     def sumo_type(self, prepared: _PreparedSumo) -> SumoType:
         p = prepared
-        limits = np.minimum(p.drive, p.grip), np.minimum(p.decel, p.grip)
-        return SumoType(p.mass, *limits, p.max_speed, p.actuator_lag, p.tau)
+        accel = np.minimum(p.drive, p.grip)
+        decel = np.minimum(p.decel, p.grip)
+        return SumoType(p.mass, accel, decel, p.max_speed, p.actuator_lag, p.tau)
 
     def _acceleration(
         self,
@@ -157,9 +158,8 @@ class SumoVehicle(
             is_braking, -brake * p.brake_gain * p.decel, throttle * p.drive
         )
         target = np.minimum(np.maximum(commanded, -p.grip), p.grip)
-        acceleration = state.acceleration + (target - state.acceleration) * (
-            p.step / (p.actuator_lag + p.step)
-        )
+        share = p.step / (p.actuator_lag + p.step)
+        acceleration = state.acceleration + (target - state.acceleration) * share
         # The lag delays braking itself, but the engine stops driving at once.
         return np.where(is_braking, np.minimum(acceleration, 0.0), acceleration)
 
@@ -293,12 +293,9 @@ class WornVehicle(
     ) -> _PreparedWorn:
         c = characteristics
         mass = self.kerb_mass + c["payload"]
-        rear_load = (
-            (self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"])
-            / mass
-            / self.wheelbase
-        )
-
+        moment = self.kerb_mass * self.kerb_centre + c["payload"] * c["payloadCentre"]
+        rear_load = moment / mass / self.wheelbase
+        tread_depth = np.maximum(c["treadDepth"], 0.0)
         tangent = None
         if "sensorAngle" in c:
             exact_tangent = np.tan(np.radians(c["sensorAngle"]))
@@ -309,12 +306,7 @@ class WornVehicle(
             drive=self.drive_force / mass,
             brake=c["brakeTorque"] * (self.brake_force / mass),
             grip=self.tyre_friction * road_friction,
-            lift=lift_of(
-                water,
-                np.maximum(c["treadDepth"], 0.0),
-                self.water_lift,
-                self.road_texture,
-            ),
+            lift=lift_of(water, tread_depth, self.water_lift, self.road_texture),
             max_speed=self.max_speed,
             front_load=1 - rear_load,
             rear_load=rear_load,
@@ -334,20 +326,16 @@ class WornVehicle(
 
         if prepared.tangent is not None:
             distance = np.where(np.isfinite(sensed.gap), sensed.gap, 0.0)
-            sensed = sensed._replace(
-                lateral=sensed.lateral + distance * prepared.tangent
-            )
+            lateral = sensed.lateral + distance * prepared.tangent
+            sensed = sensed._replace(lateral=lateral)
         if prepared.dropout is None:
             return sensed, state
 
         frame = np.stack([getattr(sensed, name) for name in DELAYED])
         if state.frame is not None:
             number = round(observation.time / prepared.step)
-            is_lost = (
-                np.random.default_rng([self.frame_seed, number]).random()
-                < prepared.dropout
-            )
-            frame = np.where(is_lost, state.frame, frame)
+            rng = np.random.default_rng([self.frame_seed, number])
+            frame = np.where(rng.random() < prepared.dropout, state.frame, frame)
         sensed = sensed._replace(**dict(zip(DELAYED, frame, strict=True)))
         return sensed, state._replace(frame=frame)
 
@@ -355,12 +343,12 @@ class WornVehicle(
         p = prepared
         full_pedal = np.ones_like(prepared.mass)
         grip = lifted_friction(p.grip, p.lift, 0 * full_pedal)
-        limits = (
+        return SumoType(
+            p.mass,
             np.minimum(p.drive, grip * p.slope.down),
             self._deceleration(p, full_pedal, grip),
-        )
-        return SumoType(
-            p.mass, *limits, self.max_speed * full_pedal, p.brake_delay + p.step
+            self.max_speed * full_pedal,
+            p.brake_delay + p.step,
         )
 
     def _acceleration(
@@ -385,12 +373,9 @@ class WornVehicle(
         demand = pedal * p.brake
         grip_limit = grip * p.slope.down
         lever = grip * (self.centre_height / self.wheelbase)
-        rear_limit = (self.front_share * demand + grip_limit * p.rear_load) / (
-            1 + lever
-        )
-        front_limit = ((1 - self.front_share) * demand + grip_limit * p.front_load) / (
-            1 - lever
-        )
-        return np.minimum(
-            np.minimum(demand, grip_limit), np.minimum(rear_limit, front_limit)
-        )
+        front = self.front_share * demand
+        rear = (1 - self.front_share) * demand
+        rear_limit = (front + grip_limit * p.rear_load) / (1 + lever)
+        front_limit = (rear + grip_limit * p.front_load) / (1 - lever)
+        limit_of_axles = np.minimum(rear_limit, front_limit)
+        return np.minimum(np.minimum(demand, grip_limit), limit_of_axles)

@@ -8,7 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import BoolArray, Command, FloatArray, IntArray, Observation
+from safevar_sumo.records import (
+    BoolArray,
+    Command,
+    FloatArray,
+    IntArray,
+    Observation,
+    clip_to_share,
+)
 from safevar_sumo.vehicles.base import Prepared, Sensors, Vehicle
 
 LONGEST_DELAY = 3600.0
@@ -218,8 +225,8 @@ class SensingVehicle(Vehicle):
         """The steady state at a speed. The slope is the only resistance: the pedals balance it."""
         standing = self.at_rest(prepared)
         back = prepared.slope.back
-        throttle = np.minimum(np.maximum(back / prepared.drive, 0.0), 1.0)
-        brake = np.minimum(np.maximum(-back / prepared.brake, 0.0), 1.0)
+        throttle = clip_to_share(back / prepared.drive)
+        brake = clip_to_share(-back / prepared.brake)
         return standing._replace(
             speed=speed,
             throttle=throttle,
