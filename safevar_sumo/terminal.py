@@ -131,7 +131,8 @@ class Parts:
     def __init__(self, show: Progress, expected: Iterable[int] = ()) -> None:
         self._show = show
         self._expected = list(expected)
-        self._before = self._whole = 0
+        self._before = 0
+        self._whole = 0
         """Numbers of simulations of all parts before this part, and of this part."""
 
     def begin(self, name: str = "") -> Progress:

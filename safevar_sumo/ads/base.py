@@ -67,7 +67,8 @@ class Ads:
     """
 
     __slots__ = ()
-    recognition_delay = hesitation = 0.0
+    recognition_delay = 0.0
+    hesitation = 0.0
     tau_parameter = ""
     max_vehicles: int | None = None
     RETURNS: ClassVar[Contract] = {

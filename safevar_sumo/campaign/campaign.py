@@ -302,7 +302,9 @@ def journal_progress(
         readers.append(JournalReader(file, study.search.evaluations))
 
     def show(ended: Sequence[int]) -> None:
-        evaluations = remaining = finished = 0
+        evaluations = 0
+        remaining = 0
+        finished = 0
         for reader in readers:
             evaluations += reader.asked()
             remaining += reader.left

@@ -97,7 +97,9 @@ class Pool:
         self.verified = Counter[bytes]()
         self.compiled = set[str]()
         self.attempts: Path | None = None
-        self.simulated = self.failed = self.checked = 0
+        self.simulated = 0
+        self.failed = 0
+        self.checked = 0
         self.spare: tuple[int, int] | None = None
         self.shared: dict[bytes, dict[bytes, Evaluations]] | None = None
         self.on_cluster: Work | None = None

@@ -469,7 +469,8 @@ class UnsafeMetric(UnsafeStated):
 class UnsafeImpact(UnsafeMetric):
     """A bound on the impact: an impact up to an allowed speed is safe."""
 
-    is_of_impacts = stands_alone = True
+    is_of_impacts = True
+    stands_alone = True
 
     def _breach_in_words(self, vehicle: Evaluations) -> str:
         if not vehicle.collided[0]:

@@ -231,7 +231,8 @@ class JournalReader:
     def __init__(self, path: Path, budget: int) -> None:
         self._path = path
         self._budget = budget
-        self._end = self._asked = 0
+        self._end = 0
+        self._asked = 0
         self.is_finished = False
 
     def asked(self) -> int:

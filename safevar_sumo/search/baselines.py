@@ -74,7 +74,9 @@ class SafeFuzzer(Algorithm, Table, frozen=True, kw_only=True):
         scores = []
         lowest_score = np.inf
         budget = problem.evaluations
-        used = n_unimproved = window_start = 0
+        used = 0
+        n_unimproved = 0
+        window_start = 0
         while used < budget and n_unimproved < self.generations_without_improvement:
             size = min(self.generation, budget - used)
             evaluated = yield ranges.draw(size, rng)

@@ -28,7 +28,10 @@ from safevar_sumo.vehicles.base import (
 
 # Constants that meet arrays in every step are arrays, too: numpy would convert a float each time,
 # which doubles the time of an operation.
-ZERO, ONE, TWO, HALF = map(np.array, (0.0, 1.0, 2.0, 0.5))
+ZERO = np.array(0.0)
+ONE = np.array(1.0)
+TWO = np.array(2.0)
+HALF = np.array(0.5)
 RPM_PER_RAD_S = np.array(30 / math.pi)  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
 WHEELS = 4
@@ -37,7 +40,8 @@ FIRST_GEAR, LAST_GEAR = map(np.array, (1.0, len(GEAR_RATIOS)))
 FINAL_RATIO = np.array(2.56)  # VehicleSMI
 SHIFT_DELAY = np.array(0.7)  # s, minimum time between two shifts; VehicleSMI
 # Engine speeds above and below which the gearbox shifts, over maxRpm (assumption).
-SHIFT_UP, SHIFT_DOWN = map(np.array, (0.33, 0.13))
+SHIFT_UP = np.array(0.33)
+SHIFT_DOWN = np.array(0.13)
 # 1/s: the engine speed follows the wheels with a time constant of 1/20 s; VehicleSMI.
 RPM_RATE = 20.0
 # Share of maxMotorTorque that the traction control allows at the start; VehicleSMI.
@@ -63,8 +67,11 @@ WHEELBASE = np.array(2.85)  # m
 # would have no effect.
 LATERAL_ERROR = 0.10  # m
 HEADING_ERROR = 0.01  # rad
-LATERAL_GAIN, HEADING_GAIN = map(np.array, (0.02, 0.35))  # rad/m, rad/rad
-TORQUE_IDLE, TORQUE_BEND = map(np.array, (0.4, 2.4))  # of maxMotorTorque (assumption)
+LATERAL_GAIN = np.array(0.02)  # rad/m
+HEADING_GAIN = np.array(0.35)  # rad/rad
+# Torques over maxMotorTorque (assumption).
+TORQUE_IDLE = np.array(0.4)
+TORQUE_BEND = np.array(2.4)
 SUBSTEPS = 2
 
 
