@@ -35,7 +35,7 @@ from safevar_sumo.campaign.evaluation import Task, evaluate_batch, system_of
 from safevar_sumo.cli.program import run_command_line
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import largest_batch
+from safevar_sumo.sumo.matrix import most_in_memory
 
 COMMANDS = (
     "study rain",
@@ -98,7 +98,7 @@ def seconds_of_one(study: Study) -> float:
     """Processor seconds of a simulation of a study in a large batch."""
     system = system_of(study)
     each = len(system.points) * vehicles_each(study)
-    task, rows = Task(study=study), drawn(study, max(largest_batch(system) // each, 1))
+    task, rows = Task(study=study), drawn(study, max(most_in_memory(system) // each, 1))
     evaluate_batch(task, rows)
     times = [processor_seconds(lambda: evaluate_batch(task, rows)) for _ in range(5)]
     return statistics.median(times) / (len(rows) * each)

@@ -39,7 +39,7 @@ from safevar_sumo.campaign.user_checks import check_code
 from safevar_sumo.errors import InputError, UserCodeError, warn
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, differences
 from safevar_sumo.study import Study, user_code_names
-from safevar_sumo.sumo import reason_against_scenes, settings_per_batch
+from safevar_sumo.sumo import efficient_batch, reason_against_scenes
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.terminal import Progress
@@ -323,7 +323,7 @@ def choose_batches(study: Study, selection: Selection) -> Batches:
         isinstance(system.ads, PerVehicleAds) or system.ads.max_vehicles is not None
     )
     return Batches(
-        settings_per_batch(system), are_recorded and not have_turns, are_recorded
+        efficient_batch(system), are_recorded and not have_turns, are_recorded
     )
 
 

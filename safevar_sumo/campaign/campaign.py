@@ -41,7 +41,7 @@ from safevar_sumo.results import (
     read_manifest,
 )
 from safevar_sumo.study import Study
-from safevar_sumo.sumo import reason_against_scenes, settings_per_batch
+from safevar_sumo.sumo import efficient_batch, reason_against_scenes
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import Parts, Progress
 
@@ -126,7 +126,7 @@ def run_campaign(
     system, engine_used, reason = choose_engine(system, engine)
     results.manifest["engine"] = {"name": engine_used, "reason": reason}
     results.manifest |= _about_algorithms(study)
-    size = batch_size or settings_per_batch(system)
+    size = batch_size or efficient_batch(system)
     task = Task(study=study, in_sumo=system.in_sumo, batch_size=size)
 
     evaluations = len(keys) * study.search.evaluations

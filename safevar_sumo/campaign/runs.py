@@ -218,10 +218,10 @@ class Run:
         """For each setting of this request without a known evaluation: its first position in the
         run.
         """
-        self.is_finished = self._has_ended = budget in journal.content.results
+        self.is_finished = self._has_ended = budget in journal.content.solutions
         if self.is_finished:
             self.solutions = journal.content.take_positions(
-                journal.content.results[budget]
+                journal.content.solutions[budget]
             )
 
     def look_up(self) -> FloatArray:

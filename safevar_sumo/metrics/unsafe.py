@@ -172,13 +172,13 @@ class Unsafe:
         """Return which of the R runs of each of M evaluations are unsafe, shape (R, M). R is 1
         without repeats.
         """
-        rounds = self._rounds(evaluations)
+        repeats = self._repeats(evaluations)
         return np.stack(
-            [self._holds(repeat.outcome, repeat.column) for repeat in rounds]
+            [self._holds(repeat.outcome, repeat.column) for repeat in repeats]
         )
 
-    def _rounds(self, evaluations: Evaluations) -> list[Evaluations]:
-        return evaluations.rounds or [evaluations]
+    def _repeats(self, evaluations: Evaluations) -> list[Evaluations]:
+        return evaluations.repeats or [evaluations]
 
     def number(self, evaluations: Evaluations) -> float:
         """The number of unsafe evaluations. With repeats, an evaluation adds its share of unsafe
@@ -204,8 +204,8 @@ class Unsafe:
         infinite if undefined. After a collision, a bound that does not stand alone gives minus the
         speed of the collision. With repeats, the worst run counts.
         """
-        rounds = self._rounds(evaluations)
-        return np.asarray(np.min(list(map(self._robustness, rounds)), axis=0))
+        repeats = self._repeats(evaluations)
+        return np.asarray(np.min(list(map(self._robustness, repeats)), axis=0))
 
     def _robustness(self, evaluations: Evaluations) -> FloatArray:
         """The robustness of evaluations that are not repeated."""
@@ -486,7 +486,7 @@ class UnsafeShare(UnsafeMetric):
 
     stands_alone = True
 
-    def _rounds(self, evaluations: Evaluations) -> list[Evaluations]:
+    def _repeats(self, evaluations: Evaluations) -> list[Evaluations]:
         return [evaluations]
 
 

@@ -46,7 +46,7 @@ class Evaluations:
         The metrics of `safevar_sumo.metrics.METRICS`, and the study's further metrics; an undefined
         value is NaN.
     f_diff, f_num_diff
-        The largest change, as a fraction, and the number of changes, after the filter.
+        The largest change, as a fraction, and the number of changes (small changes reset).
     reasons
         For the bytes of a setting: the reason why it could not be simulated.
     worst_points
@@ -67,7 +67,9 @@ class Evaluations:
 
     @property
     def f_safe(self) -> FloatArray:
-        """First objective: the safety degree (method section 3) [m, or -m/s on a collision]."""
+        """First objective: the safety degree (method section 3) [m]. On a collision it is the
+        negative speed of the collision [m/s].
+        """
         return self.metrics[SAFETY_DEGREE]
 
     @property
@@ -81,7 +83,7 @@ class Evaluations:
 
     @property
     def results(self) -> ResultColumns:
-        """The outcomes and metrics by name."""
+        """The outcomes, collision speeds and metrics by name."""
         return {
             "outcome": self.outcome,
             "collision_speed": self.collision_speed,
@@ -132,29 +134,30 @@ class Evaluations:
         return self.reasons.get(self.settings[row].tobytes(), "no reason was recorded")
 
     @property
-    def rounds(self) -> list[Evaluations]:
+    def repeats(self) -> list[Evaluations]:
         """The evaluations of each repeat, if settings are repeated; else an empty list. A repeat
         has its own outcome (as far as collisions are concerned), and the metrics that are kept for
         each repeat.
         """
-        rounds = list[Evaluations]()
-        while (
-            end := f"_{len(rounds) + 1}"
-        ) and f"{SAFETY_DEGREE}{end}" in self.metrics:
+        repeats = list[Evaluations]()
+        while f"{SAFETY_DEGREE}_{len(repeats) + 1}" in self.metrics:
+            end = f"_{len(repeats) + 1}"
             metrics = {
                 name: self.metrics[f"{name}{end}"]
                 for name in self.metrics
                 if f"{name}{end}" in self.metrics
             }
+            # A repeat without a collision, of a setting that collides in another repeat, has no
+            # recorded outcome.
             outcome = np.where(
                 metrics[SAFETY_DEGREE] < 0,
                 Outcome.COLLISION.value,
                 np.where(self.collided, "", self.outcome),
             )
-            rounds.append(
+            repeats.append(
                 replace(self, outcome=outcome, metrics={**self.metrics, **metrics})
             )
-        return rounds
+        return repeats
 
     @property
     def first_metrics(self) -> NamedValues:
@@ -172,13 +175,13 @@ class Evaluations:
         # User code gets the reasons as a read-only view, which cannot be sent to another process.
         return replace(self, **columns, reasons=dict(self.reasons))
 
-    def where(self, is_kept: BoolArray, outcome: str) -> Evaluations:
+    def keep_only(self, is_kept: BoolArray, outcome: str) -> Evaluations:
         """The evaluations with undefined results and this outcome for all settings that are not
         kept. `is_kept` has shape (M,).
         """
         return replace(
             self,
-            outcome=np.where(is_kept, self.outcome, str(outcome)),
+            outcome=np.where(is_kept, self.outcome, outcome),
             collision_speed=np.where(is_kept, self.collision_speed, np.nan),
             metrics={
                 name: np.where(is_kept, values, np.nan)
@@ -235,18 +238,18 @@ class Evaluations:
 
 
 def differences(
-    outputs: ResultColumns, references: ResultColumns, tolerance: float = 0.0
+    expected: ResultColumns, actual: ResultColumns, tolerance: float = 0.0
 ) -> Iterator[tuple[int, str]]:
     """Yield the first row with a difference for each result that differs, and both values in
     words.
     """
-    for name, values in outputs.items():
-        reference = references[name]
-        is_same = values == reference
+    for name, expected_values in expected.items():
+        values = actual[name]
+        is_same = values == expected_values
         if values.dtype.kind == "f":
             is_same |= np.isclose(
-                values, reference, rtol=0, atol=tolerance, equal_nan=True
+                values, expected_values, rtol=0, atol=tolerance, equal_nan=True
             )
         if not is_same.all():
             row = int(np.argmin(is_same))
-            yield row, f"{name} is {reference[row]} instead of {values[row]}"
+            yield row, f"{name} is {values[row]} instead of {expected_values[row]}"

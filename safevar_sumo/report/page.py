@@ -61,12 +61,13 @@ USUAL_QUESTIONS = (
 Samples are smaller than the default of the commands.
 """
 LEAST_COST = 40_000
-USUAL_COSTS = {"tolerance": 500_000, "repair": 500_000, "explain": 100_000}
-PAGE_COSTS = 25_000, 5_000
-"""Times of the parts of a page, in simulations that take as long: the least time of a question,
-with its start; the usual times of some questions; and the times of a study's figures and replays.
-Only the bar of progress needs them.
+"""Time of a question that `USUAL_COSTS` lacks, as the number of simulations that take as long. Only
+the bar of progress needs this number and the next ones.
 """
+USUAL_COSTS = {"tolerance": 500_000, "repair": 500_000, "explain": 100_000}
+"""Usual times of questions by name, in the same unit."""
+PAGE_COSTS = 25_000, 5_000
+"""Times of a study's figures and of its replays, in the same unit."""
 TEMPLATE_FOLDER = Path(__file__).parent / "web"
 LONG_DECIMALS = re.compile(r"(\d\.\d\d)\d+")
 """A number with more than two decimals, more than a screen can show of a coordinate."""
@@ -161,7 +162,7 @@ def report(
     joint = _joint_questions(ask, len(cases))
     alone = [text for text in ask if text not in joint]
     later_changes = _later_changes(paths, cases, as_it_is_now=as_it_is_now)
-    at_point = _simulated(cases, point, quick=quick)
+    at_point = _cases_asked_about(cases, point, quick=quick)
     key = f"report {paths} {point} {ask} {unsafe} {quick}"
     with (
         open_progress(progress) as show,
@@ -172,29 +173,39 @@ def report(
         questions = (
             [alone] * len(cases) if ask else list(map(usual_questions, by_criterion))
         )
-        texts = [*chain(*map(with_speed_part, questions, by_criterion)), *joint]
-        budgets = _budgets(cases, at_point, by_criterion, questions, joint, simulations)
+        texts_of = list(map(with_speed_part, questions, by_criterion))
+        texts = [*chain(*texts_of), *joint]
+        # Joint questions take a part from the first results.
+        texts_of[0] += joint
+        budgets = _budgets(at_point, by_criterion, point, texts_of, simulations)
         pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
         numbers = count(1)
         costs = [USUAL_COSTS.get(text.split()[0], LEAST_COST) for text in texts]
-        parts = Parts(show, [*costs, *PAGE_COSTS * len(cases)])
+        progress_parts = Parts(show, [*costs, *PAGE_COSTS * len(cases)])
 
         def next_answer(
-            chosen: slice, text: str, parsed: tuple[Question, JsonObject] | None = None
+            places: slice, text: str, parsed: tuple[Question, JsonObject] | None = None
         ) -> Answer:
+            """The answer to a question about the results at `places`."""
             question, values = parsed or parse_question(text)
-            part = ChainMap(*budgets[chosen]).get(text)
-            values = completed(question, values, unsafe, part, quick=quick)
+            budget = ChainMap(*budgets[places]).get(text)
+            values = completed(question, values, unsafe, budget, quick=quick)
+            # A question with another criterion than the page, or without any, must not get results
+            # that are adapted to the page's criterion.
             subjects = by_criterion if values.get("unsafe") == unsafe else at_point
             name = f"question {next(numbers)} of {len(texts)}, {question.name}"
-            about = subjects[chosen], paths[chosen], point, jobs, parts.begin(name)
-            how: JsonObject = {
-                "as_it_is_now": as_it_is_now,
-                "pool": pool,
-                "questions": len(texts),
-            }
             return answer_about(
-                question, values, *about, is_asked=bool(ask) and not parsed, **how
+                question,
+                values,
+                subjects[places],
+                paths[places],
+                point,
+                jobs,
+                progress_parts.begin(name),
+                is_asked=bool(ask) and not parsed,
+                as_it_is_now=as_it_is_now,
+                pool=pool,
+                questions=len(texts),
             )
 
         studies = []
@@ -212,11 +223,13 @@ def report(
         shared = list(map(partial(next_answer, slice(None)), joint))
         # Close the pool of workers: this process simulates the replays.
         stack.close()
-        write_whole(out, make_page(studies, parts, shared))
+        write_whole(out, make_page(studies, progress_parts, shared))
     return out
 
 
-def _simulated(cases: Sequence[Case], point: str | None, *, quick: bool) -> list[Case]:
+def _cases_asked_about(
+    cases: Sequence[Case], point: str | None, *, quick: bool
+) -> list[Case]:
     """The results about which the page asks: at a `point` if there is one, and only with the
     study's own parameter set if the page is `quick`.
     """
@@ -228,31 +241,29 @@ def _simulated(cases: Sequence[Case], point: str | None, *, quick: bool) -> list
 
 
 def _budgets(
-    cases: Sequence[Case],
     at_point: Sequence[Case],
     by_criterion: Sequence[Case],
-    questions: Sequence[Sequence[str]],
-    joint: Sequence[str],
+    point: str | None,
+    texts_of: Sequence[Sequence[str]],
     simulations: int | None,
 ) -> list[dict[str, int]]:
-    """The largest numbers of simulations of the questions about each of the results, by text; see
-    `divided`. Without `simulations` there are no limits.
+    """The largest numbers of simulations of the questions about each of the results (`texts_of`
+    has their texts), by text; see `divided`. Without `simulations` there are no limits.
 
-    All results have equal parts. Joint questions take a part from the first results. Simulations
-    that have already repeated solutions (at a point, or by a criterion) are subtracted.
+    All results have equal parts. Simulations that have already repeated solutions (at a point, or
+    by a criterion) are subtracted.
     """
     if not simulations:
-        return [{}] * len(cases)
+        return [{}] * len(texts_of)
     budgets = []
-    for number, case in enumerate(cases):
-        study = by_criterion[number].study
-        system = assemble(study)
-        repetitions = (at_point[number] is not case) + (study != at_point[number].study)
+    for case, adapted, texts in zip(at_point, by_criterion, texts_of, strict=True):
+        system = assemble(adapted.study)
+        # The solutions are simulated at the point, and again if the criterion changes the study.
+        is_at_point = point is not None
+        is_by_criterion = adapted.study != case.study
+        repetitions = [is_at_point, is_by_criterion].count(True)
         spent = repetitions * len(case.settings) * simulations_of_setting(system)
-        texts = with_speed_part(questions[number], case)
-        if number == 0:
-            texts += joint
-        budgets.append(divided(texts, simulations // len(cases) - spent, system))
+        budgets.append(divided(texts, simulations // len(texts_of) - spent, system))
     return budgets
 
 
@@ -261,17 +272,17 @@ def _pool_of(
     cases: Sequence[Case],
     jobs: int | None,
     cluster: str | None,
-    counts: bool,
+    is_limited: bool,
 ) -> Pool | None:
     """The pool of workers that the questions of a page share; None if each question opens its own.
-    If a simulator takes long, and simulations are limited (`counts`), the pool keeps its results,
-    so that questions share samples.
+    If a simulator takes long, and simulations are limited (`is_limited`), the pool keeps its
+    results, so that questions share samples.
     """
     take_long = any(assemble(case.study).mover.takes_long for case in cases)
-    if not (take_long or cluster or counts):
+    if not (take_long or cluster or is_limited):
         return None
     pool = stack.enter_context(open_pool(jobs, cluster))
-    if take_long and counts:
+    if take_long and is_limited:
         pool.shared = {}
     return pool
 
@@ -350,7 +361,8 @@ def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
     `sections` are all other answers.
     """
     anchor = f"study-{number}"
-    parts.begin()("figures", 0, 1)
+    show = parts.begin()
+    show("figures", 0, 1)
     answers = study.answers
     front, *sections = _sections(anchor, [*answers, tested(study), trust(study)])
     return {
@@ -361,7 +373,7 @@ def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
         "shortfall": study.case.shortfall,
         "later_changes": study.later_changes,
         "sheet": sheet_of(study),
-        "tables": study.case.study,
+        "study": study.case.study,
         "versions": study.versions,
         "is_for_workshop": study.has_workshop_parts,
         "front": front,

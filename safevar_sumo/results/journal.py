@@ -34,7 +34,7 @@ PATIENCE = 2.0
 """Longest time to wait for a lock [s]: workers of a killed process hold locks until they end."""
 SECONDS_BETWEEN_ATTEMPTS = 0.05
 """Time between two attempts to lock a journal [s]."""
-# Keys of a line.
+# Keys of lines, most of them names of columns.
 POSITION = "evaluation"
 OUTCOME = "outcome"
 REASON = "reason"
@@ -42,7 +42,7 @@ POINT = "point"
 SOLUTIONS = "solutions"
 CHECKSUM = "crc32"
 CHECKSUM_MARK = f',"{CHECKSUM}":'.encode()
-OBJECTIVE_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
+FIXED_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
 
 def journal_head(study: str, run: str, characteristics: Iterable[str]) -> JsonObject:
@@ -66,7 +66,7 @@ class JournalContent(NamedTuple):
         The number of each evaluation in its run, from 0.
     evaluations
         The evaluations, in the order in which they were written.
-    results
+    solutions
         The positions of the run's solutions, by the budget (number of evaluations) of the search
         that returned them.
     size
@@ -77,7 +77,7 @@ class JournalContent(NamedTuple):
 
     positions: list[int]
     evaluations: Evaluations
-    results: Mapping[int, list[int]]
+    solutions: Mapping[int, list[int]]
     size: int
     checksum: int
 
@@ -153,19 +153,18 @@ class Journal:
                 zip(self._characteristics, evaluations.settings.T.tolist(), strict=True)
             ),
         }
-        for name in OBJECTIVE_COLUMNS:
+        for name in FIXED_COLUMNS:
             line[name] = getattr(evaluations, name).tolist()
         for name, values in evaluations.metrics.items():
             line[name] = values.tolist()
         if evaluations.worst_points is not None:
             line[POINT] = evaluations.worst_points.tolist()
-        if evaluations.reasons:
-            reasons = [
-                evaluations.reasons.get(setting.tobytes())
-                for setting in evaluations.settings
-            ]
-            if any(reasons):
-                line[REASON] = reasons
+        reasons = [
+            evaluations.reasons.get(setting.tobytes())
+            for setting in evaluations.settings
+        ]
+        if any(reasons):
+            line[REASON] = reasons
         self._add(line)
 
     def finish(self, positions: Sequence[int], budget: int) -> None:
@@ -183,6 +182,8 @@ class Journal:
     def _add(self, line: JsonObject) -> None:
         text = msgspec.json.encode(line)
         self._checksum = zlib.crc32(text, self._checksum)
+        # For example {"solutions":[1,5],"budget":9} becomes
+        # {"solutions":[1,5],"budget":9,"crc32":123}.
         self._write(text[:-1] + CHECKSUM_MARK + b"%d}" % self._checksum)
 
     def _write(self, text: bytes) -> None:
@@ -196,7 +197,7 @@ def read_journal(
     path: Path, head: JsonObject, *, head_only: bool = False
 ) -> JournalContent:
     """The contents of a journal that another process may be writing; for `path` and `head` see
-    `Journal`. With `head_only`, only the owner is checked.
+    `Journal`. With `head_only`, only the owner is checked, and the contents are incomplete.
 
     Raises
     ------
@@ -205,7 +206,7 @@ def read_journal(
     """
     try:
         with path.open("rb") as file:
-            # One byte after the head suffices to see that lines follow: only then the owner counts.
+            # One byte after the head suffices to see that lines follow, as `_read` requires.
             data = file.readline() + file.read(1)
             if not head_only:
                 data += file.read()
@@ -294,9 +295,10 @@ def _read(
     """
     positions = list[int]()
     batches = []
-    results = {}
+    solutions = {}
 
-    # The first line says to which run the journal belongs.
+    # The first line says to which run the journal belongs. A file without another line holds no
+    # evaluations: it may be of any run, and `Journal` writes this run's head if `size` is 0.
     head_line, *lines = data.splitlines(keepends=True) or [b""]
     owner = _decoded(head_line)
     if lines and owner != head:
@@ -312,11 +314,14 @@ def _read(
     checksum = zlib.crc32(head_line.rstrip())
     for text in lines:
         line, checksum_of_line = _checked(text, checksum)
+        if not line:
+            break
         try:
             if SOLUTIONS in line:
+                # Only somebody who also made the checksum can have written other positions.
                 if not {*line[SOLUTIONS]} <= {*positions}:
                     break
-                results[line["budget"]] = line[SOLUTIONS]
+                solutions[line["budget"]] = line[SOLUTIONS]
             else:
                 batch = _evaluations_of(line, head["characteristics"])
                 if until_failure and batch.failed.any():
@@ -329,7 +334,11 @@ def _read(
         checksum = checksum_of_line
     empty = Evaluations.none(len(head["characteristics"]), METRICS)
     return JournalContent(
-        positions, Evaluations.concatenate(batches or [empty]), results, size, checksum
+        positions,
+        Evaluations.concatenate(batches or [empty]),
+        solutions,
+        size,
+        checksum,
     )
 
 
@@ -366,14 +375,17 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
         for name, values in line.items()
         if name not in (POSITION, OUTCOME, REASON, POINT)
     }
+    # Each `pop` takes a column that is no metric: the columns that remain are metrics.
     settings = np.stack(list(map(columns.pop, characteristics)), axis=1)
     reasons = zip(
-        map(bytes, settings), line.get(REASON, [None] * len(settings)), strict=True
+        map(np.ndarray.tobytes, settings),
+        line.get(REASON, [None] * len(settings)),
+        strict=True,
     )
     worst_points = None
     if POINT in line:
         worst_points = np.array(line[POINT], np.intp)
-    speed, f_diff, f_num_diff = map(columns.pop, OBJECTIVE_COLUMNS)
+    speed, f_diff, f_num_diff = map(columns.pop, FIXED_COLUMNS)
     return Evaluations(
         settings=settings,
         outcome=np.array(line[OUTCOME], "U16"),

@@ -106,9 +106,9 @@ def load_runs(directory: str | Path) -> StoredResults:
         for row in np.flatnonzero(evaluations.failed).tolist():
             place = f"{key[0]}:{key[1]}, evaluation {positions[row]}"
             failures.append((place, evaluations.reason(row)))
-        if budget in content.results:
+        if budget in content.solutions:
             solutions_of_runs.append(
-                (key, content.take_positions(content.results[budget]))
+                (key, content.take_positions(content.solutions[budget]))
             )
 
     # Both lists have the order of the runs, so that rows of the frame and positions match.

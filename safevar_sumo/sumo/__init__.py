@@ -4,7 +4,7 @@ from safevar_sumo.sumo.batch import reason_against_scenes as reason_against_scen
 from safevar_sumo.sumo.matrix import (
     drive_and_score as drive_and_score,
     drive_worst as drive_worst,
-    settings_per_batch as settings_per_batch,
+    efficient_batch as efficient_batch,
     simulate_all_points as simulate_all_points,
     vehicle_remarks as vehicle_remarks,
 )

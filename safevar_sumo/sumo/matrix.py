@@ -113,16 +113,18 @@ def vehicle_remarks(system: System) -> list[str]:
 def drive_and_score(
     system: System, settings: FloatArray, *, with_originals: bool = True
 ) -> Evaluations:
-    """Simulate and score settings, shape (N, n), without a filter, in as few batches as fit.
+    """Simulate and score settings, shape (N, n), in as few batches as fit. Vehicles drive the
+    settings unfiltered.
 
-    A pure function: row i of the result depends only on row i of `settings`, to the last bit. In a
+    A pure function: row i of the result depends only on row i of `settings`, to the last bit (if
+    a study skips failures, and user code other than a simulator fails, all rows fail). In a
     matrix, row i holds the result of setting i at its worst point. If encounters count only where
     the original vehicle is safe, the original drives in each encounter, too, and row i also holds
     its safety degree. This is left out if `with_originals` is false.
     """
     # The original drives beside each setting, so that only half as many settings fit.
     takes_pairs = with_originals and system.measuring.scoring.safe_original is not None
-    size = max(1, batch_size(system) // (system.repeats * (1 + takes_pairs)))
+    size = max(1, most_at_once(system) // (system.repeats * (1 + takes_pairs)))
     if len(settings) > size:
         batches = np.split(settings, range(size, len(settings), size))
         score_batch = partial(drive_and_score, system, with_originals=with_originals)
@@ -131,7 +133,7 @@ def drive_and_score(
     vehicles = settings
     if takes_pairs:
         originals = system.characteristics.with_original_vehicle(settings)
-        vehicles, variants, original_of = _beside(system, settings, originals)
+        vehicles, rows, original_rows = _beside(system, settings, originals)
 
     try:
         if system.matrix:
@@ -141,6 +143,7 @@ def drive_and_score(
     except UserCodeError as error:
         if not system.skips_failed:
             raise
+        # A batch of a user's simulator has one setting: no other setting fails with it.
         reason = " ".join(f"{error.source}: {error.problem}".split())
         changes = system.characteristics.change_objectives(vehicles)
         reasons = {row.tobytes(): reason for row in vehicles}
@@ -154,9 +157,9 @@ def drive_and_score(
     if not takes_pairs:
         return evaluations
 
-    of_variants = evaluations.take(variants)
-    metrics = {**of_variants.metrics, ORIGINAL_DEGREE: evaluations.f_safe[original_of]}
-    return replace(of_variants, metrics=metrics)
+    beside = evaluations.take(rows)
+    metrics = {**beside.metrics, ORIGINAL_DEGREE: evaluations.f_safe[original_rows]}
+    return replace(beside, metrics=metrics)
 
 
 def _beside(
@@ -165,15 +168,14 @@ def _beside(
     """Join settings and the original vehicle in their encounters, both of shape (N, n), into one
     array. Returns the array, the row of each setting, and the row of each setting's original.
     """
-    n = len(settings)
+    rows = np.arange(len(settings))
     # Among bodies on tracks one run of the original serves all settings with the same encounter.
     if system.has_tracks:
-        distinct, number = np.unique(originals, axis=0, return_inverse=True)
-        return np.concatenate([settings, distinct]), np.arange(n), n + np.ravel(number)
+        distinct, places = np.unique(originals, axis=0, return_inverse=True)
+        return np.concatenate([settings, distinct]), rows, len(rows) + np.ravel(places)
     # In recorded scenes a setting and its original are neighbours, because a pair shares a scene.
     vehicles = np.stack([settings, originals], axis=1).reshape(-1, settings.shape[1])
-    rows = np.arange(0, 2 * n, 2)
-    return vehicles, rows, rows + 1
+    return vehicles, 2 * rows, 2 * rows + 1
 
 
 def evaluate_matrix(system: System, settings: FloatArray) -> Evaluations:
@@ -189,13 +191,13 @@ def evaluate_points(system: System, settings: FloatArray) -> list[Evaluations]:
     dropped, because the traces of all points would take gigabytes.
     """
     evaluations = {}
-    for result in simulate_points(system, settings):
+    for result in _simulate_unordered(system, settings):
         evaluations[result.point.name] = result.evaluations
     return [evaluations[point.name] for point in system.points]
 
 
-def settings_per_batch(system: System) -> int:
-    """Number of settings in an efficient batch."""
+def efficient_batch(system: System) -> int:
+    """Number of settings in an efficient batch, which a worker gets at once."""
     # The journal gets the results of a batch at its end: an interruption must not lose more than
     # one long simulation.
     if system.mover.takes_long:
@@ -204,30 +206,30 @@ def settings_per_batch(system: System) -> int:
         return MAX_COPIES
     # The original vehicle drives beside each setting; points are simulated one after another.
     if len(system.characteristics.scenario):
-        return largest_batch(system) // 2
+        return most_in_memory(system) // 2
     # A step costs about as much for few vehicles as for many: smaller batches would save nothing.
-    return max(largest_batch(system) // len(system.points), MAX_COPIES)
+    return max(most_in_memory(system) // len(system.points), MAX_COPIES)
 
 
-def largest_batch(system: System) -> int:
-    """Largest number of vehicles in one batch. Long runs, and an ADS that is an FMU for each
-    vehicle, make it smaller.
+def most_in_memory(system: System) -> int:
+    """Largest number of vehicles in one batch, by memory. Long runs, and an ADS that is an FMU for
+    each vehicle, make it smaller.
     """
     longest = max(float(np.max(scenario.duration)) for scenario in system.scenarios)
     in_memory = round(MAX_VEHICLES * min(LONG_RUN / longest, 1.0))
     return min(in_memory, system.ads.max_vehicles or in_memory)
 
 
-def batch_size(system: System) -> int:
-    """Largest number of vehicles in one simulation, in recorded scenes or in copies of the largest
-    network.
+def most_at_once(system: System) -> int:
+    """Largest number of vehicles in one simulation, by memory, and in copies of the largest network
+    by its lanes.
     """
     if system.mover.takes_long:
         return 1
     if not reason_against_scenes(system):
-        return largest_batch(system)
+        return most_in_memory(system)
     lanes = max(map(number_of_lanes, map(open_network, system.networks)))
-    return min(max(MAX_LANES // max(lanes, 1), 1), MAX_COPIES, largest_batch(system))
+    return min(max(MAX_LANES // max(lanes, 1), 1), MAX_COPIES, most_in_memory(system))
 
 
 def drive_worst(system: System, settings: FloatArray) -> SimulationRuns:
@@ -244,23 +246,26 @@ def simulate_all_points(system: System, settings: FloatArray) -> list[PointResul
     errors of `drive_all`.
     """
     names = [point.name for point in system.points]
-    results = simulate_points(system, settings)
+    results = _simulate_unordered(system, settings)
     return sorted(results, key=lambda result: names.index(result.point.name))
 
 
-def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResult]:
+def _simulate_unordered(system: System, settings: FloatArray) -> Iterator[PointResult]:
     """Yield the results of settings at every point, group by group of points that share a
     simulation.
     """
-    n = len(settings)
+    number = len(settings)
 
     groups: Iterable[Points] = ((point,) for point in system.points)
-    searched = system.characteristics.scenario.names
-    if not reason_against_scenes(system) and (not searched or [*searched] == [PHASE]):
-        groups = _group_points(system, max(largest_batch(system) // max(n, 1), 1))
+    searched = {*system.characteristics.scenario.names}
+    are_met = all(met_at(point, system, settings).all() for point in system.points)
+    # Points share a simulation only if all settings meet them. A range of any parameter but the
+    # phase may give each setting a scenario of its own.
+    if are_met and searched <= {PHASE} and not reason_against_scenes(system):
+        groups = _group_points(system, max(most_in_memory(system) // max(number, 1), 1))
     for points in groups:
-        # Settings that do not meet these points get the original encounter of the points, so that
-        # row i stays setting i. Their results are replaced below.
+        # Settings that do not meet a point, which then is alone, get the original encounter of the
+        # point, so that row i stays setting i. Their results are replaced below.
         is_met = met_at(points[0], system, settings)
         vehicles = settings
         if not is_met.all():
@@ -268,9 +273,9 @@ def simulate_points(system: System, settings: FloatArray) -> Iterator[PointResul
         runs = drive_all(replace(system, points=points), vehicles)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
         if not is_met.all():
-            evaluations = evaluations.where(is_met, Outcome.INFEASIBLE)
+            evaluations = evaluations.keep_only(is_met, Outcome.INFEASIBLE)
         for k, point in enumerate(points):
-            rows = slice(k * n, (k + 1) * n)
+            rows = slice(k * number, (k + 1) * number)
             yield PointResult(point, evaluations.take(rows), runs.of(rows))
 
 

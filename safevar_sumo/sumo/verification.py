@@ -31,7 +31,7 @@ from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.drive import enter
 from safevar_sumo.sumo.encounters import met_at
 from safevar_sumo.sumo.engine import Start, open_in_process
-from safevar_sumo.sumo.matrix import batch_size
+from safevar_sumo.sumo.matrix import most_at_once
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traffic import OVERTIME
 from safevar_sumo.sumo.world import SumoWorld
@@ -116,7 +116,7 @@ def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str
     )
 
     remark = ""
-    size = batch_size(system)
+    size = most_at_once(system)
     for number in np.union1d(worst, second_points):
         at_point = system.at(points[number])
         is_here = (worst == number) | (second_points == number)
@@ -135,7 +135,7 @@ def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) ->
     copies of the network wait for the longest run.
     """
     order = np.argsort(np.count_nonzero(runs.trace.active, axis=0))
-    size = batch_size(replace(system, in_sumo=True))
+    size = most_at_once(replace(system, in_sumo=True))
     for start in range(0, len(order), size):
         rows = order[start : start + size]
         chosen = runs.of(rows)

@@ -14,8 +14,8 @@ from safevar_sumo.study import Constraint, Study, unit_text
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
 SLACK = 1e-9
-"""Largest violation of bounds that counts as a rounding error, as a share of the range of the
-constraint's sum over the domains [-].
+"""Largest violation of bounds that counts as a rounding error, as a share of `_BoundedSum.width`
+[-].
 """
 N_REPAIR_SHARES = 64
 """Number of settings that a repair tries on the line from an infeasible setting to the original."""
@@ -29,8 +29,8 @@ LEAST_SHARE = 0.002
 """Share of these settings that has to be feasible."""
 
 
-class _Bounds(NamedTuple):
-    """A constraint of a study, ready to compute: a weighted sum of characteristics with bounds.
+class _BoundedSum(NamedTuple):
+    """A weighted sum of characteristics with bounds, ready to compute: a constraint of a study.
 
     `weights` are pairs of a column of a setting and its weight. `width` is the range of the sum
     over the domains. `minimum` and `maximum` bound the sum. `condition` states the bounds in words,
@@ -48,9 +48,9 @@ class _Bounds(NamedTuple):
     @classmethod
     def of(
         cls, constraint: Constraint, study: Study, characteristics: CharacteristicSet
-    ) -> _Bounds:
+    ) -> _BoundedSum:
         """The computation of a study's constraint."""
-        table = study.domains
+        domains = study.domains
         widths = characteristics.upper - characteristics.lower
         weights = tuple(
             (characteristics.names.index(name), weight)
@@ -62,11 +62,11 @@ class _Bounds(NamedTuple):
             weights,
             width,
             *constraint.ends,
-            constraint.bounds_in_words(table),
-            unit_text(constraint.unit_of(table)),
+            constraint.bounds_in_words(domains),
+            unit_text(constraint.unit_of(domains)),
         )
 
-    def quantity(self, settings: FloatArray) -> FloatArray:
+    def sums(self, settings: FloatArray) -> FloatArray:
         """The weighted sum of each setting, shape (N,). It is added term by term, because the last
         bits of a product of matrices depend on the number of settings.
         """
@@ -79,7 +79,7 @@ class _Bounds(NamedTuple):
         """The violation of the bounds by each setting, as a share of `width`, shape (N,); 0 within
         the bounds.
         """
-        values = self.quantity(settings)
+        values = self.sums(settings)
         return (
             np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0)
             / self.width
@@ -94,7 +94,7 @@ class FeasibleRegion:
     """Settings that satisfy all constraints of a study; without constraints, all settings."""
 
     characteristics: CharacteristicSet
-    bounds: tuple[_Bounds, ...]
+    bounds: tuple[_BoundedSum, ...]
 
     def __bool__(self) -> bool:
         return bool(self.bounds)
@@ -116,7 +116,8 @@ class FeasibleRegion:
         return np.asarray(self.violation(settings) == 0)
 
     def check(self, settings: FloatArray, *, otherwise: str = "") -> None:
-        """Refuse settings, shape (N, n), that are not feasible.
+        """Refuse settings, shape (N, n), that are not feasible. `otherwise` is added to the bound
+        that the error states as legal.
 
         Raises
         ------
@@ -127,6 +128,7 @@ class FeasibleRegion:
         # The error is about the first infeasible setting, if there is any.
         for setting in settings[~self.feasible(settings)][:1]:
             row = setting[None]
+            # The sum of all violations is above `SLACK`, so that one is above this share.
             bound = next(
                 bound
                 for bound in self.bounds
@@ -136,7 +138,9 @@ class FeasibleRegion:
             for member, value in zip(self.characteristics, setting, strict=True):
                 if member.name in bound.constraint.sum:
                     values.append(f"{member.name} = {value:g}{member.suffix}")
-            quantity = f"{bound.constraint.quantity} = {bound.quantity(row)[0]:g}{bound.suffix}"
+            quantity = (
+                f"{bound.constraint.quantity} = {bound.sums(row)[0]:g}{bound.suffix}"
+            )
             raise InputError(
                 "",
                 f"violates a constraint: {quantity} ({', '.join(values)})",
@@ -193,7 +197,7 @@ def region_of(study: Study) -> FeasibleRegion:
     """
     characteristics = CharacteristicSet.of(study)
     bounds = tuple(
-        _Bounds.of(constraint, study, characteristics)
+        _BoundedSum.of(constraint, study, characteristics)
         for constraint in study.shared_constraints
     )
     region = FeasibleRegion(characteristics, bounds)
@@ -215,6 +219,6 @@ def region_of(study: Study) -> FeasibleRegion:
             "",
             f"constraints: fewer than {LEAST_SHARE * 1000:g} in 1,000 random settings satisfy them:"
             f" {region}",
-            "narrower domains, or constraints that leave more than an equation does",
+            "narrower domains, or inequalities with wider bounds",
         )
     return region

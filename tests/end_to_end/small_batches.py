@@ -11,5 +11,5 @@ from safevar_sumo.cli.program import run_command_line
 
 if __name__ == "__main__":
     size = int(sys.argv.pop(1))
-    campaign.settings_per_batch = lambda *_: size
+    campaign.efficient_batch = lambda *_: size
     run_command_line()

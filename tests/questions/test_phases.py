@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as replace_in
 from numpy.testing import assert_allclose, assert_array_equal
 
 import safevar_sumo as sv
@@ -17,7 +18,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.between import COUNTS_STEPS, in_phases
+from safevar_sumo.questions.between import COUNTS_STEPS, DOMAIN, in_phases
 from safevar_sumo.questions.cases import (
     SearchPlan,
     Space,
@@ -94,11 +95,16 @@ def test_vehicles_at_several_points_each_have_their_own_phase() -> None:
     phased = assemble(in_phases(study, system))
     settings = drawn(system, 5, 3)
     phases = np.array([0.0, 0.4, 0.4, 0.9131, 0.2])
-    found = degrees(phased, np.column_stack([settings, phases]))
+    rows = np.column_stack([settings, phases])
+    found = degrees(phased, rows)
     for row, phase in enumerate(phases.tolist()):
         assert_array_equal(
-            found[:, row], degrees(at_phase(system, phase), settings[[row]])[:, 0]
+            found[:, [row]], degrees(at_phase(system, phase), settings[[row]])
         )
+    test, *others = phased.points
+    test = test._replace(ranges={"phase": replace_in(DOMAIN, upper=0.5)})
+    found[0, 3] = np.nan  # the test excludes the phase
+    assert_array_equal(degrees(replace(phased, points=(test, *others)), rows), found)
 
 
 def test_sumo_repeats_a_phase_to_the_bit() -> None:

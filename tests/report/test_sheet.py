@@ -133,10 +133,10 @@ def reported(
 
 def html_of(study: ReportedStudy) -> str:
     """The sheet; empty if there is none."""
-    tables = study.case.study
+    simulated = study.case.study
     parts = {
-        "name": tables.name,
-        "title": tables.title,
+        "name": simulated.name,
+        "title": simulated.title,
         "anchor": "a",
         "versions": study.versions,
     }
@@ -145,7 +145,7 @@ def html_of(study: ReportedStudy) -> str:
     if sheet is None:
         return ""
     return str(
-        template.module.sheet_section({**parts, "tables": tables, "sheet": sheet})
+        template.module.sheet_section({**parts, "study": simulated, "sheet": sheet})
     )  # type: ignore[attr-defined]
 
 

@@ -53,20 +53,22 @@ def places(number: int) -> list[int]:
     return [ROWS * number + row for row in range(ROWS)]
 
 
-def write(path: Path, batches: int = BATCHES, finished: bool = True) -> list[int]:
+def append(journal: Journal, first: int = 0) -> None:
+    """Append the batches from `first` on."""
+    for number in range(first, BATCHES):
+        journal.append(places(number), batch(number))
+
+
+def write(path: Path, finished: bool = True) -> list[int]:
     """Write a new journal; returns the offsets at which its lines end."""
     path.unlink(missing_ok=True)
-    ends = []
     journal = Journal(path, HEAD)
-    ends.append(path.stat().st_size)
-    for number in range(batches):
-        journal.append(places(number), batch(number))
-        ends.append(path.stat().st_size)
+    append(journal)
     if finished:
         journal.finish(RESULT, BUDGET)
-        ends.append(path.stat().st_size)
     journal.close()
-    return ends
+    lines = path.read_bytes().splitlines(keepends=True)
+    return np.cumsum([*map(len, lines)]).tolist()
 
 
 def same(one: Evaluations, other: Evaluations) -> bool:
@@ -74,38 +76,43 @@ def same(one: Evaluations, other: Evaluations) -> bool:
         np.array_equal(getattr(one, name), getattr(other, name))
         for name in ("settings", "f_diff", "f_num_diff")
     )
-    return all(rest) and not [*differences(one.results, other.results)]
+    return all(rest) and not any(differences(one.results, other.results))
 
 
 def holds_the_first(batches: int, content: JournalContent) -> bool:
     """Whether the journal holds exactly the first batches."""
     positions, evaluations, *_ = content
     if not batches:
-        return positions == [] and len(evaluations) == 0
-    expected = Evaluations.concatenate([batch(number) for number in range(batches)])
+        return not (positions or len(evaluations))
+    expected = Evaluations.concatenate(list(map(batch, range(batches))))
     return positions == list(range(ROWS * batches)) and same(evaluations, expected)
+
+
+def complete(journal: Journal, first: int) -> None:
+    append(journal, first)
+    journal.close()
+    assert holds_the_first(BATCHES, read_journal(journal.path, HEAD))
 
 
 def test_a_journal_returns_its_evaluations(tmp_path: Path) -> None:
     path = tmp_path / "runs" / "a.jsonl"
     write(path)
     journal = Journal(path, HEAD)
-    assert holds_the_first(BATCHES, journal.content)
-    assert journal.content.results == {BUDGET: RESULT}
     journal.close()
-    content = read_journal(path, HEAD)
-    assert holds_the_first(BATCHES, content)
-    assert content.results == {BUDGET: RESULT}
+    for content in (journal.content, read_journal(path, HEAD)):
+        assert holds_the_first(BATCHES, content)
+        assert content.solutions == {BUDGET: RESULT}
     _, first = content.requested_within(ROWS)
     assert same(first, batch(0)), "positions count from 0: the first three"
 
 
 def test_a_journal_is_a_table_that_pandas_reads(tmp_path: Path) -> None:
-    write(tmp_path / "a.jsonl")
-    head, *lines = map(json.loads, (tmp_path / "a.jsonl").read_text().splitlines())
+    path = tmp_path / "a.jsonl"
+    write(path)
+    head, *lines, _ = map(json.loads, path.read_text().splitlines())
     assert head["characteristics"] == ["a", "b"]
-    frame = pd.concat([pd.DataFrame(line) for line in lines if "evaluation" in line])
-    expected = Evaluations.concatenate([batch(number) for number in range(BATCHES)])
+    frame = pd.concat(map(pd.DataFrame, lines))
+    expected = Evaluations.concatenate(list(map(batch, range(BATCHES))))
     assert frame["evaluation"].tolist() == list(range(ROWS * BATCHES))
     for name, column in (
         ("b", expected.settings[:, 1]),
@@ -128,11 +135,8 @@ def test_a_truncated_journal_loads_its_whole_lines_and_continues(
     whole = sum(end <= left for end in ends)
     journal = Journal(path, HEAD)
     assert holds_the_first(max(0, whole - 1), journal.content)
-    assert not journal.content.results
-    for number in range(max(0, whole - 1), BATCHES):
-        journal.append(places(number), batch(number))
-    journal.close()
-    assert holds_the_first(BATCHES, read_journal(path, HEAD))
+    assert not journal.content.solutions
+    complete(journal, max(0, whole - 1))
 
 
 def edited(line: bytes, **columns: object) -> bytes:
@@ -193,14 +197,11 @@ def test_an_altered_line_and_all_after_it_are_not_believed(
         intact = line - (alteration != "twice")
         content = read_journal(path, HEAD)
         assert holds_the_first(intact, content)
-        assert content.results == {}
+        assert not content.solutions
         assert path.read_bytes() == damaged
         journal = Journal(path, HEAD)
         assert path.stat().st_size == ends[intact]
-        for number in range(intact, BATCHES):
-            journal.append(places(number), batch(number))
-        journal.close()
-        assert holds_the_first(BATCHES, read_journal(path, HEAD))
+        complete(journal, intact)
 
 
 def test_other_solutions_and_lines_in_another_order_are_not_believed(
@@ -210,7 +211,7 @@ def test_other_solutions_and_lines_in_another_order_are_not_believed(
     write(path)
     whole = path.read_bytes()
     path.write_bytes(whole.replace(b'"solutions":[1,5]', b'"solutions":[1,4]'))
-    assert read_journal(path, HEAD).results == {}
+    assert not read_journal(path, HEAD).solutions
     head, first, second, *rest = whole.splitlines(keepends=True)
     path.write_bytes(b"".join([head, second, first, *rest]))
     assert holds_the_first(0, read_journal(path, HEAD))
@@ -230,7 +231,7 @@ def test_a_line_with_wrong_values_and_a_right_checksum_is_simulated_again(
 ) -> None:
     path = tmp_path / "a.jsonl"
     write(path)
-    head, *lines = (json.loads(line) for line in path.read_text().splitlines())
+    head, *lines = map(json.loads, path.read_text().splitlines())
     place = -1 if name in ("solutions", "budget") else 1
     lines[place][name] = value
     texts = [json.dumps(head)]
@@ -243,7 +244,7 @@ def test_a_line_with_wrong_values_and_a_right_checksum_is_simulated_again(
     path.write_text("\n".join(texts) + "\n")
     journal = Journal(path, HEAD)
     assert holds_the_first(BATCHES if place == -1 else 1, journal.content)
-    assert not journal.content.results
+    assert not journal.content.solutions
     journal.close()
 
 
@@ -323,4 +324,4 @@ def test_a_retry_drops_the_first_batch_that_failed_and_all_after_it(
     content = read_journal(path, HEAD)
     assert content.positions == [0, 1]
     assert same(content.evaluations, whole.take([0, 1]))
-    assert content.results == {}
+    assert not content.solutions

@@ -25,7 +25,7 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import Study, free_parameters
-from safevar_sumo.sumo.matrix import drive_and_score, settings_per_batch
+from safevar_sumo.sumo.matrix import drive_and_score, efficient_batch
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import SLOW, InlinePool, searched, verify_everywhere
 from tests.made_up import case_of, drawn
@@ -169,7 +169,7 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
     assert beside.original.evaluation.f_safe == pytest.approx(
         together.metrics["original_safety_degree"][:1]
     )
-    assert settings_per_batch(system) > len(settings)
+    assert efficient_batch(system) > len(settings)
     assert_the_same_in_sumo(system, settings)
 
 
