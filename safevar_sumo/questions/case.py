@@ -219,6 +219,17 @@ class Case:
             )
         return self.solutions[self.solutions["algorithm"] == algorithm]
 
+    def require_runs(self) -> None:
+        """Refuse solutions that belong to no run, because they are imported: raise
+        `UnanswerableError`.
+        """
+        if not self.has_runs:
+            raise UnanswerableError(
+                self.name,
+                "is imported: the runs of its solutions are unknown",
+                "results of the command `study`",
+            )
+
     def runs_of(self, algorithm: str) -> list[int]:
         """The numbers of the finished runs of an algorithm, in ascending order.
 
@@ -227,12 +238,7 @@ class Case:
         UnanswerableError
             If the solutions are imported and belong to no run.
         """
-        if not self.has_runs:
-            raise UnanswerableError(
-                self.name,
-                "is imported: the runs of its solutions are unknown",
-                "results of the command `study`",
-            )
+        self.require_runs()
         return sorted(run for name, run in self.finished_runs if name == algorithm)
 
     @property

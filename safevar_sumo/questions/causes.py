@@ -179,7 +179,8 @@ def select_affordable_rows(
         return list(range(len(settings)))
     order = np.random.default_rng(evaluator.seed).permutation(len(settings))
     smallest_number = int(
-        evaluator.left is not None and len(evaluator.characteristics) < max_evaluations
+        evaluator.account.is_limited
+        and len(evaluator.characteristics) < max_evaluations
     )
     number = max(
         smallest_number, np.count_nonzero(np.cumsum(costs[order]) <= max_evaluations)

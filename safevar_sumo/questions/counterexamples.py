@@ -268,7 +268,7 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
 
 def _command(model: Model, setting: FloatArray, point: Point) -> str:
     """The command that simulates a setting, shape (n,). It sets the parameters of the point that
-    the command `simulate` can set. `values` are the searched parameters of the encounter.
+    the command `simulate` can set.
     """
     system = model.evaluator.system
     members = model.evaluator.characteristics

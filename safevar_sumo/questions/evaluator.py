@@ -179,7 +179,7 @@ class Evaluator:
             account.open(expected * self._each, seconds, self._pool.checked)
             if seconds is not None:
                 account.spend(MEASURED * self._each)
-            elif of_list and self.left is None:
+            elif of_list and not self.account.is_limited:
                 simulations = expected * len(self.system.points)
                 print_price_of_list(self.study, self.system, self._pool, simulations)
         share = 1.0 if self.left is None else self.left / expected
@@ -414,7 +414,7 @@ class Evaluator:
         settings = self.feasible_settings(CRITERION_SETTINGS)
         # Most of few simulations should serve the question, and not the choice of a criterion.
         evaluations = self.evaluate(settings[: self.at_most(FIRST_SETTINGS, 8)], stage)
-        if not evaluations.collided.any() and self.left is None:
+        if not evaluations.collided.any() and not self.account.is_limited:
             evaluations = self.evaluate(settings, stage)
         return Unsafe.default_among(evaluations, original)
 

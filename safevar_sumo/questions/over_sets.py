@@ -33,8 +33,8 @@ SETS_STAGE = "check other parameter sets"
 BY_SET, INTERVALS = "by_set", "by_set_intervals"
 """Keys of the numbers of an answer: the share with each set, and the interval of each share."""
 VEHICLES = 400
-"""Largest number of vehicles that are simulated with each set: of all vehicles, and in addition of
-the vehicles that are in further groups.
+"""Largest number of vehicles that are simulated with each set, twice: of all vehicles, and of the
+vehicles in further groups.
 """
 ONE_SET = Sentence(
     "condition",
@@ -80,13 +80,12 @@ def planned_over_sets(
     In the phase `stage`, all `settings` are simulated with the study's own set. In the phase
     `SETS_STAGE`, the first `VEHICLES` settings are simulated with each of the first `fits` sets (by
     default all). The study's own set is the first one. Without other sets, `SETS_STAGE` has no
-    settings.
+    settings. Vehicles of further groups are not planned: only the sample shows their number.
     """
-    number = len(other_sets(study, fits))
-    return {
-        stage: settings,
-        SETS_STAGE: (number + bool(number)) * min(settings, VEHICLES),
-    }
+    sets = len(other_sets(study, fits))
+    if sets:
+        sets += 1
+    return {stage: settings, SETS_STAGE: sets * min(settings, VEHICLES)}
 
 
 class SharesOverSets(NamedTuple):
@@ -136,13 +135,14 @@ class SharesOverSets(NamedTuple):
         is_chosen = is_first | (in_groups & (np.cumsum(in_groups) <= VEHICLES))
         members = np.array([is_first, *groups])[:, is_chosen]
         rows = []
-        if evaluator.left is None and other_sets(evaluator.study, fits):
+        if not evaluator.account.is_limited and other_sets(evaluator.study, fits):
             models = models_of(evaluator, unsafe, fits, with_unsafe_originals=True)
             for model in models.members:
-                runs = model.evaluator.evaluate(settings[is_chosen], SETS_STAGE)
-                of_runs = unsafe.runs(runs).mean(axis=0)
-                for group in members & runs.valid:
-                    count = round(float(of_runs[group].sum()), SHARE_DECIMALS)
+                evaluations = model.evaluator.evaluate(settings[is_chosen], SETS_STAGE)
+                # A vehicle that is unsafe in some repeats only counts as a part of a vehicle.
+                share_of_repeats = unsafe.runs(evaluations).mean(axis=0)
+                for group in members & evaluations.valid:
+                    count = round(float(share_of_repeats[group].sum()), SHARE_DECIMALS)
                     rows.append(share_with_interval(count, int(group.sum())))
         table = np.array(rows).reshape(-1, len(members), 3)
         return cls(evaluator.study, table[..., 0], table[..., 1:])
@@ -155,16 +155,16 @@ class SharesOverSets(NamedTuple):
         return {BY_SET: shares, INTERVALS: self.intervals[:, 0].tolist()}
 
     def ends(
-        self, group: int, facts: Sequence[float]
+        self, group: int, own_share: Sequence[float]
     ) -> tuple[float, float, float, float]:
         """The least share of a group, its greatest share, the lowest end of all intervals, and the
         highest end of all intervals.
 
-        `facts` are a share and the two ends of its interval, from a larger sample of the group with
-        the study's own set. They count beside the shares of all sets.
+        `own_share` is a share and the two ends of its interval, from a larger sample of the group
+        with the study's own set. It counts beside the shares of all sets.
         """
         rows = np.column_stack([self.shares[:, group], self.intervals[:, group]])
-        share, low, high = np.vstack([facts, rows]).T
+        share, low, high = np.vstack([own_share, rows]).T
         smallest, lowest = np.fmin.reduce([share, low], axis=1).tolist()
         greatest, highest = np.fmax.reduce([share, high], axis=1).tolist()
         return smallest, greatest, lowest, highest

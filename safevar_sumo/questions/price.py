@@ -98,6 +98,11 @@ class Account:
     judged: int = 0
 
     @property
+    def is_limited(self) -> bool:
+        """Whether the user or the time limits the number of simulations."""
+        return self.limit is not None
+
+    @property
     def left(self) -> float:
         """The number of simulations that may still be done; infinite without a limit."""
         if self.limit is None:

@@ -25,9 +25,10 @@ column `x`.
 """
 LONG_TEXT = 60
 """Number of characters above which a text is long. On the terminal, long texts stand below their
-table, unless a column of `LEAST_TEXT` characters fits beside the other columns.
+table, unless they fit beside the other columns.
 """
 LEAST_TEXT = 36
+"""Least width of a column of long texts beside other columns [characters]."""
 MAX_LEAD_ROWS, MAX_LEAD_COLUMNS = 12, 6
 """Largest number of rows and of columns in the table that one screen shows."""
 LATEX_PREAMBLE = (
@@ -190,7 +191,7 @@ def plain(value: Any) -> Any:
 
 
 def cell_text(value: Any, number_format: str = ".4g") -> str:
-    """A value as a text for readers; `-` if the value is undefined or infinite."""
+    """A value as a text; `-` if it is undefined or infinite. Two numbers are an interval."""
     value = plain(value)
     if value is None:
         return "-"
@@ -198,6 +199,7 @@ def cell_text(value: Any, number_format: str = ".4g") -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         text = f"{value:{number_format}}"
+        # A large number is written in full, whatever its format.
         if "e+" in text:
             return f"{value:,.0f}"
         return text
@@ -209,7 +211,7 @@ def cell_text(value: Any, number_format: str = ".4g") -> str:
     if isinstance(value, list):
         for item in value:
             texts.append(cell_text(item, number_format))
-        is_interval = len(value) == 2 and not isinstance(value[0], dict)
+        is_interval = len(value) == 2 and not isinstance(value[0], dict | str)
         return (" to " if is_interval else "; ").join(texts) or "-"
     return str(value)
 
@@ -244,30 +246,28 @@ def reader_tables(name: str, table: AnswerTable) -> Iterator[tuple[str, AnswerTa
         return
 
     # Make a table for each name in `values`, with one or two columns for each value of `by`.
-    heads = frame[wide.by].unique()
+    by_values = frame[wide.by].unique()
     for value in wide.values:
         ends = ("",) if value in frame else (LOW, HIGH)
         value_columns = [f"{value}{end}" for end in ends]
         column = columns[value_columns[0]]
-        reader_heads = {label: columns[label] for label in wide.labels}
-        for head, end in product(heads, ends):
-            text = table.words.get(str(head), wide.head.format(head))
-            reader_heads[f"{text}{end}"] = column._replace(unit="")
+        columns_of_reader = {label: columns[label] for label in wide.labels}
+        for by_value, end in product(by_values, ends):
+            head = table.words.get(str(by_value), wide.head.format(by_value))
+            columns_of_reader[f"{head}{end}"] = column._replace(unit="")
 
         # Make a row for each combination of the labels' values; a missing cell is NaN.
         rows = []
         for labels, group in frame.groupby(list(wide.labels), sort=False):
-            by_head = group.set_index(wide.by)[value_columns].reindex(heads)
-            rows.append((*labels, *by_head.to_numpy().ravel()))
+            cells = group.set_index(wide.by)[value_columns].reindex(by_values)
+            rows.append((*labels, *cells.to_numpy().ravel()))
         heading = table.title
         if len(wide.values) > 1:
-            # The meanings of a pair of columns differ in the first word: the heading names both.
-            meanings = [columns[name].meaning.partition(" ") for name in value_columns]
-            beginnings, _, endings = zip(*meanings, strict=True)
-            heading += f": {' and '.join(beginnings)} {endings[0]}"
+            meanings = [columns[name].meaning for name in value_columns]
+            heading += f": {' and '.join(meanings)}"
         yield (
             f"{name}-{value}",
-            tabulate(heading, reader_heads, rows, words=table.words),
+            tabulate(heading, columns_of_reader, rows, words=table.words),
         )
 
 
@@ -298,18 +298,19 @@ def reader_columns(table: AnswerTable) -> Iterator[_ReaderColumn]:
         column = table.columns[name]
         ends = [f"{base}{LOW}", f"{base}{HIGH}"]
         is_end = base != name
-        is_with_value = is_end and (base in frame or name == ends[1])
-        if not column.is_shown or is_with_value:
+        is_shown_elsewhere = is_end and (base in frame or name == ends[1])
+        if not column.is_shown or is_shown_elsewhere:
             continue
         values = frame[ends if is_end else [name]]
         # A column that is undefined in every row is left out.
         if len(frame) and values.isna().all(axis=None):
             continue
         head = column.head or base.replace("_", " ")
+        # A unit such as "as characteristic" says that the unit differs between rows.
         if column.unit not in ("", "-") and not column.unit.startswith("as "):
             head += f" [{column.unit}]"
         yield _ReaderColumn(
-            list(filter(frame.__contains__, (name, *ends))),
+            list(filter(frame.__contains__, dict.fromkeys((name, *ends)))),
             head,
             column.meaning,
             _texts_of(table, name, ends),
@@ -356,7 +357,7 @@ def lead_table(table: AnswerTable, max_rows: int) -> AnswerTable:
         if not is_detail and (is_label or says_something) and number < MAX_LEAD_COLUMNS:
             names += column.names
             number += 1
-    return replace(table, frame=lead[list(dict.fromkeys(names))], bars=())
+    return replace(table, frame=lead[names], bars=())
 
 
 def _interval_text(low: Any, high: Any, number_format: str) -> str:
@@ -374,16 +375,15 @@ def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str
     columns of text that name the rows. Long texts stand below the tables, a line for each row.
     """
     all_columns = list(reader_columns(table))
-    columns = list[_ReaderColumn]()
-    long_columns = list[_ReaderColumn]()
-    least_width = 1
-    for column in all_columns:
-        (long_columns if column.is_long else columns).append(column)
-        least_width += max(_least_width(column), LEAST_TEXT * column.is_long)
+    columns = [column for column in all_columns if not column.is_long]
+    long_columns = [column for column in all_columns if column.is_long]
+    least_width = 1 + sum(map(_least_width, columns))
+    for column in long_columns:
+        least_width += max(_least_width(column), LEAST_TEXT)
     title = table.title
     has_numbers = any(column.is_number for column in columns)
     if long_columns and len(columns) < 2 and not has_numbers:
-        # The lines below say all that a table would say.
+        # Each row fits into a line: a table would not say more.
         yield title
         cells = [column.texts for column in (*columns, *long_columns)]
         for label, *texts in zip(*cells, strict=True):

@@ -235,12 +235,12 @@ class Adding:
     a vehicle needs.
     """
 
-    arrays = True
+    drives_arrays = True
 
     def __init__(self, parameters: int, need: float) -> None:
         self.today, self._need = np.full(parameters, 0.1), need
 
-    def robustness_of_each(
+    def robustness_of_changes(
         self, shares: FloatArray, cases: FloatArray, stage: str
     ) -> FloatArray:
         gain = np.clip(shares - self.today, 0, 0.85).sum(axis=1)
@@ -314,19 +314,21 @@ def test_cases_leave_what_vehicles_leave_unless_nobody_saves_them(name: str) -> 
         )
         vehicles = problem.promise.draw(6, default_rng(1))
         cases = product_of(vehicles, problem.encounters)
-        left = problem.robustness_with(problem.today, cases, "")
+        left = problem.robustness_of_change(problem.today, cases, "")
         expected = unsafe.robustness(evaluator.evaluate(vehicles, ""))
         assert left.reshape(6, -1).min(axis=1) == pytest.approx(expected)
         is_saved = problem.repairable(cases)
         assert is_saved.all() == (name == "rain")
         counted = np.where(is_saved, left, np.inf)
-        assert_array_equal(problem.robustness(problem.today, cases, ""), counted)
+        assert_array_equal(
+            problem.counted_robustness(problem.today, cases, ""), counted
+        )
 
         # Between the tests only encounters count that a new vehicle survives today.
         cases[:, problem.size + 1 :] = 0.37
         cases[:, : problem.size] = evaluator.characteristics.original
-        survives = problem.robustness_with(problem.today, cases, "") >= 0
-        assert_array_equal(problem.counts(cases), survives)
+        survives = problem.robustness_of_change(problem.today, cases, "") >= 0
+        assert_array_equal(problem.is_promised(cases), survives)
 
 
 def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:

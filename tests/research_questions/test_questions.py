@@ -27,7 +27,7 @@ from safevar_sumo.questions.research_questions.changes import (
 )
 from safevar_sumo.questions.research_questions.comparisons import (
     Choices,
-    median_runs,
+    medians_over_runs,
     rq1,
     rq1_runs,
     rq2,
@@ -251,7 +251,7 @@ def test_a_reader_chooses_the_level_of_significance() -> None:
         for frame in (strict, loose)
     ]
     assert (widths[0] > widths[1]).all()
-    medians = median_runs(case, Choices(alpha=0.05))
+    medians = medians_over_runs(case, Choices(alpha=0.05))
     means = (
         case.solutions.groupby(["algorithm", "run"])["safety_degree"]
         .mean()["rs"]

@@ -151,7 +151,7 @@ def explain(
     study, of_study = evaluator.study, of_study or isinstance(subject, Study)
     subject = study if of_study else subject
     limit = _plan(subject, evaluator, fits)
-    fits = 0 if evaluator.left is not None else fits
+    fits = 0 if evaluator.account.is_limited else fits
 
     if evaluator.left is not None:
         top = max(1, min(top, evaluator.left // FOR_ONE))

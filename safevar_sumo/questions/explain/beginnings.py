@@ -99,7 +99,7 @@ def _begin(
     """The beginnings of causes, and smaller causes that were found where a cause begins."""
     # With few simulations, half of them are left to check the causes: with similar vehicles and in
     # other parameter sets.
-    is_free = evaluator.left is None
+    is_free = not evaluator.account.is_limited
     steps = STEPS if is_free else COARSE_STEPS
     causes = [cause for cause, _ in placed]
     prices = np.cumsum([steps + 2 ** len(cause.changes) for cause in causes])

@@ -49,11 +49,12 @@ from safevar_sumo.vehicles import CharacteristicSet
 
 MOST_VALUES = 10_000
 """Largest number of values of a grid."""
-SEARCHES = 2
+SEARCH_FACTOR = 2
 """Number of simulations that search for a counterexample to a speed, as a multiple of
 `LEAST_SIMULATIONS`.
 """
 NEED = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(\S.*?)?\s*")
+"""The form of the option `need`: a number and its unit, such as "50 km/h"."""
 
 
 @question
@@ -97,8 +98,8 @@ def permit(
     each car, what happens above this speed, and the part to renew first. The speed is safe in
     every encounter of the study and in every parameter set (calibration) of the vehicle model.
 
-    Example: python -m safevar_sumo permit wear --set treadDepth=3 --set payload=300 --set
-    brakeTorque=0.9
+    Example: python -m safevar_sumo permit wear --set treadDepth=3 --set payload=300
+    --set brakeTorque=0.9
 
     Parameters
     ----------
@@ -171,30 +172,25 @@ def permit(
     )
     # With limits, the answer is a claim about all cars within the limits. It is searched as much as
     # joint limits are.
-    budget = cases.USUAL_BUDGET if limits else SEARCHES * cases.LEAST_SIMULATIONS
+    budget = cases.USUAL_BUDGET if limits else SEARCH_FACTOR * cases.LEAST_SIMULATIONS
     budget = 0 if quick else evaluator.scaled(budget)
-    search = PermitSearch(
-        models,
-        span,
-        values,
-        budget,
-    )
+    search = PermitSearch(models, span, values, budget)
     _check_driven(demand, search)
     if limits:
         candidates = [_cars_within(members, limits, study, fleet.settings[0])]
     else:
         candidates = cars_of(members, fleet)
     has_repairs = not (quick or limits)
-    new_car, permits, repaired = _drive(
+    new_car, permits, repaired = _search_speeds(
         evaluator, search, fleet, candidates, with_repairs=has_repairs
     )
     # The search for the worst assumed values needs further simulations. It is left out if the
-    # number of simulations has a limit.
-    is_free = not limits and evaluator.account.allowance is evaluator.left is None
-    ends = None
-    if is_free:
+    # number of simulations is limited, or if the user states a number, even one that suffices.
+    is_stated = evaluator.account.allowance is not None
+    worst_ends = None
+    if not (limits or is_stated or evaluator.account.is_limited):
         of_cars = zip(candidates, fleet.measured, permits, strict=True)
-        ends = [search.worst_end(members, *of_car) for of_car in of_cars]
+        worst_ends = [search.worst_end(members, *of_car) for of_car in of_cars]
     answer = PermitAnswer(
         study=study,
         span=span,
@@ -207,9 +203,9 @@ def permit(
         permits=permits,
         repaired=repaired,
         is_quick=quick,
-        is_rough=quick or evaluator.account.limit is not None,
+        is_rough=quick or evaluator.account.is_limited,
         is_box=bool(limits),
-        ends=ends,
+        worst_ends=worst_ends,
     ).answer()
     if out is not None:
         with whole_file(Path(out), "out") as file:
@@ -217,7 +213,7 @@ def permit(
     return answer
 
 
-def _drive(
+def _search_speeds(
     evaluator: Evaluator,
     search: PermitSearch,
     fleet: Fleet,
@@ -236,11 +232,12 @@ def _drive(
     members = evaluator.characteristics.vehicle
     cars = [Cars.one(members.original), *candidates]
     phases = search.phases(cars, with_repairs=with_repairs)
-    # In a study in which all encounters count, the original vehicle need not be simulated in each
-    # encounter of a car.
-    alone = evaluator.for_study(evaluator.study.all_count)
-    alone.begin(phases, search.least, of_list=len(candidates) > 1)
-    new_car, *permits = search.reach(cars, [-np.inf, *[None] * len(candidates)])
+    # All encounters count: the price has no simulation of the original in each car's encounters.
+    without_originals = evaluator.for_study(evaluator.study.all_count)
+    without_originals.begin(phases, search.least, of_list=len(candidates) > 1)
+    # The new car has a floor: only its least speed over all sets is of interest.
+    floors = [-np.inf, *[None] * len(candidates)]
+    new_car, *permits = search.reach(cars, floors)
     if new_car.safe_value is None:
         study = evaluator.study
         words = failure_columns([new_car.least.failure])[0]["because"]
@@ -250,8 +247,8 @@ def _drive(
             f"{unit_text(search.span.unit)}: {words}",
             "a study in which it is, or another --unsafe",
         )
-    # If the number of simulations has a limit, too few are left to search for repairs.
-    if not with_repairs or evaluator.left is not None:
+    # If the number of simulations is limited, too few are left to search for repairs.
+    if not with_repairs or evaluator.account.is_limited:
         return new_car, permits, [None] * len(permits)
     worn = fleet.measured & (fleet.settings != members.original)
     repaired = search.repair_first(candidates, worn, members.original, permits)
@@ -365,6 +362,8 @@ def _grid(span: Span, step: float) -> FloatArray:
             f"{step:g}",
             f"at most {MOST_VALUES:,} steps from {span.low:g} to {span.high:g}",
         )
+    # The first multiple may lie below the range: it is clipped. Digits beyond the ninth decimal are
+    # errors of rounding.
     numbers = np.arange(span.low // step, span.high / step)
     multiples = np.round(step * numbers, 9)
     values = [span.low, *multiples, span.high]

@@ -82,7 +82,7 @@ class PermitAnswer:
         Whether the answer is rough for any reason.
     is_box
         Whether the only "car" stands for all cars within the limits that the user states.
-    ends
+    worst_ends
         The assumed value that lowers the speed of each car most; None if it was not searched.
     """
 
@@ -99,7 +99,7 @@ class PermitAnswer:
     is_quick: bool
     is_rough: bool
     is_box: bool
-    ends: Sequence[WorstEnd | None] | None
+    worst_ends: Sequence[WorstEnd | None] | None
 
     def answer(self) -> Answer:
         """Make the answer: its verdict, numbers, tables and list."""
@@ -184,7 +184,7 @@ class PermitAnswer:
             "margin": criterion.keep,
             "unsafe": str(criterion),
         }
-        ends = self.ends or [None] * len(failures)
+        ends = self.worst_ends or [None] * len(failures)
         cells = assumed_cells(vehicle, self.fleet)
         rows = []
         for name, permit, failure, best, assumed, end in zip(
@@ -270,8 +270,8 @@ class PermitAnswer:
             yield answer(cars["because"][0])
         yield from assumed_sentences(self.study, vehicle, self.fleet)
         is_checked = len(cars) == 1 and not pd.isna(cars["up_to"][0])
-        if is_checked and self.ends and not self.fleet.measured.all():
-            end = self.ends[0]
+        if is_checked and self.worst_ends and not self.fleet.measured.all():
+            end = self.worst_ends[0]
             if end is None:
                 yield words.NO_WORST_END(name=span.title)
             else:

@@ -185,7 +185,7 @@ def _first_cases(problem: RepairProblem, subject: Subject) -> FloatArray:
     vehicles = np.unique(settings[:, : problem.size], axis=0)
     listed = product_of(vehicles, problem.encounters)
     cases = problem.cases_of(failures)
-    cases = np.vstack([listed, cases[problem.counts(cases)]])
+    cases = np.vstack([listed, cases[problem.is_promised(cases)]])
     if not len(cases):
         keep = problem.unsafe.keep
         demand = f"keeps {keep:g} m" if keep else "is safe"
@@ -205,7 +205,7 @@ def _worst_first(
     says which of them a driving system can keep safe. All other vehicles need a repaired part, not
     a changed parameter.
     """
-    robustness = problem.robustness_with(
+    robustness = problem.robustness_of_change(
         problem.today, cases, "the driving system of today"
     )
     worst_first = np.argsort(robustness, kind="stable")

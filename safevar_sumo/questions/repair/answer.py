@@ -195,7 +195,7 @@ def _row(
         "largest_change": float(np.max(np.abs(change - problem.today))),
         "fits": fits,
         **_columns_of(proof),
-        **price_of(problem.study, values, problem.new_vehicles),
+        **price_of(problem.study, values, problem.new_vehicle_settings),
     }
 
 

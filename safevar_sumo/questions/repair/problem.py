@@ -64,8 +64,8 @@ class Parameter(NamedTuple):
         """The position of a value in the range: 0 at the lower bound, 1 at the upper bound. The
         position of a logarithmic parameter is that of the value's logarithm.
         """
-        ends = np.array([self.range.lower, self.range.upper, value])
-        lower, upper, place = (np.log(ends) if self.range.log else ends).tolist()
+        values = np.array([self.range.lower, self.range.upper, value])
+        lower, upper, place = (np.log(values) if self.range.log else values).tolist()
         return float((place - lower) / (upper - lower))
 
     def values(self, shares: FloatArray) -> FloatArray:
@@ -101,30 +101,32 @@ class Promise(Box):
             If a text cannot be read, its name is no characteristic, its value is outside of the
             domain, or no characteristic may wear.
         """
-        rows = study.domains
+        domains = study.domains
         stated = study.repair.promise
-        everything = region.characteristics
+        characteristics = region.characteristics
         if list(texts) == [ALL] or (not texts and stated == ALL):
-            return cls(region, everything.lower, everything.upper)
-        of_study = stated if stated and isinstance(stated, dict) else study.limits
-        with about(study.source):
-            check_limits(rows, of_study, "repair.promise.")
+            return cls(region, characteristics.lower, characteristics.upper)
+        of_study = study.limits
+        if stated and isinstance(stated, dict):
+            of_study = stated
+            with about(study.source):
+                check_limits(domains, stated, "repair.promise.")
         with about("promise"):
-            limits = limits_of(texts, rows, None if texts else of_study)
+            limits = limits_of(texts, domains, None if texts else of_study)
         if not limits:
             raise InputError(
                 "promise",
                 "nothing is promised",
-                f'"NAME >= X" with one of {", ".join(rows)}; or {ALL}',
+                f'"NAME >= X" with one of {", ".join(domains)}; or {ALL}',
             )
         lower, upper = (
-            np.where(everything.of_vehicle, everything.original, ends)
-            for ends in (everything.lower, everything.upper)
+            np.where(characteristics.of_vehicle, characteristics.original, ends)
+            for ends in (characteristics.lower, characteristics.upper)
         )
         for name, limit in limits.items():
-            column = everything.names.index(name)
-            lower[column], upper[column] = limit.interval(rows[name])
-        if (lower == upper)[everything.of_vehicle].all():
+            column = characteristics.names.index(name)
+            lower[column], upper[column] = limit.interval(domains[name])
+        if (lower == upper)[characteristics.of_vehicle].all():
             raise InputError(
                 "promise",
                 "promises a new vehicle only",
@@ -178,13 +180,14 @@ class Promise(Box):
 
 def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
     """The parameters of the ADS that may change: the table under [repair] of the study or, without
-    a table, the parameters of a shipped ADS. With `names`, only the parameters with these names.
+    a table, the parameters of a shipped ADS, whose ranges are widened to hold the present values.
+    With `names`, only the parameters with these names.
 
     Raises
     ------
     InputError
-        If no parameter may change, a name is unknown, or a parameter's present value is outside of
-        its bounds.
+        If no parameter may change, a name is unknown, or a parameter's present value is no number
+        or outside of the bounds that the study states.
     """
     source = study.source
     shipped = CHANGEABLE.get(study.ads.model, {})
@@ -234,9 +237,11 @@ def parameters_of(study: Study, names: Sequence[str]) -> list[Parameter]:
 class RepairProblem:
     """A study's ADS with P parameters that may change, and the cases of vehicles within a promise.
 
-    A case is a vehicle in an encounter of a world (`oracle`). A change is a set of P values of the
-    parameters, as positions in their ranges: 0 is the lower bound, 1 the upper one. `shares` are M
-    changes, shape (M, P).
+    A case is a vehicle in an encounter of a world: a row with the n values of the vehicle, the
+    number of the world, and k places in the ranges of encounters (tolerance/oracle.py).
+
+    A change is a set of P values of the parameters, as positions in their ranges: 0 is the lower
+    bound, 1 the upper one. `shares` are M changes, shape (M, P).
 
     Attributes
     ----------
@@ -302,13 +307,15 @@ class RepairProblem:
         return {parameter.name: value for parameter, value in changed}
 
     @cached_property
-    def arrays(self) -> bool:
+    def drives_arrays(self) -> bool:
         """Whether one object of the ADS drives vehicles with different parameters, as arrays. A
         shipped ADS does, an FMU or a TraCI controller does not. A user's class does if a sample has
         the same results, to the bit, as with an object for each change.
         """
-        if self.study.ads.kind or self.study.ads.model in ADS:
-            return not self.study.ads.kind
+        if self.study.ads.kind:
+            return False
+        if self.study.ads.model in ADS:
+            return True
         values = self.values(sobol_points(ARRAY_CHECKS, len(self.parameters), 0))
         points = sobol_points(ARRAY_CHECKS, len(self.promise.lower), 1)
         rows = np.hstack([self.promise.at(points), values])
@@ -333,7 +340,7 @@ class RepairProblem:
         """The M * L evaluations of M changes, each with the L settings of a model in order."""
         values = np.repeat(self.values(shares), len(settings), axis=0)
         rows = np.hstack([np.tile(settings, (len(shares), 1)), values])
-        selection = self._selection(self.arrays)
+        selection = self._selection(self.drives_arrays)
         return model.evaluator.evaluate_selection(rows, selection, stage)
 
     def outcome_today(self, case: FloatArray) -> Evaluations:
@@ -350,12 +357,12 @@ class RepairProblem:
         axes = self.promise.region.characteristics.scenario
         cases = np.zeros((len(settings), n + 1 + self.oracle.places))
         cases[:, :n] = settings[:, :n]
-        shares = (settings[:, n:] - axes.lower) / (axes.upper - axes.lower)
-        cases[:, n + 2 : n + 2 + len(axes)] = shares
+        places = (settings[:, n:] - axes.lower) / (axes.upper - axes.lower)
+        cases[:, n + 2 : n + 2 + len(axes)] = places
         return cases
 
     @cached_property
-    def new_vehicles(self) -> FloatArray:
+    def new_vehicle_settings(self) -> FloatArray:
         """Settings of the new vehicle, shape (K, n): in the original encounter, and in the promised
         encounters among those in which the new vehicle is least safe.
         """
@@ -363,7 +370,7 @@ class RepairProblem:
         settings = self.evaluator.critical_encounters
         return np.vstack([original, settings[self.promise.holds(settings)]])
 
-    def robustness_of_each(
+    def robustness_of_changes(
         self, shares: FloatArray, cases: FloatArray, stage: str
     ) -> FloatArray:
         """The robustness (distance to the limit of the criterion) of L cases with each of M
@@ -374,48 +381,50 @@ class RepairProblem:
         robustness = np.zeros((len(shares), len(cases)))
         for number, rows, settings in self.oracle.in_worlds(cases):
             model = self.oracle.worlds[number].model
-            runs = self.evaluate(model, shares, settings, stage)
-            of_world = model.robustness_by(runs, failed=-np.inf)
+            evaluations = self.evaluate(model, shares, settings, stage)
+            of_world = model.robustness_by(evaluations, failed=-np.inf)
             robustness[:, rows] = of_world.reshape(len(shares), -1)
         return robustness
 
-    def robustness_with(
+    def robustness_of_change(
         self, change: FloatArray, cases: FloatArray, stage: str
     ) -> FloatArray:
         """The robustness of L cases with one change, shape (L,)."""
-        return self.robustness_of_each(change[np.newaxis], cases, stage).reshape(-1)
+        return self.robustness_of_changes(change[np.newaxis], cases, stage).reshape(-1)
 
-    def robustness(
+    def counted_robustness(
         self, change: FloatArray, cases: FloatArray, stage: str
     ) -> FloatArray:
         """The robustness of L cases with one change, shape (L,). An unsafe case does not count, and
         becomes infinity, in an encounter that is not promised, or if no driving system can keep the
         case safe.
         """
-        robustness = self.robustness_with(change, cases, stage)
+        robustness = self.robustness_of_change(change, cases, stage)
 
         # Whether a case counts takes further simulations: only the few unsafe cases are asked.
         unsafe = np.flatnonzero(robustness < 0)
-        is_failure = self.counts(cases[unsafe])
-        counted = unsafe[is_failure]
-        is_failure[is_failure] = self.repairable(cases[counted])
-        robustness[unsafe[~is_failure]] = np.inf
+        is_promised = self.is_promised(cases[unsafe])
+        promised = unsafe[is_promised]
+        is_repairable = self.repairable(cases[promised])
+        robustness[unsafe[~is_promised]] = np.inf
+        robustness[promised[~is_repairable]] = np.inf
         return robustness
 
-    def counts(self, cases: FloatArray) -> BoolArray:
-        """Which cases are in an encounter that counts, shape (L,). A listed encounter counts at any
-        phase. Any other encounter counts if the present ADS keeps a new vehicle safe in it.
+    def is_promised(self, cases: FloatArray) -> BoolArray:
+        """Which cases are in a promised encounter, shape (L,). A listed encounter is promised at
+        any phase, any other encounter if the present ADS keeps a new vehicle safe in it.
         """
-        is_counted = np.full(len(cases), not self.study.ranges)
+        # A world without a test holds listed encounters only, unless the encounters are ranges.
+        is_promised = np.full(len(cases), not self.study.ranges)
         for number, rows, settings in self.oracle.in_worlds(cases):
             world = self.oracle.worlds[number]
             if world.test is not None:
-                is_counted[rows] &= self._is_listed(world, settings)
-        originals = cases[~is_counted]
+                is_promised[rows] &= self._is_listed(world, settings)
+        originals = cases[~is_promised]
         originals[:, : self.size] = self.oracle.vehicle.original
-        robustness = self.robustness_with(self.today, originals, "new vehicles")
-        is_counted[~is_counted] = robustness >= 0
-        return is_counted
+        robustness = self.robustness_of_change(self.today, originals, "new vehicles")
+        is_promised[~is_promised] = robustness >= 0
+        return is_promised
 
     def _is_listed(self, world: CaseWorld, settings: FloatArray) -> BoolArray:
         """Which settings, shape (L, n), are in a listed encounter of the world's test."""
@@ -430,10 +439,10 @@ class RepairProblem:
 
     @cached_property
     def encounters(self) -> FloatArray:
-        """The E listed encounters that count, shape (E, 1 + k), as the last numbers of a case."""
+        """The E promised listed encounters, shape (E, 1 + k), as the last numbers of a case."""
         listed = np.unique(self.oracle.listed(), axis=0)
         originals = product_of(self.oracle.vehicle.original[np.newaxis], listed)
-        return listed[self.counts(originals)]
+        return listed[self.is_promised(originals)]
 
     def space(self, fit: int) -> Space:
         """The space of the promised cases with the parameter set number `fit`."""
@@ -442,9 +451,10 @@ class RepairProblem:
 
     def with_sets(self, cases: FloatArray, fits: IntArray | int) -> FloatArray:
         """The same cases, but with the parameter sets number `fits`."""
-        worlds = self.oracle.fits.count(0)
+        # The worlds of set 0 are first, then as many worlds of each further set, in equal order.
+        number = self.oracle.fits.count(0)
         cases = cases.copy()
-        cases[:, self.size] = cases[:, self.size] % worlds + worlds * fits
+        cases[:, self.size] = cases[:, self.size] % number + number * fits
         return cases
 
     def best_driver(self, model: Model) -> Evaluator | None:
@@ -476,11 +486,14 @@ class RepairProblem:
                 self.drivers[number] = self.best_driver(model)
             driver = self.drivers[number]
             if driver is not None:
-                runs = driver.evaluate(settings, BRAKING_STAGE)
-                is_safe[rows] = runs.valid & (model.unsafe.robustness(runs) >= 0)
+                evaluations = driver.evaluate(settings, BRAKING_STAGE)
+                is_kept_safe = model.unsafe.robustness(evaluations) >= 0
+                is_safe[rows] = evaluations.valid & is_kept_safe
 
         # The present ADS may keep a case safe that full braking does not: braking later can be
         # better.
-        robustness = self.robustness_with(self.today, cases[~is_safe], BRAKING_STAGE)
+        robustness = self.robustness_of_change(
+            self.today, cases[~is_safe], BRAKING_STAGE
+        )
         is_safe[~is_safe] = robustness >= 0
         return is_safe

@@ -52,7 +52,7 @@ class Search:
     def __init__(self, problem: RepairProblem, cases: FloatArray) -> None:
         self.problem = problem
         self.cases = cases
-        self._thinning = 1 if problem.arrays else THINNING
+        self._thinning = 1 if problem.drives_arrays else THINNING
         self._hardest = cases[:1]
         """The cases with which changes failed, the last one first."""
         self._best = dict[int, FloatArray]()
@@ -134,7 +134,7 @@ class Search:
         size = FIRST_CASES
         while start < len(self.cases):
             cases = self.cases[start : start + size]
-            (robustness,) = self.problem.robustness_of_each(
+            (robustness,) = self.problem.robustness_of_changes(
                 change[np.newaxis],
                 cases,
                 "changes with all cases",
@@ -166,7 +166,7 @@ class Search:
         alive = np.arange(len(changes))
         while cases.size and alive.size:
             count = max(1, BATCH // len(alive))
-            robustness = self.problem.robustness_of_each(
+            robustness = self.problem.robustness_of_changes(
                 changes[alive], cases[:count], "changes with one case"
             )
             alive = alive[(robustness >= 0).all(axis=1)]

@@ -72,7 +72,7 @@ def find_failures(
 
     def judge(cases: FloatArray) -> FloatArray:
         """The robustness of cases with the change, shape (L,)."""
-        return problem.robustness(change, cases, ATTACK_STAGE)
+        return problem.counted_robustness(change, cases, ATTACK_STAGE)
 
     # Searches with other parameter sets have large generations: a few large ones cost less than
     # many small ones.
@@ -117,7 +117,7 @@ def prove_change(
         """
         cases = product_of(vehicles, problem.encounters)
         cases = problem.with_sets(cases, np.repeat(sets, len(problem.encounters)))
-        robustness = problem.robustness(change, cases, PROOF_STAGE)
+        robustness = problem.counted_robustness(change, cases, PROOF_STAGE)
         unsafe.append(cases[robustness < 0][:KNOWN])
         return robustness.reshape(len(vehicles), -1)
 
@@ -198,7 +198,7 @@ def _survivors_in(
             attacks += 1
             unsafe = find_failures(problem, fits, change, search.cases, attacks)
             if not len(unsafe):
-                robustness = problem.robustness(change, cases, ATTACK_STAGE)
+                robustness = problem.counted_robustness(change, cases, ATTACK_STAGE)
                 unsafe = cases[robustness < 0][:KNOWN]
             if not len(unsafe):
                 # Only now is it likely that the round is the last one: expect its simulations.

@@ -24,7 +24,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from msgspec import structs
 
 from safevar_sumo.metrics import Measure
 from safevar_sumo.questions.case import (
@@ -54,8 +53,8 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE
 
 CAUSES, BEST = "causes", "best_safety_degree"
-BETTER = {CAUSES: True, BEST: False}
-"""For samples that only some tables have: whether a larger value means a better algorithm. CAUSES
+OPTIONAL_DIRECTIONS = {CAUSES: True, BEST: False}
+"""For samples that only some tables have: True if a larger value means a better algorithm. CAUSES
 is the number of minimal causes of a run, BEST is the lowest safety degree of a run.
 """
 MARKS = {"large": "L", "medium": "M", "small": "S", "negligible": ""}
@@ -195,14 +194,19 @@ def compare_over_runs(
     if len(case.algorithms) > 1:
         rows["RQ2"] = _test_opponents(case, choices, over_runs=True, further=further)
     families = {
-        question: _corrected(question, tests, choices.alpha)
+        question: _corrected_by_holm(question, tests, choices.alpha)
         for question, tests in rows.items()
     }
-    return _with_significance(pd.concat(families).droplevel(1), choices)
+    tests = _with_significance(pd.concat(families).droplevel(1), choices)
+    return with_intervals(tests, choices.alpha)
 
 
-def _corrected(question: str, rows: list[JsonObject], alpha: float) -> pd.DataFrame:
-    """The tests of a question over runs, with p-values that are corrected for all these tests."""
+def _corrected_by_holm(
+    question: str, rows: list[JsonObject], alpha: float
+) -> pd.DataFrame:
+    """The tests of a question over runs, with p-values that are corrected for all these tests.
+    `enough_runs`, which the rows state for a test alone, is that of corrected p-values.
+    """
     tests = pd.DataFrame(rows)
     count = int(tests["p_value"].count())
     tests["p_holm"] = correct_by_holm(tests["p_value"])
@@ -214,17 +218,13 @@ def _corrected(question: str, rows: list[JsonObject], alpha: float) -> pd.DataFr
 
 def _with_significance(tests: pd.DataFrame, choices: Choices) -> pd.DataFrame:
     """Add the column `significant`. A test is significant if its p-value is below the level, and
-    the runs are enough for a test. If there is a corrected p-value, the corrected one counts, and
-    the effect sizes get intervals, too.
+    the runs are enough for a test. If there is a corrected p-value, the corrected one counts.
     """
     p_values = tests["p_holm" if "p_holm" in tests else "p_value"]
     is_significant = ((p_values < choices.alpha) & tests["enough_runs"]).astype(
         "boolean"
     )
-    tests = tests.assign(significant=is_significant.where(p_values.notna()))
-    if "p_holm" not in tests:
-        return tests
-    return with_intervals(tests, choices.alpha)
+    return tests.assign(significant=is_significant.where(p_values.notna()))
 
 
 def with_intervals(tests: pd.DataFrame, alpha: float) -> pd.DataFrame:
@@ -239,7 +239,7 @@ def with_intervals(tests: pd.DataFrame, alpha: float) -> pd.DataFrame:
     return tests.assign(effect_size_low=low, effect_size_high=high)
 
 
-def median_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
+def medians_over_runs(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
     """The medians, with intervals, of every indicator and metric over the runs of each algorithm.
     The columns are algorithm, metric, runs, median, median_low and median_high.
     """
@@ -263,8 +263,7 @@ def minimal_causes(case: Case, choices: Choices) -> pd.DataFrame:
     UnanswerableError
         If the causes were not counted, or the solutions belong to no run.
     """
-    # The call raises an error if the solutions are imported.
-    case.runs_of(NSGA2)
+    case.require_runs()
     if case.name not in choices.causes:
         raise UnanswerableError(
             case.name,
@@ -343,11 +342,11 @@ def _test_opponents(
     # By name, whether a larger value means a better algorithm: a better front, more unsafe
     # solutions, or more causes.
     directions = {metric.name: metric.more_is_unsafe for metric in case.scoring.metrics}
-    directions = MORE_IS_BETTER | directions | BETTER
+    directions = MORE_IS_BETTER | directions | OPTIONAL_DIRECTIONS
     rows = []
     for baseline, (metric, more_is_better) in product(opponents, directions.items()):
         values = samples.get((algorithm, metric), ())
-        if metric in BETTER and (algorithm, metric) not in samples:
+        if metric in OPTIONAL_DIRECTIONS and (algorithm, metric) not in samples:
             continue
         test = compare_samples(values, samples.get((baseline, metric), ()))
         test = test.oriented(larger_is_better=more_is_better)
@@ -377,19 +376,18 @@ def _samples(case: Case, choices: Choices, over_runs: bool) -> Samples:
 
 
 def _values(
-    case: Case, algorithm: str, metric: Measure, over_runs: bool
+    case: Case, algorithm: str, metric: Measure, over_runs: bool, column: str = ""
 ) -> pd.Series[float]:
-    """The defined values of a metric over the solutions that count for it, or, with `over_runs`,
-    their mean in each run.
+    """The defined values of a column, by default the metric's, over the solutions that count for
+    the metric, or, with `over_runs`, their mean in each run.
     """
-    solutions = solutions_for_metric(case.solutions_of(algorithm), metric).dropna(
-        subset=metric.name
-    )
-    values = solutions[metric.name].astype(float)
+    column = column or metric.name
+    solutions = solutions_for_metric(case.solutions_of(algorithm), metric)
+    solutions = solutions.dropna(subset=column)
+    values = solutions[column].astype(float)
     if not over_runs:
         return values
-    # The call raises an error if the solutions belong to no run.
-    case.runs_of(algorithm)
+    case.require_runs()
     return values.groupby(solutions["run"]).agg(
         lambda sample: np.mean(sample.to_numpy())
     )
@@ -407,9 +405,8 @@ def _originals(
         return pd.Series(case.original[metric.name], index=values.index, dtype=float)
     if metric.name != SAFETY_DEGREE:
         return pd.Series(np.nan, index=values.index, dtype=float)
-    return _values(
-        case, algorithm, structs.replace(metric, name=ORIGINAL_DEGREE), over_runs
-    )
+    # Every solution has both degrees: in its encounter, the original vehicle is safe.
+    return _values(case, algorithm, metric, over_runs, ORIGINAL_DEGREE)
 
 
 def describe_runs_without_solutions(case: Case) -> str:

@@ -60,7 +60,7 @@ FUNCTIONS: dict[str, Compute] = {
     "rq2-runs": comparisons.rq2_runs,
     "rq2-common": comparisons.rq2_common,
     "a12": comparisons.effects,
-    "medians": comparisons.median_runs,
+    "medians": comparisons.medians_over_runs,
     CAUSES: comparisons.minimal_causes,
     "rq1": comparisons.rq1,
     "rq2": comparisons.rq2,

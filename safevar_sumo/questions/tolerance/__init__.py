@@ -168,7 +168,7 @@ def tolerance(
     usual = _usual_settings(evaluator, len(columns), fits)
     planned = {name: (1 + len(smaller)) * number for name, number in usual.items()}
     evaluator.begin(planned, minimum=1 + 2 * len(columns) * LEAST_VALUES)
-    is_few = evaluator.left is not None
+    is_few = evaluator.account.is_limited
     if is_few and fits is None:
         # Few simulations do not suffice for other parameter sets.
         fits = 0
