@@ -30,23 +30,18 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import Limit
 from safevar_sumo.vehicles import region_of
-from tests.in_process import InlinePool, rows_of
+from tests.in_process import SLOW, InlinePool, rows_of
 from tests.made_up import case_of
 from tests.questions.conftest import (
     Plant,
     Region,
-    box,
+    box as corner,
     made_up_evaluator,
     made_up_model,
     made_up_study,
     nowhere,
     two_islands,
 )
-
-SLOW = pytest.mark.slow
-
-
-corner = box
 
 
 def pair(rows: FloatArray) -> BoolArray:
@@ -222,16 +217,14 @@ def test_sets_that_break_or_cut_limits_are_told() -> None:
     assert all_sets.sides[1, 1] <= 2
     assert all_sets.alone.upper.tolist() == pytest.approx([8, 7], abs=0.1)
     assert all_sets.proofs == 2, "the smaller box is proved anew"
-    corner = 5 + all_sets.sides[1]
-    assert corner.tobytes() in plants[0].seen, "its corners are driven anew"
+    # Its corners are driven anew.
+    assert (5 + all_sets.sides[1]).tobytes() in plants[0].seen
 
 
 def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> None:
     """a above 7 with b below 3: the largest box ends at the one or the other."""
-    asked = asked_of(
-        Models((made_up_model(3, corner),), ()), Unsafe(), [0, 1], {}, at_tests=True
-    )
-    limits = find_limits(asked)
+    models = Models((made_up_model(3, corner),), ())
+    limits = find_limits(asked_of(models, Unsafe(), [0, 1], {}, at_tests=True))
     assert limits.sides is not None
     ends = np.stack(limits.boxes.ends(limits.sides))
     assert ends[:, 2].tolist() == [5, 5], "it does not vary"
@@ -257,12 +250,13 @@ def test_the_worst_clearance_is_what_is_left_beside_the_margin_of_its_set() -> N
 
 
 def test_few_simulations_claim_nothing_of_a_set_that_they_do_not_reach() -> None:
-    own = made_up_model(2, nowhere)
+    own = made_up_model(8, nowhere)
     own.evaluator.account.limit = 600
     models = Models((own, own._replace(fit=1)), ())
-    limits = find_limits(asked_of(models, Unsafe(), [0, 1], {}, at_tests=True))
+    limits = find_limits(asked_of(models, Unsafe(), range(8), {}, at_tests=True))
     assert [*limits.attacks] == [0]
     assert limits.sides is None
+    assert bytes(64) in own.evaluator._pool.seen, "a corner, with all values 0"
 
 
 def test_few_simulations_are_shared_between_limits_alone_and_the_box() -> None:
@@ -271,7 +265,7 @@ def test_few_simulations_are_shared_between_limits_alone_and_the_box() -> None:
     assert (effort.values, effort.alone, effort.cases) == (8, 0, 300)
     on_lines = effort.encounters * (effort.values + sum(effort.box.parts))
     assert 300 < 8 * on_lines <= 0.15 * 3000
-    assert (effort.corners, effort.confirmations, effort.share) == (0, 2, 1)
+    assert (effort.corners, effort.confirmations, effort.share) == (1, 2, 1)
     assert effort.box.retreat == pytest.approx(0.5 + 200 / 3000)
     assert effort_of(evaluator, 200, 4).values == 3
     assert usual_alone(evaluator) == 4 * usual_alone(evaluator, 1) == 4 * 5000

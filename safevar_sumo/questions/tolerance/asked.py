@@ -308,7 +308,7 @@ def _effort_of_few(cases: int, varied: int) -> Effort:
         generation=FEW_GENERATION,
         followers=0,
         box=box,
-        corners=0,
+        corners=1,
         confirmations=2,
         share=1.0,
     )

@@ -135,16 +135,16 @@ def _with_own_set(task: Asked, wider: FoundLimits | None) -> FoundLimits:
     except Exhausted:
         suffices = False
     longest = task.sides(alone.lower, alone.upper)
+    broken: Mapping[int, FloatArray] = {}
     if wider is not None:
+        broken = wider.broken
         sides = wider.specified if wider.sides is None else wider.sides
         longest = np.minimum(longest, sides)
     boxes = task.boxes(longest)
     # Vehicles to avoid are known failures: a failure needs an encounter, and any one will do.
     encounter = task.star.lower[np.newaxis, boxes.space.size :]
     avoided = product_of(task.avoided, encounter)
-    limits = FoundLimits(alone, boxes, Failures(avoided, task.nothing))
-    if wider is not None:
-        limits = limits._replace(broken=wider.broken)
+    limits = FoundLimits(alone, boxes, Failures(avoided, task.nothing), broken)
     if not suffices:
         return limits
     try:
@@ -224,25 +224,23 @@ def _with_largest_box(task: Asked, limits: FoundLimits) -> FoundLimits:
     boxes = limits.boxes
     settled = Settled(boxes.longest, limits.failures)
     if boxes.effort.explored:
-        budgets = QUICK_GENERATIONS * effort.generation, effort.cases
         quick, thorough = task.searches(
             Stream.JOINT_LIMITS,
             0,
-            budgets,
+            [QUICK_GENERATIONS * effort.generation, effort.cases],
             phases=False,
         )
-        rng = Stream.LARGER_BOXES.generator(task.seed)
         settled = find_largest_box(
             boxes,
             limits.failures,
             quick,
             thorough,
-            rng,
+            Stream.LARGER_BOXES.generator(task.seed),
         )
     search = task.search(Stream.VALIDATION, 0)
     searches = [search] * (1 + effort.confirmations)
-    if effort.corners:
-        searches.insert(1, _corner_search(task))
+    # Few simulations begin with a corner, as a box that is far too large fails there at once.
+    searches.insert(int(effort.share < 1), _corner_search(task))
     return _with_settled(
         task,
         limits,
@@ -319,7 +317,7 @@ def _with_settled(
         # With the study's own set, the searches included the corners of this box. Otherwise the
         # corners are still to be driven.
         has_corners = fit == 0 and np.array_equal(settled.sides, sides)
-        if task.effort.corners and not is_same and not has_corners:
+        if not is_same and not has_corners:
             unsafe = _corner_search(task)(boxes.cases_in(sides), unsafe).unsafe
         if not (is_same or len(unsafe)) and task.effort.share < 1:
             number = limits.proofs + 1
@@ -346,14 +344,12 @@ def _alone_before(task: Asked, limits: FoundLimits) -> Alone:
     vehicles = cases[:, : len(task.original)]
     is_single = np.count_nonzero(vehicles != task.original, axis=1) == 1
     is_inside = ((vehicles >= alone.lower) & (vehicles <= alone.upper)).all(axis=1)
-    unsafe = cases[is_single & is_inside]
-    parts = task.effort.box.parts
     return limits_before(
         task.oracle,
         task.star,
         alone,
-        unsafe,
-        parts,
+        cases[is_single & is_inside],
+        task.effort.box.parts,
     )
 
 
@@ -380,18 +376,22 @@ def _corner_search(task: Asked) -> CaseSearch:
     def search(space: Space, start: FloatArray) -> Counterexamples:
         lower = space.lower[: space.size]
         upper = space.upper[: space.size]
-        # Bit i of a corner's number says whether value i that varies is at its upper end.
-        columns = np.flatnonzero(lower < upper)
-        number = 2 ** len(columns)
+        is_open = lower < upper
+        # A bit of a corner's number says whether a value that varies is at its upper end.
+        bits = is_open * 2 ** np.cumsum(is_open) // 2
+        number = 1 + bits.sum()
         corners = np.arange(min(number, limit))
         if number > limit:
             corners = rng.integers(number, size=limit)
-        vehicles = np.tile(lower, (len(corners), 1))
-        is_high = corners[:, np.newaxis] >> np.arange(len(columns)) & 1
-        vehicles[:, columns] = np.where(is_high, upper[columns], lower[columns])
-        cases = product_of(vehicles, listed)
-        results = Counterexamples(start[:0], np.zeros(0))
-        results = results.after(cases, task.oracle(cases))
+            # The first corner is the one towards which most former failures lie. A value that none
+            # of them changed is at the end of the longer side.
+            votes = np.sign(start[:, : space.size] - task.original).sum(axis=0)
+            longer = lower + upper - 2 * task.original
+            corners[0] = bits @ (np.where(votes, votes, longer) > 0)
+        is_high = corners[:, np.newaxis] & bits
+        cases = product_of(np.where(is_high, upper, lower), listed)
+        nothing = Counterexamples(start[:0], np.zeros(0))
+        results = nothing.after(cases, task.oracle(cases))
         # Corners do not count as cases of the search for counterexamples.
         return results._replace(simulated=0)
 

@@ -128,7 +128,7 @@ def _tested(facts: Told) -> Iterator[Sentence]:
     corners = 2 ** np.count_nonzero(facts.box.lower < facts.box.upper)
     if corners <= limit:
         yield words.CORNERS
-    elif limit:
+    elif limit > 1:
         yield words.SOME_CORNERS(number=limit)
     proof = facts.limits.proof
     if proof is not None:
