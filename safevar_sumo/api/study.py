@@ -361,7 +361,7 @@ def summarise(results: Results) -> Answer:
         outcomes = Counter(simulated["outcome"])
         feasible = simulated[case.scoring.feasible_rows(simulated)]
         counts = outcomes[Outcome.INVALID_TEST], outcomes[Outcome.SIMULATOR_ERROR]
-        means = solutions[[*metrics]].mean()
+        means = solutions[list(metrics)].mean()
         collisions = int(are_collisions(feasible).sum())
         ends = (collisions, *counts, feasible["f_safe"].min(), len(solutions))
         rows.append(

@@ -254,7 +254,7 @@ def search_side_by_side(
         if not generations:
             break
         ends = np.cumsum(list(map(len, generations.values())))[:-1]
-        robustness = judge(np.concatenate([*generations.values()]))
+        robustness = judge(np.concatenate(list(generations.values())))
         parts = np.split(robustness, ends)
         judged = dict(zip(generations, parts, strict=True))
     return [results[number] for number in range(len(searches))]

@@ -110,7 +110,7 @@ def find_minimal_causes(
                         members.encounter_of(settings[row]),
                         float(of_runs[index]),
                     )
-    return [[*of_row.values()] for of_row in causes]
+    return [list(of_row.values()) for of_row in causes]
 
 
 def _subsets(
@@ -295,7 +295,7 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     """
     keys = ["algorithm", "run"]
     order = [F_NUM_DIFF.name, F_DIFF.name]
-    names = [*evaluator.characteristics.names]
+    names = list(evaluator.characteristics.names)
     failures = case.solutions[case.unsafe.rows(case.solutions)].drop_duplicates(
         [*keys, *names]
     )

@@ -140,7 +140,7 @@ def describe(
                 for name, setting in waiting.items()
             ]
         )
-        names = [*waiting]
+        names = list(waiting)
         for row, failure in failures_at(model, rows).items():
             failures[names[row]] = failure
             del waiting[names[row]]
@@ -176,7 +176,7 @@ def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
         return None
     handle = choose_handle(case.solutions, case.unsafe, "fewest")
     row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
-    setting = row[[*case.characteristics.names]].to_numpy(dtype=float)
+    setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
     with open_evaluator(case.study, jobs=jobs) as evaluator:
         (causes,) = find_minimal_causes(evaluator, setting[np.newaxis], case.unsafe)
         if not causes:

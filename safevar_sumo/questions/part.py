@@ -220,7 +220,7 @@ def _ranges_up_to(study: Study, name: str, high: float) -> Study:
         return domain is None or domain.lower < high
 
     if study.tests:
-        study = study.with_tests([*filter(begins_below, study.tests)])
+        study = study.with_tests(list(filter(begins_below, study.tests)))
     return study.mapped(cut)
 
 
@@ -281,7 +281,7 @@ def points_of_tests(
         return [(None, points)]
     remaining_points = iter(points)
     return [
-        (test, [*islice(remaining_points, len(study.points_of(test)))])
+        (test, list(islice(remaining_points, len(study.points_of(test)))))
         for test in study.tests
     ]
 

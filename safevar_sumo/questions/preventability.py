@@ -82,7 +82,7 @@ def drivers_frame(verdicts: pd.DataFrame, collisions: int) -> pd.DataFrame:
             low = high = share
         points = verdicts["point"][of_driver.isna()].unique()
         counts = (driver, avoided, number - avoided, len(verdicts) - number)
-        rows.append((*counts, share, low, high, [*filter(None, points)]))
+        rows.append((*counts, share, low, high, list(filter(None, points))))
     shares = dict.fromkeys(("share", "share_low", "share_high"), float)
     return pd.DataFrame(rows, columns=list(COLUMNS)).astype(shares)
 

@@ -157,7 +157,7 @@ def replay_command(subject: str, point: str = "") -> str:
 
 def join_phrases(phrases: Iterable[str], conjunction: str = "and") -> str:
     """Phrases of a sentence as a list: `a, b and c`; empty without any."""
-    *beginning, ending = [*phrases] or [""]
+    *beginning, ending = list(phrases) or [""]
     return f"{', '.join(beginning)} {conjunction} {ending}" if beginning else ending
 
 
@@ -242,7 +242,7 @@ def notes_on(unsafe: Unsafe, *texts: str) -> list[Sentence]:
     """Notes with the given texts and the criterion's remark. A last note says what unsafe means, if
     that is not only a collision.
     """
-    notes = [*map(note, (*texts, unsafe.remark))]
+    notes = list(map(note, (*texts, unsafe.remark)))
     if not unsafe.is_collision:
         notes.append(UNSAFE_MEANS(description=unsafe.description))
     return notes

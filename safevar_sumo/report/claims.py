@@ -197,7 +197,7 @@ class Packed:
                 raise InputError(
                     "ask", f"{text!r} writes a file", "a question without --out"
                 )
-        named = [*filter(None, map(list_in, self.packed.questions))]
+        named = list(filter(None, map(list_in, self.packed.questions)))
         packed = [name for name in self.files if name.startswith(f"{LISTS}/")]
         if sorted(named) != sorted(packed):
             raise ValueError(

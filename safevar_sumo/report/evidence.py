@@ -287,7 +287,7 @@ def _files_of_user(
     modules = [
         text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]
     ]
-    folders = [*filter(None, (*places, os.getcwd(), *sys.path))]
+    folders = list(filter(None, (*places, os.getcwd(), *sys.path)))
     for path in code_files(modules, places):
         folder = max(filter(path.is_relative_to, folders), key=len)
         paths[path.relative_to(folder).as_posix()] = path

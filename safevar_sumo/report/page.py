@@ -339,7 +339,7 @@ def make_page(
 ) -> str:
     """The HTML of the page about studies; `shared` are the answers about all studies together."""
     names = ", ".join(study.case.name for study in studies)
-    commands = [*chain(*map(page_commands, studies))]
+    commands = list(chain(*map(page_commands, studies)))
     for answer in shared:
         if answer.command:
             commands.append((f"The answer {answer.question}", answer.command))

@@ -221,7 +221,7 @@ def evaluations_frame(
     import pandas as pd
 
     all_runs = list(runs)
-    metrics = [*METRICS]
+    metrics = list(METRICS)
     for _, evaluations in all_runs:
         metrics += evaluations.metrics
     # Without runs the frame has all columns, too.

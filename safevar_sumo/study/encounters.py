@@ -372,7 +372,7 @@ class Encounters(Table, frozen=True, kw_only=True):
     @property
     def _tests_or_none(self) -> list[MatrixTest | None]:
         """The tests; [None] for a study without a matrix, whose only encounter is its scenario."""
-        return [*self.tests] or [None]
+        return list(self.tests) or [None]
 
     def axes_of(self, test: MatrixTest | None) -> AxisTables:
         """The axes of a test: first its own axes, then the axes of [scenario.over] that the test
@@ -485,5 +485,5 @@ class Encounters(Table, frozen=True, kw_only=True):
             common = [name for name in constraint.tests if name in names]
             if common or not constraint.tests:
                 constraints.append(replace(constraint, tests=common))
-        matrix = replace(self.matrix, tests=[*tests])
+        matrix = replace(self.matrix, tests=list(tests))
         return replace(self, matrix=matrix, constraints=constraints)

@@ -83,7 +83,7 @@ class _Place(NamedTuple):
 
 def _place(raw: Any, table: Any, prefix: Sequence[str], location: str) -> _Place:
     """Find the place that a message of msgspec names, such as `.search.runs` or `.tests[0]`."""
-    path: list[str | int] = [*prefix]
+    path: list[str | int] = list(prefix)
     value = raw
     declared = [table]
     siblings = dict[str, Any]()

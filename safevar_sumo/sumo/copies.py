@@ -124,7 +124,7 @@ def write_demand(roots: Sequence[ElementTree.Element], n: int, file: Path) -> No
     InputError
         If an element cannot be copied.
     """
-    traffics = [[*_departures(root)] for root in roots]
+    traffics = [list(_departures(root)) for root in roots]
     departures = []
     for copy in range(n):
         for time, text in traffics[copy % len(roots)]:

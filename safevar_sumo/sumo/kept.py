@@ -84,7 +84,7 @@ class Kept:
 
     def close(self) -> None:
         """End all simulators."""
-        for name in [*self._handles]:
+        for name in list(self._handles):
             self._close(name)
 
     def _close(self, name: str) -> None:

@@ -55,7 +55,7 @@ class RecordedWorld:
     """
 
     def __init__(self, recording: Recording, size: int) -> None:
-        films = [*recording.tracks.values()]
+        films = list(recording.tracks.values())
         n_samples = max((len(film.motion) for film in films), default=1)
         n_scenes = np.size(recording.speed)
         self._size = size

@@ -366,7 +366,7 @@ def joined(
 
     outcomes = evaluations.outcome.reshape(repeats, n)
     ranks = map(list(map(str, SEVERITY)).index, evaluations.outcome.tolist())
-    severity = np.reshape([*ranks], (repeats, n))
+    severity = np.reshape(list(ranks), (repeats, n))
     degrees = evaluations.f_safe.reshape(repeats, n)
     worst = np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)
     metrics = {name: mean(values) for name, values in evaluations.metrics.items()}

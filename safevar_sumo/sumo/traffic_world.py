@@ -219,7 +219,7 @@ class TrafficWorld(SumoWorld):
         has a vehicle under test or an actor at another place.
         """
         front = np.stack(self._start.point(motion.fronts[:, 0], 0.0), axis=1)
-        driving = [*self.driving.values()]
+        driving = list(self.driving.values())
         places = {"vehicle under test": (front[driving], self._fronts[driving])}
         for actor in self._actors:
             get_position = self._get_position

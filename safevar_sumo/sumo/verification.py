@@ -74,12 +74,12 @@ def drive_again(
             watch(world)
             scene = observer.observe(motion)
             collisions = contacts.count(world, motion.hits, scene)
-            values["collision"][sample, [*collisions]] = [*collisions.values()]
+            values["collision"][sample, list(collisions)] = list(collisions.values())
             values["position"][sample] = frame.along(motion.fronts)
             for name in COMPARED[1:]:
                 values[name][sample] = getattr(scene, name)
             is_open = is_open & trace.active[sample]
-            is_open[[*collisions]] = False
+            is_open[list(collisions)] = False
             # A trace may be longer than the point's runs, which end before those of other points.
             if (
                 sample + 1 == len(trace.time)

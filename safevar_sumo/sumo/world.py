@@ -158,7 +158,7 @@ class SumoWorld:
             ) from None
 
     def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
-        for id_, copy in [*self.driving.items()]:
+        for id_, copy in list(self.driving.items()):
             if not is_open[copy]:
                 self.api.vehicle.remove(id_)
                 del self.driving[id_]
@@ -171,7 +171,7 @@ class SumoWorld:
     def _motion(self, is_open: BoolArray) -> VehicleStates:
         self._speeds = self._speeds.copy()
         self._fronts = self._fronts.copy()
-        copies = [*self.driving.values()]
+        copies = list(self.driving.values())
         self._speeds[copies] = list(map(self._get_speed, self.driving))
         self._fronts[copies] = list(map(self._get_position, self.driving))
         return VehicleStates(self._fronts, self._speeds, self._hits(is_open))
@@ -250,7 +250,7 @@ class SumoWorld:
 
     def person_positions(self, actor: str) -> FloatArray:
         ids = self.ids(actor)
-        copies = [*self.driving.values()]
+        copies = list(self.driving.values())
         try:
             positions = np.array(list(map(self._get_person_position, ids)))
         # A person has left the road in a copy: ask SUMO only where a vehicle is still driving.

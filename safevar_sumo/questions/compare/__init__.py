@@ -164,7 +164,7 @@ def compare(
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings, valid)
-    counts = counts_of(settings.drop_duplicates([*evaluator.characteristics.names]))
+    counts = counts_of(settings.drop_duplicates(list(evaluator.characteristics.names)))
     names = (study.name, second.study.name)
     if names[0] == names[1]:
         names = ("A", "B")
@@ -179,7 +179,7 @@ def compare(
         *compare_limits(alone.frame, evaluator.characteristics),
         *compare_values(tested.p, tested.a12),
     ]
-    lacks = [*missing_in_words(*evaluators, titles)]
+    lacks = list(missing_in_words(*evaluators, titles))
     number_of_better = sum(difference.is_better for difference in differences)
     decision, why = _decide(differences, titles, of_originals, lacks)
     numbers: JsonObject = {
@@ -225,7 +225,7 @@ def compare(
         },
         folded=("settings",),
         failures=(Verdict(why),) if decision == DO_NOT_RELEASE else (),
-        draw=partial(draw_pairs, titles=[*titles.values()]),
+        draw=partial(draw_pairs, titles=list(titles.values())),
     )
 
 
@@ -279,7 +279,7 @@ def _settings_frame(
     frame, settings, runs = pairs
     of_pairs = table_of_pairs(frame["solution"], runs, criteria)
     a, b = (pd.DataFrame(of_side, columns=names) for of_side in settings)
-    differing = b[[*compress(names, common.shift)]].add_prefix("b_")
+    differing = b[list(compress(names, common.shift))].add_prefix("b_")
     return pd.concat([frame.drop(columns="solution"), of_pairs, a, differing], axis=1)
 
 
@@ -301,8 +301,8 @@ def _table(common: CommonDomain, settings: pd.DataFrame) -> AnswerTable:
         item = members[column]
         meaning = f"{item.name} in B, the same change of another original"
         columns[f"b_{item.name}"] = Column(item.unit, meaning, is_shown=False)
-    places = settings["unsafe_in"].map([*UNSAFE_IN].index)
-    rows = settings.loc[places.sort_values(kind="stable").index, [*columns]]
+    places = settings["unsafe_in"].map(list(UNSAFE_IN).index)
+    rows = settings.loc[places.sort_values(kind="stable").index, list(columns)]
     return tabulate("The same changed vehicles in both versions", columns, rows)
 
 
@@ -324,12 +324,12 @@ def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
     of a run or, if there are fewer runs than the test needs, the sampled settings on a line.
     """
     a, b = (run.f_safe for run in runs.runs)
-    frame = settings.assign(a=a, b=b).dropna(subset=[*SIDES])
-    pairs = frame[frame["source"] == SAMPLE].groupby(LINE)[[*SIDES]].mean()
+    frame = settings.assign(a=a, b=b).dropna(subset=list(SIDES))
+    pairs = frame[frame["source"] == SAMPLE].groupby(LINE)[list(SIDES)].mean()
     names = [f"line {int(line)}" for line in pairs.index]
     groups = "sampled on one line through the domain"
     if "run" in frame:
-        means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[[*SIDES]].mean()
+        means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[list(SIDES)].mean()
         if len(means) >= fewest_runs("RQ1"):
             pairs = means
             names = [

@@ -65,7 +65,7 @@ def missing_parts(side: Evaluator, reference: Evaluator) -> list[str]:
         *_excluded(side.study, reference.study),
         *_missing_sets(side.study, reference.study),
     ]
-    return [*dict.fromkeys(parts)]
+    return list(dict.fromkeys(parts))
 
 
 def missing_in_words(

@@ -85,7 +85,7 @@ def summary_of(
             numbers["only_a_unsafe"] + number_in_both,
             numbers["only_b_unsafe"] + number_in_both,
         ],
-        "mean safety degree of the changed vehicles": pairs[[*SIDES]].mean(),
+        "mean safety degree of the changed vehicles": pairs[list(SIDES)].mean(),
         f"scenes with needless braking, of {numbers['benign_scenes']} benign scenes": [
             numbers["a_needless_braking"],
             numbers["b_needless_braking"],
@@ -235,7 +235,7 @@ def compare_originals(
     ends = _ends_of_originals(evaluators, originals)
     numbers = {**ends, **braking, **_metres_earlier(*evaluators)}
 
-    differences = [*_new_collisions(evaluators)]
+    differences = list(_new_collisions(evaluators))
     if in_a != in_b:
         template = words.ORIGINAL_UNSAFE if in_b else words.ORIGINAL_SAFE
         differences.append(Difference(template, {}, is_better=in_a))

@@ -287,7 +287,7 @@ def _collision_numbers(verdicts: pd.DataFrame, collisions: int | None) -> JsonOb
     """
     if collisions is None:
         return dict.fromkeys(COLLISION_NUMBERS)
-    is_avoided = (verdicts[[*TITLES]] == 1).any(axis=1)
+    is_avoided = (verdicts[list(TITLES)] == 1).any(axis=1)
     unavoidable = verdicts[FULL].notna() & ~is_avoided
     numbers = collisions, int(is_avoided.sum()), int(unavoidable.sum())
     return dict(zip(COLLISION_NUMBERS, numbers, strict=True))

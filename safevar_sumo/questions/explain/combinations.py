@@ -76,7 +76,7 @@ class Enumeration(NamedTuple):
         complete_sizes = takewhile(
             lambda size: self.simulated[size] == self.existing[size], sizes
         )
-        return len([*complete_sizes])
+        return len(list(complete_sizes))
 
     @property
     def size(self) -> int:
@@ -128,7 +128,7 @@ def enumerate_causes(
         is_cut = comb(len(columns), size) * 2**size > MAX_COMBINATIONS
         if is_cut:
             break
-        of_size = [*_of_size(changes, size)]
+        of_size = list(_of_size(changes, size))
         is_feasible = evaluator.region.feasible(_settings(members, of_size)).tolist()
         candidates = list[Combination]()
         larger = list[Combination]()

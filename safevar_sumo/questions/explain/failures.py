@@ -144,7 +144,7 @@ def gather_failures(
         omissions = int(evaluations.infeasible.sum())
         is_met = ~evaluations.infeasible
         evaluations = evaluations.take(is_met)
-        names = [*compress(names, is_met)]
+        names = list(compress(names, is_met))
         vehicles = VariationModel(subject).draw(
             VEHICLES, default_rng(subject.search.seed)
         )
@@ -270,7 +270,7 @@ def _failures_that_matter(population: Population) -> Reasons:
     failures = population.evaluations.take(population.rows)
     for choice, reason in REASONS.items() if population.rows else ():
         columns = map(failures.column, reversed(CHOICES[choice]))
-        order = np.lexsort([*columns])
+        order = np.lexsort(list(columns))
         row = population.rows[order[0]]
         reasons[row] = f"{reasons[row]}; {reason}" if row in reasons else reason
     return reasons

@@ -113,10 +113,12 @@ def smallest_tables(smallest: Smallest | None) -> dict[str, AnswerTable]:
         "How many changes are enough, with every change at the same share of the way to its"
         " end"
     )
-    stairs = pd.DataFrame(rows, columns=[*STAIRCASE_COLUMNS]).astype(
+    stairs = pd.DataFrame(rows, columns=list(STAIRCASE_COLUMNS)).astype(
         {"fewest": "Int64"}
     )
-    causes = smallest.table if smallest else pd.DataFrame(columns=[*SMALLEST_COLUMNS])
+    causes = (
+        smallest.table if smallest else pd.DataFrame(columns=list(SMALLEST_COLUMNS))
+    )
     return {
         "causes": tabulate(TITLE, SMALLEST_COLUMNS, causes),
         "staircase": tabulate(title, STAIRCASE_COLUMNS, stairs),
@@ -194,7 +196,7 @@ def _table(
             beginnings, holds, robust.tolist(), strict=True
         )
     ]
-    frame = pd.DataFrame(rows, columns=[*SMALLEST_COLUMNS])
+    frame = pd.DataFrame(rows, columns=list(SMALLEST_COLUMNS))
     in_order = frame.astype({"holds": "Int64", "fits": "Int64"}).sort_values(
         ["robust_share", "holds", "size"], ascending=[False, False, True]
     )

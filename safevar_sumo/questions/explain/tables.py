@@ -70,7 +70,7 @@ def failures_frame(
     the chosen failures, and why each was chosen.
     """
     if not reasons:
-        return pd.DataFrame(columns=[*SOLUTION_COLUMNS])
+        return pd.DataFrame(columns=list(SOLUTION_COLUMNS))
 
     failures = population.evaluations.take(list(reasons))
     settings = failures.settings
@@ -81,17 +81,17 @@ def failures_frame(
     is_assessed = failures.collided & has_reference_drivers(evaluator)
     verdicts = assess_collisions(evaluator, failures.take(is_assessed))
     drivers = np.full(len(failures), None)
-    drivers[is_assessed] = [*map(avoided_by, verdicts.to_dict("records"))]
+    drivers[is_assessed] = list(map(avoided_by, verdicts.to_dict("records")))
     columns = {
-        "solution": [*map(population.names.__getitem__, reasons)],
-        "reason": [*reasons.values()],
+        "solution": list(map(population.names.__getitem__, reasons)),
+        "reason": list(reasons.values()),
         "outcome": failures.outcome,
         "safety_degree": failures.f_safe,
         "changed": failures.f_num_diff.astype(int),
         "largest_change": failures.f_diff,
         "unsafe_neighbours": robust_shares(evaluator, settings, unsafe).mean(axis=1),
         "ends": sentences,
-        "points": [*map(list, points)],
+        "points": list(map(list, points)),
         "avoided_by": drivers,
     }
     return pd.DataFrame(columns)
@@ -122,7 +122,7 @@ def causes_table(
     study = evaluator.study
     unsafe = population.unsafe
 
-    causes = [*chain.from_iterable(causes_of)]
+    causes = list(chain.from_iterable(causes_of))
     robust, holds, number_of_sets = sureness(evaluator, causes, unsafe, fits)
 
     limits = find_cause_limits(evaluator, causes, unsafe)
@@ -158,7 +158,7 @@ def causes_table(
         }
         for index in order.tolist()
     ]
-    frame = pd.DataFrame(rows, columns=[*CAUSE_COLUMNS]).astype(
+    frame = pd.DataFrame(rows, columns=list(CAUSE_COLUMNS)).astype(
         {"holds": "Int64", "fits": "Int64"}
     )
     columns = {**CAUSE_COLUMNS}

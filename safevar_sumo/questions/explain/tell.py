@@ -158,7 +158,7 @@ def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Iterator[Sentence]:
     """
     by_size = groupby(steps, lambda step: (step.size, max(step.simulated)))
     for (size, largest), group in by_size:
-        alike = [*group]
+        alike = list(group)
         ends = dict.fromkeys(f"{100 * alike[place].share:.0f}" for place in (-1, 0))
         shares = " to ".join(ends)
         if size:
@@ -264,7 +264,7 @@ def _beyond(
     number = evaluator.at_most(BEYOND, 4)
     at_cause = members.setting(cause | encounter, beyond=True)
     ends = np.where(at_cause > members.original, members.upper, members.lower)
-    is_open = np.isin(members.names, [*cause]) & (ends != at_cause)
+    is_open = np.isin(members.names, list(cause)) & (ends != at_cause)
     if number < LEAST_NEIGHBOURS or not is_open.any():
         return
     shares = np.random.default_rng(evaluator.seed).random((number, len(members)))

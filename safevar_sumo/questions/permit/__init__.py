@@ -300,7 +300,7 @@ def _check_forms(
     the list of cars itself, or that would hold a rough answer.
     """
     is_given = (cars is not None, values, limits)
-    forms = [*compress(("--cars", "--set", "--limits"), is_given)]
+    forms = list(compress(("--cars", "--set", "--limits"), is_given))
     if len(forms) != 1:
         raise InputError(
             "permit",

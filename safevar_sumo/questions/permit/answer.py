@@ -119,7 +119,7 @@ class PermitAnswer:
         scope = scope_of(claim)
         unsafe = self.models.own.unsafe
         failures = []
-        sentences = [*self._sentences(cars, counts)]
+        sentences = list(self._sentences(cars, counts))
         if self.need is not None:
             is_slow = ~(cars["up_to"].astype(float) >= self.need)
             too_slow = int(is_slow.sum())

@@ -179,7 +179,7 @@ def unit_places(dimensions: int, value: float) -> FloatArray:
     if not dimensions:
         return np.zeros((1, 0))
     seed = zlib.crc32(np.array([value]).tobytes())
-    corners = np.array([*product((0.0, 1.0), repeat=min(dimensions, MOST_ENDS))])
+    corners = np.array(list(product((0.0, 1.0), repeat=min(dimensions, MOST_ENDS))))
     shape = len(corners), dimensions - corners.shape[1]
     further = np.random.default_rng(seed).integers(0, 2, size=shape)
     spread = sobol_points(SPREAD_PLACES, dimensions, seed)
@@ -222,8 +222,8 @@ def span_of(study: Study, by: str | None) -> Span:
         raise InputError("permit", problem, "a study that varies a speed")
     check_name("by", problem, name, speeds)
 
-    names = np.array([*ends])
-    lows, tops = np.transpose([*ends.values()]).astype(float)
+    names = np.array(list(ends))
+    lows, tops = np.transpose(list(ends.values())).astype(float)
     # The range ends where the first test ends.
     high = tops.min()
     goes_on = tops.max() > high

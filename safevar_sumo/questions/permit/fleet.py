@@ -166,7 +166,7 @@ def read_fleet(
     is_rough = False
     if is_answer:
         is_rough = YES in [text.strip() for text in table[ROUGH]]
-        table = table.drop(columns=[*written])
+        table = table.drop(columns=list(written))
     return Fleet(names, settings, measured, table, is_rough)
 
 
@@ -243,15 +243,15 @@ def _cells_of_file(path: Path) -> _Cells:
                 number_of(len(row), "field"),
                 f"{number} fields with a {SEPARATORS[separator]} between them",
             )
-    return _Cells(place, rows[0], [*places[1:]], [*rows[1:]], separator)
+    return _Cells(place, rows[0], list(places[1:]), list(rows[1:]), separator)
 
 
 def _cells_of_frame(frame: pd.DataFrame) -> _Cells:
     """The cells of a data frame. A missing value becomes an empty cell."""
     present = frame.astype(object).where(frame.notna(), None)
-    rows = [[*map(_text, row)] for row in present.itertuples(index=False, name=None)]
+    rows = [list(map(_text, row)) for row in present.itertuples(index=False, name=None)]
     places = [f"cars, row {label}" for label in frame.index]
-    return _Cells("cars", [*map(str, frame.columns)], places, rows)
+    return _Cells("cars", list(map(str, frame.columns)), places, rows)
 
 
 def _cells_of_mapping(cars: Mapping[Any, Any], place: str) -> _Cells:
@@ -265,7 +265,8 @@ def _cells_of_mapping(cars: Mapping[Any, Any], place: str) -> _Cells:
             )
     columns = dict.fromkeys(chain.from_iterable(cars.values()))
     rows = [
-        [*map(_text, (car, *map(values.get, columns)))] for car, values in cars.items()
+        list(map(_text, (car, *map(values.get, columns))))
+        for car, values in cars.items()
     ]
     places = [f"{place}, {car!r}" for car in cars]
     if place == TYPED:
@@ -297,7 +298,7 @@ def _columns(
         for name in ignore:
             check_name("", f"--ignore {name}: there is no such column", name, header)
         read = [column for column, text in enumerate(header) if text not in ignore]
-        names = [*header]
+        names = list(header)
         for column in read:
             names[column] = header[column].partition("[")[0].strip()
         naming = read[0] if read else 0

@@ -144,10 +144,10 @@ class PermitSearch:
         ranges = encounters_of(models.own, span)
         self._ranges = {models.own.fit: ranges}
         fixed = [encounters.low for encounters in ranges if encounters.column is None]
-        self.listed = np.unique([*filter(np.isfinite, fixed)])
+        self.listed = np.unique(list(filter(np.isfinite, fixed)))
         is_moved = len(fixed) < len(ranges)
         self.values = np.union1d(values, self.listed) if is_moved else self.listed
-        self._models_in_order = [*models.members]
+        self._models_in_order = list(models.members)
         self._usual = 0.0
         """Usual number of settings of a car in all parameter sets."""
 
@@ -207,7 +207,7 @@ class PermitSearch:
                 self._ranges[model.fit],
                 [cars[car] for car in caps],
                 self.values,
-                [*caps.values()],
+                list(caps.values()),
                 name,
             )
             with model.evaluator.phases.stage(name):
@@ -367,7 +367,7 @@ def cars_of(vehicle: CharacteristicSet, fleet: Fleet) -> list[Cars]:
     """The cars of a list. A measured value becomes the range of values that it may really have."""
     cars = []
     for setting, is_measured in zip(fleet.settings, fleet.measured, strict=True):
-        ends = [*map(Characteristic.measured, vehicle, setting)]
+        ends = list(map(Characteristic.measured, vehicle, setting))
         lower, upper = np.where(is_measured, np.transpose(ends), setting)
         cars.append(Cars.measured(lower, upper))
     return cars

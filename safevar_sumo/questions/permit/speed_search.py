@@ -206,7 +206,7 @@ class SpeedSearch:
             values = values[size:]
             if alive and len(places):
                 cases = [self._cases(car, places) for car in alive]
-                ends = np.cumsum([*map(len, cases)])[:-1]
+                ends = np.cumsum(list(map(len, cases)))[:-1]
                 parts = np.split(self._judge(np.concatenate(cases)), ends)
                 for car, of_car, robustness in zip(alive, cases, parts, strict=True):
                     self._note(car, of_car, robustness)
@@ -240,7 +240,7 @@ class SpeedSearch:
         car. The result has shape (P * together, n + 2 + k).
         """
         cars = self._cars[car]
-        vehicles = np.concatenate([*map(cars.at, places)])
+        vehicles = np.concatenate(list(map(cars.at, places)))
         return np.hstack([vehicles, np.repeat(places, cars.together, axis=0)])
 
     def _judge(self, cases: FloatArray) -> FloatArray:

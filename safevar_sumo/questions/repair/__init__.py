@@ -233,7 +233,7 @@ def _not_repairable(problem: RepairProblem, cases: FloatArray) -> list[NamedValu
             for case in cases[evenly_spaced.astype(int)]
         ]
     )
-    causes = [*chain(*find_minimal_causes(driver, failures, unsafe))]
+    causes = list(chain(*find_minimal_causes(driver, failures, unsafe)))
     parts: dict[tuple[object, ...], NamedValues] = {}
     for limits, cause in zip(
         find_cause_limits(driver, causes, unsafe), causes, strict=True

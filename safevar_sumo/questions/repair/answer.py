@@ -83,11 +83,11 @@ def answer_of(
         necessary = template(safe=_safe_in_words(unsafe))
         sentences = [necessary, words.WORST(ending=ending)]
     else:
-        sentences = [*_repair(problem, repairs)]
+        sentences = list(_repair(problem, repairs))
     tested = []
     if survivors.changes:
         proof = repairs[0] if repairs else _columns_of(survivors.changes[0][1])
-        tested = [*_tested(models, survivors, proof)]
+        tested = list(_tested(models, survivors, proof))
     return Answer(
         question="repair",
         study=problem.study,

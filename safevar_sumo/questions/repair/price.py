@@ -92,7 +92,7 @@ def benign_scenes(study: Study, system: System) -> list[Point]:
     """
     if study.repair.benign:
         matrix = MatrixTable(tests=study.repair.benign)
-        return [*assemble(replace_in(study, matrix=matrix)).matrix]
+        return list(assemble(replace_in(study, matrix=matrix)).matrix)
     searched = system.characteristics.scenario
     ends = [searched.original, searched.lower, searched.upper]
     scenes = dict[str, Point]()

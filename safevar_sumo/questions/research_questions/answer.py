@@ -243,7 +243,7 @@ def answer_questions(
 
     if errors and all(table.frame.empty for table in tables.values()):
         raise errors[0]
-    sentences = [*chain.from_iterable(map(_verdict, cases))]
+    sentences = list(chain.from_iterable(map(_verdict, cases)))
     of_all = []
     for case in cases:
         sentences += [REMARK(remark=remark) for remark in case.remarks]
@@ -254,7 +254,7 @@ def answer_questions(
         ]
     on_all = product(["all"], filter(None, of_all))
     different = dict.fromkeys([*on_all, *remarks])
-    tables["remarks"] = tabulate("Remarks", REMARKS, [*different])
+    tables["remarks"] = tabulate("Remarks", REMARKS, list(different))
     return Answer(
         question="tables",
         study=cases[0].study,
@@ -367,7 +367,7 @@ def _on_pooled_tests(
         # the solutions.
         if case.study.ranges:
             values = values.where(values.index == SAFETY_DEGREE)
-        omitted = [*values.index[values.isna()]]
+        omitted = list(values.index[values.isna()])
         if omitted:
             yield (
                 f"No test uses {join_phrases(omitted)}, because the original vehicle has no such"

@@ -223,6 +223,6 @@ def frequent_combinations(case: Case) -> pd.DataFrame:
     for row in np.argsort(-counts, kind="stable")[:COMBINATIONS_SHOWN]:
         count = counts[row]
         rank = 1 + np.count_nonzero(counts > count)
-        combination = [*compress(names, combinations[row])]
+        combination = list(compress(names, combinations[row]))
         rows.append((rank, combination, 100 * count / len(masks)))
     return pd.DataFrame(rows, columns=["rank", "characteristics", "percent"])

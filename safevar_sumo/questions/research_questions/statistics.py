@@ -142,7 +142,7 @@ def signed_rank_test(x: ArrayLike, y: ArrayLike = 0.0) -> TwoSampleTest:
     """
     # Differences of decimal numbers have no rounding errors.
     baselines = _decimals(np.broadcast_to(y, np.shape(x)))
-    differences = np.array([*map(sub, _decimals(x), baselines)], float)
+    differences = np.array(list(map(sub, _decimals(x), baselines)), float)
 
     if not differences.size or np.isnan(differences).any():
         return TwoSampleTest(np.nan, np.nan, None, differences.size, 0, None)

@@ -138,7 +138,7 @@ def rules(
         own_shares = shares(box, testing.settings, unsafe_in_test)
         ends = over_sets.ends(number, own_shares[:3])
         rows.append((conditions(box, characteristics), *own_shares, *ends))
-    frame = pd.DataFrame(rows, columns=[*COLUMNS])
+    frame = pd.DataFrame(rows, columns=list(COLUMNS))
     frame = frame.sort_values("coverage", ascending=False, kind="stable")
     title = "Regions in which many vehicles are unsafe"
     table = tabulate(title, COLUMNS, frame.reset_index(drop=True))

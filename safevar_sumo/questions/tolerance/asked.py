@@ -70,6 +70,8 @@ class Effort(NamedTuple):
     alone, cases, cases_of_set
         Cases that search for a counterexample to limits alone, and to a box with the study's own
         parameter set, and with another one.
+    edges
+        Number of lines that seek encounters that only just count, with another parameter set.
     generation, followers
         Cases of a generation of such a search, and generations that follow the first with an unsafe
         case.
@@ -88,6 +90,7 @@ class Effort(NamedTuple):
     alone: int = 2000
     cases: int = 5000
     cases_of_set: int = 1000
+    edges: int = 0
     generation: int = 512
     followers: int = 2
     box: BoxEffort = BoxEffort()
@@ -98,10 +101,9 @@ class Effort(NamedTuple):
 
 USUAL = Effort()
 """How much is searched by default."""
-OF_RANGES = 3
-"""Factor on the cases that search with another parameter set if encounters have axes, too: of nine
-searches with 3,000 cases, eight found a vehicle within limits of `sun` that collided, of twelve
-with 1,000 two.
+EDGES = 256
+"""Number of lines on which a search with another parameter set seeks encounters that only just
+count, if encounters are ranges.
 """
 
 
@@ -186,8 +188,11 @@ class Asked(NamedTuple):
             n = space.size
             cases = oracle.space(fit, space.lower[:n], space.upper[:n], phases=phases)
             cases = cases._replace(center=space.center)
+            edges = oracle.edges(fit, self.effort.edges if fit else 0, rng)
+            on_edges = cases.draw(len(edges), rng)
+            on_edges[:, n:] = edges
+            start = np.concatenate([start, on_edges])
             # A failure in another parameter set begins the search in its own test.
-            start = start.copy()
             start[:, n] = cases.lower[n] + start[:, n] % oracle.fits.count(fit)
             return search_cases(oracle, cases, start, plan, rng)
 
@@ -277,7 +282,7 @@ def effort_of(evaluator: Evaluator, cases: float, varied: int) -> Effort:
     scaled["values"] = max(scaled["values"], LEAST_VALUES)
     box = USUAL.box._replace(growths=evaluator.scaled(USUAL.box.growths))
     if evaluator.study.ranges:
-        scaled["cases_of_set"] *= OF_RANGES
+        scaled["edges"] = EDGES
         # A small batch costs almost as much as a large one: each box drives at all points.
         box = box._replace(explored=evaluator.scaled(box.explored))
     return USUAL._replace(

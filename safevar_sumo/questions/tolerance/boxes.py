@@ -421,7 +421,7 @@ def shrink(
 
     def are_unsafe(shares: FloatArray) -> BoolArray:
         candidates = at_share(shares)
-        is_empty = np.array([*_are_empty(boxes, failures, candidates)])
+        is_empty = np.array(list(_are_empty(boxes, failures, candidates)))
         return ~(is_empty & _are_safe(boxes, failures, candidates))
 
     full = np.ones((1, 1))
@@ -445,7 +445,7 @@ def widen(
     for deviation in DEVIATIONS:
         proposals = _propose(boxes, sides, deviation, rng)
         is_empty = _are_empty(boxes, failures, proposals)
-        chosen = [*islice(compress(proposals, is_empty), number)]
+        chosen = list(islice(compress(proposals, is_empty), number))
         candidates = np.array(chosen).reshape(-1, *sides.shape)
         safe = candidates[_are_safe(boxes, failures, candidates)]
         sides = max(safe, key=boxes.log_volume, default=sides)

@@ -20,10 +20,12 @@ from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace as replace_in
+from numpy.random import Generator
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.between import in_ranges
+from safevar_sumo.questions.boundary import find_boundaries
 from safevar_sumo.questions.cases import Space
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.part import moving_axes, points_of_tests
@@ -108,7 +110,7 @@ class CaseWorld(NamedTuple):
                 [0.0] if name == PHASE else self.test.axes[name].at
                 for name in axes.names
             ]
-            rows = np.array([*product(*values)]).reshape(-1, len(axes))
+            rows = np.array(list(product(*values))).reshape(-1, len(axes))
         shares = (rows - axes.lower) / (axes.upper - axes.lower)
         phases = np.zeros((len(shares), 1))
         return np.hstack([phases, shares[:, : self.places - 1]])
@@ -238,7 +240,7 @@ class Oracle:
         keys = [case.tobytes() for case in cases[:, n:]]
         rows = {key: row for row, key in enumerate(keys) if key not in self._counts}
         if rows:
-            places = cases[[*rows.values()], n + 1 :]
+            places = cases[list(rows.values()), n + 1 :]
             originals = np.tile(self.vehicle.original, (len(rows), 1))
             does_count = world.model.do_count(
                 world.settings(originals, places), LIMITS_STAGE
@@ -320,6 +322,33 @@ class Oracle:
             return encounters
         robustness = self(product_of(self.vehicle.original[np.newaxis], encounters))
         return encounters[np.argsort(robustness, kind="stable")[: int(number)]]
+
+    def edges(self, fit: int, number: int, rng: Generator) -> FloatArray:
+        """Encounters with a parameter set that only just count, shape (K, 1 + k): next to them, the
+        original vehicle is unsafe. The encounters in which another vehicle fails may be a sliver
+        between these and those in which it is safe.
+
+        They are sought on `number` lines, along each of which one place becomes 1 minus its value.
+        Each stands in the result eight times, for as many vehicles.
+        """
+        original = self.vehicle.original
+        n = len(original)
+        starts = self.space(fit, original, original).draw(number, rng)
+        # Four fifths of the places are at an end: most lines are edges of the ranges.
+        starts[:, n + 1 :] = np.clip(5 * starts[:, n + 1 :] - 2, 0, 1)
+        ends = starts.copy()
+        columns = rng.integers(n + 1, starts.shape[1], number)
+        ends[range(number), columns] = 1 - starts[range(number), columns]
+
+        # From an encounter that counts to one that does not.
+        is_edge = np.isfinite(self(starts)) & np.isinf(self(ends))
+        edges = find_boundaries(
+            starts[is_edge],
+            ends[is_edge],
+            lambda cases: np.isinf(self(cases)),
+            (2,) * 8,
+        )
+        return edges.safe[:, n:].repeat(8, 0)
 
 
 def product_of(vehicles: FloatArray, encounters: FloatArray) -> FloatArray:

@@ -188,7 +188,7 @@ def alone_with_own_set(task: Asked, limits: Alone) -> Alone:
         )
 
     # A case that could not be simulated is no example of an unsafe vehicle.
-    cases = [*limits.breaches.values()]
+    cases = list(limits.breaches.values())
     rows = np.array(cases).reshape(-1, task.nothing.shape[1])
     breaches = compress(limits.breaches.items(), oracle(rows) < 0)
     return limits._replace(breaches=dict(breaches))
@@ -275,7 +275,9 @@ def _with_set(
         return limits
     sides = _within_alone(task, limits, limits.sides)
     settled = Settled(sides, limits.failures)
-    searches = [task.search(Stream.VALIDATION, fit)]
+    search = task.search(Stream.VALIDATION, fit)
+    # A search that begins on the edge of what counts may draw lines that miss a sliver.
+    searches = [search] * (1 + bool(effort.edges))
     return _with_settled(
         task,
         limits,

@@ -298,7 +298,7 @@ def _values_in_words(facts: Told, box: Box, column: int, failure: Failure) -> st
         # value.
         ends = {float(box.lower[number]), float(box.upper[number])}
         limits = ends - {item.lower, item.upper} or {item.original}
-        is_said = len(limits) == 1 and np.isclose(value, [*limits])[0]
+        is_said = len(limits) == 1 and np.isclose(value, list(limits))[0]
         if number == column:
             texts.insert(0, text)
         elif not is_said:

@@ -222,7 +222,7 @@ class Told:
         """
         if self.limits.broken or not self.is_safe:
             return self.stated
-        return [*filter(self._is_broken, self.stated)]
+        return list(filter(self._is_broken, self.stated))
 
     def _is_broken(self, column: int) -> bool:
         """Whether a specified limit is beyond the limit alone. A rough search leaves a wide gap
@@ -272,7 +272,7 @@ def worst_of(
     """The worst value that searches found, by parameter set; None without a finite value."""
     pairs = attacks.items()
     values = [value_in(unsafe, fit, attack.least) for fit, attack in pairs]
-    finite = [*filter(np.isfinite, values)]
+    finite = list(filter(np.isfinite, values))
     return float(unsafe.worst(finite)) if finite else None
 
 
@@ -431,7 +431,7 @@ def _limits(facts: Told, box: Box) -> Iterator[Sentence]:
         for column in facts.columns
         if box.lower[column] < box.upper[column]
     ]
-    limits = [*filter(None, texts)]
+    limits = list(filter(None, texts))
     if len(limits) > MOST_LIMITS:
         yield words.JOINT(number=len(limits))
     elif limits:
