@@ -336,20 +336,24 @@ def only_from(folder: str) -> Iterator[None]:
     """
     path = ImportPath.here()
     names = {*sys.modules}
-    user_modules = {}
-    for name in names - {"__main__"}:
-        if is_user_file(file_of_module(name)):
-            user_modules[name] = sys.modules.pop(name)
+    user_names = _modules_of_user(names - {"__main__"})
+    user_modules = {name: sys.modules.pop(name) for name in user_names}
     ImportPath([*filter(_is_of_libraries, path.folders), folder], []).inherit()
     try:
         with chdir(folder):
             yield
     finally:
         path.inherit()
-        for name in sys.modules.keys() - names:
-            if is_user_file(file_of_module(name)):
-                del sys.modules[name]
+        for name in _modules_of_user(sys.modules.keys() - names):
+            del sys.modules[name]
         sys.modules.update(user_modules)
+
+
+def _modules_of_user(names: Iterable[str]) -> list[str]:
+    """The modules of user code among imported ones, before any of them is removed: a folder without
+    `__init__.py` has no path without its parent.
+    """
+    return [name for name in names if is_user_file(file_of_module(name))]
 
 
 def _is_of_libraries(entry: str) -> bool:
