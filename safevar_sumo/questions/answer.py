@@ -156,8 +156,7 @@ class Answer:
     numbers
         Values by name; NaN or None where undefined.
     tables
-        Frames by name. A question gives what `tabulate` makes, or a frame, whose columns then have
-        no meaning; `tables.records` has each as an `AnswerTable`.
+        Frames by name. A question gives what `tabulate` makes; `tables.records` has it.
     failures
         Sentences that say which of the user's limits are not kept; the command then ends with exit
         code 3.

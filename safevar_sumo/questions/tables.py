@@ -127,13 +127,9 @@ class AnswerTable:
 class Frames(dict[str, pd.DataFrame]):
     """The data frames of an answer's tables by name; `records` holds the `AnswerTable` objects."""
 
-    def __init__(self, tables: Mapping[str, AnswerTable | pd.DataFrame]) -> None:
-        self.records = dict[str, AnswerTable]()
-        for name, table in tables.items():
-            if isinstance(table, pd.DataFrame):
-                table = tabulate(name, dict.fromkeys(map(str, table), ""), table)
-            self.records[name] = table
-            self[name] = table.frame
+    def __init__(self, records: Mapping[str, AnswerTable]) -> None:
+        super().__init__({name: table.frame for name, table in records.items()})
+        self.records = records
 
 
 def tabulate(

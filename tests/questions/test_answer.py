@@ -234,7 +234,7 @@ def test_no_control_character_of_a_name_reaches_a_reader(form: str) -> None:
     assert not re.search("[\\0-\\x08\\x0b-\\x1f\\x7f-\\x9f\u202e]", printed)
 
 
-def test_a_spreadsheet_calculates_no_cell_of_a_plain_frame() -> None:
+def test_a_spreadsheet_calculates_no_cell_of_a_csv() -> None:
     cells = [
         "=1+1",
         "@SUM(A1)",
@@ -247,7 +247,7 @@ def test_a_spreadsheet_calculates_no_cell_of_a_plain_frame() -> None:
         "-inf",
         "a=1",
     ]
-    names = pd.DataFrame({"name": cells})
+    names = tabulate("Names", {"name": "it"}, [(cell,) for cell in cells])
     printed = replace(ANSWER, tables={"names": names}).render("csv")
     cells_there = pd.read_csv(io.StringIO(printed), dtype=str)["name"].tolist()
     assert cells_there == [
