@@ -275,7 +275,7 @@ def test_few_simulations_are_shared_between_limits_alone_and_the_box() -> None:
     evaluator.limit(None, 1, quick=True)
     quick = effort_of(evaluator, np.inf, 1)
     assert (quick.values, quick.cases, quick.box.explored) == (8, 130, 0)
-    assert (quick.cases_of_set, usual_alone(evaluator, 1)) == (78, 130)
+    assert (quick.cases_of_set, usual_alone(evaluator, 1)) == (26, 130)
 
 
 @pytest.mark.parametrize(("limit", "kept"), [("a <= 6", None), ("a <= 7.5", False)])
