@@ -70,8 +70,8 @@ class Effort(NamedTuple):
     alone, cases, cases_of_set
         Cases that search for a counterexample to limits alone, and to a box with the study's own
         parameter set, and with another one.
-    edges
-        Number of lines that seek encounters that only just count, with another parameter set.
+    lines
+        Number of lines on which a search seeks encounters that only just count.
     generation, followers
         Cases of a generation of such a search, and generations that follow the first with an unsafe
         case.
@@ -90,7 +90,7 @@ class Effort(NamedTuple):
     alone: int = 2000
     cases: int = 5000
     cases_of_set: int = 1000
-    edges: int = 0
+    lines: int = 0
     generation: int = 512
     followers: int = 2
     box: BoxEffort = BoxEffort()
@@ -101,10 +101,12 @@ class Effort(NamedTuple):
 
 USUAL = Effort()
 """How much is searched by default."""
-EDGES = 256
-"""Number of lines on which a search with another parameter set seeks encounters that only just
-count, if encounters are ranges.
+LINES = 640
+"""Number of lines on which a search seeks encounters that only just count, if encounters are
+ranges.
 """
+EDGE_CORNERS = 16
+"""Number of vehicles, at corners of the box, in each such encounter."""
 
 
 class Asked(NamedTuple):
@@ -168,15 +170,22 @@ class Asked(NamedTuple):
         phases: bool = True,
     ) -> CaseSearch:
         """A search for unsafe cases with a parameter set, by default for a counterexample to a
-        box.
+        box. It begins with vehicles in encounters that only just count.
         """
         if budget is None:
             budget = self.effort.cases_of_set if fit else self.effort.cases
-        (search,) = self.searches(stream, fit, [budget], phases=phases)
+        lines = self.effort.lines
+        (search,) = self.searches(stream, fit, [budget], lines, phases=phases)
         return search
 
     def searches(
-        self, stream: Stream, fit: int, budgets: Sequence[int], *, phases: bool
+        self,
+        stream: Stream,
+        fit: int,
+        budgets: Sequence[int],
+        lines: int = 0,
+        *,
+        phases: bool,
     ) -> list[CaseSearch]:
         """Searches with some numbers of cases, which draw from the same stream in turn."""
         oracle = self.oracle
@@ -188,10 +197,12 @@ class Asked(NamedTuple):
             n = space.size
             cases = oracle.space(fit, space.lower[:n], space.upper[:n], phases=phases)
             cases = cases._replace(center=space.center)
-            edges = oracle.edges(fit, self.effort.edges if fit else 0, rng)
-            on_edges = cases.draw(len(edges), rng)
-            on_edges[:, n:] = edges
-            start = np.concatenate([start, on_edges])
+            # New lines each time: where there is one sliver, there may be others.
+            encounters = oracle.edges(fit, lines, rng).repeat(EDGE_CORNERS, axis=0)
+            corners = rng.random((len(encounters), n)) < 0.5
+            vehicles = np.where(corners, space.lower[:n], space.upper[:n])
+            start = np.concatenate([start, np.hstack([vehicles, encounters])])
+            plan = plan._replace(budget=plan.budget + len(encounters))
             # A failure in another parameter set begins the search in its own test.
             start[:, n] = cases.lower[n] + start[:, n] % oracle.fits.count(fit)
             return search_cases(oracle, cases, start, plan, rng)
@@ -282,7 +293,7 @@ def effort_of(evaluator: Evaluator, cases: float, varied: int) -> Effort:
     scaled["values"] = max(scaled["values"], LEAST_VALUES)
     box = USUAL.box._replace(growths=evaluator.scaled(USUAL.box.growths))
     if evaluator.study.ranges:
-        scaled["edges"] = EDGES
+        scaled["lines"] = evaluator.scaled(LINES)
         # A small batch costs almost as much as a large one: each box drives at all points.
         box = box._replace(explored=evaluator.scaled(box.explored))
     return USUAL._replace(

@@ -35,6 +35,8 @@ from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import assemble
 
 LIMITS_STAGE = "limits"
+EDGE_PARTS = 4, 4, 4, 4
+"""Into how many parts each round divides a line to an encounter that does not count."""
 
 
 class Exhausted(InputError):
@@ -324,31 +326,34 @@ class Oracle:
         return encounters[np.argsort(robustness, kind="stable")[: int(number)]]
 
     def edges(self, fit: int, number: int, rng: Generator) -> FloatArray:
-        """Encounters with a parameter set that only just count, shape (K, 1 + k): next to them, the
-        original vehicle is unsafe. The encounters in which another vehicle fails may be a sliver
-        between these and those in which it is safe.
+        """Encounters with a parameter set that only just count, shape (E, 1 + k): next to them the
+        original vehicle is unsafe. The encounters in which only other vehicles fail may be a sliver
+        there, which no search meets that draws from all encounters.
 
-        They are sought on `number` lines, along each of which one place becomes 1 minus its value.
-        Each stands in the result eight times, for as many vehicles.
+        They are sought on `number` random lines, along each of which one place changes.
         """
+        n = len(self.vehicle)
         original = self.vehicle.original
-        n = len(original)
+        if not number or self.places == 1:
+            return np.zeros((0, 1 + self.places))
         starts = self.space(fit, original, original).draw(number, rng)
-        # Four fifths of the places are at an end: most lines are edges of the ranges.
-        starts[:, n + 1 :] = np.clip(5 * starts[:, n + 1 :] - 2, 0, 1)
+        # Two thirds of the places are at an end, as slivers are widest at the ends of ranges.
+        starts[:, n + 1 :] = np.clip(3 * starts[:, n + 1 :] - 1, 0, 1)
+        # No line leads along the phases, the first place.
+        columns = rng.integers(n + 2, starts.shape[1], number)
         ends = starts.copy()
-        columns = rng.integers(n + 1, starts.shape[1], number)
         ends[range(number), columns] = 1 - starts[range(number), columns]
 
         # From an encounter that counts to one that does not.
-        is_edge = np.isfinite(self(starts)) & np.isinf(self(ends))
+        do_count = np.isfinite(self(np.concatenate([starts, ends])))
+        is_line = do_count[:number] & ~do_count[number:]
         edges = find_boundaries(
-            starts[is_edge],
-            ends[is_edge],
+            starts[is_line],
+            ends[is_line],
             lambda cases: np.isinf(self(cases)),
-            (2,) * 8,
+            EDGE_PARTS,
         )
-        return edges.safe[:, n:].repeat(8, 0)
+        return edges.safe[:, n:]
 
 
 def product_of(vehicles: FloatArray, encounters: FloatArray) -> FloatArray:

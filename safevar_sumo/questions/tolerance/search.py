@@ -102,18 +102,21 @@ def find_limits(task: Asked, wider: FoundLimits | None = None) -> FoundLimits:
     with phases.stage(OWN_SET_STAGE):
         limits = _with_own_set(task, wider)
     with phases.stage(OTHER_SETS_STAGE):
-        for number, fit in enumerate(task.fits[1:], 1):
-            phases.begin_round(number, len(task.fits) - 1, is_known=True)
-            try:
+        own_sides = limits.sides
+        try:
+            for number, fit in enumerate(task.fits[1:], 1):
+                phases.begin_round(number, len(task.fits) - 1, is_known=True)
                 limits = _with_set(task, limits, fit)
-            except Exhausted:
-                # The simulations did not suffice for this set: the answer then claims no joint
-                # limits at all.
-                nothing = task.nothing
-                limits = limits._replace(
-                    sides=None, failures=Failures(nothing, nothing)
-                )
-                break
+            if limits.sides is not None and np.any(limits.sides != own_sides):
+                # A narrower box has other corners, and is tested anew.
+                settled = Settled(limits.sides, limits.failures)
+                corners = _corner_search(task)
+                limits = _with_settled(task, limits, settled, [corners], 0)
+        except Exhausted:
+            # The simulations did not suffice for this set: the answer then claims no joint limits
+            # at all.
+            failures = Failures(task.nothing, task.nothing)
+            limits = limits._replace(sides=None, failures=failures)
         if limits.sides is None or task.effort.share >= 1:
             return limits
         return limits._replace(breaches=_breaches(task, limits, limits.sides))
@@ -275,9 +278,7 @@ def _with_set(
         return limits
     sides = _within_alone(task, limits, limits.sides)
     settled = Settled(sides, limits.failures)
-    search = task.search(Stream.VALIDATION, fit)
-    # A search that begins on the edge of what counts may draw lines that miss a sliver.
-    searches = [search] * (1 + bool(effort.edges))
+    searches = [task.search(Stream.VALIDATION, fit)]
     return _with_settled(
         task,
         limits,
@@ -294,14 +295,11 @@ def _with_settled(
     searches: list[CaseSearch],
     fit: int,
 ) -> FoundLimits:
-    """Limits with a part of a box that passes the searches with a parameter set.
-
-    If this part is smaller than the box of the former limits, it must also pass the test of its
-    corners and the test with random vehicles, both with the study's own set. The limits have no
-    joint limits if no box passes.
+    """Limits with a part of a box that passes the searches with a parameter set. With the study's
+    own set, this part must also pass the test with random vehicles. The limits have no joint limits
+    if no part passes.
     """
     boxes = limits.boxes
-    former = limits.sides
     while settled.sides is not None and limits.proofs < MOST_PROOFS:
         settled = settle(
             boxes,
@@ -314,25 +312,22 @@ def _with_settled(
         limits = limits._replace(failures=settled.failures)
         limits = limits._replace(alone=_alone_before(task, limits))
         sides = _within_alone(task, limits, settled.sides)
-        unsafe = task.nothing
-        is_same = former is not None and np.array_equal(former, sides)
-        # With the study's own set, the searches included the corners of this box. Otherwise the
-        # corners are still to be driven.
-        has_corners = fit == 0 and np.array_equal(settled.sides, sides)
-        if not is_same and not has_corners:
-            unsafe = _corner_search(task)(boxes.cases_in(sides), unsafe).unsafe
-        if not (is_same or len(unsafe)) and task.effort.share < 1:
+        if fit == 0 and not np.array_equal(settled.sides, sides):
+            # The searches include the corners, and this box has others.
+            settled = settled._replace(sides=sides)
+            continue
+        if fit == 0 and task.effort.share < 1:
             number = limits.proofs + 1
             proof, unsafe = _prove(task, boxes.cases_in(sides), number)
             limits = limits._replace(proof=proof, proofs=number)
-        if len(unsafe):
-            failures = learn(boxes, settled.failures, unsafe, sides)
-            settled = settled._replace(failures=failures)
-            continue
+            if len(unsafe):
+                failures = learn(boxes, settled.failures, unsafe, sides)
+                settled = settled._replace(failures=failures)
+                continue
         if boxes.is_free.any() and not sides[boxes.is_free].any():
             # The box leaves no room to any characteristic that may vary.
             break
-        attacks = {**limits.attacks, fit: settled.attack}
+        attacks = {fit: settled.attack, **limits.attacks}
         return limits._replace(sides=sides, attacks=attacks)
     return limits._replace(sides=None, failures=settled.failures, proof=None)
 
