@@ -16,6 +16,7 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.box import Box, prove
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
+from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance import asked, boxes
 from safevar_sumo.questions.tolerance.asked import (
     asked_of,
@@ -23,6 +24,7 @@ from safevar_sumo.questions.tolerance.asked import (
     usual_alone,
 )
 from safevar_sumo.questions.tolerance.boxes import Attack
+from safevar_sumo.questions.tolerance.oracle import Oracle
 from safevar_sumo.questions.tolerance.search import find_limits
 from safevar_sumo.questions.tolerance.told import worst_of
 from safevar_sumo.questions.words import bound_in_words
@@ -219,6 +221,34 @@ def test_sets_that_break_or_cut_limits_are_told() -> None:
     assert all_sets.proofs == 2, "the smaller box is proved anew"
     # Its corners are driven anew.
     assert (5 + all_sets.sides[1]).tobytes() in plants[0].seen
+
+
+class Sliver(Oracle):
+    """Encounters in which the first axis is beyond 0.7 of its range do not count. In 0.5 % of the
+    range before, vehicles collide in which all 8 values are above 9.9. All others keep 1 m.
+    """
+
+    def __call__(self, cases: FloatArray, failed: float = np.inf) -> FloatArray:
+        share = cases[:, 8 + 2]
+        collides = (cases[:, :8] > 9.9).all(axis=1) & (share > 0.695)
+        return np.where(share > 0.7, np.inf, 1 - 2.0 * collides)
+
+
+def test_a_search_begins_where_encounters_only_just_count() -> None:
+    """Where vehicles fail there is no slope towards these encounters, and hardly any is drawn."""
+    models = Models((made_up_model(8, nowhere),), ())
+    oracle = Sliver(models.members, Unsafe(), between=False)
+    oracle.places = 4
+    edges = oracle.edges(0, 64, np.random.default_rng(1))
+    assert ((edges[:, 2] > 0.69) & (edges[:, 2] <= 0.7)).all()
+    assert len(np.unique(edges[:, 3:], axis=0)) > 4, "lines between several places"
+    task = asked_of(models, Unsafe(), range(8), {}, at_tests=True)
+    for lines in (0, 64):
+        effort = task.effort._replace(lines=lines)
+        question = task._replace(oracle=oracle, effort=effort)
+        search = question.search(Stream.VALIDATION, 0)
+        space = oracle.space(0, task.lower, task.upper)
+        assert bool(len(search(space, question.nothing).unsafe)) == bool(lines)
 
 
 def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> None:
