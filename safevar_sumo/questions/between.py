@@ -18,7 +18,6 @@ from safevar_sumo.questions.part import moving_axes, points_of_tests
 from safevar_sumo.questions.words import join_phrases
 from safevar_sumo.scenarios import PHASES
 from safevar_sumo.study import PHASE, RANGES, Domain, MatrixTest, Study, axis_of
-from safevar_sumo.study.encounters import Axes
 from safevar_sumo.sumo.batch import reason_against_scenes
 from safevar_sumo.sumo.system import System, assemble
 
@@ -54,7 +53,7 @@ def in_phases(study: Study, system: System) -> Study:
     ):
         return study
     base = study if study.ranges else study.listed().all_count
-    over: Axes = {**base.scenario.over, PHASE: axis_of(DOMAIN)}
+    over = {**base.scenario.over, PHASE: axis_of(DOMAIN)}
     return replace_in(
         base, encounters=RANGES, scenario=replace_in(base.scenario, over=over)
     )

@@ -242,10 +242,10 @@ def search_side_by_side(
     """Run several searches at the same time. The judge gets a generation of each search in one
     batch, because few large batches cost less than many small ones.
     """
-    results = dict[int, Counterexamples]()
+    results = {}
     judged: dict[int, Any] = dict.fromkeys(range(len(searches)))
     while judged:
-        generations = dict[int, FloatArray]()
+        generations = {}
         for number, robustness in judged.items():
             try:
                 generations[number] = searches[number].send(robustness)

@@ -19,7 +19,7 @@ from safevar_sumo.study.characteristics import (
     Uniform,
     stated_values,
 )
-from safevar_sumo.vehicles import Characteristic, FeasibleRegion, region_of
+from safevar_sumo.vehicles import Characteristic, region_of
 from safevar_sumo.vehicles.region import REJECTIONS
 
 
@@ -30,7 +30,7 @@ class VariationModel:
 
     def __init__(self, study: Study) -> None:
         with about(study.source):
-            self.region: FeasibleRegion = region_of(study)
+            self.region = region_of(study)
         self.characteristics = self.region.characteristics
 
         self._source = study.source

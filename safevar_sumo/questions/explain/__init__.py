@@ -256,7 +256,7 @@ def _counts(
     original = population.original
     over_sets = population.over_sets
     failures = population.unsafe.number(runs)
-    by_set: JsonObject = dict.fromkeys((BY_SET, INTERVALS))
+    by_set = dict.fromkeys((BY_SET, INTERVALS))
     if over_sets is not None:
         by_set = over_sets.numbers(failures / max(len(runs), 1))
     omissions = 0

@@ -44,7 +44,7 @@ def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonO
     needless = needless_braking(changed, benign)
     metres, seconds = onsets_today - onsets
     braked = np.flatnonzero(np.isfinite(metres))
-    price: JsonObject = dict.fromkeys(OF_BRAKING)
+    price = dict.fromkeys(OF_BRAKING)
     if len(braked):
         row = braked[np.argmax(metres[braked])]
         point = today.points[row // len(encounters)].name or None

@@ -160,7 +160,7 @@ def tables(
         if value not in ("", ALPHA, 0):
             words += [f"--{name}", quote(str(value))]
     has_runs = any(case.has_runs for case in cases)
-    leading: Collection[str] = OVER_RUNS if has_runs else POOLED
+    leading = OVER_RUNS if has_runs else POOLED
     lead = next(filter(answer.tables.__contains__, leading), "")
     folded = AS_PUBLISHED if has_runs else ()
     return replace(answer, command=" ".join(words), lead=lead, folded=folded)
