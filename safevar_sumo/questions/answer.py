@@ -35,6 +35,12 @@ if TYPE_CHECKING:
 AnswerFunction = TypeVar("AnswerFunction", bound="Callable[..., Answer]")
 
 
+Names = Collection[str | EllipsisType]
+"""Names of numbers or columns; `...` stands for names that a study gives."""
+JsonRows = list[JsonObject]
+"""Rows of a table, by the names of its columns."""
+
+
 class Contents(NamedTuple):
     """The names that an answer declares, so that a command can refuse others.
 
@@ -51,8 +57,8 @@ class Contents(NamedTuple):
         Name of the question that a user should ask next; "" for none.
     """
 
-    numbers: Collection[str | EllipsisType]
-    tables: Mapping[str, Collection[str | EllipsisType]]
+    numbers: Names
+    tables: Mapping[str, Names]
     lead: str = ""
     next: str = ""
 
@@ -93,7 +99,7 @@ class Contents(NamedTuple):
         return keys
 
 
-def _without_ellipsis(names: Collection[str | EllipsisType]) -> list[str]:
+def _without_ellipsis(names: Names) -> list[str]:
     """The names without `...`."""
     return [name for name in names if isinstance(name, str)]
 
@@ -106,7 +112,7 @@ def contents(
     *numbers: str | EllipsisType,
     lead: Any = "",
     next: Any = "",
-    **tables: Collection[str | EllipsisType],
+    **tables: Names,
 ) -> Callable[[AnswerFunction], AnswerFunction]:
     """Decorator that declares the `Contents` of a function's answers: the names of numbers, and the
     names of columns by table. The command refuses other names before it computes anything.

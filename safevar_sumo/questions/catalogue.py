@@ -19,7 +19,7 @@ from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, UNSAFE_S
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.questions.answer import Answer, contents, tabulate
 from safevar_sumo.questions.options import Range
-from safevar_sumo.questions.sentence import Sentence, Verdict, answer, evidence
+from safevar_sumo.questions.sentence import Sentences, Verdict, answer, evidence
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.scenarios import (
@@ -335,7 +335,7 @@ def check(
 
 def _sentences(
     name: str, findings: Sequence[Finding], extents: Iterable[Extent]
-) -> Iterator[Sentence]:
+) -> Sentences:
     """Yield the sentences of the verdict of `check`: the first finding, then the numbers of
     vehicles and test cases that were simulated and left out.
     """

@@ -13,7 +13,7 @@ import numpy as np
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.boundary import find_boundaries
-from safevar_sumo.questions.causes import BOUNDARIES, Cause, settings_of
+from safevar_sumo.questions.causes import BOUNDARIES, Causes, settings_of
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import FloatArray, NamedValues
 
@@ -66,7 +66,7 @@ class Limits(NamedTuple):
 
 
 def find_cause_limits(
-    evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe
+    evaluator: Evaluator, causes: Causes, unsafe: Unsafe
 ) -> list[Limits]:
     """Find the limits of each cause, in the order of the causes."""
     if not causes:

@@ -59,6 +59,9 @@ class Cause(NamedTuple):
     unsafe_runs: float = 1.0
 
 
+Causes = Sequence[Cause]
+
+
 def find_minimal_causes(
     evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe, limit: int = MAX_SUBSETS
 ) -> list[list[Cause]]:
@@ -139,9 +142,7 @@ def largest_complete(numbers: Sequence[int], limit: int) -> int:
     return max(affordable, default=1)
 
 
-def are_causes(
-    evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe
-) -> BoolArray:
+def are_causes(evaluator: Evaluator, causes: Causes, unsafe: Unsafe) -> BoolArray:
     """Whether each of M causes is also a minimal cause with the parameters of another evaluator,
     shape (M,). All its changes together are unsafe there, and safe if any single change is left
     out.
@@ -191,7 +192,7 @@ def select_affordable_rows(
 def count_needed(
     characteristics: CharacteristicSet,
     changed: BoolArray,
-    causes: Sequence[Sequence[Cause]],
+    causes: Sequence[Causes],
     failures: int,
 ) -> pd.DataFrame:
     """How often each characteristic is changed, and how often it is needed.
@@ -259,14 +260,14 @@ def directions(
 
 
 def kinds_of(
-    characteristics: CharacteristicSet, causes: Sequence[Cause]
+    characteristics: CharacteristicSet, causes: Causes
 ) -> set[tuple[str, ...]]:
     """The different kinds of causes: which characteristics change, and in which direction."""
     return {directions(characteristics, cause.changes) for cause in causes}
 
 
 def count_distinct_causes(
-    characteristics: CharacteristicSet, causes: Sequence[Sequence[Cause]]
+    characteristics: CharacteristicSet, causes: Sequence[Causes]
 ) -> pd.DataFrame:
     """Every distinct minimal cause, most frequent first.
 
@@ -328,9 +329,7 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     return frame.fillna(0).astype(int).reset_index()
 
 
-def settings_of(
-    characteristics: CharacteristicSet, causes: Sequence[Cause]
-) -> FloatArray:
+def settings_of(characteristics: CharacteristicSet, causes: Causes) -> FloatArray:
     """The settings of M causes, shape (M, n): the original vehicle with only the changes of the
     cause, in the encounter of the cause.
     """

@@ -51,6 +51,10 @@ confidence interval.
 """
 
 
+IndexTable = tuple[AnswerTable, str]
+"""The table of the indices, and the name of the measure whose variance is shared out."""
+
+
 def _problem(names: Sequence[str]) -> JsonObject:
     """The problem as SALib wants it: the quantile of each characteristic varies from 0 to 1. The
     names are numbers, because SALib reserves some endings of names.
@@ -86,7 +90,7 @@ def design_of(evaluator: Evaluator, model: VariationModel) -> Evaluations:
 
 def sobol_indices(
     evaluator: Evaluator, evaluations: Evaluations, criterion: Unsafe, confidence: float
-) -> tuple[AnswerTable, str]:
+) -> IndexTable:
     """The table of the Sobol indices, first order and total, of independent characteristics; and
     the name of the measure whose variance is shared out.
 
@@ -117,7 +121,7 @@ def sobol_indices(
 
 def given_data_indices(
     evaluator: Evaluator, evaluations: Evaluations, criterion: Unsafe, confidence: float
-) -> tuple[AnswerTable, str]:
+) -> IndexTable:
     """The table of the first-order indices from any sample of vehicles (`evaluations`); and the
     name of the measure whose variance is shared out.
 
@@ -155,7 +159,7 @@ def _table(
     criterion: Unsafe,
     indices_of: Callable[[FloatArray], Indices],
     kinds: dict[str, tuple[str, str]],
-) -> tuple[AnswerTable, str]:
+) -> IndexTable:
     """The table with a row for each characteristic, the one with the largest influence first; and
     the name of the measure. `kinds` maps the name of an index to SALib's key and the index's
     meaning.

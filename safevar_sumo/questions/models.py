@@ -29,6 +29,10 @@ anything.
 """
 
 
+FitNumbers = tuple[int, ...]
+"""Numbers of parameter sets."""
+
+
 class Model(NamedTuple):
     """A parameter set of the vehicle model in which a claim about a study is tested.
 
@@ -128,7 +132,7 @@ class Models(NamedTuple):
         return self.members[0]
 
     @property
-    def fits(self) -> tuple[int, ...]:
+    def fits(self) -> FitNumbers:
         """The numbers of the parameter sets in which a claim is tested."""
         return tuple(member.fit for member in self.members)
 

@@ -4,7 +4,7 @@ the same vehicles: the first `VEHICLES` of those that `risk`, `rules` and `expla
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -16,7 +16,7 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import models_of
 from safevar_sumo.questions.sampling import share_with_interval
-from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.sentence import Sentence, Sentences
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import interval_in_words, percentage
 from safevar_sumo.records import (
@@ -169,7 +169,7 @@ class SharesOverSets(NamedTuple):
         greatest, highest = np.fmax.reduce([share, high], axis=1).tolist()
         return smallest, greatest, lowest, highest
 
-    def sentences(self) -> Iterator[Sentence]:
+    def sentences(self) -> Sentences:
         """A sentence with the least and the greatest share of all vehicles. If the study has other
         sets, but none was simulated, the sentence says so.
         """

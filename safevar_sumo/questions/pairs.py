@@ -5,7 +5,7 @@ version a setting is unsafe, and its safety degree in both.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,8 +33,14 @@ SETTING_COLUMNS = shipped_columns("compare")["settings"]
 ENDS = [name for name in SETTING_COLUMNS if name.startswith(("a_", "b_"))]
 
 
+Criteria = Sequence[Unsafe]
+Runs = Sequence[Evaluations]
+Titles = Mapping[str, str]
+"""The criteria of A and B; the evaluations of settings in A and in B; the names of A and B."""
+
+
 def table_of_pairs(
-    solutions: pd.Series[str], runs: Sequence[Evaluations], criteria: Sequence[Unsafe]
+    solutions: pd.Series[str], runs: Runs, criteria: Criteria
 ) -> pd.DataFrame:
     """The frame with `SETTING_COLUMNS` for settings that were evaluated in A and in B. `runs` and
     `criteria` have the evaluations and the criterion of each version.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 
+from safevar_sumo.records import NamedValues
 from safevar_sumo.terminal import Progress
 
 OVERRUN = 0.18
@@ -28,7 +29,7 @@ class Phases:
         self._show_whole = show
         self._points = 1
         """Number of points at which a setting is simulated."""
-        self._later = dict[str, float]()
+        self._later = NamedValues()
         """The planned phases that have not begun, with their expected numbers of simulations."""
         self._done = self._before = 0
         """Number of simulations so far, and number of simulations before the present phase."""
@@ -42,7 +43,7 @@ class Phases:
         self._waiting = 0
         """Number of simulations that the present part still has to do."""
 
-    def plan(self, settings: Mapping[str, float], points: int = 1) -> None:
+    def plan(self, settings: NamedValues, points: int = 1) -> None:
         """Plan the phases: `settings` holds the expected number of settings of each phase. A
         setting is simulated at `points` points.
         """

@@ -22,6 +22,7 @@ from safevar_sumo.questions.tables import (
     LATEX_PREAMBLE,
     MAX_LEAD_ROWS,
     AnswerTable,
+    AnswerTables,
     csv_cell,
     html_table,
     latex_notes,
@@ -70,7 +71,7 @@ class Screen(NamedTuple):
     unsaid: int
     lead: AnswerTable
     notes: list[str]
-    tables: dict[str, AnswerTable]
+    tables: AnswerTables
 
 
 def screen_of(answer: Answer, max_rows: int = MAX_LEAD_ROWS) -> Screen:
@@ -271,7 +272,7 @@ def _details_in_words(answer: Answer) -> Iterator[str]:
         yield " ".join(sentences)
 
 
-def _shown_tables(answer: Answer) -> dict[str, AnswerTable]:
+def _shown_tables(answer: Answer) -> AnswerTables:
     """The tables that the details show, by name. Folded tables are left out, and so are the remarks
     on them. A table of remarks without a row is left out, too.
     """
@@ -287,13 +288,13 @@ def _shown_tables(answer: Answer) -> dict[str, AnswerTable]:
             rows = rows.replace({"table": {"all": ""}})
         if not rows.empty:
             tables["remarks"] = remarks.with_rows(rows)
-    parts = dict[str, AnswerTable]()
+    parts = AnswerTables()
     for name, table in tables.items():
         parts |= reader_tables(name, table)
     return parts
 
 
-def _short_tables(answer: Answer) -> dict[str, AnswerTable]:
+def _short_tables(answer: Answer) -> AnswerTables:
     """The tables that the details show, without those with more than `MAX_ROWS` rows."""
     tables = _shown_tables(answer).items()
     return {name: table for name, table in tables if len(table.frame) <= MAX_ROWS}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -26,6 +26,8 @@ class Sentence(NamedTuple):
         # A first word such as `brake_force` or `sensorLatency` is a key: users write it so.
         return self._replace(text=FIRST_WORD.sub(lambda word: word[0].title(), text))
 
+
+Sentences = Iterator[Sentence]
 
 answer, evidence, condition, note = (partial(Sentence, kind) for kind in KINDS)
 """Functions that make a sentence of their kind from a text."""

@@ -74,6 +74,7 @@ Columns = dict[str, Column | str]
 """Columns by name. A text stands for a column without a unit: the text is its meaning."""
 Rows = Sequence[tuple[Any, ...]]
 """The rows of a table."""
+NamedColumns = dict[str, Column]
 
 
 class Wide(NamedTuple):
@@ -112,7 +113,7 @@ class AnswerTable:
 
     frame: pd.DataFrame
     title: str = ""
-    columns: Mapping[str, Column] = field(default_factory=dict)
+    columns: NamedColumns = field(default_factory=dict)
     wide: Wide | None = None
     words: Mapping[str, str] = field(default_factory=dict)
     lead_rows: Sequence[int] = ()
@@ -122,6 +123,9 @@ class AnswerTable:
     def with_rows(self, frame: pd.DataFrame) -> AnswerTable:
         """The same table, but with the rows of `frame`."""
         return replace(self, frame=frame)
+
+
+AnswerTables = dict[str, AnswerTable]
 
 
 class Frames(dict[str, pd.DataFrame]):
@@ -147,18 +151,18 @@ def tabulate(
     return AnswerTable(pd.DataFrame(rows, columns=list(named)), title, named, **layout)
 
 
-def with_interval(name: str, column: Column) -> dict[str, Column]:
+def with_interval(name: str, column: Column) -> NamedColumns:
     """The column `name`, and two columns for the lower and upper end of its interval."""
     low = column._replace(meaning=f"lower end of {name}")
     high = column._replace(meaning=f"upper end of {name}")
     return {name: column, f"{name}{LOW}": low, f"{name}{HIGH}": high}
 
 
-def columns_from(table: Mapping[str, Any]) -> dict[str, Column]:
+def columns_from(table: Mapping[str, Any]) -> NamedColumns:
     """The columns that a TOML table declares. The value of a name is the column's meaning, or a
     table of attributes of `Column`; there, `interval = true` adds columns for an interval.
     """
-    columns = dict[str, Column]()
+    columns = NamedColumns()
     for name, facts in table.items():
         described = {"meaning": facts} if isinstance(facts, str) else dict(facts)
         has_interval = described.pop("interval", False)
@@ -167,7 +171,7 @@ def columns_from(table: Mapping[str, Any]) -> dict[str, Column]:
     return columns
 
 
-def shipped_columns(command: str) -> dict[str, dict[str, Column]]:
+def shipped_columns(command: str) -> dict[str, NamedColumns]:
     """The columns of a shipped command's tables, by the name of the table."""
     tables = shipped_table("questions/columns.toml")[command]
     return {name: columns_from(table) for name, table in tables.items()}

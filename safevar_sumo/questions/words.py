@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from shlex import quote
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.questions.sentence import Sentence, note
-from safevar_sumo.records import Outcome
+from safevar_sumo.records import NamedValues, Outcome
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import Study
@@ -63,7 +63,7 @@ def collision_in_words(closing_speed: float, own_speed: float, digits: int = 2) 
 
 def change_texts(
     characteristics: CharacteristicSet,
-    values: Mapping[str, float],
+    values: NamedValues,
     *,
     are_printed: bool = False,
 ) -> list[str]:
@@ -121,7 +121,7 @@ def precise_in_words(items: Iterable[Characteristic]) -> str:
 
 def place_in_words(
     characteristics: CharacteristicSet,
-    values: Mapping[str, float],
+    values: NamedValues,
     *,
     are_printed: bool = False,
 ) -> str:
@@ -136,7 +136,7 @@ def place_in_words(
 
 def encounter_in_words(
     characteristics: CharacteristicSet,
-    values: Mapping[str, float],
+    values: NamedValues,
     *,
     are_printed: bool = False,
 ) -> str:

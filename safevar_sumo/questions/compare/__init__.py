@@ -8,7 +8,7 @@ vehicle into the common domain, near the place where the vehicles begin to fail.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import compress
@@ -46,6 +46,7 @@ from safevar_sumo.questions.compare.settings import (
     RUN_COLUMNS,
     SAMPLE,
     CommonDomain,
+    Evaluators,
     Pairs,
     in_order_of,
     pairs_of,
@@ -58,6 +59,9 @@ from safevar_sumo.questions.pairs import (
     SETTING_COLUMNS,
     SIDES,
     UNSAFE_IN,
+    Criteria,
+    Runs,
+    Titles,
     counts_of,
     draw_pairs,
     table_of_pairs,
@@ -67,13 +71,13 @@ from safevar_sumo.questions.research_questions.statistics import (
     fewest_runs,
     signed_rank_test,
 )
-from safevar_sumo.questions.sentence import Sentence, Verdict, answer, note
+from safevar_sumo.questions.sentence import Sentence, Sentences, Verdict, answer, note
 from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.tolerance.asked import usual_alone
 from safevar_sumo.questions.tolerance.oracle import LIMITS_STAGE
 from safevar_sumo.questions.words import UNSAFE_MEANS, counted_in_words, join_phrases
-from safevar_sumo.records import Evaluations, JsonObject
+from safevar_sumo.records import JsonObject
 from safevar_sumo.study import limits_of
 
 RELEASE = "RELEASE"
@@ -231,8 +235,8 @@ def compare(
 
 def _criteria(
     subjects: Sequence[Subject],
-    evaluators: Sequence[Evaluator],
-    originals: Sequence[Evaluations],
+    evaluators: Evaluators,
+    originals: Runs,
     unsafe: Unsafe | None,
     margin: float | None,
 ) -> list[Unsafe]:
@@ -252,8 +256,8 @@ def _criteria(
 
 def _default_criterion(
     subjects: Sequence[Subject],
-    evaluators: Sequence[Evaluator],
-    originals: Sequence[Evaluations],
+    evaluators: Evaluators,
+    originals: Runs,
 ) -> Unsafe:
     """The criterion if the user states nothing: a collision if that is the default criterion of
     either version, else the default criterion of A.
@@ -270,7 +274,7 @@ def _default_criterion(
 
 
 def _settings_frame(
-    common: CommonDomain, pairs: Pairs, criteria: Sequence[Unsafe]
+    common: CommonDomain, pairs: Pairs, criteria: Criteria
 ) -> pd.DataFrame:
     """The frame of the settings, with a row for each pair of vehicles. It has `SETTING_COLUMNS`,
     the values in A, and the values in B of all characteristics whose original values differ.
@@ -350,7 +354,7 @@ def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
 
 def _decide(
     differences: Sequence[Difference],
-    titles: Mapping[str, str],
+    titles: Titles,
     of_originals: JsonObject,
     lacks: Sequence[Sentence],
 ) -> tuple[str, list[Sentence]]:
@@ -393,7 +397,7 @@ def _decide(
     return decision, [*sentences, *dict.fromkeys(reasons)]
 
 
-def _test_in_words(tested: _PairedTest, titles: Mapping[str, str]) -> str:
+def _test_in_words(tested: _PairedTest, titles: Titles) -> str:
     """The result of the paired test in a sentence."""
     if np.isnan(tested.p):
         return words.NO_TEST.text
@@ -410,8 +414,8 @@ def _basis(
     unsafe: Unsafe,
     common: CommonDomain,
     limits: Sequence[str],
-    titles: Mapping[str, str],
-) -> Iterator[Sentence]:
+    titles: Titles,
+) -> Sentences:
     """Yield the sentences on the basis of the comparison: what counts as unsafe, the user's limits,
     and original values that differ.
     """

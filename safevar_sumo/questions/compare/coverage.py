@@ -7,14 +7,15 @@ safer.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from safevar_sumo.questions.compare.words import LACKS
 from safevar_sumo.questions.counterexamples import OF_ENCOUNTER
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.pairs import Titles
 from safevar_sumo.questions.part import points_of_tests
-from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.sentence import Sentences
 from safevar_sumo.questions.words import join_phrases, number_of
 from safevar_sumo.scenarios import Point
 from safevar_sumo.study import Study, Weather
@@ -68,9 +69,7 @@ def missing_parts(side: Evaluator, reference: Evaluator) -> list[str]:
     return list(dict.fromkeys(parts))
 
 
-def missing_in_words(
-    a: Evaluator, b: Evaluator, titles: Mapping[str, str]
-) -> Iterator[Sentence]:
+def missing_in_words(a: Evaluator, b: Evaluator, titles: Titles) -> Sentences:
     """Yield a sentence for each version that lacks parts of the other version, such as `Version b
     lacks the test CCRs, which a has.` `titles` are the names of the versions.
     """

@@ -4,23 +4,22 @@ Compared are limits, unsafe vehicles, needless braking, and where the new vehicl
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import tabulate
 from safevar_sumo.questions.boundary import Alone
 from safevar_sumo.questions.compare import words
 from safevar_sumo.questions.compare.coverage import TestCase, cases_of
-from safevar_sumo.questions.compare.settings import within
+from safevar_sumo.questions.compare.settings import Evaluators, Restriction, within
 from safevar_sumo.questions.counterexamples import place_of
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
-from safevar_sumo.questions.pairs import SIDES
+from safevar_sumo.questions.pairs import SIDES, Criteria, Runs, Titles
 from safevar_sumo.questions.repair.price import (
     benign_scenes,
     drive_new_cars,
@@ -33,9 +32,8 @@ from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.tolerance.asked import Asked, asked_of
 from safevar_sumo.questions.tolerance.search import alone_with_own_set
 from safevar_sumo.questions.words import count_in_words, join_phrases
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject
+from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.scenarios import Point
-from safevar_sumo.study import Limit
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.vehicles import CharacteristicSet
 
@@ -69,9 +67,10 @@ class Difference(NamedTuple):
     weight: int = SAFETY
 
 
-def summary_of(
-    numbers: JsonObject, pairs: pd.DataFrame, titles: Mapping[str, str]
-) -> AnswerTable:
+Differences = Iterator[Difference]
+
+
+def summary_of(numbers: JsonObject, pairs: pd.DataFrame, titles: Titles) -> AnswerTable:
     """The table with a row for each compared quantity, and a column for each version. `numbers` are
     those of the answer; `pairs` has the safety degrees of A and B.
     """
@@ -103,7 +102,7 @@ def summary_of(
     return tabulate("What was compared", columns, rows)
 
 
-def compare_counts(counts: Mapping[str, int]) -> Iterator[Difference]:
+def compare_counts(counts: Mapping[str, int]) -> Differences:
     """The differences by the numbers of settings that are unsafe in one version only. `counts`
     holds the numbers `only_a_unsafe`, `only_b_unsafe`, `both` and `neither`.
     """
@@ -120,7 +119,7 @@ def compare_counts(counts: Mapping[str, int]) -> Iterator[Difference]:
             yield Difference(template, values, is_better)
 
 
-def compare_values(p: float, a12: float) -> Iterator[Difference]:
+def compare_values(p: float, a12: float) -> Differences:
     """The difference of the safety degree over all pairs, if it is significant; p is NaN without
     pairs. An A12 below 0.5 means that B is better.
     """
@@ -131,9 +130,9 @@ def compare_values(p: float, a12: float) -> Iterator[Difference]:
 
 
 def limits_of_both(
-    evaluators: Sequence[Evaluator],
-    criteria: Sequence[Unsafe],
-    limits: Mapping[str, Limit],
+    evaluators: Evaluators,
+    criteria: Criteria,
+    limits: Restriction,
     *,
     at_tests: bool,
 ) -> AnswerTable:
@@ -167,9 +166,7 @@ def limits_of_both(
     )
 
 
-def _safe_alone(
-    request: Asked, limits: Mapping[str, Limit]
-) -> list[Interval] | list[None]:
+def _safe_alone(request: Asked, limits: Restriction) -> list[Interval] | list[None]:
     """The safe interval of each characteristic alone, rounded inwards, and within the user's
     limits; None for all characteristics if the original vehicle is unsafe.
     """
@@ -197,9 +194,7 @@ def _change_of(a: Interval | None, b: Interval | None) -> str:
     return CHANGES[grows + 2 * shrinks]
 
 
-def compare_limits(
-    limits: pd.DataFrame, members: CharacteristicSet
-) -> Iterator[Difference]:
+def compare_limits(limits: pd.DataFrame, members: CharacteristicSet) -> Differences:
     """The differences by limits that exist in both versions, and change. An interval that grows on
     one side and shrinks on the other gives two differences: B is better, and B is worse.
     """
@@ -219,9 +214,9 @@ def compare_limits(
 
 
 def compare_originals(
-    evaluators: Sequence[Evaluator],
-    originals: Sequence[Evaluations],
-    criteria: Sequence[Unsafe],
+    evaluators: Evaluators,
+    originals: Runs,
+    criteria: Criteria,
 ) -> tuple[JsonObject, list[Difference]]:
     """Compare the original vehicles of A and B: how they end, how often they brake needlessly, and
     how much earlier B's original vehicle brakes. Returns the numbers of the answer, and the
@@ -249,7 +244,7 @@ def compare_originals(
     return numbers, differences
 
 
-def _new_collisions(evaluators: Sequence[Evaluator]) -> Iterator[Difference]:
+def _new_collisions(evaluators: Evaluators) -> Differences:
     """The difference by new collisions: B's original vehicle collides in a test case in which A's
     does not. The sentence names the fastest new collision. Test cases that A lacks do not count,
     because they show nothing about a change.
@@ -286,9 +281,7 @@ def _collisions_of_original(side: Evaluator) -> list[tuple[TestCase, Point, floa
     ]
 
 
-def _ends_of_originals(
-    evaluators: Sequence[Evaluator], originals: Sequence[Evaluations]
-) -> JsonObject:
+def _ends_of_originals(evaluators: Evaluators, originals: Runs) -> JsonObject:
     """The outcome and the safety degree of both original vehicles. The gap between the bodies [m]
     is added if the safety degree is not measured between bumpers.
     """

@@ -14,9 +14,9 @@ import pandas as pd
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, about
-from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.pairs import Criteria, Runs
 from safevar_sumo.questions.sampling import Interval, sobol_points
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.results import handles_of
@@ -43,6 +43,12 @@ setting is half as far from the setting before it as that setting was from its p
 """
 
 
+Evaluators = tuple[Evaluator, Evaluator]
+"""The evaluators of A and B."""
+Restriction = Mapping[str, Limit]
+"""The user's limits, by the name of the characteristic."""
+
+
 class Pairs(NamedTuple):
     """M pairs of settings: the same changes in A and in B.
 
@@ -59,7 +65,7 @@ class Pairs(NamedTuple):
 
     frame: pd.DataFrame
     settings: FloatArray
-    runs: Sequence[Evaluations]
+    runs: Runs
 
     @classmethod
     def joined(cls, groups: Sequence[Pairs]) -> Pairs:
@@ -100,15 +106,13 @@ class CommonDomain(NamedTuple):
         The ends of both domains within the limits, A's in row 0 and B's in row 1, shape (2, n).
     """
 
-    evaluators: tuple[Evaluator, Evaluator]
+    evaluators: Evaluators
     shift: FloatArray
     lower: FloatArray
     upper: FloatArray
 
     @classmethod
-    def of(
-        cls, evaluators: tuple[Evaluator, Evaluator], limits: Mapping[str, Limit]
-    ) -> CommonDomain:
+    def of(cls, evaluators: Evaluators, limits: Restriction) -> CommonDomain:
         """The common domain of two versions, within the user's limits.
 
         Raises
@@ -175,7 +179,7 @@ class CommonDomain(NamedTuple):
         return [side.evaluate(of_side, BOTH_STAGE) for side, of_side in pairs]
 
 
-def within(limits: Mapping[str, Limit], name: str, domains: Domains) -> Interval:
+def within(limits: Restriction, name: str, domains: Domains) -> Interval:
     """The ends of the domain of the characteristic `name` within the user's limits."""
     domain = domains[name]
     if name in limits:
@@ -221,7 +225,7 @@ def in_order_of(a: Study, b: Study) -> Study:
 def pairs_of(
     subjects: Sequence[Subject],
     common: CommonDomain,
-    criteria: Sequence[Unsafe],
+    criteria: Criteria,
     samples: int,
 ) -> tuple[Pairs, int]:
     """The solutions of both sides and `samples` sampled settings, evaluated in both versions. The
@@ -253,9 +257,7 @@ def pairs_of(
     return Pairs.joined(groups), outside
 
 
-def _draw_on_lines(
-    common: CommonDomain, criteria: Sequence[Unsafe], samples: int
-) -> Pairs:
+def _draw_on_lines(common: CommonDomain, criteria: Criteria, samples: int) -> Pairs:
     """Sample `samples` settings near the place where the vehicles begin to fail.
 
     The settings lie on lines from the original vehicle to Sobol points of the common domain, in the

@@ -14,6 +14,7 @@ from safevar_sumo.questions.boundary import on_lines
 from safevar_sumo.questions.causes import (
     BOUNDARIES,
     Cause,
+    Causes,
     directions,
     find_minimal_causes,
     settings_of,
@@ -77,7 +78,7 @@ def find_beginnings(
 
 def _smallest(
     members: CharacteristicSet,
-    references: Sequence[Cause],
+    references: Causes,
     candidates: Sequence[PlacedCause],
 ) -> list[PlacedCause]:
     """The candidates that contain neither a cause of `references` nor a smaller candidate. A cause

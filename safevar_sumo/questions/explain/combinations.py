@@ -37,6 +37,10 @@ Change = tuple[int, float]
 Combination = frozenset[Change]
 
 
+CountBySize = dict[int, int]
+"""Numbers of combinations, by the number of their changes."""
+
+
 class Enumeration(NamedTuple):
     """The result of an enumeration: the causes, which are unsafe combinations of changes without a
     smaller unsafe combination in them.
@@ -59,8 +63,8 @@ class Enumeration(NamedTuple):
 
     share: float
     causes: list[Cause]
-    simulated: dict[int, int]
-    existing: dict[int, int]
+    simulated: CountBySize
+    existing: CountBySize
     containing: dict[int, list[Combination]]
     is_cut: bool
 
@@ -164,7 +168,7 @@ def enumerate_causes(
 
 def count_cures(
     evaluator: Evaluator, unsafe: Unsafe, enumeration: Enumeration, limit: int
-) -> dict[int, int]:
+) -> CountBySize:
     """By size, the number of combinations that contain a smaller cause, but are safe. Only sizes
     are simulated that can be simulated completely, with at most `limit` settings altogether.
     """

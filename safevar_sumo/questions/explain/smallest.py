@@ -15,6 +15,7 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.beginnings import find_beginnings
 from safevar_sumo.questions.explain.combinations import (
+    CountBySize,
     Enumeration,
     count_cures,
     enumerate_causes,
@@ -25,7 +26,7 @@ from safevar_sumo.questions.explain.tables import (
     STAIRCASE_COLUMNS,
     sureness,
 )
-from safevar_sumo.questions.tables import AnswerTable, tabulate
+from safevar_sumo.questions.tables import AnswerTables, tabulate
 from safevar_sumo.records import JsonObject
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ class Smallest(NamedTuple):
 
     at_ends: Enumeration
     steps: Sequence[Enumeration]
-    cures: dict[int, int]
+    cures: CountBySize
     table: pd.DataFrame
 
     @classmethod
@@ -101,7 +102,7 @@ class Smallest(NamedTuple):
         return dict(zip(SMALLEST_NUMBERS, values, strict=True))
 
 
-def smallest_tables(smallest: Smallest | None) -> dict[str, AnswerTable]:
+def smallest_tables(smallest: Smallest | None) -> AnswerTables:
     """The tables of causes and of the staircase. Both are empty if `smallest` is None, because the
     original vehicle itself is unsafe.
     """

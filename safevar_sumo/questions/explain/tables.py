@@ -15,7 +15,7 @@ from safevar_sumo.questions.cause_limits import Limits, find_cause_limits
 from safevar_sumo.questions.causes import (
     BOUNDARIES,
     OTHER_SETS,
-    Cause,
+    Causes,
     are_causes,
     directions,
     settings_of,
@@ -39,6 +39,7 @@ from safevar_sumo.questions.preventability import (
 )
 from safevar_sumo.questions.tables import (
     AnswerTable,
+    AnswerTables,
     shipped_columns,
     tabulate,
 )
@@ -102,7 +103,7 @@ def causes_table(
     evaluator: Evaluator,
     fits: int,
     solutions: pd.DataFrame,
-    causes_of: Sequence[Sequence[Cause]],
+    causes_of: Sequence[Causes],
     distinct: pd.DataFrame,
 ) -> AnswerTable:
     """The table with a row of `CAUSE_COLUMNS` for each cause of each chosen failure. Robust causes
@@ -170,7 +171,7 @@ def causes_table(
 
 
 def printed_limits(
-    model: Model, causes: Sequence[Cause], limits: Sequence[Limits]
+    model: Model, causes: Causes, limits: Sequence[Limits]
 ) -> list[dict[str, NamedValues]]:
     """The columns encounter, boundary and single_boundary of each cause, with values as they are
     printed. Values are rounded to the unsafe side, with so many digits that the vehicle is unsafe.
@@ -211,7 +212,7 @@ def printed_limits(
 
 
 def sureness(
-    evaluator: Evaluator, causes: Sequence[Cause], unsafe: Unsafe, sets: int
+    evaluator: Evaluator, causes: Causes, unsafe: Unsafe, sets: int
 ) -> tuple[FloatArray, list[int | None], int | None]:
     """How sure M causes are. The results are:
 
@@ -244,7 +245,7 @@ def statistics_tables(
     verdicts: pd.DataFrame,
     collisions: int,
     distinct: pd.DataFrame,
-) -> dict[str, AnswerTable]:
+) -> AnswerTables:
     """The tables of characteristics, of drivers and of distinct causes, by name.
 
     Parameters

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
@@ -18,7 +18,7 @@ from safevar_sumo.questions.explain.failures import Population
 from safevar_sumo.questions.explain.robustness import LEAST_NEIGHBOURS, MIN_ROBUST_SHARE
 from safevar_sumo.questions.explain.smallest import Smallest
 from safevar_sumo.questions.preventability import FULL, LETTER
-from safevar_sumo.questions.sentence import Sentence, answer
+from safevar_sumo.questions.sentence import Sentence, Sentences, answer
 from safevar_sumo.questions.variation import sampled_in_words
 from safevar_sumo.questions.words import (
     constraints_in_words,
@@ -56,7 +56,7 @@ AVOIDING = {LETTER: words.COMPETENT_DRIVER, FULL: words.FULL_BRAKING}
 
 def smallest_sentences(
     smallest: Smallest, evaluator: Evaluator, unsafe: Unsafe
-) -> Iterator[Sentence]:
+) -> Sentences:
     """Yield the sentences on the smallest unsafe changes of a study, on how sure they are, and on
     what was simulated.
     """
@@ -74,7 +74,7 @@ def smallest_sentences(
 
 def _leading_of_study(
     smallest: Smallest, members: CharacteristicSet, unsafe: Unsafe
-) -> Iterator[Sentence]:
+) -> Sentences:
     """Yield the sentences on the leading cause, and on how sure it is. The leading cause has the
     fewest changes and, among several such causes, begins nearest to the original.
     """
@@ -152,7 +152,7 @@ def _of_size(at_ends: Enumeration, unsafe: Unsafe, size: int) -> Sentence:
     )
 
 
-def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Iterator[Sentence]:
+def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Sentences:
     """Say how many changes are needed at each share of the way to the ends. Successive shares with
     equal results share a sentence.
     """
@@ -180,7 +180,7 @@ def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Iterator[Sentence]:
         )
 
 
-def _containing(smallest: Smallest) -> Iterator[Sentence]:
+def _containing(smallest: Smallest) -> Sentences:
     """Say how many combinations contain a smaller cause, and how many of these are safe."""
     total, simulated, cures = smallest.containing
     if total:
@@ -189,7 +189,7 @@ def _containing(smallest: Smallest) -> Iterator[Sentence]:
         yield words.CURES(count=count_in_words(cures, simulated))
 
 
-def _in_none(at_ends: Enumeration, members: CharacteristicSet) -> Iterator[Sentence]:
+def _in_none(at_ends: Enumeration, members: CharacteristicSet) -> Sentences:
     """Say which characteristics are in no cause, up to the number of changes up to which all
     combinations were simulated.
     """
@@ -205,7 +205,7 @@ def _in_none(at_ends: Enumeration, members: CharacteristicSet) -> Iterator[Sente
 
 def failure_sentences(
     evaluator: Evaluator, population: Population, causes: pd.DataFrame, analysed: int
-) -> Iterator[Sentence]:
+) -> Sentences:
     """Yield the sentences on the causes of failures in results: which changes are enough, and how
     sure the leading cause is.
 
@@ -255,7 +255,7 @@ def failure_sentences(
 
 def _beyond(
     evaluator: Evaluator, unsafe: Unsafe, cause: NamedValues, encounter: NamedValues
-) -> Iterator[Sentence]:
+) -> Sentences:
     """Say how many vehicles with larger changes than those of a cause are unsafe. All other values
     are as in the original. There is no sentence if no change can be larger, or if too few vehicles
     may be simulated.
@@ -281,7 +281,7 @@ def _beyond(
     )
 
 
-def _sureness(row: Mapping[Any, Any]) -> Iterator[Sentence]:
+def _sureness(row: Mapping[Any, Any]) -> Sentences:
     """Say how robust the cause in a row of the table is, and in how many parameter sets it is a
     cause, as far as this is known.
     """
@@ -298,7 +298,7 @@ def _sureness(row: Mapping[Any, Any]) -> Iterator[Sentence]:
 
 def other_sentences(
     study: Study, population: Population, complete: int | None, verdicts: pd.DataFrame
-) -> Iterator[Sentence]:
+) -> Sentences:
     """Yield the sentences below the causes: up to which number of changes the causes are complete,
     who would have avoided the failures, how many vehicles fail, and what counts. `verdicts` are
     those of `assess_sample`.
@@ -322,7 +322,7 @@ def other_sentences(
     yield from notes_on(unsafe, *texts)
 
 
-def avoidance(verdicts: pd.DataFrame) -> Iterator[Sentence]:
+def avoidance(verdicts: pd.DataFrame) -> Sentences:
     """Say how many collisions a competent driver, and full braking, would have avoided. Only the
     collisions count on which the driver has a verdict.
     """

@@ -5,7 +5,7 @@ numbers, the tables, and the list (CSV) that fleet software reads.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
 
@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.campaign.inputs import manifest_now
-from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.answer import Answer, JsonRows
 from safevar_sumo.questions.between import remark_on_phases
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.part import UpperEnd, scope_of, study_up_to
@@ -38,15 +38,20 @@ from safevar_sumo.questions.permit.rows import (
     set_rows,
     verdict_of,
 )
-from safevar_sumo.questions.sentence import Sentence, Verdict, answer, condition
-from safevar_sumo.questions.tables import Column, tabulate
+from safevar_sumo.questions.sentence import (
+    Sentence,
+    Sentences,
+    Verdict,
+    answer,
+    condition,
+)
+from safevar_sumo.questions.tables import NamedColumns, tabulate
 from safevar_sumo.questions.words import (
     VALID_FOR,
     join_phrases,
     number_of,
     precise_in_words,
 )
-from safevar_sumo.records import JsonObject
 from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, unit_text
 from safevar_sumo.sumo.system import assemble
@@ -170,7 +175,7 @@ class PermitAnswer:
             listing=self._listing(cars),
         )
 
-    def _rows(self) -> list[JsonObject]:
+    def _rows(self) -> JsonRows:
         """A row of `CARS` for each car, in the order of the list."""
         vehicle = self.models.own.characteristics.vehicle
         new_car = self.new_car.order
@@ -251,9 +256,7 @@ class PermitAnswer:
             template = words.NEED_REACHED
         return template(**slots)
 
-    def _sentences(
-        self, cars: pd.DataFrame, counts: Mapping[str, int]
-    ) -> Iterator[Sentence]:
+    def _sentences(self, cars: pd.DataFrame, counts: Mapping[str, int]) -> Sentences:
         """Yield the first sentences: how far cars are safe, why no farther, what is assumed."""
         span = self.span
         if len(cars) == 1:
@@ -296,7 +299,7 @@ class PermitAnswer:
             **self._verbs,
         )
 
-    def _groups(self, counts: Mapping[str, int]) -> Iterator[Sentence]:
+    def _groups(self, counts: Mapping[str, int]) -> Sentences:
         """Say how many cars have each verdict; `counts` has their number by verdict."""
         span = self.span
         slots = {
@@ -318,7 +321,7 @@ class PermitAnswer:
                     **slots,
                 )
 
-    def _notes(self) -> Iterator[Sentence]:
+    def _notes(self) -> Sentences:
         """Yield notes on exact measurements, a rough list, phases, and tests that end early or were
         left out.
         """
@@ -406,7 +409,7 @@ class PermitAnswer:
         return listing
 
 
-def _in_unit(columns: Mapping[str, Column], span: Span) -> dict[str, Column]:
+def _in_unit(columns: NamedColumns, span: Span) -> NamedColumns:
     """The same columns; columns of speeds have the unit of the parameter."""
     named = dict(columns)
     for name in {"up_to", "new_car_up_to", "up_to_after_repair"} & named.keys():

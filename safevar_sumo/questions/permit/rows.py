@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import compress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from safevar_sumo.questions.answer import JsonRows
 from safevar_sumo.questions.counterexamples import OF_ENCOUNTER, failures_at, texts_of
 from safevar_sumo.questions.permit import words
 from safevar_sumo.questions.permit.fleet import Fleet
 from safevar_sumo.questions.permit.permits import Permit
 from safevar_sumo.questions.permit.speed_search import LimitingFailure
-from safevar_sumo.questions.sentence import Sentence
+from safevar_sumo.questions.sentence import Sentence, Sentences
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import EXACT, change_texts, join_phrases
 from safevar_sumo.records import FloatArray, JsonObject
@@ -36,7 +37,7 @@ NO_FAILURE: JsonObject = dict.fromkeys(
 
 def failure_columns(
     failures: Sequence[LimitingFailure | None], *, with_car: bool = False
-) -> list[JsonObject]:
+) -> JsonRows:
     """For each failure, the columns that describe it; `because` has the failure in words. A failure
     is None for a car that does not fail.
 
@@ -102,7 +103,7 @@ def verdict_of(
 
 def set_rows(
     names: Sequence[str], permits: Sequence[Permit], *, with_car: bool
-) -> list[JsonObject]:
+) -> JsonRows:
     """The rows of the table `SETS`: a row for each car and each parameter set that was driven."""
     cells = [
         {"car": name, **reached._asdict(), "up_to": reached.safe_value}
@@ -133,7 +134,7 @@ def _texts(vehicle: CharacteristicSet, setting: FloatArray) -> NDArray[Any]:
 
 def assumed_sentences(
     study: Study, vehicle: CharacteristicSet, fleet: Fleet
-) -> Iterator[Sentence]:
+) -> Sentences:
     """Say which values are assumed in all cars, and whether a value is stated by the study or is
     that of the new car. Then say in how many cars further values are assumed.
     """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -16,7 +16,7 @@ from safevar_sumo.questions.repair import words
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.repair.survivors import Survivors
-from safevar_sumo.questions.sentence import Sentence, Verdict, condition
+from safevar_sumo.questions.sentence import Sentences, Verdict, condition
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import (
     UNSAFE_MEANS,
@@ -103,9 +103,7 @@ def _safe_in_words(unsafe: Unsafe) -> str:
     return f"keep {unsafe.keep:g} m of clearance" if unsafe.keep else "stay safe"
 
 
-def _repair(
-    problem: RepairProblem, repairs: Sequence[JsonObject]
-) -> Iterator[Sentence]:
+def _repair(problem: RepairProblem, repairs: Sequence[JsonObject]) -> Sentences:
     """Yield sentences on the first repair, which is the cheapest one, and on its price for a new
     vehicle.
     """
@@ -132,9 +130,7 @@ def _repair(
     yield from (price(**repair), needless(**repair))
 
 
-def _notes(
-    problem: RepairProblem, not_repairable: Sequence[NamedValues]
-) -> Iterator[Sentence]:
+def _notes(problem: RepairProblem, not_repairable: Sequence[NamedValues]) -> Sentences:
     """Yield notes on the promised wear, the criterion, and the wear that no driving system can keep
     safe.
     """
@@ -150,9 +146,7 @@ def _notes(
         yield words.MORE_NOT_REPAIRABLE(number=number)
 
 
-def _tested(
-    models: Models, survivors: Survivors, proof: JsonObject
-) -> Iterator[Sentence]:
+def _tested(models: Models, survivors: Survivors, proof: JsonObject) -> Sentences:
     """Say how a change was tested, and in how many parameter sets it holds."""
     bound = bound_in_words(proof["at_most"])
     yield words.PROOF(

@@ -12,6 +12,7 @@ import numpy as np
 from safevar_sumo.questions.box import Proof, proof_size, prove
 from safevar_sumo.questions.cases import SearchPlan, search_cases
 from safevar_sumo.questions.evaluator import ENCOUNTERS
+from safevar_sumo.questions.models import FitNumbers
 from safevar_sumo.questions.repair.problem import RepairProblem
 from safevar_sumo.questions.repair.smallest import Search
 from safevar_sumo.questions.sampling import Stream
@@ -52,7 +53,7 @@ def unsafe_share(problem: RepairProblem) -> float:
 
 def find_failures(
     problem: RepairProblem,
-    fits: tuple[int, ...],
+    fits: FitNumbers,
     change: FloatArray,
     cases: FloatArray,
     number: int,
@@ -90,7 +91,7 @@ def find_failures(
 
 def prove_change(
     problem: RepairProblem,
-    fits: tuple[int, ...],
+    fits: FitNumbers,
     change: FloatArray,
     number: int,
     attempt: int,
@@ -151,11 +152,11 @@ class Survivors(NamedTuple):
 
     changes: list[tuple[FloatArray, Proof]]
     fits: int
-    broken: tuple[int, ...]
+    broken: FitNumbers
 
 
 def find_survivors(
-    problem: RepairProblem, fits: tuple[int, ...], cases: FloatArray
+    problem: RepairProblem, fits: FitNumbers, cases: FloatArray
 ) -> Survivors:
     """Find the smallest changes that survive in all parameter sets. If there are none, find those
     that survive in the study's own set, and the sets in which a search finds a counterexample to
@@ -178,7 +179,7 @@ def find_survivors(
 
 
 def _survivors_in(
-    problem: RepairProblem, fits: tuple[int, ...], cases: FloatArray
+    problem: RepairProblem, fits: FitNumbers, cases: FloatArray
 ) -> list[tuple[FloatArray, Proof]]:
     """Find the smallest changes, search for counterexamples and prove in turns, until the smallest
     changes survive. The result is empty if no change survives.

@@ -48,7 +48,7 @@ from safevar_sumo.questions.research_questions.tables import (
     POOLED,
     TABLES,
 )
-from safevar_sumo.questions.sentence import Sentence, Verdict, answer, note
+from safevar_sumo.questions.sentence import Sentences, Verdict, answer, note
 from safevar_sumo.questions.words import demanded_in_words, join_phrases, number_of
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import SAFETY_DEGREE, label_of
@@ -269,7 +269,7 @@ def answer_questions(
     )
 
 
-def _verdict(case: Case) -> Iterator[Sentence]:
+def _verdict(case: Case) -> Sentences:
     """Say how many solutions of a case collide, and how many solutions of NSGA-II are critical
     (less safe than the original vehicle).
     """

@@ -26,6 +26,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import Measure
+from safevar_sumo.questions.answer import JsonRows
 from safevar_sumo.questions.case import (
     NSGA2,
     Case,
@@ -49,7 +50,6 @@ from safevar_sumo.questions.research_questions.statistics import (
     median_interval,
     signed_rank_test,
 )
-from safevar_sumo.records import JsonObject
 from safevar_sumo.study import ORIGINAL_DEGREE, SAFETY_DEGREE
 
 CAUSES, BEST = "causes", "best_safety_degree"
@@ -201,9 +201,7 @@ def compare_over_runs(
     return with_intervals(tests, choices.alpha)
 
 
-def _corrected_by_holm(
-    question: str, rows: list[JsonObject], alpha: float
-) -> pd.DataFrame:
+def _corrected_by_holm(question: str, rows: JsonRows, alpha: float) -> pd.DataFrame:
     """The tests of a question over runs, with p-values that are corrected for all these tests.
     `enough_runs`, which the rows state for a test alone, is that of corrected p-values.
     """
@@ -302,7 +300,7 @@ def opponents_of(case: Case, algorithm: str) -> tuple[str, list[str]]:
 
 def _test_original(
     case: Case, choices: Choices, *, over_runs: bool = False
-) -> list[JsonObject]:
+) -> JsonRows:
     """The tests of RQ1: a row for each algorithm and metric, against the original vehicle."""
     case.require_solutions()
     rows = []
@@ -333,7 +331,7 @@ def _test_opponents(
     *,
     over_runs: bool = False,
     further: Samples | None = None,
-) -> list[JsonObject]:
+) -> JsonRows:
     """The tests of RQ2: a row for each baseline (other algorithm) and each indicator or metric,
     also of the `further` samples.
     """

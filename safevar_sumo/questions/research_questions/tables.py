@@ -4,18 +4,18 @@ beside this module has their titles and columns, and how readers see them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.questions.answer import Column, Wide
+from safevar_sumo.questions.answer import Wide
 from safevar_sumo.questions.research_questions import budgets, changes, comparisons
 from safevar_sumo.questions.research_questions.fronts import (
     count_evaluations,
     summarise_convergence,
 )
-from safevar_sumo.questions.tables import columns_from
+from safevar_sumo.questions.tables import NamedColumns, columns_from
 from safevar_sumo.shipped import shipped_table
 
 CAUSES = "causes"
@@ -41,7 +41,7 @@ class PaperTable(NamedTuple):
 
     title: str
     compute: Compute
-    columns: Mapping[str, Column]
+    columns: NamedColumns
     wide: Wide | None
 
     @classmethod

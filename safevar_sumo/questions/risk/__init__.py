@@ -11,7 +11,7 @@ the first-order index is computed from the sampled vehicles themselves (Plischke
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from itertools import product
 
 import numpy as np
@@ -43,7 +43,7 @@ from safevar_sumo.questions.over_sets import (
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.risk import words
 from safevar_sumo.questions.sampling import clopper_pearson
-from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.sentence import Sentence, Sentences, Verdict
 from safevar_sumo.questions.variation import VariationModel, sampled_in_words
 from safevar_sumo.questions.words import (
     constraints_in_words,
@@ -210,7 +210,7 @@ def influence_in_words(
     failures: float,
     confidence: float,
     names: Mapping[str, str],
-) -> Iterator[Sentence]:
+) -> Sentences:
     """Say which characteristic has the largest influence on the measure. If the interval of its
     share of the variance overlaps intervals of other characteristics, these are named, too.
 

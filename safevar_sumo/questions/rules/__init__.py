@@ -35,7 +35,7 @@ from safevar_sumo.questions.over_sets import (
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.rules import words
 from safevar_sumo.questions.sampling import clopper_pearson, share_with_interval
-from safevar_sumo.questions.sentence import Sentence, Verdict
+from safevar_sumo.questions.sentence import Sentences, Verdict
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.variation import VariationModel, sampled_in_words
 from safevar_sumo.questions.words import (
@@ -188,7 +188,7 @@ def rules(
     )
 
 
-def _region_in_words(rule: pd.Series[Any], region: str) -> Iterator[Sentence]:
+def _region_in_words(rule: pd.Series[Any], region: str) -> Sentences:
     """Yield the sentences about the region of a rule (a row of the table): the region, the share of
     unsafe vehicles in it, and the share of all unsafe vehicles that it holds.
     """
