@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 AnswerFunction = TypeVar("AnswerFunction", bound="Callable[..., Answer]")
 
 
-Names = Collection[str | EllipsisType]
+DeclaredNames = Collection[str | EllipsisType]
 """Names of numbers or columns; `...` stands for names that a study gives."""
 JsonRows = list[JsonObject]
 """Rows of a table, by the names of its columns."""
@@ -57,8 +57,8 @@ class Contents(NamedTuple):
         Name of the question that a user should ask next; "" for none.
     """
 
-    numbers: Names
-    tables: Mapping[str, Names]
+    numbers: DeclaredNames
+    tables: Mapping[str, DeclaredNames]
     lead: str = ""
     next: str = ""
 
@@ -99,7 +99,7 @@ class Contents(NamedTuple):
         return keys
 
 
-def _without_ellipsis(names: Names) -> list[str]:
+def _without_ellipsis(names: DeclaredNames) -> list[str]:
     """The names without `...`."""
     return [name for name in names if isinstance(name, str)]
 
@@ -112,7 +112,7 @@ def contents(
     *numbers: str | EllipsisType,
     lead: Any = "",
     next: Any = "",
-    **tables: Names,
+    **tables: DeclaredNames,
 ) -> Callable[[AnswerFunction], AnswerFunction]:
     """Decorator that declares the `Contents` of a function's answers: the names of numbers, and the
     names of columns by table. The command refuses other names before it computes anything.

@@ -274,7 +274,8 @@ class Question:
         # The evaluator loads SUMO, which takes long: import it only when a question is asked.
         from safevar_sumo.questions.evaluator import open_evaluator
 
-        if values.get(QUICK):
+        is_quick = bool(values.get(QUICK))
+        if is_quick:
             subjects = list(map(with_own_set, subjects))
         study = study_in(subjects[0])
         with (
@@ -282,7 +283,7 @@ class Question:
             open_evaluator(study, pool, jobs, show, cluster) as evaluator,
         ):
             account = evaluator.account
-            evaluator.limit(simulations, questions, quick=bool(values.get(QUICK)))
+            evaluator.limit(simulations, questions, quick=is_quick)
             for subject in subjects:
                 if isinstance(subject, Case) and not as_it_is_now:
                     evaluator.for_study(subject.study).refuse_other_original(subject)
@@ -310,7 +311,7 @@ class Question:
             evaluator.end()
         numbers = {"driven": not reason, **result.numbers}
         beginning = [answer(reason)]
-        if values.get(QUICK):
+        if is_quick:
             beginning.append(ROUGH)
         if account.limit is not None:
             numbers |= {"rough": True, "simulations": account.spent}
@@ -434,6 +435,7 @@ def find_question(name: str) -> Question:
         If there is no such question.
     """
     legal = f"{', '.join(QUESTIONS)}, or module:name of a function with @question"
+    unknown = InputError("question", f"there is no {name!r}", legal)
     if ":" in name:
         module, _, function = name.partition(":")
         # The user's module may be in the working directory, which is not on the path of an
@@ -442,7 +444,7 @@ def find_question(name: str) -> Question:
     elif name in QUESTIONS:
         module, function = QUESTIONS[name], name
     else:
-        raise InputError("question", f"there is no {name!r}", legal)
+        raise unknown
     # Python's caches of folders would hide a module that was written a moment ago.
     invalidate_caches()
 
@@ -450,7 +452,7 @@ def find_question(name: str) -> Question:
         with user_errors(name):
             imported = import_module(module)
     except ModuleNotFoundError:
-        raise InputError("question", f"there is no {name!r}", legal) from None
+        raise unknown from None
     questions = {
         name: value
         for name, value in vars(imported).items()

@@ -69,9 +69,10 @@ def find_boundaries(
     lowest
         Share of each line at which the search begins, shape (K,) or a number.
     """
-    lines = np.arange(len(starts))
-    low = np.full(len(lines), lowest, dtype=float)
-    high = np.ones(len(lines))
+    line_count = len(starts)
+    lines = np.arange(line_count)
+    low = np.full(line_count, lowest, dtype=float)
+    high = np.ones(line_count)
     for number in parts:
         # Divide the piece from `low` to `high` of each line: shares of the bounds between the
         # parts, shape (K, number + 1).
@@ -80,9 +81,9 @@ def find_boundaries(
         # The last bound gets its exact value, without a rounding error.
         shares[:, -1] = high
         bounds = on_lines(starts, ends, shares[:, 1:-1])
-        is_unsafe = np.ones((len(lines), number), dtype=bool)
+        is_unsafe = np.ones((line_count, number), dtype=bool)
         tested = are_unsafe(bounds.reshape(-1, starts.shape[1]))
-        is_unsafe[:, :-1] = tested.reshape(len(lines), number - 1)
+        is_unsafe[:, :-1] = tested.reshape(line_count, number - 1)
         # The next round divides the part below the first unsafe bound.
         first_unsafe = np.argmax(is_unsafe, axis=1)
         low = shares[lines, first_unsafe]

@@ -33,10 +33,11 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
     # Only samples until the obstacle is nearest count.
     nearest_sample = runs.nearest(column)
     samples = slice(None if nearest_sample is None else nearest_sample + 1)
+    place = samples, column
     trace = runs.trace
-    is_active = trace.active[samples, column]
-    speed = np.where(is_active, trace.speed[samples, column], 0.0)
-    brake = np.where(speed > STANDSTILL, trace.brake[samples, column], 0.0)
+    is_active = trace.active[place]
+    speed = np.where(is_active, trace.speed[place], 0.0)
+    brake = np.where(speed > STANDSTILL, trace.brake[place], 0.0)
     is_braking = (brake > 0) & (brake >= REGULATION_SHARE * brake.max())
     has_collided = bool(np.isfinite(runs.collision_speed[column]))
     sample = find_manoeuvre(speed, is_braking, has_collided)
@@ -44,7 +45,7 @@ def brake_onset(runs: SimulationRuns, column: int) -> int | None:
         return None
 
     # The manoeuvre begins after the last sample in which pedals only regulate the speed.
-    is_pressed = (brake > 0) | (trace.throttle[samples, column] > 0)
+    is_pressed = (brake > 0) | (trace.throttle[place] > 0)
     (regulation,) = np.nonzero((is_pressed & ~is_braking)[:sample])
     end = int(regulation[-1]) if regulation.size else 0
     onset = end + int(is_braking[end:].argmax())

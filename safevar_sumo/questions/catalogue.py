@@ -210,9 +210,7 @@ def _in_a_workshop(item: Characteristic) -> str | None:
 
 def _studies() -> Iterator[tuple[str, ...]]:
     """The rows of the table of studies."""
-    facts = attrgetter(
-        *("name", "title", "vehicle.model", "ads.model", "scenario.model")
-    )
+    facts = attrgetter("name", "title", "vehicle.model", "ads.model", "scenario.model")
     for study in map(read_study, study_names()):
         yield *facts(study), weather_of(study.weather).name
 

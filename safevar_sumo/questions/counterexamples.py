@@ -206,8 +206,8 @@ def as_printed(
     members: CharacteristicSet,
     setting: FloatArray,
     further: int,
-    box: Box | None = None,
-    single_name: str = "",
+    box: Box | None,
+    single_name: str,
 ) -> FloatArray:
     """A setting whose values are rounded to the digits of limits, plus `further` digits. Values of
     the vehicle are rounded away from the original, and values of the encounter to the nearest. With
@@ -242,8 +242,9 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
     runs = model.evaluate(settings, BEYOND_STAGE)
     failures = {}
     for row in np.flatnonzero(model.robustness_by(runs) < 0).tolist():
+        setting = settings[row]
         point = points[runs.points[row]]
-        values = members.encounter_of(settings[row])
+        values = members.encounter_of(setting)
         scenario = encounter(point, values).scenario
         breach = model.unsafe.breach_in_words(runs.take(np.array([row])))
         collided = bool(runs.collided[row])
@@ -255,13 +256,13 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
         elif collided and speed >= LEAST_IMPACT:
             impact = f"impact at {float(f'{speed:.2g}'):g} km/h"
         failures[row] = Failure(
-            settings[row],
+            setting,
             event,
             impact,
             place_of(points, point, scenario, values, model.fit),
             dict(point.parameters),
             breach,
-            _command(model, settings[row], point),
+            _command(model, setting, point),
         )
     return failures
 

@@ -168,23 +168,25 @@ class Evaluator:
         """
         expected = sum(settings.values())
         account = self.account
+        system = self.system
+        pool = self._pool
         if account.is_question:
-            number = minimum + MEASURED * self.system.mover.takes_long
+            number = minimum + MEASURED * system.mover.takes_long
             account.require(account.spent + number * self._each)
-            if self.system.mover.takes_long:
+            if system.mover.takes_long:
                 if account.allowance is not None:
-                    self._pool.spare = spare(account.allowance, account.minimum)
-                opened_by(self.study, self._pool)
-            seconds = seconds_of_simulation(self.study, self.system, self._pool)
-            account.open(expected * self._each, seconds, self._pool.checked)
+                    pool.spare = spare(account.allowance, account.minimum)
+                opened_by(self.study, pool)
+            seconds = seconds_of_simulation(self.study, system, pool)
+            account.open(expected * self._each, seconds, pool.checked)
             if seconds is not None:
                 account.spend(MEASURED * self._each)
-            elif of_list and not self.account.is_limited:
-                simulations = expected * len(self.system.points)
-                print_price_of_list(self.study, self.system, self._pool, simulations)
+            elif of_list and not account.is_limited:
+                simulations = expected * len(system.points)
+                print_price_of_list(self.study, system, pool, simulations)
         share = 1.0 if self.left is None else self.left / expected
         planned = {name: share * number for name, number in settings.items()}
-        self.phases.plan(planned, len(self.system.points))
+        self.phases.plan(planned, len(system.points))
 
     @property
     def left(self) -> int | None:

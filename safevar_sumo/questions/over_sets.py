@@ -16,7 +16,7 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import models_of
 from safevar_sumo.questions.sampling import share_with_interval
-from safevar_sumo.questions.sentence import Sentence, Sentences
+from safevar_sumo.questions.sentence import Sentences, condition
 from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.questions.words import interval_in_words, percentage
 from safevar_sumo.records import (
@@ -36,18 +36,15 @@ VEHICLES = 400
 """Largest number of vehicles that are simulated with each set, twice: of all vehicles, and of the
 vehicles in further groups.
 """
-ONE_SET = Sentence(
-    "condition",
+ONE_SET = condition(
     "This share was computed with parameter set 0 of the vehicle model (the calibration that the"
     " study uses). Other parameter sets (alternative calibrations) were not simulated.",
 )
-SHARES = Sentence(
-    "condition",
+SHARES = condition(
     "The share of unsafe vehicles ranges from {least} to {greatest} over the {sets} parameter sets"
     " of the vehicle model (alternative calibrations; at most {most} vehicles with each set).",
 )
-SAME_SHARE = Sentence(
-    "condition",
+SAME_SHARE = condition(
     "The share of unsafe vehicles is {least} in each of the {sets} parameter sets of the vehicle"
     " model (alternative calibrations; at most {most} vehicles with each set).",
 )

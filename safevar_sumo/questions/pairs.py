@@ -19,7 +19,7 @@ from safevar_sumo.records import Evaluations
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SIDES = ("a", "b")
+SIDES = ["a", "b"]
 UNSAFE_IN = {
     "a": "only_a_unsafe",
     "b": "only_b_unsafe",

@@ -123,7 +123,7 @@ def place_in_words(
     characteristics: CharacteristicSet,
     values: NamedValues,
     *,
-    are_printed: bool = False,
+    are_printed: bool,
 ) -> str:
     """The searched parameters of the scenario, such as `speed 59.5 km/h`; "" without any."""
     phrases = []

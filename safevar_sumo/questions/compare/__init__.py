@@ -159,6 +159,7 @@ def compare(
     common = CommonDomain.of(evaluators, restriction)
     originals = [evaluator.evaluate_original(), second.evaluate_original()]
     criteria = _criteria((subject, other), evaluators, originals, unsafe, margin)
+    criterion = criteria[0]
 
     # With few simulations, a third of them drives the pairs: a sixth in each version. The other two
     # thirds are for the limits.
@@ -191,8 +192,8 @@ def compare(
         "decision": decision.lower(),
         "better_in": number_of_better,
         "worse_in": len(differences) - number_of_better,
-        "unsafe": str(criteria[0]),
-        "margin": criteria[0].keep,
+        "unsafe": str(criterion),
+        "margin": criterion.keep,
         "settings": sum(counts.values()),
         **counts,
         "p": tested.p,
@@ -206,12 +207,12 @@ def compare(
     summary = summary_of(numbers, tested.pairs.frame, titles)
     table = _table(common, settings)
     reason = second.no_verdict if second.no_verdict != evaluator.no_verdict else ""
-    notes = [criteria[0].remark, *counted_in_words(study, pairs.number_infeasible)]
+    notes = [criterion.remark, *counted_in_words(study, pairs.number_infeasible)]
     verdict = Verdict(
         [
             answer(reason),
             *why,
-            *_basis(criteria[0], common, limits, titles),
+            *_basis(criterion, common, limits, titles),
             *map(note, notes),
         ]
     )
@@ -328,12 +329,12 @@ def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
     of a run or, if there are fewer runs than the test needs, the sampled settings on a line.
     """
     a, b = (run.f_safe for run in runs.runs)
-    frame = settings.assign(a=a, b=b).dropna(subset=list(SIDES))
-    pairs = frame[frame["source"] == SAMPLE].groupby(LINE)[list(SIDES)].mean()
+    frame = settings.assign(a=a, b=b).dropna(subset=SIDES)
+    pairs = frame[frame["source"] == SAMPLE].groupby(LINE)[SIDES].mean()
     names = [f"line {int(line)}" for line in pairs.index]
     groups = "sampled on one line through the domain"
     if "run" in frame:
-        means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[list(SIDES)].mean()
+        means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[SIDES].mean()
         if len(means) >= fewest_runs("RQ1"):
             pairs = means
             names = [

@@ -84,7 +84,7 @@ def summary_of(numbers: JsonObject, pairs: pd.DataFrame, titles: Titles) -> Answ
             numbers["only_a_unsafe"] + number_in_both,
             numbers["only_b_unsafe"] + number_in_both,
         ],
-        "mean safety degree of the changed vehicles": pairs[list(SIDES)].mean(),
+        "mean safety degree of the changed vehicles": pairs[SIDES].mean(),
         f"scenes with needless braking, of {numbers['benign_scenes']} benign scenes": [
             numbers["a_needless_braking"],
             numbers["b_needless_braking"],

@@ -35,6 +35,7 @@ that those that are likely to be unsafe are simulated first.
 Change = tuple[int, float]
 """A change of a characteristic: its column in a setting, and its new value."""
 Combination = frozenset[Change]
+Combinations = list[Combination]
 
 
 CountBySize = dict[int, int]
@@ -65,7 +66,7 @@ class Enumeration(NamedTuple):
     causes: list[Cause]
     simulated: CountBySize
     existing: CountBySize
-    containing: dict[int, list[Combination]]
+    containing: dict[int, Combinations]
     is_cut: bool
 
     @property
@@ -122,7 +123,7 @@ def enumerate_causes(
     simulated = {}
     existing = {}
     containing = {}
-    unsafe_ones = list[Combination]()
+    unsafe_ones = Combinations()
     is_cut = False
 
     for size in range(1, len(columns) + 1):
@@ -134,8 +135,8 @@ def enumerate_causes(
             break
         of_size = list(_of_size(changes, size))
         is_feasible = evaluator.region.feasible(_settings(members, of_size)).tolist()
-        candidates = list[Combination]()
-        larger = list[Combination]()
+        candidates = Combinations()
+        larger = Combinations()
         for combination in compress(of_size, is_feasible):
             group = candidates
             if any(smaller <= combination for smaller in unsafe_ones):
@@ -241,7 +242,7 @@ def _of_size(changes: list[Change], size: int) -> Iterator[Combination]:
         yield from map(frozenset, product(*columns))
 
 
-def _settings(members: CharacteristicSet, chosen: list[Combination]) -> FloatArray:
+def _settings(members: CharacteristicSet, chosen: Combinations) -> FloatArray:
     """The settings of the original vehicle with each of M combinations, shape (M, n)."""
     settings = np.tile(members.original, (len(chosen), 1))
     for setting, combination in zip(settings, chosen, strict=True):
@@ -251,7 +252,7 @@ def _settings(members: CharacteristicSet, chosen: list[Combination]) -> FloatArr
 
 
 def _robustness(
-    evaluator: Evaluator, unsafe: Unsafe, chosen: list[Combination]
+    evaluator: Evaluator, unsafe: Unsafe, chosen: Combinations
 ) -> tuple[FloatArray, list[Cause]]:
     """The robustness of each of M combinations (below 0: unsafe), shape (M,), infinite without a
     valid simulation; and each combination as a cause, in its worst encounter.

@@ -41,8 +41,13 @@ CURES = 4
 TITLE = "The smallest unsafe changes, each at an end of its domain"
 
 SMALLEST_NUMBERS = (
-    *("tried", "up_to_changes", "complete_up_to", "causes"),
-    *("containing", "containing_tried", "cures"),
+    "tried",
+    "up_to_changes",
+    "complete_up_to",
+    "causes",
+    "containing",
+    "containing_tried",
+    "cures",
 )
 
 

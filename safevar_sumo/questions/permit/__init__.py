@@ -356,18 +356,20 @@ def _grid(span: Span, step: float) -> FloatArray:
     """The grid of speeds, in ascending order: the ends of the range, and all multiples of `step`
     between them.
     """
-    if (span.high - span.low) / step > MOST_VALUES:
+    low = span.low
+    high = span.high
+    if (high - low) / step > MOST_VALUES:
         raise InputError(
             "step",
             f"{step:g}",
-            f"at most {MOST_VALUES:,} steps from {span.low:g} to {span.high:g}",
+            f"at most {MOST_VALUES:,} steps from {low:g} to {high:g}",
         )
     # The first multiple may lie below the range: it is clipped. Digits beyond the ninth decimal are
     # errors of rounding.
-    numbers = np.arange(span.low // step, span.high / step)
+    numbers = np.arange(low // step, high / step)
     multiples = np.round(step * numbers, 9)
-    values = [span.low, *multiples, span.high]
-    return np.unique(np.clip(values, span.low, span.high))
+    values = [low, *multiples, high]
+    return np.unique(np.clip(values, low, high))
 
 
 def _cars_within(

@@ -259,7 +259,8 @@ class PermitAnswer:
     def _sentences(self, cars: pd.DataFrame, counts: Mapping[str, int]) -> Sentences:
         """Yield the first sentences: how far cars are safe, why no farther, what is assumed."""
         span = self.span
-        if len(cars) == 1:
+        is_single = len(cars) == 1
+        if is_single:
             yield self._car(cars["car"][0], cars["up_to"][0])
         else:
             yield from self._groups(counts)
@@ -269,10 +270,10 @@ class PermitAnswer:
             **self._verbs,
         )
         vehicle = self.models.own.characteristics.vehicle
-        if len(cars) == 1:
+        if is_single:
             yield answer(cars["because"][0])
         yield from assumed_sentences(self.study, vehicle, self.fleet)
-        is_checked = len(cars) == 1 and not pd.isna(cars["up_to"][0])
+        is_checked = is_single and not pd.isna(cars["up_to"][0])
         if is_checked and self.worst_ends and not self.fleet.measured.all():
             end = self.worst_ends[0]
             if end is None:
@@ -325,6 +326,7 @@ class PermitAnswer:
         """Yield notes on exact measurements, a rough list, phases, and tests that end early or were
         left out.
         """
+        span = self.span
         vehicle = self.models.own.characteristics.vehicle
         # Limits that a user states are no measurements, so no note on their exactness is needed.
         is_measured = np.any(self.fleet.measured, axis=0) & (not self.is_box)
@@ -333,16 +335,16 @@ class PermitAnswer:
         if self.fleet.is_rough:
             yield words.ROUGH_LIST
         yield condition(remark_on_phases(self.models.own.in_phases))
-        top = self.span.text(self.span.high)
-        if self.span.ending:
+        top = span.text(span.high)
+        if span.ending:
             yield words.ENDING(
                 top=top,
-                tests=join_phrases(self.span.ending),
+                tests=join_phrases(span.ending),
             )
-        if self.span.tests_above:
+        if span.tests_above:
             yield words.LEFT_OUT(
                 top=top,
-                tests=join_phrases(self.span.tests_above),
+                tests=join_phrases(span.tests_above),
             )
 
     @property

@@ -207,12 +207,12 @@ def _cells_of_file(path: Path) -> _Cells:
     # The separator is stated by Excel's first line, or else guessed from the header.
     stated = SEPARATOR_LINE.match(text)
     lines = io.StringIO(text[stated.end() :] if stated else text, newline="")
-    skipped = 1 if stated else 0
+    header_line = 2 if stated else 1
     head = re.sub('"[^"]*"', "", lines.readline())
     lines.seek(0)
     separator = next(filter(head.__contains__, SEPARATORS), "")
     separator = stated[1] if stated else separator
-    place = f"{path}, line {skipped + 1}"
+    place = f"{path}, line {header_line}"
     if separator not in SEPARATORS or separator not in head:
         raise InputError(
             place,
@@ -223,15 +223,13 @@ def _cells_of_file(path: Path) -> _Cells:
     # A record with a line break in a cell has several lines: its place is its first line.
     reader = csv.reader(lines, delimiter=separator, strict=True)
     records = []
-    start = 0
+    line = header_line
     try:
         for record in reader:
-            records.append((f"{path}, line {skipped + start + 1}", record))
-            start = reader.line_num
+            records.append((f"{path}, line {line}", record))
+            line = header_line + reader.line_num
     except csv.Error as error:
-        raise InputError(
-            f"{path}, line {skipped + start + 1}", str(error), "CSV"
-        ) from None
+        raise InputError(f"{path}, line {line}", str(error), "CSV") from None
     while len(records) > 1 and not any(cell.strip() for cell in records[-1][1]):
         records.pop()
     places, rows = zip(*records, strict=True)
@@ -409,7 +407,9 @@ def _number(text: str, mark: str, item: Characteristic) -> float:
     """The value of a cell. A text that is no number with the decimal mark `mark` (a key of
     `NUMBERS`), or a value outside of the characteristic's domain, is refused.
     """
-    domain = f"a number in [{item.lower:g}, {item.upper:g}]{item.suffix}"
+    lower = item.lower
+    upper = item.upper
+    domain = f"a number in [{lower:g}, {upper:g}]{item.suffix}"
     if not NUMBERS[mark].fullmatch(text):
         raise InputError("", f"{text!r} is no number with {MARKS[mark]}", domain)
     value = float(text.replace(",", "."))
@@ -419,7 +419,7 @@ def _number(text: str, mark: str, item: Characteristic) -> float:
         # value is exempt.
         if all(
             np.round(abs(value - end), 12) >= item.error
-            for end in {item.lower, item.upper} - {item.original}
+            for end in {lower, upper} - {item.original}
         ):
             return value
         raise InputError(
@@ -430,13 +430,9 @@ def _number(text: str, mark: str, item: Characteristic) -> float:
 
     # If the new car's value is the upper end of the domain, a part may be measured as better than
     # new. The user may enter the new car's value then.
-    problem = (
-        f"{value:{EXACT}} is outside {item.lower:g} to {item.upper:g}{item.suffix}"
-    )
-    if item.upper == item.original and item.upper < value <= item.upper + item.error:
-        raise InputError(
-            "", problem, f"{domain}; at most {item.upper:g}: enter {item.upper:g}"
-        )
+    problem = f"{value:{EXACT}} is outside {lower:g} to {upper:g}{item.suffix}"
+    if upper == item.original and upper < value <= upper + item.error:
+        raise InputError("", problem, f"{domain}; at most {upper:g}: enter {upper:g}")
     # Any other value may have another unit, such as percent. Then the message recommends no end of
     # the domain.
     is_share = not item.suffix and item.is_legal(value / 100, beyond=False)

@@ -192,6 +192,7 @@ class PermitSearch:
         permits = [Permit([]) for _ in cars]
         top = float(self.values[-1])
         for model in self._models_in_order:
+            fit = model.fit
             # The cars that are still of interest, and the greatest value that is of interest.
             caps = {}
             for car, (permit, floor) in enumerate(zip(permits, floors, strict=True)):
@@ -200,11 +201,11 @@ class PermitSearch:
                     caps[car] = cap
             if not caps:
                 break
-            if model.fit not in self._ranges:
-                self._ranges[model.fit] = encounters_of(model, self.span)
-            name = stage or self._stage(model.fit)
+            if fit not in self._ranges:
+                self._ranges[fit] = encounters_of(model, self.span)
+            name = stage or self._stage(fit)
             search = SpeedSearch(
-                self._ranges[model.fit],
+                self._ranges[fit],
                 [cars[car] for car in caps],
                 self.values,
                 list(caps.values()),
@@ -220,7 +221,7 @@ class PermitSearch:
                 # Between listed values nothing is known: the last safe listed value counts.
                 values = self.listed[self.listed <= (safe_value or -np.inf)]
                 safe_value = max(values.tolist(), default=safe_value)
-                reached = Reached(model.fit, safe_value, search.failures[number])
+                reached = Reached(fit, safe_value, search.failures[number])
                 permits[car].reached.append(reached)
         return permits
 

@@ -267,14 +267,15 @@ def write_repair(path: Path, answer: Answer) -> None:
         If the file cannot be written.
     """
     study = answer.study
+    origin = study.origin
     values = answer.table("repairs")["parameters"][0]
     comment = answer.verdict + (
-        f" Only {study.origin.point} was simulated." if study.origin.point else ""
+        f" Only {origin.point} was simulated." if origin.point else ""
     )
-    if not study.origin.called and study.name not in study_names():
+    if not origin.called and study.name not in study_names():
         write_study(path, with_parameters(study, values), comment)
         return
-    base = os.path.abspath(study.origin.called) if study.origin.called else study.name
+    base = os.path.abspath(origin.called) if origin.called else study.name
     tables = {
         "extends": base,
         "name": f"{study.name}-repaired",

@@ -111,19 +111,18 @@ class Search:
         Changes of the same size are ordered by the sum of their differences from today.
         """
         today = self.problem.today
+        size = len(today)
         ring = np.array(
             list(product(np.linspace(-1.0, 1.0, SIDE // self._thinning), repeat=number))
         )
         ring = ring[np.max(np.abs(ring), axis=1) == 1]
-        subsets = list(combinations(range(len(today)), number))
-        moves: FloatArray = np.zeros((len(subsets), len(ring), len(today)))
+        subsets = list(combinations(range(size), number))
+        moves: FloatArray = np.zeros((len(subsets), len(ring), size))
         for row, subset in enumerate(subsets):
             moves[row][:, subset] = ring
-        moves = moves.reshape(-1, len(today))
+        moves = moves.reshape(-1, size)
         moves = moves[np.argsort(np.sum(np.abs(moves), axis=1), kind="stable")]
-        changes = (today + sizes[:, np.newaxis, np.newaxis] * moves).reshape(
-            -1, len(today)
-        )
+        changes = (today + sizes[:, np.newaxis, np.newaxis] * moves).reshape(-1, size)
         return changes[((changes >= 0) & (changes <= 1)).all(axis=1)]
 
     def _failure_of(self, change: FloatArray) -> FloatArray | None:

@@ -393,16 +393,17 @@ def remarks_on_runs(
     """
     rq = table.partition("-")[0].upper()
     tests = frame.dropna(subset="effect_size")
-    tests_in_words = number_of(len(tests), "test")
-    few = len(tests) - int(tests["enough_runs"].sum())
+    number = len(tests)
+    tests_in_words = number_of(number, "test")
+    few = number - int(tests["enough_runs"].sum())
     if few:
-        least_number = fewest_runs(rq, alpha, len(tests))
+        least_number = fewest_runs(rq, alpha, number)
         beginning = f"{few} of {tests_in_words} of {rq} cannot"
-        if few == len(tests) > 1:
+        if few == number > 1:
             beginning = f"None of the {tests_in_words} of {rq} can"
         yield (
             f"{beginning} be significant: after Holm's correction, a test"
             f" needs at least {least_number} runs of each algorithm."
         )
-    if len(tests):
+    if number:
         yield f"Holm's method corrects the p-values of the {tests_in_words} of {rq} together."

@@ -185,7 +185,7 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 
 
 def compare_over_runs(
-    case: Case, choices: Choices = DEFAULT, further: Samples | None = None
+    case: Case, choices: Choices, further: Samples | None = None
 ) -> pd.DataFrame:
     """Every test of RQ1 over runs and, if there are two algorithms, every test of RQ2, which also
     compares the `further` samples. The index is the question, RQ1 or RQ2.

@@ -95,17 +95,17 @@ def compare_samples(x: ArrayLike, y: ArrayLike) -> TwoSampleTest:
     """Compare two samples by the Mann-Whitney U test and A12. No value may be undefined."""
     sample = rounded_to_rank(x)
     baseline = rounded_to_rank(y)
-    if not sample.size or not baseline.size:
-        return TwoSampleTest(np.nan, np.nan, None, sample.size, baseline.size, None)
+    n1 = sample.size
+    n2 = baseline.size
+    if not n1 or not n2:
+        return TwoSampleTest(np.nan, np.nan, None, n1, n2, None)
     name, method = ASYMPTOTIC_TEST, "asymptotic"
-    is_small = min(sample.size, baseline.size) <= EXACT_SAMPLE_SIZE
+    is_small = min(n1, n2) <= EXACT_SAMPLE_SIZE
     if is_small and has_distinct_values([*sample, *baseline]):
         name, method = EXACT_TEST, "exact"
     test = scipy.stats.mannwhitneyu(sample, baseline, method=method, nan_policy="raise")
-    a12 = float(test.statistic) / (sample.size * baseline.size)
-    return TwoSampleTest(
-        float(test.pvalue), a12, magnitude_of(a12), sample.size, baseline.size, name
-    )
+    a12 = float(test.statistic) / (n1 * n2)
+    return TwoSampleTest(float(test.pvalue), a12, magnitude_of(a12), n1, n2, name)
 
 
 def rounded_to_rank(values: ArrayLike) -> FloatArray:
@@ -206,7 +206,7 @@ def effect_interval(effect: float, m: int, n: float, alpha: float = ALPHA) -> In
     return low, high
 
 
-def median_interval(values: ArrayLike, alpha: float = ALPHA) -> Interval:
+def median_interval(values: ArrayLike, alpha: float) -> Interval:
     """The interval of a median at a confidence of at least 1 - alpha. Its ends are two of the
     ordered values; NaN if there are too few values.
     """

@@ -143,14 +143,15 @@ def rules(
     title = "Regions in which many vehicles are unsafe"
     table = tabulate(title, COLUMNS, frame.reset_index(drop=True))
 
+    share = failures / total
     low, high = clopper_pearson(failures, total)
     numbers = {
         "unsafe": str(criterion),
         "samples": total,
         "failures": failures,
-        "share": failures / total,
+        "share": share,
         "interval": [low, high],
-        **over_sets.numbers(failures / total),
+        **over_sets.numbers(share),
     }
     counted = counted_in_words(study, int(evaluations.infeasible.sum()))
     sentences = [
@@ -158,13 +159,13 @@ def rules(
             count=count_in_words(failures, total),
             sampled=sampled_in_words(study),
             collide=criterion.verbs[failures > 1],
-            share=percentage(failures / total),
+            share=percentage(share),
             interval=interval_in_words(low, high),
         ),
         *over_sets.sentences(),
         *notes_on(criterion, *counted, *constraints_in_words(study)),
     ]
-    denser = frame[frame["density_low"] > failures / total]
+    denser = frame[frame["density_low"] > share]
     if not boxes:
         sentences.append(
             words.TOO_FEW(
@@ -209,9 +210,10 @@ def conditions(
     texts = []
     for item, low, high in zip(characteristics, *box.tolist(), strict=True):
         name = getattr(item, attribute)
-        if low > -np.inf and high < np.inf:
+        has_low = low > -np.inf
+        if has_low and high < np.inf:
             texts.append(f"{name} from {low:g} to {high:g}{item.suffix}")
-        elif low > -np.inf:
+        elif has_low:
             texts.append(f"{name} above {low:g}{item.suffix}")
         elif high < np.inf:
             texts.append(f"{name} below {high:g}{item.suffix}")
