@@ -153,6 +153,13 @@ def system_of(study: Path, **changes: object) -> System:
     return assemble(sv.load_study(str(study), **changes))
 
 
+def choose(model: str, code: str = "") -> None:
+    """Let the study simulate another class, whose module has the code, if any is given."""
+    write("wall.toml", STUDY.replace("models:Wall", model))
+    if code:
+        write(f"{model.partition(':')[0]}.py", code)
+
+
 def wrong_system(study: Path, change: str, **changes: object) -> System:
     """The system of a simulator whose results are changed."""
     (study.parent / "models.py").write_text(MODELS.replace("CHANGE", change))
@@ -361,8 +368,7 @@ def test_each_setting_has_an_object_that_was_created_with_its_fields(
 @pytest.mark.parametrize("name", ["Served", "Struct"])
 def test_a_process_opens_its_worker_once_and_ends_it(wall: Path, name: str) -> None:
     """Also where the code is loaded again, and with a number: 0 without worker processes."""
-    write("keeps.py", KEEPS)
-    wall.write_text(STUDY.replace("models:Wall", f"keeps:{name}"))
+    choose(f"keeps:{name}", KEEPS)
     run("check wall.toml")
     run("simulate wall.toml")
     kept.close_simulator()
@@ -379,8 +385,7 @@ def test_a_process_opens_its_worker_once_and_ends_it(wall: Path, name: str) -> N
 @SLOW
 @pytest.mark.usefixtures("worker_processes")
 def test_workers_have_numbers_which_those_have_that_replace_them(wall: Path) -> None:
-    write("keeps.py", KEEPS)
-    wall.write_text(STUDY.replace("models:Wall", "keeps:Dies"))
+    choose("keeps:Dies", KEEPS)
     run("study wall.toml --out results --jobs 2")
     kept.close_simulator()  # of this process
     lines = Path("log").read_text().splitlines()
@@ -396,7 +401,7 @@ def test_runs_have_one_time_step(wall: Path) -> None:
     simulators.simulate_each(system, np.array([[9.0, 0.0]]))
     with pytest.raises(InputError, match=r"time steps of 0.05 and 0.1 s"):
         simulators.simulate_each(system, np.array([[4.0, 0.5]]))
-    wall.write_text(STUDY.replace("models:Wall", "models:Wrong"))
+    choose("models:Wrong")
     refused("check wall.toml", "time steps of 0.05 and 0.1 s")
 
 
@@ -426,7 +431,7 @@ def test_a_speed_that_disagrees_with_the_way_is_a_finding(
     wall: Path, change: str, told: str
 ) -> None:
     wrong_system(wall, f"lambda r: {{**r, **dict({change})}}")
-    wall.write_text(STUDY.replace("models:Wall", "models:Wrong"))
+    choose("models:Wrong")
     assert told in run("check wall.toml --vehicles 3", expect=int(bool(told))).stdout
 
 
@@ -474,7 +479,7 @@ def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
     run("simulate wall.toml --set decel=4 --plot a.png --animate a.html")
     assert Path("a.png").stat().st_size
     assert "wall" in Path("a.html").read_text()
-    wall.write_text(STUDY.replace("models:Wall", "models:Rig"))
+    choose("models:Rig")
     refused("simulate wall.toml --animate b.html", "needs the position")
     refused("simulate wall.toml --trace b.csv", "states metrics alone")
     refused("study wall.toml --engine sumo --out r", "no other engine")
@@ -519,8 +524,7 @@ def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(
     wall: Path,
 ) -> None:
     """The worst run counts, each is in the journal, and without repeats the study is refused."""
-    write("noisy.py", NOISY)
-    wall.write_text(STUDY.replace("models:Wall", "noisy:Drifts"))
+    choose("noisy:Drifts", NOISY)
     assert "repeats = N" in run("check wall.toml", expect=1).stdout
     wall.write_text(STUDY.replace('"models:Wall"', '"noisy:Drifts"\nrepeats = 4'))
     run("check wall.toml")
@@ -649,8 +653,7 @@ def test_a_simulator_that_ends_its_process_is_started_again_once(
 ) -> None:
     """What was simulated before is kept; the error names the setting and the command."""
     end = f"len(open('ended', 'a+').write('x') and open('ended').read()) <= {often}"
-    write("noisy.py", NOISY.replace("END", end))
-    wall.write_text(STUDY.replace("models:Wall", "noisy:Ends"))
+    choose("noisy:Ends", NOISY.replace("END", end))
     if often == 1:
         run("study wall.toml --out results")
         return
@@ -786,8 +789,7 @@ class Leaks(Rig):
 def test_threads_and_exit_functions_of_a_simulator_keep_no_command(
     wall: Path, damage: str
 ) -> None:
-    write("leaks.py", LEAKS.replace("DAMAGE", damage))
-    wall.write_text(STUDY.replace("models:Wall", "leaks:Leaks"))
+    choose("leaks:Leaks", LEAKS.replace("DAMAGE", damage))
     command = [
         sys.executable,
         "-m",
@@ -813,8 +815,7 @@ def test_threads_and_exit_functions_of_a_simulator_keep_no_command(
 def test_a_simulator_that_takes_its_process_apart_is_named(
     wall: Path, damage: str, told: str
 ) -> None:
-    write("leaks.py", LEAKS.replace("DAMAGE", damage))
-    wall.write_text(STUDY.replace("models:Wall", "leaks:Leaks"))
+    choose("leaks:Leaks", LEAKS.replace("DAMAGE", damage))
     message = (told, "leaks:Leaks" if "close" in damage else "leaks.py:5")
     refused("study wall.toml --out results --jobs 1", *message)
 
@@ -879,8 +880,7 @@ BY = {
 
 
 def with_data(wall: Path, how: str, value: float) -> None:
-    write("reads.py", READS.replace("READ", BY[how], 1))
-    wall.write_text(STUDY.replace("models:Wall", "reads:Reads"))
+    choose("reads:Reads", READS.replace("READ", BY[how], 1))
     write("data.txt", f"{value}")
     (wall.parent / "data.db").unlink(missing_ok=True)
     with closing(sqlite3.connect(wall.parent / "data.db")) as database:
@@ -955,8 +955,7 @@ def test_a_study_repeats_three_settings_in_another_process(
     """A hash of a text is the same in all workers, a process's number is not."""
     options = f"study wall.toml --jobs {jobs} --out"
     for value in ("1 + hash('a') % 9973", "1 + os.getpid() % 997"):
-        write("reads.py", READS.replace("READ", value, 1))
-        wall.write_text(STUDY.replace("models:Wall", "reads:Reads"))
+        choose("reads:Reads", READS.replace("READ", value, 1))
         if "pid" in value:
             refused(f"{options} other", "in another process")
         else:
