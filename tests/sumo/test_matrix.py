@@ -17,19 +17,18 @@ from safevar_sumo.records import (
     Command,
     FloatArray,
     Outcome,
-    SimulationRuns,
     differences,
 )
-from safevar_sumo.scenarios import Crossing, Point, Scenario
+from safevar_sumo.scenarios import Crossing, Point
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.study import MatrixTable, MatrixTest, Study
 from safevar_sumo.sumo.bodies import Body, find_touches
 from safevar_sumo.sumo.driving_robot import DrivingRobot
-from safevar_sumo.sumo.matrix import drive_and_score, drive_worst, simulate_all_points
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
+from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW
 from tests.made_up import drawn, original_of
-from tests.scenarios.holding import Pedals
+from tests.scenarios.holding import CARLA as SUN, Pedals, driven
 
 BASE = load_study("euro_ncap_pedestrian")
 TESTS = [
@@ -77,7 +76,6 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
     assert whole.collided.tolist() == np.any(collided, axis=0).tolist()
 
 
-SUN = assemble(load_study("sun"))
 WEAK = replace(SUN, vehicle=replace_in(SUN.vehicle, engine_torque=0.5))  # type: ignore[type-var]
 MAX_RPM = SUN.characteristics.names.index("max_rpm")
 EAST = np.array([1.0, 0.0])
@@ -85,17 +83,6 @@ EAST = np.array([1.0, 0.0])
 
 HOLDS_HALF = Pedals(lambda seen: (0.5, 0))
 """Half of the throttle."""
-
-
-def run(
-    scenario: Scenario,
-    ads: Any = None,
-    settings: FloatArray | None = None,
-    system: System = SUN,
-) -> SimulationRuns:
-    alone = system.at(system.points[0]._replace(scenario=scenario))
-    system = replace(alone, ads=ads or HOLDS_HALF)
-    return drive_worst(system, original_of(system) if settings is None else settings)
 
 
 def with_max_rpm(*values: float) -> FloatArray:
@@ -114,7 +101,7 @@ def with_max_rpm(*values: float) -> FloatArray:
 def test_unbraked_a_vehicle_holds_the_tests_speed_in_one_gear_and_hits_with_its_front(
     scenario: Any, settings: FloatArray
 ) -> None:
-    runs = run(scenario, settings=settings)
+    runs = driven(scenario, HOLDS_HALF, settings)
     speed = np.where(runs.trace.active, runs.trace.speed * 3.6, scenario.speed)
     assert speed.max() < scenario.speed + 1.0
     assert speed.min() > scenario.speed - 0.5
@@ -186,10 +173,10 @@ def test_an_ads_that_releases_the_accelerator_or_brakes_takes_control_of_the_veh
     None
 ):
     far = CarToCar(test="CCRs", speed=50.0, headway=20.0)
-    coasts = run(far, Pedals(lambda seen: (0.5 * (seen.time < 2), 0)))
+    coasts = driven(far, Pedals(lambda seen: (0.5 * (seen.time < 2), 0)))
     assert coasts.outcome[0] != Outcome.INVALID_TEST
     assert coasts.trace.throttle[41:, 0].max() == 0
-    faster = run(
+    faster = driven(
         far, Pedals(lambda seen: (0, 0.5) if 1.0 <= seen.time < 1.1 else (1, 0))
     )
     assert abs(faster.test_speed_error[0]) * 3.6 < 0.5
