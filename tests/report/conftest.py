@@ -21,12 +21,17 @@ ASK = (
 )
 
 
-def page_of(*directories: Path, **options: Any) -> str:
-    """The page that `report` writes."""
+def page_of(
+    *directories: Path,
+    ask: Any = ("rules --samples 20",),
+    jobs: int = 1,
+    **options: Any,
+) -> str:
+    """The page that `report` writes, with one quick answer unless others are asked for."""
     with tempfile.TemporaryDirectory() as folder:
-        return report(*directories, out=Path(folder, "page.html"), **options).read_text(
-            encoding="utf-8"
-        )
+        return report(
+            *directories, out=Path(folder, "page.html"), ask=ask, jobs=jobs, **options
+        ).read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="session")
@@ -42,9 +47,7 @@ def page(slippery: Path, case: Case) -> str:
             lambda _: Plant(case.study, lambda rows: rows[:, friction] < 1.5),
         )
         shows: list[tuple[str, int, int]] = []
-        page = page_of(
-            slippery, ask=ASK, jobs=1, progress=lambda *values: shows.append(values)
-        )
+        page = page_of(slippery, ask=ASK, progress=lambda *values: shows.append(values))
         assert shows[0][1] == 0
         assert shows[-1][0] == "replays"
         assert all(done <= total or not total for _, done, total in shows)

@@ -204,7 +204,7 @@ def test_what_is_not_as_the_results_say_any_more_is_told(
         lambda *study: replace(assemble(*study), ads=FullBraking()),
     )
     with pytest.warns(UserWarning, match="simulated again with different results: "):
-        other = page_of(slippery, ask=["rules --samples 20"], jobs=1)
+        other = page_of(slippery)
     assert re.search(r"the outcome was collision and is \w+ now", other)
     assert Outline(other).open == []
 
@@ -223,7 +223,7 @@ def test_the_staircase_is_on_the_page_as_a_table_and_as_steps_with_names(
     slippery: Path,
 ) -> None:
     asked = "explain --of-study --simulations 600"
-    page = page_of(slippery, ask=("rules --samples 20", asked), jobs=1)
+    page = page_of(slippery, ask=("rules --samples 20", asked))
     section = page.partition(">Smallest changes<")[2].partition("</section>")[0]
     first = r'How many changes are enough[^\n]*\n[^\n]*>1\.0</td>[^\n]*class="label"[^>]*>(\w+)'
     part = re.findall(first, section)[0]
@@ -271,7 +271,7 @@ def test_text_of_a_study_stays_text(bad: str, slippery: Path, tmp_path: Path) ->
     manifest = read_manifest(slippery)
     manifest["study"]["title"] = bad
     write_manifest(tmp_path / "copy", manifest)
-    page = page_of(tmp_path / "copy", ask=["rules --samples 20"], jobs=1)
+    page = page_of(tmp_path / "copy")
     assert Outline(page).open == []
     assert "alert(1)</script>" not in page
     assert "49" not in re.findall(r"<h2 id=.*?>(.*?)</h2>", page)[0]
@@ -286,7 +286,7 @@ def test_results_without_a_solution_have_a_report(
         tmp_path / "begun",
         ignore=shutil.ignore_patterns("answers", "nsga2*", "rs*", "solutions.csv"),
     )
-    page = page_of(tmp_path / "begun", ask=["rules --samples 20"], jobs=1)
+    page = page_of(tmp_path / "begun")
     assert "There is no solution to replay" in page
     assert "The results of slippery are incomplete: 0 of " in page
     assert '<section class="front" ' in page, "nothing is unsafe"
@@ -323,7 +323,7 @@ def test_on_a_page_about_two_studies_each_is_headed_by_its_name_as_titles_may_be
 ) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(slippery, copy)
-    page = page_of(slippery, copy, ask=["rules --samples 20"], jobs=1)
+    page = page_of(slippery, copy)
     title = read_manifest(slippery)["study"]["title"]
     heads = [f"slippery ({place}): {title}" for place in (slippery, copy)]
     assert re.findall(r'<h2 id="study-\d">([^<]*)</h2>', page) == heads
@@ -389,7 +389,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @SLOW
 def test_all_of_it_is_of_the_point(results: Path) -> None:
-    page = page_of(results, ask=["rules --samples 20"], jobs=1, point=DAY)
+    page = page_of(results, point=DAY)
     assert f"the test case {DAY} alone" in page
     (whole,) = load_cases([results])
     assert f" --point &#39;{DAY}&#39;" in page
