@@ -19,13 +19,12 @@ Pedals = Callable[[float], tuple[Any, Any]]
 
 
 class Drive(NamedTuple):
-    """States of N vehicles at T times 0, step, 2 step, ... [s]; speeds [m/s] and travelled
+    """States of N vehicles at T times 0, STEP, 2 STEP, ... [s]; speeds [m/s] and travelled
     distances [m] have shape (T, N).
     """
 
     prepared: Any
     states: list[Any]
-    step: float
 
     @property
     def speed(self) -> FloatArray:
@@ -37,19 +36,18 @@ class Drive(NamedTuple):
         return np.concatenate(
             [
                 np.zeros((1, speed.shape[1])),
-                np.cumsum((speed[1:] + speed[:-1]) / 2 * self.step, axis=0),
+                np.cumsum((speed[1:] + speed[:-1]) / 2 * STEP, axis=0),
             ]
         )
 
     def at(self, time: float) -> int:
-        return round(time / self.step)
+        return round(time / STEP)
 
 
 def prepare(
     model: str,
     settings: FloatArray,
     road: float = 1.0,
-    step: float = STEP,
     grade: float = 0.0,
     water: float = 0.0,
 ) -> Any:
@@ -62,7 +60,7 @@ def prepare(
         )
     )
     return SYSTEMS[model].vehicle.prepare(
-        values, road, step, slope_of(np.full(len(settings), grade)), water
+        values, road, STEP, slope_of(np.full(len(settings), grade)), water
     )
 
 
@@ -71,7 +69,6 @@ def drive(
     settings: FloatArray,
     pedals: Pedals,
     duration: float,
-    step: float = STEP,
     road: float = 1.0,
     rolling: float = 0.0,
     grade: float = 0.0,
@@ -81,15 +78,15 @@ def drive(
     `rolling` is the initial speed [m/s].
     """
     vehicle = SYSTEMS[model].vehicle
-    prepared = prepare(model, settings, road, step, grade, water)
+    prepared = prepare(model, settings, road, grade, water)
     states = [_rolling(vehicle.at_rest(prepared), prepared, rolling)]
-    for k in range(round(duration / step)):
-        throttle, brake = pedals(round(k * step, 9))
+    for k in range(round(duration / STEP)):
+        throttle, brake = pedals(round(k * STEP, 9))
         command = Command(
             np.zeros(len(settings)) + throttle, np.zeros(len(settings)) + brake
         )
         states.append(vehicle.advance(prepared, states[-1], command))
-    return Drive(prepared, states, step)
+    return Drive(prepared, states)
 
 
 def _rolling(state: Any, prepared: Any, speed: float) -> Any:
