@@ -110,7 +110,6 @@ def braking(
     driver: Any,
     speed: float,
     gap: float,
-    leader: float = 0.0,
     lateral: float = 0.0,
     lateral_speed: float = 0.0,
 ) -> tuple[float, np.ndarray]:
@@ -121,7 +120,7 @@ def braking(
     first = np.nan
     decelerations = []
     for k in range(400):
-        now = gap - (speed - leader) * k * STEP
+        now = gap - speed * k * STEP
         if now <= 0:
             break
         one = seen(
@@ -130,7 +129,6 @@ def braking(
             now,
             lateral + lateral_speed * k * STEP,
             lateral_speed=lateral_speed,
-            leader=leader,
         )
         command, memory = driver.drive(one, memory)
         if command.brake[0] > 0.05 and np.isnan(
