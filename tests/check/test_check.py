@@ -4,7 +4,6 @@ is right elsewhere passes.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import NamedTuple
 
@@ -388,7 +387,7 @@ def test_a_driving_system_that_does_not_end_is_a_finding_in_time(
 def test_the_command_prints_the_json_and_ends_with_its_exit_codes(in_tmp: Path) -> None:
     write("mine.py", DEFECTS["out of range"].module)
     write("mine.toml", STUDY_OF["ads"])
-    answer = json.loads(run("check mine.toml --json", expect=1).stdout)
+    answer = json_of("check mine.toml", expect=1)
     assert answer["numbers"]["passed"] is False
     (finding,) = rows_of(answer, "findings")
     assert {"finding", "where", "input", "expected"} <= set(finding)

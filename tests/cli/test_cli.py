@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import errno
 import inspect
-import json
 import os
 import re
 import subprocess
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import click
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
 from rich.console import Console
 
 import safevar_sumo as sv
@@ -109,10 +108,6 @@ def test_one_simulation_loads_sumo_and_no_statistics() -> None:
 SUN = CharacteristicSet.of(load_study("sun"))
 
 
-def simulate(*arguments: str) -> Result:
-    return CliRunner(env={"COLUMNS": "80"}).invoke(commands, ["simulate", *arguments])
-
-
 @pytest.mark.parametrize(
     ("typed", "condition", "words"),
     [
@@ -148,31 +143,28 @@ def test_a_change_is_a_value_or_a_share(change: str, value: float) -> None:
 @SLOW
 def test_a_matrix_says_of_how_many_test_cases_a_degree_is_the_least() -> None:
     """Every number stands once, and the test case of the least degree is named."""
-    lead, _, _ = simulate("wear").stdout.partition("\n┏")
-    points = rows_of(json.loads(simulate("wear", "--json").stdout), "points")
+    text = run("simulate wear").stdout
+    lead, _, _ = text.partition("\n┏")
+    points = rows_of(json_of("simulate wear"), "points")
     worst = min(points, key=lambda row: row["safety_degree"])
     least = f"{worst['safety_degree']:.2f} m in the worst of {len(points)} test cases"
     assert f"{least} ({worst['point']}). The original vehicle fails in none" in lead
-    assert "simulated" not in simulate("wear").stdout
+    assert "simulated" not in text
 
 
 def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them() -> (
     None
 ):
-    result = simulate(
-        "rain",
-        *("--set", "tireFric=1.1", "--set", "mass=2600", "--set", "dragCoeff=0.301"),
-        "--details",
-    )
-    assert "original" in result.stdout
+    changes = "--set tireFric=1.1 --set mass=2600 --set dragCoeff=0.301"
+    text = run(f"simulate rain {changes} --details").stdout
     assert (
         "The original vehicle stops, with a safety degree (smallest distance) of 2.01 m"
-        in result.stdout
+        in text
     )
-    assert "The changed vehicle is less safe" in result.stdout
-    said = " ".join(result.stdout.replace("│", " ").split())
+    assert "The changed vehicle is less safe" in text
+    said = " ".join(text.replace("│", " ").split())
     assert "(f_num_diff) count dragCoeff = 0.301 as unchanged" in said
-    assert "changed vehicle" not in simulate("rain").stdout
+    assert "changed vehicle" not in run("simulate rain").stdout
     hit, stop = (sv.simulate("native", {"decel": value}) for value in (4.5, 8))
     assert (hit.outcome, hit.gap) == ("collision", 0), "the vehicle is 4.7 m long"
     gap = stop.gap
@@ -180,7 +172,7 @@ def test_the_original_stands_beside_the_changed_vehicle_and_a_verdict_under_them
         "stopped",
         pytest.approx(stop.metrics["safety_degree"] - 4.7),
     )
-    lead = simulate("native", "--set", "decel=8").stdout
+    lead = run("simulate native --set decel=8").stdout
     assert (
         f"{gap + 4.7:.2f} m from centre to centre (gap {gap:.2f} m). The original vehicle"
         in lead

@@ -12,15 +12,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
 import safevar_sumo as sv
-from safevar_sumo.cli.program import commands
-from safevar_sumo.errors import InputError
 from safevar_sumo.results import FILES, load_runs, read_manifest
 from safevar_sumo.shipped import NETWORKS
 from tests.end_to_end.conftest import solutions, study, written
-from tests.in_process import SLOW, numbers_of, run, write
+from tests.in_process import SLOW, json_of, numbers_of, refused, run, write
 
 pytestmark = pytest.mark.usefixtures("small")
 
@@ -173,13 +170,6 @@ class Test(PedestrianCrossing, frozen=True):
 """
 
 
-def refusal(*words: str) -> str:
-    """What a command says that ends with code 2."""
-    result = CliRunner().invoke(commands, words).exception
-    assert isinstance(result, InputError), (words, result)
-    return f"{result.problem}: {result.legal}"
-
-
 @SLOW
 def test_code_and_named_files_count_and_every_command_that_simulates_results_refuses_by_name(
     mine: None, monkeypatch: pytest.MonkeyPatch
@@ -209,18 +199,13 @@ def test_code_and_named_files_count_and_every_command_that_simulates_results_ref
         name for name in listed if not any(fnmatch(name, row[0]) for row in FILES)
     ] == [], "a file that the manual does not list"
     Path("../far.txt").write_text("another")
-    for words in (
+    for typed in (
         "simulate ../out --solution most-severe",
         "explain ../out",
         "report ../out",
     ):
-        result = refusal(*words.split())
-        assert "far.txt has changed since" in result
-        assert "--as-it-is-now" in result
-    done = CliRunner().invoke(
-        commands, ["rules", "../out", "--samples", "8", "--json", "--as-it-is-now"]
-    )
-    assert done.exit_code == 0, done.exception
+        refused(typed, "far.txt has changed since", "--as-it-is-now")
+    done = run("rules ../out --samples 8 --json --as-it-is-now")
     assert (
         "warning: ../out: far.txt has changed since; simulated as it is now"
         in done.stderr
@@ -241,10 +226,8 @@ def test_a_search_says_how_fast_an_original_collides(in_tmp: Path) -> None:
     assert json.loads(searched.stdout)["verdict"].startswith(
         f"The original vehicle is already unsafe: it {breach}."
     )
-    demanded = run(
-        "study smoke --runs 1 --evaluations 10 --json --unsafe 'ave_dece >= 2'"
-    )
-    verdict = json.loads(demanded.stdout)["verdict"]
+    demanded = "study smoke --runs 1 --evaluations 10 --unsafe 'ave_dece >= 2'"
+    verdict = json_of(demanded)["verdict"]
     assert verdict.startswith(
         "The original vehicle is already unsafe: it has ave_dece "
     )

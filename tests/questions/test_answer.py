@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from click.testing import CliRunner
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
@@ -35,7 +34,7 @@ from safevar_sumo.questions.render import MAX_LINES, MAX_ROWS
 from safevar_sumo.questions.sentence import Verdict, answer as said, note
 from safevar_sumo.questions.words import change_texts
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import refused, rows_of
+from tests.in_process import json_of, refused, rows_of, run
 from tests.manual import files_of
 
 COLUMNS = {
@@ -313,8 +312,8 @@ def test_a_label_is_that_of_one_study_question_table_and_command() -> None:
         )
         return found
 
-    other = sv.load_study("rain")
-    answers: list[dict[str, Any]] = [
+    other = load_study("rain")
+    answers = [
         {},
         {"study": other},
         {"question": "other"},
@@ -361,19 +360,16 @@ def test_the_question_that_the_manual_adds_from_outside(
     monkeypatch.syspath_prepend(str(tmp_path))
     name = "my_questions:ends"
     assert isinstance(find_question(name), Question)
-    command = [name, "smoke", "--unsafe", "below=2.2", "--jobs", "1"]
-    failed = CliRunner().invoke(commands, [*command, "--fail-if", "unsafe_ends > 0"])
-    assert failed.exit_code == 3, failed.output
-    assert "Unsafe at an end of the domain: " in failed.output
-    assert "failed: unsafe_ends = " in failed.output
+    command = f"{name} smoke --unsafe below=2.2 --jobs 1"
+    failed = run(f"{command} --fail-if 'unsafe_ends > 0'", expect=3)
+    assert "Unsafe at an end of the domain: " in failed.stdout
+    assert "failed: unsafe_ends = " in failed.stderr
     refused(
         "rules smoke --samples 0",
         "--samples: 0",
         "a whole number from 1 to 100,000,000",
     )
-    answer = json.loads(
-        CliRunner().invoke(commands, [*command, "--format", "json"]).stdout
-    )
+    answer = json_of(command)
     assert answer["question"] == name
     rows = rows_of(answer, "ends")
     assert len(rows) == 2 * len(load_study("smoke").vehicle.characteristics)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -40,7 +39,7 @@ from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, InlinePool, rows_of, run
+from tests.in_process import SLOW, InlinePool, json_of, rows_of
 
 SPEED, MARGIN, GAP_TODAY = 20.0, 0.3, 12.0
 """Speed [m/s] of the planted system; its gap of today lets even a new sled collide, so that the
@@ -292,10 +291,7 @@ def test_a_promise_that_is_kept_already_writes_no_file(
 ) -> None:
     planted.write_text(STUDY.replace("gap = 12.0, always", "gap = 30.0, always"))
     out = tmp_path / "kept.toml"
-    done = run(
-        f"repair {planted} --promise 'grip>=7.9' --change gap --out {out} --json"
-    )
-    answer = json.loads(done.stdout)
+    answer = json_of(f"repair {planted} --promise 'grip>=7.9' --change gap --out {out}")
     assert answer["numbers"]["repairs"] == 0
     assert answer["numbers"]["kept_today"]
     assert not out.exists()
