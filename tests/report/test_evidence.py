@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 
@@ -494,26 +494,16 @@ def test_a_file_outside_the_folder_of_the_study_is_refused(
         _files_of_user(study, {}, [])
 
 
-class Careless(NamedTuple):
-    """A change of the user's code with which it needs what no pack holds, and the error
-    elsewhere.
-    """
-
-    code: str
-    file: str
-    error: str
-
-
 @SLOW
 @pytest.mark.parametrize(
-    "careless",
+    ("code", "file", "error"),
     [
-        Careless(
+        (
             MINE.replace("Path(limits)", 'Path("secret.txt")'),
             "secret.txt",
             "No such file",
         ),
-        Careless(
+        (
             MINE.replace("Path(limits).read_text()", '__import__("helper").GAP'),
             "helper.py",
             "No module named 'helper'",
@@ -522,24 +512,23 @@ class Careless(NamedTuple):
     ids=["data", "code"],
 )
 def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
-    careless: Careless, mine: Path, monkeypatch: pytest.MonkeyPatch
+    code: str, file: str, error: str, mine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The code of the user needs what no pack holds, and fails elsewhere."""
     there = mine.parent
     monkeypatch.chdir(there)
     monkeypatch.syspath_prepend(str(there))
-    Path(careless.file).write_text(
-        "6.0" if careless.file == "secret.txt" else "GAP = 6.0"
-    )
-    Path("mine.py").write_text(careless.code)
+    Path(file).write_text("6.0" if file == "secret.txt" else "GAP = 6.0")
+    Path("mine.py").write_text(code)
     run("study mine.toml --out own --quiet --jobs 1")
     run("evidence own --ask 'rules --samples 20' --out it.zip")
     texts = {
         name: content
         for name, content in texts_of(Path("it.zip")).items()
-        if not name.endswith(careless.file)
+        if not name.endswith(file)
     }
     manifest = json.loads(texts["1-mine/manifest.json"])
-    manifest["files"].pop(careless.file, None)
+    manifest["files"].pop(file, None)
     written(
         Path("it.zip"),
         {
@@ -548,7 +537,7 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
         },
     )
     claims = {claim["claim"]: claim["here"] for claim in not_same("it.zip --run-code")}
-    assert careless.error in claims["solutions"]
+    assert error in claims["solutions"]
     command = [sys.executable, "-m", "safevar_sumo", "verify", "it.zip", "--run-code"]
     done = subprocess.run(
         command, capture_output=True, text=True
