@@ -55,10 +55,7 @@ def copied(model: Any, folder: Path) -> str:
 
 def results_of(study: Study) -> Mapping[str, np.ndarray]:
     system = assemble(study)
-    found: Mapping[str, np.ndarray] = drive_and_score(
-        system, drawn(system, 8, 2)
-    ).results
-    return found
+    return drive_and_score(system, drawn(system, 8, 2)).results
 
 
 def assert_equal(ours: Study, theirs: Study) -> None:

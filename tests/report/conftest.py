@@ -46,7 +46,7 @@ def page(slippery: Path, case: Case) -> str:
             "ProcessWorker",
             lambda _: Plant(case.study, lambda rows: rows[:, friction] < 1.5),
         )
-        shows: list[tuple[str, int, int]] = []
+        shows = []
         page = page_of(slippery, ask=ASK, progress=lambda *values: shows.append(values))
         assert shows[0][1] == 0
         assert shows[-1][0] == "replays"

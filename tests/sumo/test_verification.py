@@ -40,7 +40,7 @@ def study() -> Study:
 @pytest.fixture
 def repeated(monkeypatch: pytest.MonkeyPatch) -> Repeated:
     """The points and settings that SUMO is to repeat."""
-    them: Repeated = []
+    them = []
 
     def note(system: System, settings: FloatArray, runs: SimulationRuns) -> None:
         them.append((system.points[0], settings))
