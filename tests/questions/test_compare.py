@@ -226,7 +226,7 @@ def test_none_of_four_worse_versions_is_released(
     study = {"extends": "wear", "name": version, **ONE_TEST, **changes}
     Path("version.toml").write_text(tomli_w.dumps(study))
     answer = sv.compare(
-        sv.load_study("wear", **ONE_TEST), "version.toml", samples=40, pool=POOL
+        load_study("wear", **ONE_TEST), "version.toml", samples=40, pool=POOL
     )
     assert answer.numbers["decision"] == decision
     assert answer.verdict.startswith(f"{decision.upper()}: {version} ")
@@ -250,7 +250,7 @@ def test_a_system_does_not_differ_from_itself(in_tmp: Path) -> None:
 @SLOW
 def test_the_gap_stands_beside_a_degree_from_centre_to_centre() -> None:
     """The vehicle is 4.7 m long."""
-    later = sv.load_study(
+    later = load_study(
         "native", name="later", ads={"parameters": {"braking_share": 0.5}}
     )
     numbers = sv.compare("native", later, samples=8, pool=POOL).numbers
