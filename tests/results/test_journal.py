@@ -31,6 +31,12 @@ in_one_folder = settings(
 )
 
 
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Where a journal may be."""
+    return tmp_path / "a.jsonl"
+
+
 def batch(number: int) -> Evaluations:
     """Rows that their values identify; one is a collision, one failed."""
     values = np.arange(ROWS) + 10.0 * number
@@ -106,8 +112,7 @@ def test_a_journal_returns_its_evaluations(tmp_path: Path) -> None:
     assert same(first, batch(0)), "positions count from 0: the first three"
 
 
-def test_a_journal_is_a_table_that_pandas_reads(tmp_path: Path) -> None:
-    path = tmp_path / "a.jsonl"
+def test_a_journal_is_a_table_that_pandas_reads(path: Path) -> None:
     write(path)
     head, *lines, _ = map(json.loads, path.read_text().splitlines())
     assert head["characteristics"] == ["a", "b"]
@@ -126,9 +131,8 @@ def test_a_journal_is_a_table_that_pandas_reads(tmp_path: Path) -> None:
 @in_one_folder
 @given(st.data())
 def test_a_truncated_journal_loads_its_whole_lines_and_continues(
-    tmp_path: Path, data: st.DataObject
+    path: Path, data: st.DataObject
 ) -> None:
-    path = tmp_path / "a.jsonl"
     ends = write(path)
     left = data.draw(st.integers(0, ends[-1] - 1))
     os.truncate(path, left)
@@ -179,10 +183,9 @@ ALTERATIONS: dict[str, Callable[[bytes], bytes]] = {
 
 @pytest.mark.parametrize("alteration", ALTERATIONS)
 def test_an_altered_line_and_all_after_it_are_not_believed(
-    alteration: str, tmp_path: Path
+    alteration: str, path: Path
 ) -> None:
     """A reader leaves the file as it is; what is lost is simulated again."""
-    path = tmp_path / "a.jsonl"
     ends = write(path)
     whole = path.read_bytes().splitlines(keepends=True)
     altered = {
@@ -205,9 +208,8 @@ def test_an_altered_line_and_all_after_it_are_not_believed(
 
 
 def test_other_solutions_and_lines_in_another_order_are_not_believed(
-    tmp_path: Path,
+    path: Path,
 ) -> None:
-    path = tmp_path / "a.jsonl"
     write(path)
     whole = path.read_bytes()
     path.write_bytes(whole.replace(b'"solutions":[1,5]', b'"solutions":[1,4]'))
@@ -227,9 +229,8 @@ def test_other_solutions_and_lines_in_another_order_are_not_believed(
     ],
 )
 def test_a_line_with_wrong_values_and_a_right_checksum_is_simulated_again(
-    name: str, value: object, tmp_path: Path
+    name: str, value: object, path: Path
 ) -> None:
-    path = tmp_path / "a.jsonl"
     write(path)
     head, *lines = map(json.loads, path.read_text().splitlines())
     place = -1 if name in ("solutions", "budget") else 1
@@ -249,9 +250,8 @@ def test_a_line_with_wrong_values_and_a_right_checksum_is_simulated_again(
 
 
 def test_the_zeros_that_a_crash_of_the_machine_leaves_are_cut_off(
-    tmp_path: Path,
+    path: Path,
 ) -> None:
-    path = tmp_path / "a.jsonl"
     path.write_bytes(b"\0" * 99)
     Journal(path, HEAD).close()
     assert holds_the_first(0, read_journal(path, HEAD))
@@ -260,8 +260,7 @@ def test_the_zeros_that_a_crash_of_the_machine_leaves_are_cut_off(
     assert holds_the_first(BATCHES, Journal(path, HEAD).content)
 
 
-def test_a_reader_follows_a_journal_that_grows_line_by_line(tmp_path: Path) -> None:
-    path = tmp_path / "a.jsonl"
+def test_a_reader_follows_a_journal_that_grows_line_by_line(path: Path) -> None:
     ends = write(path)
     whole = path.read_bytes()
     path.unlink()
@@ -282,18 +281,17 @@ def test_a_reader_follows_a_journal_that_grows_line_by_line(tmp_path: Path) -> N
 )
 @pytest.mark.parametrize("opened", [Journal, read_journal])
 def test_a_journal_of_another_study_or_run_is_refused(
-    tmp_path: Path, opened: Callable[..., object], study: str, run: str
+    path: Path, opened: Callable[..., object], study: str, run: str
 ) -> None:
-    write(tmp_path / "a.jsonl")
+    write(path)
     with pytest.raises(
         InputError, match="belongs to another study, version or run, or is no journal"
     ):
-        opened(tmp_path / "a.jsonl", journal_head(study, run, ("a", "b")))
+        opened(path, journal_head(study, run, ("a", "b")))
 
 
 @SLOW
-def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) -> None:
-    path = tmp_path / "a.jsonl"
+def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(path: Path) -> None:
     code = "from safevar_sumo.results import Journal\nfrom pathlib import Path\n"
     code += f"J = Journal(Path({str(path)!r}), {HEAD})\n"
     code += "print('locked', flush=True)\nimport time\ntime.sleep(60)\n"
@@ -311,9 +309,8 @@ def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(tmp_path: Path) 
 
 
 def test_a_retry_drops_the_first_batch_that_failed_and_all_after_it(
-    tmp_path: Path,
+    path: Path,
 ) -> None:
-    path = tmp_path / "a.jsonl"
     whole = Evaluations.concatenate([batch(0), batch(1)])
     journal = Journal(path, HEAD)
     for rows in ([0, 1], [2, 3], [4]):  # the third row has failed
