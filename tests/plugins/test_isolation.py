@@ -40,16 +40,11 @@ class Mine:
 """
 
 
-def search_all(folder: Path, out: Path) -> None:
-    """Carry out all runs of mine.toml."""
-    searched(load_study(str(folder / "mine.toml")), out)
-
-
 def test_an_algorithm_whose_runs_do_not_learn_from_each_other_is_not_accused(
     mine: Mine, folder: Path, tmp_path: Path
 ) -> None:
     mine(SEARCH, '[search]\nalgorithms = ["mine:Mine"]\nevaluations = 20\nruns = 3\n')
-    search_all(folder, tmp_path / "out")
+    searched(load_study(str(folder / "mine.toml")), tmp_path / "out")
 
 
 SIX = """
