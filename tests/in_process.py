@@ -86,6 +86,15 @@ def write(name: str, text: str) -> None:
     Path(name).write_text(text)
 
 
+def rewrite(file: Path, *changes: tuple[str, str]) -> None:
+    """Replace texts that a file has."""
+    text = file.read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    file.write_text(text)
+
+
 def searched(
     study: Study, out: Path, warn: Callable[[str], None] = lambda message: None
 ) -> Path:

@@ -17,7 +17,7 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.network_check import network_remarks
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, json_of, rows_of
+from tests.in_process import SLOW, json_of, rewrite, rows_of
 
 CHECKED = {"collision.mingap-factor": "0", "collision.check-junctions": "true"}
 OPTIONS = {
@@ -79,14 +79,6 @@ def set_options(folder: Path, options: dict[str, str]) -> None:
         f'\n<{name} value="{value}"/>' for name, value in options.items()
     )
     file.write_text(text.replace("<processing>", f"<processing>{elements}"))
-
-
-def rewrite(file: Path, *changes: tuple[str, str]) -> None:
-    text = file.read_text()
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    file.write_text(text)
 
 
 def simulated(

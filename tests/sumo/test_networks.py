@@ -27,7 +27,7 @@ from safevar_sumo.sumo.network import (
 )
 from safevar_sumo.sumo.network_check import check_network
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import SLOW
+from tests.in_process import SLOW, rewrite
 
 FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
 
@@ -60,9 +60,8 @@ def test_a_network_has_the_road_that_netconvert_makes_of_it(folder: str) -> None
 def test_without_sumos_programs_what_needs_them_says_so(
     mine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rewritten(
-        mine / "network.edg.xml", 'width="4"', 'width="3.9"'
-    )  # a network that is in no cache
+    # a network that is in no cache
+    rewrite(mine / "network.edg.xml", ('width="4"', 'width="3.9"'))
     monkeypatch.setitem(sys.modules, "sumo", None)
     with pytest.raises(
         InputError, match=r"netccfg: needs SUMO's program netconvert\n.*\[sumo\]"
@@ -91,8 +90,7 @@ def mine(tmp_path: Path) -> Path:
 
 
 def with_traffic(mine: Path, more: str) -> str:
-    file = mine / "traffic.rou.xml"
-    file.write_text(file.read_text().replace("</routes>", f"{CAR}{more}</routes>"))
+    rewrite(mine / "traffic.rou.xml", ("</routes>", f"{CAR}{more}</routes>"))
     return str(mine)
 
 
@@ -152,12 +150,6 @@ def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> Non
         assert seen > {"vut", "pedestrian"}
 
 
-def rewritten(file: Path, old: str, new: str) -> None:
-    text = file.read_text()
-    assert old in text
-    file.write_text(text.replace(old, new))
-
-
 def on(network: Path) -> System:
     return assemble(
         load_study("smoke", scenario={"parameters": {"network": str(network)}})
@@ -176,23 +168,24 @@ def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
     (mine / "network.typ.xml").write_text(
         '<types><type id="slow" speed="7" numLanes="1" width="3" disallow="pedestrian"/></types>'
     )
-    rewritten(
+    rewrite(
         mine / "network.netccfg",
-        "</input>",
-        '<type-files value="network.typ.xml"/></input>',
+        ("</input>", '<type-files value="network.typ.xml"/></input>'),
     )
-    rewritten(
+    rewrite(
         mine / "network.edg.xml",
-        'id="departure" from="crossing" to="east" numLanes="1" width="4" speed="70"'
-        ' disallow="pedestrian"',
-        'id="departure" from="crossing" to="east" type="slow"',
+        (
+            'id="departure" from="crossing" to="east" numLanes="1" width="4" speed="70"'
+            ' disallow="pedestrian"',
+            'id="departure" from="crossing" to="east" type="slow"',
+        ),
     )
     check_network(str(mine))
     (lane,) = roads(mine).iterfind(".//lane[@id='0.departure_0']")
     assert [float(lane.attrib[name]) for name in ("speed", "width")] == [7, 3]
     assert open_network(str(mine)).digests != before
     first = copied_network(open_network(str(mine)), 1).network
-    rewritten(mine / "network.typ.xml", 'speed="7"', 'speed="8"')
+    rewrite(mine / "network.typ.xml", ('speed="7"', 'speed="8"'))
     assert copied_network(open_network(str(mine)), 1).network != first
 
 
@@ -276,10 +269,9 @@ def test_a_file_that_options_of_sumo_add_is_one_of_the_networks_files(
     mine: Path,
 ) -> None:
     (mine / "more.add.xml").write_text('<additional><vType id="more"/></additional>')
-    rewritten(
+    rewrite(
         mine / "scenario.sumocfg",
-        "</input>",
-        '<additional-files value="more.add.xml"/></input>',
+        ("</input>", '<additional-files value="more.add.xml"/></input>'),
     )
     check_network(str(mine))
     before = open_network(str(mine)).digests

@@ -19,7 +19,7 @@ from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.without_effect import without_effect
-from tests.in_process import SLOW
+from tests.in_process import SLOW, rewrite
 from tests.sumo.test_traci_controller import changed, system
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
@@ -119,7 +119,7 @@ def with_attributes(folder: Path, attributes: str) -> Path:
     shutil.copytree(NET, folder)
     traffic = folder / "traffic.rou.xml"
     old = 'speedDev="0" sigma="0" color="0,0.45,0.7"'
-    traffic.write_text(traffic.read_text().replace(old, f'speedDev="0" {attributes}'))
+    rewrite(traffic, (old, f'speedDev="0" {attributes}'))
     return traffic
 
 
@@ -171,7 +171,7 @@ def test_sumos_driver_has_the_attributes_of_the_traffic_file(
         " study's vehicle and ADS"
     )
     assert any(remark.startswith(unused) for remark in without_effect(runs))
-    traffic.write_text(traffic.read_text().replace('tau="0.3"', 'tau="1" accel="2.6"'))
+    rewrite(traffic, ('tau="0.3"', 'tau="1" accel="2.6"'))
     refuse_difference(
         runs, traffic, lambda *_: None, 0.02 if "IDM" in attributes else 1e-6
     )
