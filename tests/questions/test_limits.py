@@ -192,12 +192,13 @@ def test_a_value_whose_limit_never_settles_stays_as_in_the_original() -> None:
 
     def search(space: Space, known: FloatArray) -> Counterexamples:
         spaces.append(space)
-        return Counterexamples(cases_of([space.upper[0], 5.0]), np.array([-1.0]))
+        cases = cases_of([space.upper[0], 5.0], [5.0, space.lower[1]])
+        return Counterexamples(cases, np.array([-1.0, -1.0]))
 
     start = Alone(star.lower[:2], star.upper[:2])
     limits = search_alone(lambda cases: np.ones(len(cases)), star, start, search, (2,))
     assert limits.upper.tolist() == [5, 10]
-    assert limits.lower.tolist() == [0, 0]
+    assert limits.lower.tolist() == [0, 5]
     assert len(spaces) == MOST_SEARCHES
 
 

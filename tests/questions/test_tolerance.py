@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -113,7 +114,15 @@ def test_an_answer_says_that_not_all_corners_were_simulated(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(asked, "USUAL", asked.USUAL._replace(corners=3))
-    assert "3 random corner cases were simulated" in answer_of(2, nowhere).tested
+    tested = answer_of(2, nowhere).tested
+    assert "3 random corner cases were simulated" in tested
+    assert "parameter set" not in tested, "the study has no other"
+
+
+def test_of_two_failures_of_a_characteristic_the_nearer_one_is_told() -> None:
+    """a below 1, and above 6."""
+    answer = answer_of(2, lambda rows: (rows[:, 0] < 1) | (rows[:, 0] > 6))
+    assert answer.tables["limits"]["fails_at"][0]["a"] == pytest.approx(6, abs=0.3)
 
 
 def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
@@ -219,8 +228,10 @@ def test_sets_that_break_or_cut_limits_are_told() -> None:
     assert all_sets.sides[1, 1] <= 2
     assert all_sets.alone.upper.tolist() == pytest.approx([8, 7], abs=0.1)
     assert all_sets.proofs == 2, "the smaller box is proved anew"
-    # Its corners are driven anew.
-    assert (5 + all_sets.sides[1]).tobytes() in plants[0].seen
+    # All its corners are driven anew.
+    ends = np.stack(all_sets.boxes.ends(all_sets.sides))
+    corners = {np.array(values).tobytes() for values in product(*ends.T)}
+    assert corners <= plants[0].seen
 
 
 class Sliver(Oracle):
