@@ -17,10 +17,9 @@ from safevar_sumo.campaign import batches
 from safevar_sumo.campaign.batches import Batches
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.metrics import METRICS, Unsafe
-from safevar_sumo.questions import by_criterion, evaluator, part
+from safevar_sumo.questions import bench, by_criterion, evaluator, part
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.tolerance import oracle
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Study
 from safevar_sumo.sumo.system import assemble
@@ -48,7 +47,7 @@ def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
 def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """No vehicle has their characteristics; their failures are described as of the study smoke."""
     smoke = assemble(load_study("smoke"))
-    for module in (evaluator, by_criterion, oracle, part):
+    for module in (evaluator, by_criterion, bench, part):
         monkeypatch.setattr(
             module,
             "assemble",

@@ -7,23 +7,17 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from msgspec.structs import replace
 from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.metrics import Unsafe
-from safevar_sumo.questions.cases import SearchPlan, search_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.part import scope_of
 from safevar_sumo.questions.tolerance import tolerance
-from safevar_sumo.questions.tolerance.oracle import Exhausted, Oracle, product_of
-from safevar_sumo.study import Constraint, Study
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, json_of, write
-from tests.questions.conftest import Plant, made_up_study, model_of
 
 AHEAD = """
 extends = "wear"
@@ -35,92 +29,6 @@ model = "along"
 parameters = { vut_length = 4.7, vut_width = 1.85 }
 over = { speed = [50, 60] }
 """
-AT_TESTS_ALONE = {
-    **{"treadDepth": 5.08, "brakeTorque": 0.84, "brakeResponse": 0.196, "payload": 340},
-    **{"payloadCentre": 2.25, "sensorRange": 26.7, "sensorLatency": 0.088},
-}
-"""Limits of `wear` that hold at its tests; between them, at 59 km/h, a car keeps 0.25 m."""
-
-
-def test_a_search_between_the_tests_finds_what_no_test_shows(ahead: Study) -> None:
-    own = model_of(ahead, keep=0.3)
-    oracle = Oracle([own], own.unsafe, between=True)
-    vehicle = oracle.vehicle
-    end = vehicle.setting(AT_TESTS_ALONE)
-    ends = np.minimum(vehicle.original, end), np.maximum(vehicle.original, end)
-    space = oracle.space(0, *ends, phases=False)
-    vehicles = np.where(default_rng(0).random((512, len(vehicle))) < 0.5, *ends)
-    assert oracle(product_of(vehicles, oracle.listed())).min() >= 0
-    met = search_cases(
-        oracle, space, space.lower[np.newaxis][:0], SearchPlan(5000), default_rng(1)
-    )
-    assert met.least < 0
-    model, setting = oracle.setting(met.unsafe[0])
-    speed = dict(zip(model.characteristics.names, setting, strict=True))["speed"]
-    assert 50 < speed < 60
-    assert speed == round(speed, 2)
-
-
-def test_cases_lie_in_worlds_with_a_phase_and_a_place_on_each_axis(
-    ahead: Study,
-) -> None:
-    """One test at 50 and 60 km/h, in two parameter sets."""
-    own = model_of(ahead, keep=0.3)
-    oracle = Oracle([own, own._replace(fit=3)], own.unsafe, between=True)
-    vehicle = oracle.vehicle
-    n = len(vehicle)
-    space = oracle.space(3, vehicle.lower, vehicle.upper)
-    assert space.lower.tolist() == [*vehicle.lower, 1, 0, 0]
-    assert space.upper.tolist() == [*vehicle.upper, np.nextafter(2, 0), 1, 1]
-    at_start = oracle.space(0, vehicle.lower, vehicle.upper, phases=False)
-    assert at_start.upper[n:].tolist() == [np.nextafter(1, 0), 0, 1]
-    assert oracle.listed().tolist() == [[0, 0, 0], [0, 0, 1]]
-    assert oracle.hardest(1).tolist() == [[0, 0, 0]], "at 50 km/h"
-    model, setting = oracle.setting(np.r_[vehicle.original, 1.9, 0.25, 0.4])
-    assert model.fit == 3
-    values = dict(zip(model.characteristics.names, setting.tolist(), strict=True))
-    assert (values["speed"], values["phase"]) == (54, 0.25)
-    assert setting[:n].tolist() == vehicle.original.tolist()
-
-
-def test_what_cannot_be_simulated_or_is_infeasible_leaves_everything() -> None:
-    """a above 9 fails, a below 1 violates a constraint, and b above 7 collides."""
-    study = replace(
-        made_up_study(2), constraints=(Constraint(sum={"a": 1.0}, at_least=1.0),)
-    )
-    plant = Plant(
-        study,
-        lambda rows: rows[:, 1] > 7,
-        lambda rows: rows[:, 1],
-        lambda rows: rows[:, 0] > 9,
-    )
-    evaluator = Evaluator(study, plant)
-    evaluator.account.limit = 12
-    oracle = Oracle([Model(0, evaluator, Unsafe(keep=0.5))], Unsafe(), between=False)
-    (encounter,) = oracle.listed()
-    vehicles = np.array([[9.5, 8.0], [0.5, 8.0], [5.0, 8.0], [5.0, 0.25], [5.0, 3.0]])
-    cases = product_of(vehicles, encounter[np.newaxis])
-    assert oracle(cases).tolist() == [np.inf, np.inf, -1.5, -0.25, 2.5]
-    assert oracle.available == 10 - 4, "those that satisfy the constraint"
-    assert oracle(cases[:3], 7).tolist() == [7, np.inf, -1.5]
-    assert np.isnan(oracle(cases[:1], np.nan)).all()
-    assert oracle.available == 3
-    with pytest.raises(Exhausted):
-        oracle(cases[:4])
-    assert len(oracle(cases[2:5])) == 3, "as many as are left"
-    drawn = oracle.feasible(lambda count: vehicles[np.arange(count) % 2], 8)
-    assert {*drawn[:, 0].tolist()} == {9.5}
-
-
-def test_an_encounter_between_counts_only_where_the_original_is_safe(
-    ahead: Study,
-) -> None:
-    own = model_of(ahead, keep=0.3)
-    worn = own.characteristics.setting({"sensorLatency": 0.4})
-    for new_car, counts in ((own.unsafe, True), (Unsafe(keep=99.0), False)):
-        oracle = Oracle([own], new_car, between=True)
-        left = oracle(oracle.space(0, worn, worn).draw(64, default_rng(0)))
-        assert (left < 0).any() == counts
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,12 @@ import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import evaluator
+from safevar_sumo.questions.bench import bench_of
 from safevar_sumo.questions.case import Case, load_cases
-from safevar_sumo.questions.cases import SearchPlan, search_cases
+from safevar_sumo.questions.cases import SearchPlan, search_scope
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import asked
-from safevar_sumo.questions.tolerance.oracle import Oracle
 from safevar_sumo.results.identity import identity_digest, manifest_of
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, json_of, refused, rows_of, run, searched
@@ -217,19 +217,15 @@ small pocket of the encounters, such as 0.15 km/h by 4 % of the path.
 @pytest.mark.parametrize("name", WORN)
 def test_an_attack_finds_the_pockets_that_corners_miss(name: str) -> None:
     with open_evaluator(load_study(name, encounters="ranges"), jobs=2) as judging:
-        oracle = Oracle([Model(0, judging, Unsafe())], Unsafe(), between=False)
-        original = oracle.vehicle.original
+        bench = bench_of([Model(0, judging, Unsafe())], Unsafe(), between=False)
+        original = bench.vehicle.original
         worn = np.array(
-            [
-                WORN[name].get(item.name, item.original)
-                for item in oracle.vehicle.members
-            ]
+            [WORN[name].get(item.name, item.original) for item in bench.vehicle.members]
         )
         ends = np.sort([original, worn], axis=0)
-        space = oracle.space(0, *ends)
-        nothing = space.lower[np.newaxis][:0]
-        plan = SearchPlan(5000)
-        met = search_cases(oracle, space, nothing, plan, np.random.default_rng(0))
+        scope = bench.scope(0, *ends)
+        rng = np.random.default_rng(0)
+        met = search_scope(bench.score, scope, scope.nothing, SearchPlan(5000), rng)
     assert met.least < 0
     assert met.simulated <= 5000
 

@@ -16,12 +16,20 @@ from safevar_sumo.questions.boundary import (
 )
 from safevar_sumo.questions.cases import (
     PARENTS,
-    CaseJudge,
-    CaseSearch,
     Counterexamples,
+    Search,
     SearchPlan,
-    Space,
-    search_cases,
+    _Rows,
+    draw,
+    search_scope,
+)
+from safevar_sumo.questions.drives import (
+    Drives,
+    Encounters,
+    Judge,
+    Scope,
+    from_matrix,
+    to_matrix,
 )
 from safevar_sumo.questions.tolerance.boxes import (
     Boxes,
@@ -40,19 +48,18 @@ PARTS = 8, 8, 8
 Sides = FloatArray
 
 
-def space_of(n: int, *, worlds: int = 1, center: FloatArray | None = None) -> Space:
+def scope_of(n: int, *, worlds: int = 1, center: FloatArray | None = None) -> Scope:
     """n values from 0 to 10, some worlds, a phase and another place."""
-    first = np.r_[np.zeros(n), 0, 0, 0]
-    last = np.r_[np.full(n, 10.0), np.nextafter(worlds, 0), 1, 1]
-    return Space(first, last, n, center)
+    ends = np.zeros(n), np.full(n, 10.0)
+    return Scope(*ends, range(worlds), np.zeros(1), np.ones(1), center=center)
 
 
-def star_of(n: int) -> Space:
-    return space_of(n, center=np.full(n, 5.0))
+def star_of(n: int) -> Scope:
+    return scope_of(n, center=np.full(n, 5.0))
 
 
 def boxes_of(
-    n: int, judge: CaseJudge, given: dict[tuple[int, int], float] | None = None
+    n: int, judge: Judge, given: dict[tuple[int, int], float] | None = None
 ) -> Boxes:
     """Boxes around 5 of which some sides are given."""
     longest = np.full((2, n), 5.0)
@@ -61,70 +68,74 @@ def boxes_of(
         longest[side] = length
         is_free[side] = False
     return Boxes(
-        judge, space_of(n), np.full(n, 5.0), longest, is_free, lambda sides: sides
+        judge, scope_of(n), np.full(n, 5.0), longest, is_free, lambda sides: sides
     )
 
 
-def nothing(n: int) -> FloatArray:
-    return np.zeros((0, n + 3))
+def nothing(n: int) -> Failures:
+    return Failures.known(scope_of(n).nothing)
 
 
-def cases_of(*vehicles: list[float]) -> FloatArray:
-    return np.array([[*vehicle, 0.0, 0.0, 0.0] for vehicle in vehicles])
+def places(*values: float) -> Encounters:
+    """Encounters at these places."""
+    number = len(values)
+    world = np.zeros(number, dtype=np.intp)
+    return Encounters(world, np.zeros(number), np.array(values)[:, np.newaxis])
 
 
-def search_of(judge: CaseJudge, budget: int, seed: int = 0) -> CaseSearch:
+def drives_of(*vehicles: list[float]) -> Drives:
+    return Drives(np.array(vehicles), places(*[0.0] * len(vehicles)))
+
+
+def search_of(judge: Judge, budget: int, seed: int = 0) -> Search:
     rng = default_rng(seed)
-    return lambda space, known: search_cases(
-        judge, space, known, SearchPlan(budget), rng
+    return lambda scope, known: search_scope(
+        judge, scope, known, SearchPlan(budget), rng
     )
 
 
-def unsafe_where(region: CaseJudge) -> CaseJudge:
+def unsafe_where(region: Judge) -> Judge:
     """A judge that knows no distance."""
-    return lambda cases: np.where(region(cases), -1.0, 1.0)
+    return lambda drives: np.where(region(drives), -1.0, 1.0)
 
 
 LINEAR = np.array([1.0, 2.0, 3.0])
 """Weights of a region whose largest box has sides at 10, 7.5 and 5."""
 
 
-def linear(cases: FloatArray) -> FloatArray:
-    return np.asarray(10 - (cases[:, :3] - 5) @ LINEAR)
+def linear(drives: Drives) -> FloatArray:
+    return np.asarray(10 - (drives.vehicle - 5) @ LINEAR)
 
 
-def tooth(cases: FloatArray) -> FloatArray:
+def tooth(drives: Drives) -> FloatArray:
     """No corner and no value alone is unsafe: the first from 6 to 6.5, the others about 6.5."""
-    is_first = np.abs(cases[:, 0] - 6.25) < 0.25
-    is_unsafe = is_first & (np.abs(cases[:, 1:3] - 6.5) < 0.7).all(axis=1)
-    return np.where(is_unsafe, -1.0, np.abs(cases[:, :3] - 6.3).max(axis=1))
+    vehicle = drives.vehicle
+    is_first = np.abs(vehicle[:, 0] - 6.25) < 0.25
+    is_unsafe = is_first & (np.abs(vehicle[:, 1:] - 6.5) < 0.7).all(axis=1)
+    return np.where(is_unsafe, -1.0, np.abs(vehicle - 6.3).max(axis=1))
 
 
-def moving(cases: FloatArray) -> FloatArray:
+def moving(drives: Drives) -> FloatArray:
     """Where the encounter decides; the worst leaves 2 less."""
-    return np.asarray(
-        9 - (cases[:, :4] - 5).sum(axis=1) - 2 * np.sin(12 * cases[:, 6] + cases[:, 0])
-    )
+    vehicle = drives.vehicle
+    place = drives.encounters.place[:, 0]
+    wave = np.sin(12 * place + vehicle[:, 0])
+    return np.asarray(9 - (vehicle - 5).sum(axis=1) - 2 * wave)
 
 
 def share_of(boxes: Boxes, sides: Sides) -> float:
     return float(np.exp(boxes.log_volume(sides)))
 
 
-def unsafe_in(boxes: Boxes, sides: Sides, judge: CaseJudge) -> int:
+def unsafe_in(boxes: Boxes, sides: Sides, judge: Judge) -> int:
     """The unsafe of 20,000 cases of a box, by another draw than that of the search."""
-    points = default_rng(9).random((20_000, len(boxes.space.lower)))
-    n = boxes.space.size
-    points[:, :n] = np.where(
-        points[:, :n] < 0.25, 0, np.where(points[:, :n] > 0.75, 1, points[:, :n])
-    )
-    space = boxes.cases_in(sides)
-    return int((judge(space.lower + points * (space.upper - space.lower)) < 0).sum())
+    scope = boxes.scope_of(sides)
+    drives = draw(scope, 20_000, default_rng(9))
+    return int((judge(drives) < 0).sum())
 
 
 def largest(boxes: Boxes) -> Sides:
-    n = boxes.space.size
-    start = Failures(nothing(n), nothing(n))
+    start = nothing(len(boxes.original))
     quick, thorough = search_of(boxes.judge, 1024, 0), search_of(boxes.judge, 5000, 1)
     settled = find_largest_box(boxes, start, quick, thorough, default_rng(0))
     assert settled.sides is not None
@@ -139,11 +150,11 @@ def largest(boxes: Boxes) -> Sides:
         (linear, 3, 0.375, 0.97),
         (moving, 4, ((5 + 7 / 4) / 10) ** 4, 0.95),
         (tooth, 3, 0.58, 1.0),
-        (unsafe_where(lambda cases: (cases[:, :3] > 7).all(axis=1)), 3, 0.7, 0.97),
+        (unsafe_where(lambda drives: (drives.vehicle > 7).all(axis=1)), 3, 0.7, 0.97),
     ],
 )
 def test_the_box_is_nearly_the_largest_and_holds_nothing_unsafe(
-    judge: CaseJudge, n: int, optimum: float, share: float
+    judge: Judge, n: int, optimum: float, share: float
 ) -> None:
     boxes = boxes_of(n, judge)
     sides = largest(boxes)
@@ -159,10 +170,12 @@ def test_the_box_with_a_given_limit_is_nearly_the_largest() -> None:
 
 
 def test_no_box_where_what_is_given_fails() -> None:
-    boxes = boxes_of(2, unsafe_where(lambda cases: cases[:, 0] > 7), {(1, 0): 4.0})
+    boxes = boxes_of(
+        2, unsafe_where(lambda drives: drives.vehicle[:, 0] > 7), {(1, 0): 4.0}
+    )
     settled = settle(
         boxes,
-        Failures(nothing(2), nothing(2)),
+        nothing(2),
         boxes.longest,
         [search_of(boxes.judge, 2000)],
     )
@@ -173,13 +186,14 @@ def test_no_box_where_what_is_given_fails() -> None:
 def test_a_search_finds_the_encounter_in_which_a_value_alone_is_unsafe() -> None:
     """Where the place is from 0.4 to 0.5, above 7; a scan at place 0 shows nothing."""
 
-    def judge(cases: FloatArray) -> FloatArray:
-        is_there = np.abs(cases[:, 4] - 0.45) < 0.05
-        return np.where(is_there & (cases[:, 0] > 7), -1.0, 10 - cases[:, 0])
+    def judge(drives: Drives) -> FloatArray:
+        is_there = np.abs(drives.encounters.place[:, 0] - 0.45) < 0.05
+        value = drives.vehicle[:, 0]
+        return np.where(is_there & (value > 7), -1.0, 10 - value)
 
     star = star_of(2)
-    start = Alone(star.lower[:2], star.upper[:2])
-    scanned = scan_alone(judge, star, start, np.zeros((1, 3)), 100, PARTS)
+    start = Alone(star.lower, star.upper)
+    scanned = scan_alone(judge, star, start, places(0.0), 100, PARTS)
     assert scanned.upper.tolist() == [10, 10]
     limits = search_alone(judge, star, scanned, search_of(judge, 2000), PARTS)
     assert limits.upper.tolist() == [pytest.approx(7, abs=0.02), 10]
@@ -188,65 +202,67 @@ def test_a_search_finds_the_encounter_in_which_a_value_alone_is_unsafe() -> None
 
 def test_a_value_whose_limit_never_settles_stays_as_in_the_original() -> None:
     star = star_of(2)
-    spaces = list[Space]()
+    scopes = list[Scope]()
 
-    def search(space: Space, known: FloatArray) -> Counterexamples:
-        spaces.append(space)
-        cases = cases_of([space.upper[0], 5.0], [5.0, space.lower[1]])
-        return Counterexamples(cases, np.array([-1.0, -1.0]))
+    def search(scope: Scope, known: Drives) -> Counterexamples:
+        scopes.append(scope)
+        drives = drives_of([scope.upper[0], 5.0], [5.0, scope.lower[1]])
+        return Counterexamples(drives, np.array([-1.0, -1.0]))
 
-    start = Alone(star.lower[:2], star.upper[:2])
-    limits = search_alone(lambda cases: np.ones(len(cases)), star, start, search, (2,))
+    start = Alone(star.lower, star.upper)
+    limits = search_alone(
+        lambda drives: np.ones(len(drives)), star, start, search, (2,)
+    )
     assert limits.upper.tolist() == [5, 10]
     assert limits.lower.tolist() == [0, 5]
-    assert len(spaces) == MOST_SEARCHES
+    assert len(scopes) == MOST_SEARCHES
 
 
-def test_a_star_changes_one_value_and_a_space_holds_its_cases() -> None:
-    star = star_of(4)
-    cases = star.draw(1000, default_rng(0))
-    assert set(np.count_nonzero(cases[:, :4] != 5, axis=1).tolist()) == {1}
-    assert (np.count_nonzero(cases[:, :4] != 5, axis=0) > 150).all()
-    children = star.children(cases[:PARENTS], 1000, default_rng(1))
+def test_a_star_changes_one_value_and_a_scope_holds_its_drives() -> None:
+    rows = _Rows(star_of(4), default_rng(0))
+    drawn = rows.draw(1000)
+    assert set(np.count_nonzero(drawn[:, :4] != 5, axis=1).tolist()) == {1}
+    assert (np.count_nonzero(drawn[:, :4] != 5, axis=0) > 150).all()
+    children = rows.children(drawn[:PARENTS], 1000)
     assert (np.count_nonzero(children[:, :4] != 5, axis=1) <= 1).all()
-    space = space_of(4, worlds=3)
-    drawn = space.draw(3000, default_rng(2))
-    for each in (drawn, space.children(drawn[:PARENTS], 3000, default_rng(3))):
-        assert ((each >= space.lower) & (each <= space.upper)).all()
-        assert {*np.floor(each[:, 4])} == {0, 1, 2}, "the worlds"
-    at_ends = (drawn == space.lower) | (drawn == space.upper)
-    assert at_ends[:, :4].mean() == pytest.approx(0.5, abs=0.02)
-    assert not at_ends[:, 4:].any()
+    scope = scope_of(4, worlds=3)
+    rows = _Rows(scope, default_rng(2))
+    drawn = rows.draw(3000)
+    for each in (drawn, rows.children(drawn[:PARENTS], 3000)):
+        drives = from_matrix(each, 4)
+        assert scope.holds(drives).all()
+        assert {*drives.encounters.world.tolist()} == {0, 1, 2}
+    vehicle = from_matrix(drawn, 4).vehicle
+    assert np.isin(vehicle, [0, 10]).mean() == pytest.approx(0.5, abs=0.02)
 
 
 def test_a_search_ends_soon_after_a_failure_or_with_its_budget() -> None:
-    space = space_of(3)
+    scope = scope_of(3)
     rng = default_rng(0)
-    met = search_cases(tooth, space, nothing(3), SearchPlan(5000), rng)
+    met = search_scope(tooth, scope, scope.nothing, SearchPlan(5000), rng)
     assert met.least == -1
     assert met.simulated < 5000
     assert (tooth(met.unsafe) < 0).all()
-    met = search_cases(
-        lambda cases: 1 + cases[:, 0],
-        space,
-        cases_of([0.25, 5, 5]),
+    met = search_scope(
+        lambda drives: 1 + drives.vehicle[:, 0],
+        scope,
+        drives_of([0.25, 5, 5]),
         SearchPlan(1000),
         rng,
     )
     assert met.simulated == 1000
     assert met.least == 1
     assert not len(met.unsafe)
-    known = cases_of([6.25, 6.5, 6.5])
-    assert search_cases(tooth, space, known, SearchPlan(1), rng).least == -1, (
+    known = drives_of([6.25, 6.5, 6.5])
+    assert search_scope(tooth, scope, known, SearchPlan(1), rng).least == -1, (
         "known ones come first"
     )
 
 
 def test_children_lie_between_beside_and_around_their_parents() -> None:
     """Moved ones at nine places of parents at 4 and 5; others change about one value of seven."""
-    rng = default_rng(0)
-    parents = np.repeat(cases_of([4.0] * 4, [5.0] * 4), 16, axis=0)
-    children = space_of(4).children(parents, 4000, rng)
+    parents = np.repeat(to_matrix(drives_of([4.0] * 4, [5.0] * 4)), 16, axis=0)
+    children = _Rows(scope_of(4), default_rng(0)).children(parents, 4000)
     between = {
         pulled + shift for pulled in (4.0, 4.5, 5.0) for shift in (-0.7, 0.0, 0.7)
     }
@@ -262,13 +278,15 @@ def test_no_box_without_failures_is_larger_than_the_cut() -> None:
     """Of all that move one limit in for each failure."""
     failures = default_rng(1).uniform(0, 10, (7, 2))
     boxes = boxes_of(2, linear)
-    known = Failures(cases_of(*failures.tolist()), nothing(2))
+    known = Failures.known(drives_of(*failures.tolist()))
     box = cut(boxes, boxes.longest, known, 0.0)
     assert not len(known.inside(boxes, box))
     volumes = []
     for columns in product((0, 1), repeat=7):
         sides = boxes.longest.copy()
-        for failure, column in zip(boxes.extents(known.cases), columns, strict=True):
+        for failure, column in zip(
+            boxes.extents(known.drives.vehicle), columns, strict=True
+        ):
             side = np.argmax(failure[:, column])
             sides[side, column] = min(sides[side, column], failure[side, column])
         volumes.append(boxes.log_volume(sides))
@@ -276,7 +294,7 @@ def test_no_box_without_failures_is_larger_than_the_cut() -> None:
 
 
 def test_a_cut_keeps_off_failures_by_its_clearance_and_cuts_no_given_side() -> None:
-    known = Failures(cases_of([9.0, 9.5], [9.5, 8.0]), nothing(2))
+    known = Failures.known(drives_of([9.0, 9.5], [9.5, 8.0]))
     boxes = boxes_of(2, linear)
     near, far = (cut(boxes, boxes.longest, known, moves) for moves in (0.5, 5.0))
     assert near[1].tolist() == [pytest.approx(3.9), 5.0], "one limit cuts both off"
@@ -291,95 +309,96 @@ def test_a_cut_keeps_off_failures_by_its_clearance_and_cuts_no_given_side() -> N
 def test_causes_are_as_few_changes_as_possible_and_places_where_the_box_was_unsafe() -> (
     None
 ):
-    judge = unsafe_where(lambda cases: (cases[:, 0] > 7) & (cases[:, 1] < 3))
+    judge = unsafe_where(
+        lambda drives: (drives.vehicle[:, 0] > 7) & (drives.vehicle[:, 1] < 3)
+    )
     boxes = boxes_of(3, judge)
-    unsafe = cases_of([9, 1, 8], [8, 2, 5])
+    unsafe = drives_of([9, 1, 8], [8, 2, 5])
     causes = reduce_changes(judge, boxes.original, unsafe)
-    assert causes[:, :3].tolist() == [[9, 1, 5], [8, 2, 5]]
-    known = learn(boxes, Failures(nothing(3), nothing(3)), unsafe, boxes.longest)
+    assert causes.vehicle.tolist() == [[9, 1, 5], [8, 2, 5]]
+    known = learn(boxes, nothing(3), unsafe, boxes.longest)
     assert known.boxes == 1
-    assert (judge(known.cases) < 0).all()
-    assert known.cases[:, 0].min() == pytest.approx(7, abs=0.02), (
+    assert (judge(known.drives) < 0).all()
+    assert known.drives.vehicle[:, 0].min() == pytest.approx(7, abs=0.02), (
         "nearly the first on its way"
     )
-    assert known.places[:, :3].tolist() == [[0.8, -0.8, 0]]
-    assert known.at_places(boxes, np.full((2, 3), 2.5))[:, :3].tolist() == [[7, 3, 5]]
+    assert known.shares.tolist() == [[0.8, -0.8, 0]]
+    assert known.in_box(boxes, np.full((2, 3), 2.5)).vehicle.tolist() == [[7, 3, 5]]
 
 
 def test_a_box_grows_up_to_a_wall_and_shrinks_from_what_is_beyond() -> None:
-    judge = unsafe_where(lambda cases: (cases[:, 0] > 7) & (cases[:, 1] > 4))
+    judge = unsafe_where(
+        lambda drives: (drives.vehicle[:, 0] > 7) & (drives.vehicle[:, 1] > 4)
+    )
     boxes = boxes_of(2, judge)
-    known = Failures(nothing(2), cases_of([1.0, 0.0]))
+    known = nothing(2)._replace(shares=np.array([[1.0, 0.0]]), encounters=places(0.0))
     inner = shrink(boxes, known, boxes.longest)
     assert inner[1, 0] == pytest.approx(2, abs=0.02)
     sides = widen(boxes, known, inner, default_rng(0))
     assert sides[1, 0] == pytest.approx(2, abs=0.1)
     assert sides[1, 0] <= 2
     assert sides[:, 1].tolist() == [5, 5]
-    assert (
-        shrink(boxes, Failures(nothing(2), nothing(2)), inner).tolist()
-        == inner.tolist()
-    )
+    assert shrink(boxes, nothing(2), inner).tolist() == inner.tolist()
 
 
 def test_a_scan_meets_each_value_in_each_encounter_and_a_limit_ends_in_the_worst() -> (
     None
 ):
     """Unsafe: above 6 at place 0, above 8 at place 1, and the second value below 1 at place 1."""
-    cases = list[FloatArray]()
+    judged = list[Drives]()
 
-    def judge(rows: FloatArray) -> FloatArray:
-        cases.append(rows)
-        is_above = rows[:, 0] > 6 + 2 * rows[:, 4]
-        return np.where(is_above | (rows[:, 1] < rows[:, 4]), -1.0, 1.0)
+    def judge(drives: Drives) -> FloatArray:
+        judged.append(drives)
+        first, second = drives.vehicle.T
+        place = drives.encounters.place[:, 0]
+        return np.where((first > 6 + 2 * place) | (second < place), -1.0, 1.0)
 
     star = star_of(2)
     start = Alone(np.array([0.0, 0.0]), np.array([10.0, 5.0]))
-    encounters = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    limits = scan_alone(judge, star, start, encounters, 10, (2, 2))
+    limits = scan_alone(judge, star, start, places(0.0, 1.0), 10, (2, 2))
     assert limits.lower.tolist() == [0, 1]
     assert limits.upper.tolist() == [6, 5]
-    scanned = np.concatenate(cases[:2])
+    scanned = Drives.concatenate(judged[:2]).vehicle
     assert len(scanned) == 3 * 2 * 10, "three sides may move"
     assert {*np.diff(np.unique(scanned[:, 0]))} == {0.5}
-    assert [len(rows) for rows in cases[2:]] == [3, 3]
+    assert [len(drives) for drives in judged[2:]] == [3, 3]
     failure = limits.breaches[1, 0]
-    assert failure.tolist() == [6.125, 5, 0, 0, 0]
-    assert limits.breaches[0, 1].tolist() == [5, 0.875, 0, 0, 1]
+    assert to_matrix(failure).tolist() == [[6.125, 5, 0, 0, 0]]
+    assert to_matrix(limits.breaches[0, 1]).tolist() == [[5, 0.875, 0, 0, 1]]
 
 
 def test_what_a_search_keeps_is_the_worst_that_counts() -> None:
-    start = Counterexamples(nothing(1), np.zeros(0))
+    start = Counterexamples(scope_of(1).nothing, np.zeros(0))
     values = np.r_[np.inf, np.arange(40.0)[::-1]]
-    cases = cases_of(*([value] for value in values.tolist()))
-    met = start.after(cases, values)
-    assert met.robustness.tolist() == [*range(PARENTS)]
+    drives = drives_of(*([value] for value in values.tolist()))
+    met = start.after(drives, values)
+    assert met.scores.tolist() == [*range(PARENTS)]
     assert (met.simulated, met.least, len(met.unsafe)) == (41, 0, 0)
-    every = met.after(cases, values - 39.5)
-    assert len(every.cases) == len(every.unsafe) == 40, "all unsafe ones"
+    every = met.after(drives, values - 39.5)
+    assert len(every.drives) == len(every.unsafe) == 40, "all unsafe ones"
     assert every.least == -39.5
 
 
 def test_a_box_settles_a_step_further_inwards_after_each_failure() -> None:
     """Failures above 7: the first box meets them, the second keeps off by 0.4 of 2 %."""
-    boxes = boxes_of(1, unsafe_where(lambda cases: cases[:, 0] > 7))
-    spaces = list[Space]()
+    boxes = boxes_of(1, unsafe_where(lambda drives: drives.vehicle[:, 0] > 7))
+    scopes = list[Scope]()
 
-    def search(space: Space, places: FloatArray) -> Counterexamples:
-        spaces.append(space)
-        met = Counterexamples(nothing(1), np.zeros(0))
-        at_end = cases_of([space.upper[0]])
+    def search(scope: Scope, starts: Drives) -> Counterexamples:
+        scopes.append(scope)
+        met = Counterexamples(scope.nothing, np.zeros(0))
+        at_end = drives_of([scope.upper[0]])
         return met.after(at_end, boxes.judge(at_end))
 
-    def other(space: Space, places: FloatArray) -> Counterexamples:
-        assert len(places) == 1
-        return Counterexamples(places, np.array([0.25]), 20)
+    def other(scope: Scope, starts: Drives) -> Counterexamples:
+        assert len(starts) == 1
+        return Counterexamples(starts, np.array([0.25]), 20)
 
-    known = Failures(nothing(1), nothing(1))
+    known = nothing(1)
     settled = settle(boxes, known, boxes.longest, [search, other])
     assert settled.sides is not None
     assert settled.sides[:, 0].tolist() == [5, pytest.approx(2 - 0.08, abs=0.01)]
     assert settled.attack == (21, 0.25)
-    assert [space.upper[0] for space in spaces] == [10, 5 + settled.sides[1, 0]]
+    assert [scope.upper[0] for scope in scopes] == [10, 5 + settled.sides[1, 0]]
     assert settled.failures.boxes == 1
-    assert settled.failures.places[:, 0].tolist() == [1]
+    assert settled.failures.shares[:, 0].tolist() == [1]

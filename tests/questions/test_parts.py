@@ -11,8 +11,8 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.ask import find_question
+from safevar_sumo.questions.bench import moving_tests
 from safevar_sumo.questions.part import at_point, scope_of
-from safevar_sumo.questions.tolerance.oracle import moving_tests
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, json_of, numbers_of
 from tests.manual import PROGRAM

@@ -16,14 +16,16 @@ from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
+from safevar_sumo.questions.bench import Bench
 from safevar_sumo.questions.cases import LEAST_SIMULATIONS
+from safevar_sumo.questions.drives import Drives, Encounters, Judged
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit import permit
 from safevar_sumo.questions.permit.encounters import (
-    EncounterRange,
-    encounters_of,
+    SpeedWorld,
     span_of,
+    speed_bench,
 )
 from safevar_sumo.questions.permit.permits import PermitSearch, Reached
 from safevar_sumo.questions.permit.rows import verdict_of
@@ -255,21 +257,22 @@ def test_a_car_is_safe_with_all_values_that_its_measured_one_may_have(
     """A made-up car is unsafe above 20 km/h with one brake torque, at or between the ends."""
     members = assemble(load_study("wear")).characteristics.vehicle
     column = members.names.index("brakeTorque")
-    monkeypatch.setattr(
-        EncounterRange,
-        "robustness",
-        lambda one, settings, stage: np.where(
-            one.values_in(settings) > 20,
-            abs(settings[:, column] - unsafe_at) - 0.01,
-            1.0,
-        ),
-    )
+
+    def drive(self: Bench[SpeedWorld], drives: Drives, stage: str) -> Judged:
+        scores = np.ones(len(drives))
+        for world, rows in self.in_worlds(drives):
+            settings = world.settings(drives[rows])
+            left = abs(settings[:, column] - unsafe_at) - 0.01
+            scores[rows] = np.where(world.speeds(settings) > 20, left, 1.0)
+        return Judged.of_scores(drives, scores)
+
+    monkeypatch.setattr(Bench, "drive", drive)
     ends = np.tile(members.original, (2, 1))
     ends[:, column] = 0.75, 0.85
     found = reached(load_study("wear", encounters="ranges"), Cars.measured(*ends))
     assert found.safe_value == 20
     assert found.failure is not None
-    assert found.failure.setting[column] == pytest.approx(unsafe_at, abs=0.01)
+    assert found.failure.drive.vehicle[0, column] == pytest.approx(unsafe_at, abs=0.01)
 
 
 @SLOW
@@ -360,8 +363,9 @@ def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(
     assert (span.low, span.high, span.unit) == (10, 30, "km/h")
     assert (span.ending, span.tests_above) == (("CPFA",), ("CPLA",))
     model = model_of(study)
-    ends = [(each.test, each.low, each.high) for each in encounters_of(model, span)]
-    assert ends == [("CPFA", 20, 30), ("CPNA", 10, 30), ("CPNCO", -np.inf, -np.inf)]
+    worlds = speed_bench([model], span).worlds
+    ends = [(world.name, world.low, world.high) for world in worlds]
+    assert ends == [("CPNCO", -np.inf, -np.inf), ("CPNA", 10, 30), ("CPFA", 20, 30)]
     answer = permit(study, cars={"a": {}}, others="new", fits=0, quick=True)
     assert answer.numbers["margin"] == 0.3, "no axis states a range"
     assert "CPLA" in answer.verdict
@@ -382,24 +386,22 @@ def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
 ) -> None:
     study = load_study("wear", encounters="ranges")
 
-    def robustness(
-        self: EncounterRange, settings: FloatArray, stage: str
-    ) -> FloatArray:
-        members = self.model.characteristics
-        columns = members.columns(members.with_printed_encounters(settings))
-        speed, location = columns["speed"], columns["impact_location"]
-        fails = (
-            (speed >= begin)
-            & (speed <= begin + width)
-            & (abs(location - place) <= share)
-        )
-        return np.where(fails & (self.test == "CPLA"), -1.0, 1.0)
+    def drive(self: Bench[SpeedWorld], drives: Drives, stage: str) -> Judged:
+        scores = np.ones(len(drives))
+        for world, rows in self.in_worlds(drives):
+            settings = world.settings(drives[rows])
+            columns = world.model.characteristics.columns(settings)
+            if world.name == "CPLA":
+                beyond = columns["speed"] - begin
+                is_near = abs(columns["impact_location"] - place) <= share
+                fails = (beyond >= 0) & (beyond <= width) & is_near
+                scores[rows[fails]] = -1.0
+        return Judged.of_scores(drives, scores)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(EncounterRange, "robustness", robustness)
+        patch.setattr(Bench, "drive", drive)
         found = reached(study, budget=2 * LEAST_SIMULATIONS)
     assert found.failure is not None
-    assert found.failure.encounters.test == "CPLA"
     assert begin - 0.005 <= found.failure.value <= begin + 1.005
     assert found.safe_value == np.ceil(found.failure.value) - 1
 
@@ -408,16 +410,22 @@ def test_where_a_test_lists_speeds_the_answer_is_one_of_them(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write("listed.toml", LISTED)
-    monkeypatch.setattr(
-        EncounterRange,
-        "robustness",
-        lambda one, settings, stage: np.where(one.values_in(settings) < 35, 1.0, -1.0),
-    )
+
+    def drive(self: Bench[SpeedWorld], drives: Drives, stage: str) -> Judged:
+        scores = np.ones(len(drives))
+        for world, rows in self.in_worlds(drives):
+            speeds = world.speeds(world.settings(drives[rows]))
+            scores[rows[speeds >= 35]] = -1.0
+        return Judged.of_scores(drives, scores)
+
+    monkeypatch.setattr(Bench, "drive", drive)
     assert reached(load_study("listed.toml"), budget=0).safe_value == 30
 
 
 def test_all_corners_of_five_measured_values_drive_the_grid() -> None:
     """16 of 32 corners meet each encounter."""
     cars = Cars.measured(np.zeros(5), np.ones(5))
-    met = np.vstack([cars.at(np.array([place])) for place in range(9)])
+    places = np.arange(9.0)[:, np.newaxis]
+    encounters = Encounters(np.zeros(9, dtype=np.intp), np.zeros(9), places)
+    met = cars.drives_in(encounters).vehicle
     assert (len(met), len(np.unique(met, axis=0))) == (9 * 16, 32)

@@ -19,11 +19,8 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.between import COUNTS_STEPS, DOMAIN, in_phases
-from safevar_sumo.questions.cases import (
-    SearchPlan,
-    Space,
-    search_cases,
-)
+from safevar_sumo.questions.cases import SearchPlan, search_scope
+from safevar_sumo.questions.drives import Drives, Scope
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.part import at_point
@@ -147,15 +144,17 @@ def test_the_worst_phase_on_a_standing_car_is_the_line_through_the_tips_over_the
     some = np.arange(lower[0], lower[-1], 97)
     claim = model.in_phases
     assert claim is not None
+
+    def judge(drives: Drives) -> FloatArray:
+        settings = np.column_stack([drives.vehicle, drives.encounters.phase])
+        return claim.robustness(settings, "phases")
+
     for row in some:
-        low, high = np.append(settings[row], [0, 0]), np.append(settings[row], [0, 1])
-        result = search_cases(
-            lambda cases: claim.robustness(np.delete(cases, -2, axis=1), "phases"),
-            Space(low, high, len(original)),
-            low[np.newaxis],
-            SearchPlan(512),
-            np.random.default_rng(0),
-        )
+        setting = settings[row]
+        scope = Scope(setting, setting, range(1), np.zeros(0), np.zeros(0))
+        start = Drives(setting[np.newaxis], scope.first_encounter)
+        rng = np.random.default_rng(0)
+        result = search_scope(judge, scope, start, SearchPlan(512), rng)
         line = np.interp(speeds[row], speeds[lower], left[lower])
         assert_allclose(result.least, line, atol=0.01)
 

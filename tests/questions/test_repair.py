@@ -19,6 +19,8 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import cases, repair as question
+from safevar_sumo.questions.bench import bench_of
+from safevar_sumo.questions.drives import Drives, Encounters
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.repair import (
@@ -34,7 +36,6 @@ from safevar_sumo.questions.repair.problem import (
     parameters_of,
 )
 from safevar_sumo.questions.tables import AnswerTable
-from safevar_sumo.questions.tolerance.oracle import Oracle, product_of
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
@@ -240,10 +241,10 @@ class Adding:
         self.today, self._need = np.full(parameters, 0.1), need
 
     def robustness_of_changes(
-        self, shares: FloatArray, cases: FloatArray, stage: str
+        self, shares: FloatArray, drives: Drives, stage: str
     ) -> FloatArray:
         gain = np.clip(shares - self.today, 0, 0.85).sum(axis=1)
-        return np.subtract.outer(gain, self._need * cases[:, 0])
+        return np.subtract.outer(gain, self._need * drives.vehicle[:, 0])
 
 
 @pytest.mark.parametrize(
@@ -261,10 +262,13 @@ def test_the_smallest_changes_are_those_of_the_closed_form(
     parameters: int, need: float, changed: dict[int, float]
 ) -> None:
     problem: Any = Adding(parameters, need)
-    search = smallest.Search(problem, np.linspace(0.5, 0, 20)[:, np.newaxis])
+    number = np.zeros(20, dtype=np.intp)
+    encounters = Encounters(number, np.zeros(20), np.zeros((20, 0)))
+    easy, hard = np.linspace([0.5, 1], [0, 0.5], 20).T[..., np.newaxis]
+    search = smallest.Search(problem, Drives(easy, encounters))
     search.smallest_changes()
     # What was found before becomes a lower bound.
-    search.add(np.linspace(1, 0.5, 20)[:, np.newaxis])
+    search.add(Drives(hard, encounters))
     changes = [change - problem.today for change in search.smallest_changes()]
     found = {
         int(np.count_nonzero(change)): float(np.max(np.abs(change)))
@@ -303,28 +307,29 @@ def test_cases_leave_what_vehicles_leave_unless_nobody_saves_them(name: str) -> 
     unsafe = Unsafe(keep=0.3)
     with open_evaluator(sv.load_study(name), InlinePool()) as evaluator:
         problem = RepairProblem(
-            oracle=Oracle([Model(0, evaluator, unsafe)], unsafe, between=True),
+            bench=bench_of([Model(0, evaluator, unsafe)], unsafe, between=True),
             promise=Promise.of(evaluator.study, evaluator.region, ["all"]),
             parameters=parameters_of(evaluator.study, ()),
             budget=100,
         )
         vehicles = problem.promise.draw(6, default_rng(1))
-        cases = product_of(vehicles, problem.encounters)
-        left = problem.robustness_of_change(problem.today, cases, "")
+        drives = Drives.product(vehicles, problem.encounters)
+        left = problem.robustness_of_change(problem.today, drives, "")
         expected = unsafe.robustness(evaluator.evaluate(vehicles, ""))
         assert left.reshape(6, -1).min(axis=1) == pytest.approx(expected)
-        is_saved = problem.repairable(cases)
+        is_saved = problem.repairable(drives)
         assert is_saved.all() == (name == "rain")
         counted = np.where(is_saved, left, np.inf)
         assert_array_equal(
-            problem.counted_robustness(problem.today, cases, ""), counted
+            problem.counted_robustness(problem.today, drives, ""), counted
         )
 
         # Between the tests only encounters count that a new vehicle survives today.
-        cases[:, problem.size + 1 :] = 0.37
-        cases[:, : problem.size] = evaluator.characteristics.original
-        survives = problem.robustness_of_change(problem.today, cases, "") >= 0
-        assert_array_equal(problem.is_promised(cases), survives)
+        drives.encounters.place[:] = 0.37
+        drives.encounters.phase[:] = 0.37
+        originals = problem.bench.originals_in(drives.encounters)
+        survives = problem.robustness_of_change(problem.today, originals, "") >= 0
+        assert_array_equal(problem.is_promised(drives.encounters), survives)
 
 
 def test_a_changed_value_is_rounded_as_finely_as_its_range_needs() -> None:

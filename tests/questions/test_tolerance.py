@@ -14,7 +14,9 @@ from safevar_sumo import load_study, tolerance
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.bench import Bench, World
 from safevar_sumo.questions.box import Box, prove
+from safevar_sumo.questions.drives import Drives, Judged
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.sampling import Stream
@@ -24,10 +26,8 @@ from safevar_sumo.questions.tolerance.asked import (
     effort_of,
     usual_alone,
 )
-from safevar_sumo.questions.tolerance.boxes import Attack
-from safevar_sumo.questions.tolerance.oracle import Oracle
+from safevar_sumo.questions.tolerance.found import worst_of
 from safevar_sumo.questions.tolerance.search import find_limits
-from safevar_sumo.questions.tolerance.told import worst_of
 from safevar_sumo.questions.words import bound_in_words
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios.declared import with_ranges
@@ -234,32 +234,33 @@ def test_sets_that_break_or_cut_limits_are_told() -> None:
     assert corners <= plants[0].seen
 
 
-class Sliver(Oracle):
+class Sliver(Bench[World]):
     """Encounters in which the first axis is beyond 0.7 of its range do not count. In 0.5 % of the
     range before, vehicles collide in which all 8 values are above 9.9. All others keep 1 m.
     """
 
-    def __call__(self, cases: FloatArray, failed: float = np.inf) -> FloatArray:
-        share = cases[:, 8 + 2]
-        collides = (cases[:, :8] > 9.9).all(axis=1) & (share > 0.695)
-        return np.where(share > 0.7, np.inf, 1 - 2.0 * collides)
+    def drive(self, drives: Drives, stage: str = "") -> Judged:
+        share = drives.encounters.place[:, 0]
+        collides = (drives.vehicle > 9.9).all(axis=1) & (share > 0.695)
+        scores = np.where(share > 0.7, np.inf, 1 - 2.0 * collides)
+        return Judged.of_scores(drives, scores)
 
 
 def test_a_search_begins_where_encounters_only_just_count() -> None:
     """Where vehicles fail there is no slope towards these encounters, and hardly any is drawn."""
     models = Models((made_up_model(8, nowhere),), ())
-    oracle = Sliver(models.members, Unsafe(), between=False)
-    oracle.places = 4
-    edges = oracle.edges(0, 64, np.random.default_rng(1))
-    assert ((edges[:, 2] > 0.69) & (edges[:, 2] <= 0.7)).all()
-    assert len(np.unique(edges[:, 3:], axis=0)) > 4, "lines between several places"
+    bench = Sliver(models.own, [World(models.own)])
+    bench.places = 3
+    edges = bench.edges(0, 64, np.random.default_rng(1)).place
+    assert ((edges[:, 0] > 0.69) & (edges[:, 0] <= 0.7)).all()
+    assert len(np.unique(edges[:, 1:], axis=0)) > 4, "lines between several places"
     task = asked_of(models, Unsafe(), range(8), {}, at_tests=True)
     for lines in (0, 64):
         effort = task.effort._replace(lines=lines)
-        question = task._replace(oracle=oracle, effort=effort)
+        question = task._replace(bench=bench, effort=effort)
         search = question.search(Stream.VALIDATION, 0)
-        space = oracle.space(0, task.lower, task.upper)
-        assert bool(len(search(space, question.nothing).unsafe)) == bool(lines)
+        scope = bench.scope(0, task.lower, task.upper)
+        assert bool(len(search(scope, question.nothing).unsafe)) == bool(lines)
 
 
 def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> None:
@@ -274,11 +275,12 @@ def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> N
         [pytest.approx(-3, abs=0.15), 10],
     )
     ((side, column),) = limits.breaches
-    case = limits.breaches[side, column]
-    assert corner(case[np.newaxis, :3])[0]
-    is_within = (case[:3] >= ends[0]) & (case[:3] <= ends[1])
+    vehicles = limits.breaches[side, column].vehicle
+    assert corner(vehicles)[0]
+    (vehicle,) = vehicles
+    is_within = (vehicle >= ends[0]) & (vehicle <= ends[1])
     assert is_within.tolist() == [number != column for number in range(3)]
-    assert 0 < abs(case[column] - ends[side, column]) <= 10 / 50 + 1e-9
+    assert 0 < abs(vehicle[column] - ends[side, column]) <= 10 / 50 + 1e-9
     assert limits.attacks[0].simulated == 4 * 5000
     assert limits.attacks[0].least == 2, "what is left in all of the box"
     assert limits.proofs == 1
@@ -286,8 +288,8 @@ def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> N
 
 
 def test_the_worst_clearance_is_what_is_left_beside_the_margin_of_its_set() -> None:
-    attacks = {0: Attack(1, 0.2), 2: Attack(1, 0.4), 3: Attack(1)}
-    assert worst_of(Unsafe(keep=0.3), attacks) == 0.4
+    least = {0: 0.2, 2: 0.4, 3: np.inf}
+    assert worst_of(Unsafe(keep=0.3), least) == 0.4
 
 
 def test_few_simulations_claim_nothing_of_a_set_that_they_do_not_reach() -> None:

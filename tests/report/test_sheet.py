@@ -18,7 +18,6 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.part import scope_of
 from safevar_sumo.questions.permit.rows import CARS
-from safevar_sumo.questions.tolerance import study_in_ranges
 from safevar_sumo.questions.tolerance.tell import IN_RANGES
 from safevar_sumo.replay.animation import template_environment
 from safevar_sumo.report.page import TEMPLATE_FOLDER
@@ -384,8 +383,8 @@ def sheet_of_shipped(name: str) -> str:
     limits = answer_of(
         rows=rows, scope=scope_of(study), unsafe=study.unsafe.criterion or "collision"
     )
-    if in_ranges := study_in_ranges(study):
-        row = (scope_of(in_ranges), False, "A child is hit. " * 20, {}, None)
+    if study.states_ranges and not study.ranges:
+        row = (scope_of(with_ranges(study)), False, "A child is hit. " * 20, {}, None)
         limits = with_table(limits, row)
     own = replace(limits, study=study)
     has_speed = speed_values(reported(own))

@@ -21,6 +21,7 @@ from safevar_sumo.errors import about
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Criterion, question
+from safevar_sumo.questions.bench import LIMITS_STAGE
 from safevar_sumo.questions.case import Subject
 from safevar_sumo.questions.compare import words
 from safevar_sumo.questions.compare.coverage import missing_in_words
@@ -75,7 +76,6 @@ from safevar_sumo.questions.sentence import Sentence, Sentences, Verdict, answer
 from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.tolerance.asked import usual_alone
-from safevar_sumo.questions.tolerance.oracle import LIMITS_STAGE
 from safevar_sumo.questions.words import UNSAFE_MEANS, counted_in_words, join_phrases
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import limits_of

@@ -170,8 +170,8 @@ def _safe_alone(request: Asked, limits: Restriction) -> list[Interval] | list[No
     """The safe interval of each characteristic alone, rounded inwards, and within the user's
     limits; None for all characteristics if the original vehicle is unsafe.
     """
-    model = request.oracle.own
-    members = request.oracle.vehicle.members
+    model = request.bench.own
+    members = request.bench.vehicle.members
     if model.are_unsafe(model.characteristics.original_settings, "original vehicle")[0]:
         return [None] * len(members)
     alone = alone_with_own_set(request, Alone(request.lower, request.upper))

@@ -62,7 +62,7 @@ def answer_of(
         rows = [_row(problem, *change, survivors.fits) for change in survivors.changes]
         repairs = sorted(rows, key=_cost_of)
     tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
-    worlds = problem.oracle.worlds
+    worlds = problem.bench.worlds
     numbers = {
         "unsafe": str(unsafe),
         "margin": unsafe.keep if unsafe.is_collision else None,
