@@ -17,13 +17,8 @@ from tests.size import elements_in, sizes, sources_of
 
 LIMITS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
 DOUBLE = {
-    *(
-        "Failure",
-        "Failures",
-        "FullBraking",
-        "Parameter",
-        "Search",
-    ),  # of repair and tolerance
+    *("Failure", "Failures", "FullBraking", "Parameter", "Search"),
+    *("Found", "tell"),  # each question has its own
     *("columns_of", "parameters_of"),
 }
 """Names that may still have several meanings."""

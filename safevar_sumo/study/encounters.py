@@ -282,7 +282,7 @@ class MatrixTable(Table, frozen=True, kw_only=True):
             )
 
 
-class Encounters(Table, frozen=True, kw_only=True):
+class StudyEncounters(Table, frozen=True, kw_only=True):
     """The encounters of a study: a scenario in a weather, or the tests of a matrix. Vehicles meet
     the listed encounters, or any encounter in the ranges of the axes.
 

@@ -22,7 +22,12 @@ from safevar_sumo.study.characteristics import (
     check_variation,
     mistake,
 )
-from safevar_sumo.study.encounters import Encounters, MatrixTest, ModelTable, Parameters
+from safevar_sumo.study.encounters import (
+    MatrixTest,
+    ModelTable,
+    Parameters,
+    StudyEncounters,
+)
 from safevar_sumo.study.limits import Limit, check_limits
 from safevar_sumo.study.marks import (
     OF_STUDY,
@@ -210,7 +215,7 @@ class Origin(Table, frozen=True, kw_only=True):
     files: tuple[str, ...] = ()
 
 
-class Study(Encounters, frozen=True, kw_only=True):
+class Study(StudyEncounters, frozen=True, kw_only=True):
     """A complete study, with the keys of its TOML file. `load_study` reads a study from its file.
 
     - `name` and `title` are the study's name and its heading.

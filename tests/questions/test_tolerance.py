@@ -14,7 +14,7 @@ from safevar_sumo import load_study, tolerance
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.bench import Bench, World
+from safevar_sumo.questions.bench import Bench, DrivenWorld
 from safevar_sumo.questions.box import Box, prove
 from safevar_sumo.questions.drives import Drives, Judged
 from safevar_sumo.questions.evaluator import Evaluator
@@ -234,7 +234,7 @@ def test_sets_that_break_or_cut_limits_are_told() -> None:
     assert corners <= plants[0].seen
 
 
-class Sliver(Bench[World]):
+class Sliver(Bench[DrivenWorld]):
     """Encounters in which the first axis is beyond 0.7 of its range do not count. In 0.5 % of the
     range before, vehicles collide in which all 8 values are above 9.9. All others keep 1 m.
     """
@@ -249,7 +249,7 @@ class Sliver(Bench[World]):
 def test_a_search_begins_where_encounters_only_just_count() -> None:
     """Where vehicles fail there is no slope towards these encounters, and hardly any is drawn."""
     models = Models((made_up_model(8, nowhere),), ())
-    bench = Sliver(models.own, [World(models.own)])
+    bench = Sliver(models.own, [DrivenWorld(models.own)])
     bench.places = 3
     edges = bench.edges(0, 64, np.random.default_rng(1)).place
     assert ((edges[:, 0] > 0.69) & (edges[:, 0] <= 0.7)).all()
