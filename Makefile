@@ -1,10 +1,11 @@
 # Everything happens in .venv, and each target installs only what it needs. Needed beforehand: Python 3.11, git and make.
 PYTHON ?= python3
 RUN := .venv/bin/python
+PARALLEL := -n auto --dist worksteal
 PACKAGE := setup.cfg pyproject.toml constraints.txt
 INSTALL = $(RUN) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 
-.PHONY: study plain test test-all test-lowest lint docs docs-outputs pictures benchmark clean
+.PHONY: study plain test slow test-all test-lowest lint docs docs-outputs pictures benchmark clean
 
 study: .venv/installed
 	$(RUN) -m safevar_sumo study rain
@@ -13,13 +14,15 @@ plain:
 	$(PYTHON) -m tests.plain_machine
 
 test: .venv/installed-test
-	$(RUN) -m pytest
+	$(RUN) -m pytest $(PARALLEL)
 
-test-all: test
-	$(RUN) -m pytest -m slow
+test-all: test slow
+
+slow: .venv/installed-test-all
+	$(RUN) -m pytest $(PARALLEL) -m slow
 
 test-lowest: .venv/installed-lowest
-	.venv/lowest/bin/python -m pytest
+	.venv/lowest/bin/python -m pytest $(PARALLEL)
 
 lint: .venv/installed-test
 	$(RUN) -m ruff check .

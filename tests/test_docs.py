@@ -30,6 +30,10 @@ from safevar_sumo.study import (
 from tests.in_process import SLOW
 from tests.manual import PROGRAM, ROOT, blocks, written
 from tests.pages import PAGES, run_page
+from tests.support.needs import need_library
+
+LIBRARY_OF_PAGE = {"docs/tools.md": "optuna"}
+"""Pages whose blocks need a library of the extra `test-all`."""
 
 
 @SLOW
@@ -38,6 +42,8 @@ def test_every_block_of_a_page_does_and_shows_what_it_says(
     page: str, in_tmp: Path
 ) -> None:
     """`make docs-outputs` fills it in. Every change of the package changes the digest of a pack."""
+    if page in LIBRARY_OF_PAGE:
+        need_library(LIBRARY_OF_PAGE[page])
     digest = re.compile(r"\b[0-9a-f]{64}\b")
     for block, output in run_page(page, options_of_tests=True):
         assert digest.sub("", block.text) == digest.sub("", output)

@@ -14,13 +14,13 @@ from pathlib import Path
 import nbformat
 import numpy as np
 import pytest
-from nbclient import NotebookClient
 from PIL import Image
 
 import safevar_sumo as sv
 from safevar_sumo.reference.rows import COLUMNS
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import SLOW
+from tests.support.needs import need_library
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 SHOWN = {"quickstart": (1, 2), "rq1": (2, 0), "rq2": (1, 2), "rq3": (4, 3)}
@@ -114,13 +114,14 @@ def _read(name: str) -> nbformat.NotebookNode:
 
 def _executed(name: str, place: Path, timeout: int) -> nbformat.NotebookNode:
     notebook = _read(name)
-    NotebookClient(
+    client = need_library("nbclient").NotebookClient(
         notebook,
         timeout=timeout,
         kernel_name="python3",
         record_timing=False,
         resources={"metadata": {"path": str(place)}},
-    ).execute()
+    )
+    client.execute()
     return notebook
 
 

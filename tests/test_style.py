@@ -24,10 +24,11 @@ DOUBLE = {
 """Names that may still have several meanings."""
 COLLECTION = """
 import sys
-libraries = ("ad_rss", "cma", "distributed", "fmpy", "highway_env", "pymoo", "sumo")
+libraries = ["ad_rss", "cma", "distributed", "fmpy", "highway_env", "pymoo", "sumo"]
+libraries += ["carla", "jmetal", "nbclient", "optuna", "panda3d", "selenium"]
 sys.modules.update(dict.fromkeys(libraries))
 import pytest
-sys.exit(pytest.main(["--collect-only", "-n", "0", "-m", ""]))
+sys.exit(pytest.main(["--collect-only", "-m", ""]))
 """
 
 

@@ -5,7 +5,6 @@ has.
 from __future__ import annotations
 
 import json
-import os
 import re
 import runpy
 import subprocess
@@ -26,6 +25,11 @@ from safevar_sumo.results import write_imported
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import SLOW, refused, run
 from tests.made_up import made_up_evaluations
+from tests.support.needs import (
+    is_built_for_this_python,
+    need_library,
+    skip_unless_forbidden,
+)
 
 ASAM = Path(sys.prefix) / "asam" / "bin"
 SCENES = {
@@ -89,7 +93,7 @@ def exported(
 def test_a_second_library_reads_the_places_of_the_trace(
     exported: tuple[Path, Comparison],
 ) -> None:
-    xosc = pytest.importorskip("scenariogeneration.xosc")
+    xosc = need_library("scenariogeneration.xosc")
     out, comparison = exported
     scenario = xosc.ParseOpenScenario(str(out / "scenario.xosc"))
     row = comparison.rows[-1]
@@ -129,7 +133,7 @@ def test_a_second_library_reads_the_places_of_the_trace(
 def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(
     exported: tuple[Path, Comparison],
 ) -> None:
-    carla = pytest.importorskip("carla")
+    carla = need_library("carla")
     out, comparison = exported
     road = carla.Map("road", (out / "road.xodr").read_text())
     row = comparison.rows[-1]
@@ -151,8 +155,10 @@ def test_a_lane_of_the_road_lies_under_the_ego_at_every_sample(
 
 @SLOW
 def test_asam_finds_no_fault(exported: tuple[Path, Comparison]) -> None:
-    if not ASAM.is_dir() and os.environ.get("SAFEVAR_ASAM") != "required":
-        pytest.skip("make .venv/installed-asam installs ASAM's checks")
+    if not is_built_for_this_python("qc_opendrive"):
+        pytest.skip("ASAM's checks are not built for this Python")
+    if not ASAM.is_dir():
+        skip_unless_forbidden("make .venv/installed-asam installs ASAM's checks")
     out, _ = exported
     for kind, program, file in (
         ("xodr", "qc_opendrive", "road.xodr"),
@@ -180,9 +186,7 @@ ForCarla = tuple[Any, JsonObject, np.ndarray]
 @pytest.fixture
 def for_carla(tmp_path: Path) -> ForCarla:
     """The exported script's functions, its record, and the setting."""
-    pytest.importorskip(
-        "carla", reason="CARLA's client has wheels for Linux and Python 3.10 to 3.12"
-    )
+    need_library("carla")
     results, _, setting = results_of("rain", tmp_path)
     run(f"export {results} {HANDLE} --to carla --out {tmp_path / 'out'}")
     script = SimpleNamespace(**runpy.run_path(str(tmp_path / "out/run_in_carla.py")))

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
 from base64 import b64decode
 from collections.abc import Callable, Iterator
@@ -43,6 +42,7 @@ from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW
+from tests.support.needs import need_program
 
 
 def test_a_replay_that_differs_from_its_row_is_reported(case: Case) -> None:
@@ -123,13 +123,12 @@ def test_the_figure_draws_both_drives_until_their_ends(comparison: Comparison) -
 
 @pytest.fixture
 def screen(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A separate virtual screen; `SAFEVAR_BROWSER` demands that there is one."""
-    if shutil.which("Xvfb") is None and not os.environ.get("SAFEVAR_BROWSER"):
-        pytest.skip("Xvfb is not installed")
+    """A separate virtual screen."""
+    program = need_program("Xvfb")
     reading, writing = os.pipe()
     server = subprocess.Popen(
         [
-            "Xvfb",
+            program,
             "-displayfd",
             str(writing),
             "-screen",

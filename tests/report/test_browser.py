@@ -6,22 +6,14 @@ from __future__ import annotations
 
 import base64
 import json
-import os
-import shutil
 import subprocess
 import tarfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
-from selenium import webdriver
-from selenium.webdriver import Chrome
-from selenium.webdriver.chrome.service import Service
-from selenium.webdriver.common.by import By
-from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.remote.webelement import WebElement
 
 from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.questions.case import Case
@@ -32,6 +24,15 @@ from safevar_sumo.study.file import study_names
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW
 from tests.report.test_sheet import sheet_of_shipped
+from tests.support.needs import need_library, need_program
+
+if TYPE_CHECKING:
+    from selenium.webdriver import Chrome
+    from selenium.webdriver.remote.webelement import WebElement
+
+webdriver = need_library("selenium.webdriver")
+By = need_library("selenium.webdriver.common.by").By
+Keys = need_library("selenium.webdriver.common.keys").Keys
 
 A4 = {"width": round(190 / 25.4 * 96), "height": round(279 / 25.4 * 96)}
 """The part of a page within its margins [px]."""
@@ -46,13 +47,17 @@ TOO_WIDE = """return [...document.querySelectorAll(".wide")]
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
     """A browser with a profile of its own, that takes down what its pages say and ask for."""
     options = webdriver.ChromeOptions()
-    options.binary_location = program("chromium", "chromium-browser", "google-chrome")
+    options.binary_location = need_program(
+        "chromium", "chromium-browser", "google-chrome"
+    )
     for one in (*OPTIONS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
         options.add_argument(one)
     options.set_capability(
         "goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"}
     )
-    result = Chrome(options=options, service=Service(program("chromedriver")))
+    result = webdriver.Chrome(
+        options=options, service=webdriver.ChromeService(need_program("chromedriver"))
+    )
     yield result
     result.quit()
 
@@ -191,7 +196,9 @@ def test_it_fits_the_screen_and_everybody_can_read_it(
 def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The script of axe-core, from npm's registry."""
     folder = tmp_path_factory.mktemp("axe")
-    subprocess.run([program("npm"), "pack", AXE, "--silent"], check=True, cwd=folder)
+    subprocess.run(
+        [need_program("npm"), "pack", AXE, "--silent"], check=True, cwd=folder
+    )
     with tarfile.open(next(folder.glob("axe-core-*.tgz"))) as archive:
         return archive.extractfile("package/axe.min.js").read().decode()
 
@@ -280,8 +287,6 @@ def test_without_javascript_it_stands_still_and_tells_the_same(
         )
 
 
-REQUIRED = "SAFEVAR_BROWSER"
-"""Set where a missing browser is a failure and no reason to skip: in CI."""
 AXE = "axe-core@4.10.3"
 OPTIONS = (
     "--headless=new",
@@ -297,16 +302,7 @@ OPTIONS = (
 )
 
 
-def program(*names: str) -> str:
-    """The first of these programs that there is."""
-    result = next((path for path in map(shutil.which, names) if path), None)
-    if result is None and not os.environ.get(REQUIRED):
-        pytest.skip(f"{names[0]} is not installed")
-    assert result, f"none of {', '.join(names)} is installed"
-    return result
-
-
-def resized(browser: webdriver.Chrome, width: int, scheme: str = "light") -> None:
+def resized(browser: Chrome, width: int, scheme: str = "light") -> None:
     """Make it a screen of that width, in light or dark."""
     browser.execute_cdp_cmd(
         "Emulation.setEmulatedMedia",
@@ -318,7 +314,7 @@ def resized(browser: webdriver.Chrome, width: int, scheme: str = "light") -> Non
     )
 
 
-def violations(browser: webdriver.Chrome, axe: str) -> list[dict[str, Any]]:
+def violations(browser: Chrome, axe: str) -> list[dict[str, Any]]:
     """What axe-core finds in the page that is serious or critical."""
     browser.execute_script(axe)
     result = browser.execute_async_script(

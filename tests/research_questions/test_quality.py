@@ -8,7 +8,6 @@ import dataclasses
 import functools
 import math
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -43,6 +42,7 @@ from safevar_sumo.questions.research_questions.statistics import (
 from safevar_sumo.study import CharacteristicTable
 from tests.in_process import SLOW
 from tests.research_questions.cases import made_up, made_up_study, row, three_algorithms
+from tests.support.needs import need_program
 
 
 def test_indicators_are_those_of_each_runs_own_front_against_that_of_all_runs() -> None:
@@ -273,16 +273,18 @@ DOCUMENT = r"""\documentclass{article}
 """
 
 
-@pytest.mark.skipif(
-    shutil.which("pdflatex") is None, reason="there is no TeX here, as there is in CI"
-)
 @SLOW
 @pytest.mark.parametrize("name", CASES)
 def test_latex_compiles(name: str, tmp_path: Path) -> None:
     document = DOCUMENT % answer_about(name).render("latex")
     (tmp_path / "tables.tex").write_text(document, encoding="utf-8")
     done = subprocess.run(
-        ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "tables.tex"],
+        [
+            need_program("pdflatex"),
+            "-halt-on-error",
+            "-interaction=nonstopmode",
+            "tables.tex",
+        ],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
@@ -11,13 +10,11 @@ from mypy import api
 
 from tests.in_process import SLOW, json_of, run, write
 from tests.manual import ROOT, files_of
+from tests.support.needs import need_library
 
 PAGE = "docs/simulators.md"
 pytestmark = SLOW
-if os.environ.get("SAFEVAR_METADRIVE") != "required":
-    pytest.importorskip(
-        "panda3d"
-    )  # MetaDrive's engine; MetaDrive itself takes seconds to import
+need_library("panda3d")  # MetaDrive's engine; MetaDrive itself takes seconds to import
 
 
 @pytest.fixture
@@ -44,7 +41,7 @@ def test_the_page_says_what_the_driver_does(page: str) -> None:
 
 def test_the_calls_of_the_page_fit_the_client_of_carla(in_tmp: Path) -> None:
     """Of all calls only that is a fault which is misspelt here."""
-    carla = pytest.importorskip("carla")
+    carla = need_library("carla")
     Path("carla").symlink_to(
         Path(carla.__file__).parent
     )  # which does not say that it has types

@@ -10,11 +10,6 @@ from typing import Any, NamedTuple
 import moocore
 import numpy as np
 import pytest
-from jmetal.algorithm.multiobjective.nsgaii import NSGAII
-from jmetal.core.problem import FloatProblem
-from jmetal.operator.crossover import SBXCrossover
-from jmetal.operator.mutation import PolynomialMutation
-from jmetal.util.termination_criterion import StoppingByEvaluations
 
 from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Evaluations, FloatArray
@@ -22,6 +17,15 @@ from safevar_sumo.search import ALGORITHMS, Problem, Search
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 from tests.in_process import SLOW
 from tests.search.test_algorithms import evaluated, steps_of
+from tests.support.needs import need_library
+
+NSGAII = need_library("jmetal.algorithm.multiobjective.nsgaii").NSGAII
+FloatProblem = need_library("jmetal.core.problem").FloatProblem
+SBXCrossover = need_library("jmetal.operator.crossover").SBXCrossover
+PolynomialMutation = need_library("jmetal.operator.mutation").PolynomialMutation
+StoppingByEvaluations = need_library(
+    "jmetal.util.termination_criterion"
+).StoppingByEvaluations
 
 EVALUATIONS, POPULATION, SEEDS = 5000, 100, range(4)
 
