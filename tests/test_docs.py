@@ -59,6 +59,12 @@ def test_lines_of_prose_have_at_most_100_characters() -> None:
             )
 
 
+@pytest.mark.parametrize("name", study_names())
+def test_lines_of_a_shipped_study_have_at_most_100_characters(name: str) -> None:
+    lines = (ROOT / "studies" / f"{name}.toml").read_text("utf-8").splitlines()
+    assert not [line for line in lines if len(line) > 100]
+
+
 def script_of_docs(name: str) -> Any:
     """A script beside the pages, as a module."""
     return importlib.import_module(f"docs.{name}")
