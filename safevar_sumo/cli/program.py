@@ -69,7 +69,7 @@ ENDED_COMMANDS = {
 }
 """Commands of earlier releases, with the text that says what replaces each command."""
 ARGUMENT = re.compile(r"`(\w+)(?:=([^`]+))?`")
-"""An argument of a library function in the text of an error, such as `method=monte_carlo`."""
+"""An argument of a library function in the text of an error, such as `engine=sumo`."""
 
 
 class LazyCommands(click.Group):

@@ -237,8 +237,9 @@ def post_encroachment_time(
         )
     )
 
-    # Either the body has left the vehicle's path (`leaves`), or the vehicle has passed the body
-    # (`comes`). The way is the distance of the second road user from the shared place.
+    # Either the body has left the vehicle's path (`body_is_first`), or the vehicle has passed the
+    # body (`vehicle_is_first`). The way is the distance of the second road user from the shared
+    # place.
     lateral_gap = np.abs(lateral) - (trace.vehicle_width + obstacle_width) / 2
     body_is_first = (lateral * lateral_speed > 0) & (gap > 0)
     vehicle_is_first = (lateral * lateral_speed < 0) & (gap <= 0)

@@ -1,4 +1,5 @@
-"""Starts and stops SUMO; no other module imports libsumo or traci.
+"""Starts and stops SUMO. No other module imports libsumo or traci; only the process in which
+`network_check` loads a network opens libsumo itself.
 
 Both libraries have the same API: libsumo runs SUMO in this process, traci controls `sumo-gui`
 through a socket.

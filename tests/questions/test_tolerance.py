@@ -65,7 +65,7 @@ def answer_of(
 
 @SLOW
 def test_limits_end_before_what_cannot_be_simulated_which_counts_in_the_bound() -> None:
-    """All others, where the second is above 9 and the first below 2: a tenth of the box."""
+    """In the box these are vehicles with b above 8 and a below 2: 7 % of the box."""
 
     def fails(rows: FloatArray) -> BoolArray:
         is_alone = (rows[:, 0] > 5.75) & (rows[:, 0] < 6.75)
