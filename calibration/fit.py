@@ -397,11 +397,11 @@ def print_result(fit: Fit, log: Path) -> None:
             for k, parameter in enumerate(parameters)
             if not parameter.studies or name in parameter.studies
         ]
-        study = msgspec.structs.replace(
+        with_sets = msgspec.structs.replace(
             study, spread={parameters[k].key: sets[:, k].tolist() for k in own}
         )
         print(f"\n# {name}")
-        _, *evaluated = simulate(study, list(files.values()))
+        _, *evaluated = simulate(with_sets, list(files.values()))
         for (file, data), here in zip(files.items(), evaluated, strict=True):
             for part, rows in (
                 ("used", ~held_back(data, hold_out)),
@@ -418,7 +418,8 @@ def print_result(fit: Fit, log: Path) -> None:
                     )
                 )
         error = model_error(
-            study, [data.take(~held_back(data, hold_out)) for data in files.values()]
+            with_sets,
+            [data.take(~held_back(data, hold_out)) for data in files.values()],
         )
         print(
             f"[model_error]\n{SAFETY_DEGREE} = {round(error, ERROR_DECIMALS)}\n[spread]"

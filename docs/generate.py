@@ -113,23 +113,25 @@ def _range(kind: Any) -> str:
 def _words(kind: Any) -> str:
     """A type in words."""
     name = type(kind).__name__
-    if name == "Metadata":
-        return _words(kind.type)
-    if name == "StructType":
-        return f"[{kind.cls.__name__}](#{kind.cls.__name__.lower()})"
-    if name == "UnionType":
-        return " or ".join(
-            _words(one) for one in kind.types if type(one).__name__ != "NoneType"
-        )
-    if name == "LiteralType":
-        return " or ".join(f'`"{value}"`' for value in kind.values)
-    if name in ("ListType", "VarTupleType"):
-        return f"list of {_words(kind.item_type)}"
-    if name == "TupleType":
-        return f"list of {', '.join(map(_words, kind.item_types))}"
-    if name == "DictType":
-        return f"table of {_words(kind.value_type)} by name"
-    return PLAIN[name] + _range(kind)
+    match name:
+        case "Metadata":
+            words = _words(kind.type)
+        case "StructType":
+            words = f"[{kind.cls.__name__}](#{kind.cls.__name__.lower()})"
+        case "UnionType":
+            parts = [part for part in kind.types if type(part).__name__ != "NoneType"]
+            words = " or ".join(_words(part) for part in parts)
+        case "LiteralType":
+            words = " or ".join(f'`"{value}"`' for value in kind.values)
+        case "ListType" | "VarTupleType":
+            words = f"list of {_words(kind.item_type)}"
+        case "TupleType":
+            words = f"list of {', '.join(_words(item) for item in kind.item_types)}"
+        case "DictType":
+            words = f"table of {_words(kind.value_type)} by name"
+        case _:
+            words = PLAIN[name] + _range(kind)
+    return words
 
 
 def _structs(kind: Any) -> Iterator[Any]:

@@ -92,7 +92,13 @@ class Machine:
         }
         begin = time.monotonic()
         done = subprocess.run(
-            line, shell=True, cwd=where, env=environment, capture_output=True, text=True
+            line,
+            check=False,
+            shell=True,
+            cwd=where,
+            env=environment,
+            capture_output=True,
+            text=True,
         )
         printed = done.stdout + done.stderr
         print(f"{time.monotonic() - begin:6.1f} s  {line}", flush=True)

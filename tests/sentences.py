@@ -96,9 +96,9 @@ def split(text: str) -> Iterator[str]:
     """The sentences of a paragraph: what ends with a full stop, or is long enough to be one."""
     text = re.sub(r"\s+", " ", text.replace(" / ", "\0")).strip()
     for part in re.split(r"(?<=[.!?…])[\"”)*]*\s+(?=[\"“(*]?[A-Z\dX])|\0", text):
-        part = part.strip(" *")
-        if len(part.split()) > 3 and not part.endswith("…"):
-            yield part
+        sentence = part.strip(" *")
+        if len(sentence.split()) > 3 and not sentence.endswith("…"):
+            yield sentence
 
 
 def sentences_in(page: str) -> Iterator[str]:

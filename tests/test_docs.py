@@ -52,7 +52,9 @@ def test_every_block_of_a_page_does_and_shows_what_it_says(
 def test_lines_of_prose_have_at_most_100_characters() -> None:
     """Tables, headings, pictures, badges and blocks apart."""
     for page in PAGES:
-        text = re.sub(r"(?s)^```.*?^```$|<!--.*?-->", "", written(page), flags=re.M)
+        text = re.sub(
+            r"(?s)^```.*?^```$|<!--.*?-->", "", written(page), flags=re.MULTILINE
+        )
         for line in text.splitlines():
             assert len(line) <= 100 or line.startswith(("|", "#", "![", "[![")), (
                 f"{page}: {line}"

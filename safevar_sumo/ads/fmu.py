@@ -39,7 +39,9 @@ UNITS: Mapping[str, str] = {
     ),
     **dict.fromkeys(("gap", "lateral", "obstacle_width", "obstacle_length"), "m"),
     **dict.fromkeys(("throttle", "brake", "visibility", "detected", "warns"), "1"),
-    **{"time": "s", "step": "s", "acceleration": "m/s2"},
+    "time": "s",
+    "step": "s",
+    "acceleration": "m/s2",
     **{f"{NOMINAL}{name}": unit for name, unit in NOMINAL_UNITS.items()},
 }
 """Quantities that an FMU may receive or return, with their units.

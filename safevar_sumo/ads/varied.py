@@ -49,6 +49,14 @@ class VariedAds(Ads):
         self._values = values
         self.tau_parameter = ads.tau_parameter
 
+    def with_another(self, name: str, column: FloatArray) -> VariedAds:
+        """The same ADS in which one more parameter varies. `column` has its value in each of N
+        vehicles, shape (N,).
+        """
+        groups = len(column) // len(self._values)
+        values = np.column_stack([np.tile(self._values, (groups, 1)), column])
+        return VariedAds(self._ads, (*self._names, name), values)
+
     def start(self, n: int, nominal: Nominal, step: float) -> Memory:
         columns = [np.tile(column, n // len(column)) for column in self._values.T]
         varied: Any = copy.copy(self._ads)
@@ -85,6 +93,4 @@ def with_tau(ads: Ads, tau: FloatArray | None) -> Ads:
         return ads
     if not isinstance(ads, VariedAds):
         return VariedAds(ads, (ads.tau_parameter,), tau[:, None])
-    names = (*ads._names, ads.tau_parameter)
-    values = np.tile(ads._values, (len(tau) // len(ads._values), 1))
-    return VariedAds(ads._ads, names, np.column_stack([values, tau]))
+    return ads.with_another(ads.tau_parameter, tau)

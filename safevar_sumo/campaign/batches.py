@@ -156,20 +156,24 @@ def evaluate_all(
         evaluated.append(evaluations)
     evaluations = Evaluations.concatenate(evaluated)
     if study.search.failed == "skip":
-        pool.simulated += len(evaluations)
-        pool.failed += int(evaluations.failed.sum())
-        if pool.failed > MAX_SKIPPED * max(pool.simulated, FEW_SKIPPED):
-            failures = evaluations.take(evaluations.failed)
-            numbers = (
-                f"{pool.failed} of {pool.simulated} settings failed, more than 10 %"
-            )
-            problem = f"search.failed = 'skip': {numbers}"
-            if len(failures):
-                problem += f": {failures.reason(0)}"
-            raise UserCodeError(
-                study.source, problem, "a simulator that fails less often"
-            )
+        _refuse_many_failures(study, evaluations, pool)
     return evaluations.take(row_of.ravel())
+
+
+def _refuse_many_failures(study: Study, evaluations: Evaluations, pool: Pool) -> None:
+    """Count simulated and failed settings of a study that skips failures, and refuse a simulator
+    that fails too often.
+    """
+    pool.simulated += len(evaluations)
+    pool.failed += int(evaluations.failed.sum())
+    if pool.failed <= MAX_SKIPPED * max(pool.simulated, FEW_SKIPPED):
+        return
+    failures = evaluations.take(evaluations.failed)
+    numbers = f"{pool.failed} of {pool.simulated} settings failed, more than 10 %"
+    problem = f"search.failed = 'skip': {numbers}"
+    if len(failures):
+        problem += f": {failures.reason(0)}"
+    raise UserCodeError(study.source, problem, "a simulator that fails less often")
 
 
 def _evaluate_shared(

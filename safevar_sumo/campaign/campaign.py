@@ -74,7 +74,7 @@ class Campaign(NamedTuple):
     no_verdict: str
 
 
-def run_campaign(
+def run_campaign(  # noqa: PLR0913 - options of the command `study`
     study: Study,
     system: System,
     keys: Sequence[RunKey],

@@ -77,10 +77,10 @@ class ProcessWorker:
         ):
             # The executor starts its process with the first job.
             self._executor.submit(os.getpid)
-        (self._process,) = self._executor._processes.values()
+        (self._process,) = self._executor._processes.values()  # noqa: SLF001 - no public name
         # If a process dies while it sends a result, the reader waits for the rest until all writers
         # are closed. This process holds a writer, too: without the call it would wait for ever.
-        self._executor._result_queue._writer.close()  # type: ignore[attr-defined]
+        self._executor._result_queue._writer.close()  # type: ignore[attr-defined]  # noqa: SLF001
 
     def submit(self, function: Work, *arguments: Any) -> Future[Any]:
         return self._executor.submit(function, *arguments)

@@ -289,7 +289,7 @@ def _is_from_user_code() -> bool:
     """Return whether user code makes the present call, directly or through a library, without code
     of this package in between.
     """
-    frame = sys._getframe(2)
+    frame = sys._getframe(2)  # noqa: SLF001 - inspect.currentframe is slower, and this is a hook
     while frame is not None:
         file = frame.f_code.co_filename
         if is_user_file(file):

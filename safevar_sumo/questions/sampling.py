@@ -8,7 +8,7 @@ from enum import IntEnum
 from numpy.random import Generator, default_rng
 
 from safevar_sumo.records import FloatArray
-from safevar_sumo.study import Interval as Interval
+from safevar_sumo.study import Interval as Interval  # noqa: PLC0414 - for other modules
 from safevar_sumo.vehicles import CharacteristicSet
 
 CONFIDENCE = 0.95

@@ -247,7 +247,7 @@ def reader_tables(name: str, table: AnswerTable) -> Iterator[tuple[str, AnswerTa
 
     # Make a table for each name in `values`, with one or two columns for each value of `by`.
     by_values = frame[wide.by].unique()
-    for value in wide.values:
+    for value in wide.values:  # noqa: PD011 - a field
         ends = ("",) if value in frame else (LOW, HIGH)
         value_columns = [f"{value}{end}" for end in ends]
         column = columns[value_columns[0]]

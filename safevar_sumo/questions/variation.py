@@ -97,14 +97,14 @@ def _quantile_function(
         case Triangular():
             mode = stated.get("mode", original)
             triangle = scipy.stats.triang((mode - lower) / width, lower, width)
-            return lambda p: triangle.ppf(p)
+            return lambda p: np.asarray(triangle.ppf(p))
         case Normal():
             mean = stated.get("mean", original)
             deviation = stated["deviation"]
             normal = scipy.stats.truncnorm(
                 (low - mean) / deviation, (high - mean) / deviation, mean, deviation
             )
-            return lambda p: normal.ppf(p)
+            return lambda p: np.asarray(normal.ppf(p))
         case Lognormal():
             mean = np.log(stated.get("median", original))
             deviation = stated["sigma"]

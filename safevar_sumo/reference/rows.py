@@ -92,51 +92,8 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
         With file, row and column, if the file cannot be read, lacks a column or rows, or has a cell
         without a number in range.
     """
-    try:
-        lines = pd.read_csv(
-            BytesIO(read_file(path)),
-            dtype=str,
-            skipinitialspace=True,
-            skip_blank_lines=False,
-            encoding="utf-8-sig",
-        )
-        if not isinstance(lines.index, pd.RangeIndex):
-            raise ValueError("rows have more values than the header has columns")
-        table = lines.rename(columns=str.strip).dropna(how="all")
-    except OSError as error:
-        raise InputError(
-            path, f"cannot be read: {error.strerror or error}", "a CSV file"
-        ) from None
-    # pandas raises subclasses of ValueError for text that is no CSV.
-    except ValueError as error:
-        raise InputError(
-            path,
-            f"is not CSV: {str(error).splitlines()[0]}",
-            "a CSV file with a header and rows",
-        ) from None
-    names = list(map(str, table))
-    plain_names = list(map(_plain_name, names))
-    by_plain_name = dict(zip(plain_names, names, strict=True))
-    columns = {}
-    for name in characteristics.names:
-        columns[name] = by_plain_name.get(_plain_name(name), name)
-    columns |= COLUMNS
-    if columns[OPTIONAL_METRIC] not in table:
-        del columns[OPTIONAL_METRIC]
-    missing_columns = [column for column in columns.values() if column not in table]
-    problem = "has no rows"
-    if missing_columns:
-        problem = f"lacks the columns {', '.join(missing_columns)}"
-    if missing_columns or table.empty:
-        raise InputError(path, problem, "the format of the published package")
-    counts = Counter(plain_names)
-    doubled = [column for column in columns.values() if counts[_plain_name(column)] > 1]
-    if doubled:
-        raise InputError(
-            path,
-            f"has more than one column for {', '.join(doubled)}",
-            "each column once",
-        )
+    table = _read_texts(path)
+    columns = _columns_by_name(path, table, characteristics)
     numbers = {
         name: _parse_numbers(path, table[column], *RANGES.get(name, (-np.inf, np.inf)))
         for name, column in columns.items()
@@ -164,6 +121,64 @@ def read_reference(path: Path, characteristics: CharacteristicSet) -> ReferenceD
     return ReferenceData(
         package_filter(characteristics, settings[is_in_domain]), metrics
     )
+
+
+def _read_texts(path: Path) -> pd.DataFrame:
+    """Read a CSV file as a table of texts."""
+    try:
+        lines = pd.read_csv(
+            BytesIO(read_file(path)),
+            dtype=str,
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            encoding="utf-8-sig",
+        )
+        if not isinstance(lines.index, pd.RangeIndex):
+            raise ValueError("rows have more values than the header has columns")
+    except OSError as error:
+        raise InputError(
+            path, f"cannot be read: {error.strerror or error}", "a CSV file"
+        ) from None
+    # pandas raises subclasses of ValueError for text that is no CSV.
+    except ValueError as error:
+        raise InputError(
+            path,
+            f"is not CSV: {str(error).splitlines()[0]}",
+            "a CSV file with a header and rows",
+        ) from None
+    return lines.rename(columns=str.strip).dropna(how="all")
+
+
+def _columns_by_name(
+    path: Path, table: pd.DataFrame, characteristics: CharacteristicSet
+) -> dict[str, str]:
+    """The column of each characteristic and metric in the table of a file, by its name. A missing
+    column and a column that is there twice are refused.
+    """
+    names = [str(name) for name in table]
+    plain_names = [_plain_name(name) for name in names]
+    by_plain_name = dict(zip(plain_names, names, strict=True))
+    columns = {}
+    for name in characteristics.names:
+        columns[name] = by_plain_name.get(_plain_name(name), name)
+    columns |= COLUMNS
+    if columns[OPTIONAL_METRIC] not in table:
+        del columns[OPTIONAL_METRIC]
+    missing_columns = [column for column in columns.values() if column not in table]
+    problem = "has no rows"
+    if missing_columns:
+        problem = f"lacks the columns {', '.join(missing_columns)}"
+    if missing_columns or table.empty:
+        raise InputError(path, problem, "the format of the published package")
+    counts = Counter(plain_names)
+    doubled = [column for column in columns.values() if counts[_plain_name(column)] > 1]
+    if doubled:
+        raise InputError(
+            path,
+            f"has more than one column for {', '.join(doubled)}",
+            "each column once",
+        )
+    return columns
 
 
 def _plain_name(name: str) -> str:

@@ -201,9 +201,7 @@ def film_of(
     fps = 1 / (stride * step)
     samples = [*range(0, end, stride), *[end] * round(1 + pause * fps)]
     figure, show = draw_scene(comparison)
-    film = FuncAnimation(
-        figure, show, samples, init_func=lambda: [], cache_frame_data=False
-    )
+    film = FuncAnimation(figure, show, samples, init_func=list, cache_frame_data=False)
     return film, fps
 
 

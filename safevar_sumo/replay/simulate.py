@@ -166,10 +166,7 @@ def show_simulation(
     if target.row and "outcome" in target.row and not changes and point is None:
         _warn_of_differences(target, target.row, simulation)
     if trace is not None:
-        if simulation.pair.runs.lacking("speed").any():
-            system.require("a trace", "simulate --trace")
-        with whole_file(trace, "trace") as file:
-            simulation.trace.to_csv(file, index=False, lineterminator="\n")
+        _write_trace(trace, system, simulation)
     comparison = comparison_of(simulation)
     if animate is not None:
         animation.animate(comparison, animate)
@@ -177,6 +174,14 @@ def show_simulation(
         show_in_gui(comparison)
     answer = answer_of_setting(system, simulation, target.handle)
     return replace(answer, draw=lambda _: draw_comparison(comparison))
+
+
+def _write_trace(path: Path, system: System, simulation: Simulation) -> None:
+    """Write a simulation step by step to a CSV file. A simulator without speeds is refused."""
+    if simulation.pair.runs.lacking("speed").any():
+        system.require("a trace", "simulate --trace")
+    with whole_file(path, "trace") as file:
+        simulation.trace.to_csv(file, index=False, lineterminator="\n")
 
 
 def _where_met(system: System, setting: FloatArray) -> System:

@@ -243,15 +243,8 @@ def _is_relative(case: Case, unsafe: Unsafe) -> bool:
 
 def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
     """The reason why nobody may work by this sheet, as a sentence; "" if somebody may."""
-    numbers = limits.numbers
-    if "limits" not in limits.tables:
-        return "The question about limits has no answer."
-    if not numbers["driven"]:
-        return "The simulated vehicle does not drive with its driving system."
-    if numbers["kept"] is False:
-        return "The specified limits do not hold."
-    if not numbers["box"]:
-        return "No limits were found that hold at the same time."
+    if reason := _why_no_joint_limits(limits):
+        return reason
     items = study.case.characteristics.vehicle
     rows = _rows_of(limits)
     measured = [item for item in items if item.is_for_workshop]
@@ -265,6 +258,20 @@ def _why_no_limits(study: ReportedStudy, limits: Answer) -> str:
     if measured:
         return ""
     return "The study names no item that a workshop can measure."
+
+
+def _why_no_joint_limits(limits: Answer) -> str:
+    """The reason why the answer about limits has no joint limits; "" if it has."""
+    numbers = limits.numbers
+    if "limits" not in limits.tables:
+        return "The question about limits has no answer."
+    if not numbers["driven"]:
+        return "The simulated vehicle does not drive with its driving system."
+    if numbers["kept"] is False:
+        return "The specified limits do not hold."
+    if not numbers["box"]:
+        return "No limits were found that hold at the same time."
+    return ""
 
 
 def _together(item: Characteristic, row: JsonObject | None) -> Interval:

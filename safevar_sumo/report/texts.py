@@ -84,7 +84,7 @@ def completed(
     return usual | values
 
 
-def answer_about(
+def answer_about(  # noqa: PLR0913 - options of the command `report`
     question: Question,
     values: JsonObject,
     cases: Sequence[Case],

@@ -93,9 +93,8 @@ def _without_ranges(tables: Tables) -> JsonObject:
         """A table whose axes in `over` have only their listed values."""
         listed = dict(table)
         over = {}
-        for name, values in listed.pop("over", {}).items():
-            if isinstance(values, dict):
-                values = values.get("at")
+        for name, axis in listed.pop("over", {}).items():
+            values = axis.get("at") if isinstance(axis, dict) else axis
             if values:
                 over[name] = values
         if over:

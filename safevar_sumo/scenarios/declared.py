@@ -111,10 +111,11 @@ def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
         }
     completed_tests = []
     for test in tests:
+        with_own_axes = dict(test)
         if "over" in test:
             key = f"matrix.tests: {test['name']!r}: over"
-            test = {**test, "over": completed(test["over"], key, test)}
-        completed_tests.append(test)
+            with_own_axes["over"] = completed(test["over"], key, test)
+        completed_tests.append(with_own_axes)
     if completed_tests:
         result["matrix"] = {**(matrix or {}), "tests": completed_tests}
     return result

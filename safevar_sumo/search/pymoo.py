@@ -136,7 +136,7 @@ class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
             group = infills
             if isinstance(infills, Individual):
                 group = [infills]
-            if group is None or not len(group):
+            if group is None or len(group) == 0:
                 break
             new = [individual for individual in group if not individual.evaluated]
             batch = Population.create(*new[:budget])
@@ -178,7 +178,6 @@ class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
     def begin(self, problem: Problem, seed: int) -> Any:
         """Create pymoo's algorithm, before its first request."""
         from pymoo.core.problem import Problem as PymooProblem
-        from pymoo.util.ref_dirs import get_reference_directions
 
         # The user's arguments win over the study's population, which wins over pymoo's defaults.
         objectives = 1
@@ -200,15 +199,7 @@ class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
             )
         if "ref_dirs" in defaults:
             partitions = arguments.get("ref_dirs", PARTITIONS)
-            if isinstance(partitions, int):
-                if math.comb(partitions + objectives - 1, partitions) > MAX_DIRECTIONS:
-                    raise ValueError(
-                        f"ref_dirs = {partitions} are more than {MAX_DIRECTIONS:,} reference"
-                        " directions"
-                    )
-                arguments["ref_dirs"] = get_reference_directions(
-                    "das-dennis", objectives, n_partitions=partitions
-                )
+            arguments["ref_dirs"] = _reference_directions(partitions, objectives)
             number = len(arguments["ref_dirs"])
             if arguments.get("pop_size", np.inf) < number:
                 raise ValueError(
@@ -229,6 +220,21 @@ class PymooAlgorithm(Algorithm, Table, frozen=True, kw_only=True):
         return algorithm.setup(
             task, termination=("n_eval", problem.evaluations), seed=seed
         )
+
+
+def _reference_directions(partitions: Any, objectives: int) -> Any:
+    """The reference directions for a number of partitions of each objective; directions that the
+    user has stated stay.
+    """
+    from pymoo.util.ref_dirs import get_reference_directions
+
+    if not isinstance(partitions, int):
+        return partitions
+    if math.comb(partitions + objectives - 1, partitions) > MAX_DIRECTIONS:
+        raise ValueError(
+            f"ref_dirs = {partitions} are more than {MAX_DIRECTIONS:,} reference directions"
+        )
+    return get_reference_directions("das-dennis", objectives, n_partitions=partitions)
 
 
 def _settings(population: Any, problem: Problem) -> FloatArray:

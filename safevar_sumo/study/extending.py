@@ -48,25 +48,11 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     Marks of the records say which tables the new study does not inherit. With another weather, the
     new study does not inherit axes of the weather's parameters.
     """
-    # Keys about the scenario of the base are wrong for another scenario.
-    inherited = dict(base.tables)
-    own_keys = keys_with(OF_STUDY, Study)
-    base_model = table_in(base.tables, "scenario").get("model")
-    if table_in(overrides, "scenario").get("model", base_model) != base_model:
-        own_keys += keys_with(OF_SCENARIO, Study)
-    for key in own_keys:
-        inherited.pop(key, None)
-    scenario = inherited.get("scenario")
-    if isinstance(scenario, dict) and "over" in scenario:
-        inherited["scenario"] = _with_axes_for(overrides, scenario)
+    inherited = _inherited(base, overrides)
     tables = _merge(inherited, overrides)
 
     # Keys about a system are wrong for a system with another vehicle, ADS, scenario or weather.
-    parts = []
-    for key in keys_with(PART_OF_SYSTEM, Study):
-        inherited_part = _model_and_network(inherited.get(key))
-        if _model_and_network(tables.get(key)) != inherited_part:
-            parts.append(key)
+    parts = _different_parts(inherited, tables)
     base_keys: tuple[str, ...] = ()
     if parts:
         base_keys += keys_with(OF_SYSTEM, Study)
@@ -81,20 +67,52 @@ def with_overrides(base: StudyTables, overrides: Tables, source: object) -> Stud
     if parts or base.tables.get("title", "") == base.tables.get("name"):
         tables["title"] = overrides.get("title", tables.get("name", ""))
     remarks = base.remarks
-    # Keys of a single study are dropped without a remark, because no study inherits them.
-    named_keys = {*tables, *keys_with(OF_STUDY, Study)}
-    dropped = []
-    for key, value in base.tables.items():
-        if isinstance(value, dict) and key not in named_keys:
-            dropped.append(f"[{key}]")
-    parameters = _scenario_parameters(base.tables) - _scenario_parameters(tables)
-    for name in sorted(parameters):
-        dropped.append(f"{name} of [scenario]")
+    dropped = _dropped_keys(base.tables, tables)
     if parts and dropped:
         differences = " and a different ".join(parts).replace("ads", "ADS")
         of_base = f"than {base.tables.get('name')!r}, so not its {', '.join(dropped)}"
         remarks = (*remarks, f"{source}: has a different {differences} {of_base}")
     return StudyTables(source, tables, base.origin, remarks)
+
+
+def _inherited(base: StudyTables, overrides: Tables) -> dict[str, Any]:
+    """The tables of the base that the new study inherits, before it overrides any."""
+    inherited = dict(base.tables)
+    own_keys = keys_with(OF_STUDY, Study)
+    # Keys about the scenario of the base are wrong for another scenario.
+    base_model = table_in(base.tables, "scenario").get("model")
+    if table_in(overrides, "scenario").get("model", base_model) != base_model:
+        own_keys += keys_with(OF_SCENARIO, Study)
+    for key in own_keys:
+        inherited.pop(key, None)
+    scenario = inherited.get("scenario")
+    if isinstance(scenario, dict) and "over" in scenario:
+        inherited["scenario"] = _with_axes_for(overrides, scenario)
+    return inherited
+
+
+def _different_parts(inherited: Tables, tables: Tables) -> list[str]:
+    """The parts of the system, such as `vehicle`, whose model or network the new study changes."""
+    parts = []
+    for key in keys_with(PART_OF_SYSTEM, Study):
+        inherited_part = _model_and_network(inherited.get(key))
+        if _model_and_network(tables.get(key)) != inherited_part:
+            parts.append(key)
+    return parts
+
+
+def _dropped_keys(base: Tables, tables: Tables) -> list[str]:
+    """The tables and parameters of the base that the new study lacks, as a remark names them."""
+    # Keys of a single study are dropped without a remark, because no study inherits them.
+    named_keys = {*tables, *keys_with(OF_STUDY, Study)}
+    dropped = []
+    for key, value in base.items():
+        if isinstance(value, dict) and key not in named_keys:
+            dropped.append(f"[{key}]")
+    parameters = _scenario_parameters(base) - _scenario_parameters(tables)
+    for name in sorted(parameters):
+        dropped.append(f"{name} of [scenario]")
+    return dropped
 
 
 def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:
@@ -185,8 +203,9 @@ def _merge(base: Tables, overrides: Tables) -> Parameters:
             del result[key]
             continue
         if _refines(key, base.get(key), value):
-            value = _merge(base[key], value)
-        result[key] = value
+            result[key] = _merge(base[key], value)
+        else:
+            result[key] = value
     return result
 
 

@@ -6,7 +6,6 @@ import os
 import re
 import tomllib
 from collections.abc import Mapping
-from itertools import filterfalse
 from pathlib import Path
 from typing import Any
 
@@ -311,9 +310,10 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     # TOML refuses control characters in comments.
     text = SCHEMA_LINE
     for line in comment.splitlines():
-        for character in filterfalse(str.isprintable, line):
-            line = line.replace(character, "?")
-        text += f"# {line}".rstrip() + "\n"
+        legal_line = ""
+        for character in line:
+            legal_line += character if character.isprintable() else "?"
+        text += f"# {legal_line}".rstrip() + "\n"
     text += "\n" + tomli_w.dumps(tables_of(study))
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")

@@ -238,11 +238,10 @@ def _path_text(path: Sequence[str | int]) -> str:
         if isinstance(key, int):
             text += f"[{key}]"
             continue
-        if ("." in key and text) or not key.isprintable():
-            key = repr(key)
         if text:
             text += "."
-        text += key
+        needs_quotes = ("." in key and text) or not key.isprintable()
+        text += repr(key) if needs_quotes else key
     return text
 
 

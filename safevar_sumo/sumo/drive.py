@@ -76,32 +76,19 @@ def drive(
     length = float(world.vehicle_length(VUT))
     nominal = system.nominal._replace(length=length, width=float(world.vehicle_width))
     memory = ads.start(n, nominal, step)
-    weathers = [point.weather for point in points]
-    perception = Perception(weathers, step, group_size)
+    perception = Perception([point.weather for point in points], step, group_size)
     robot = DrivingRobot(points, vehicle, prepared, state, step)
-    is_tested = np.zeros(n, bool)
-    may_go_on = np.zeros(n, bool)
-    last_sample = np.zeros(n, int)
-    for k, point in enumerate(points):
-        group = slice(k * group_size, (k + 1) * group_size)
-        is_tested[group] = point.scenario.is_hit_in_front
-        may_go_on[group] = point.scenario.goes_on
-        last_sample[group] = np.round(last_sample_of(point, step))
+    is_tested, may_go_on, last_sample = _limits_of_runs(points, group_size, step)
     contacts = FirstContacts(n, is_tested)
     outcomes = _Outcomes(n)
-    n_samples = int(last_sample.max()) + 1
-    if may_go_on.any():
-        n_samples += round(OVERTIME / step)
-    log = _Log(world, n_samples)
+    log = _Log(world, _most_samples(last_sample, may_go_on, step))
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.capacity):
             time = sample * step
             speed = motion.speeds
             scene = observer.observe(motion)
-            # An ADS that sees nobody would drive on: a run ends when the vehicle reaches the body.
             if system.sees_nobody:
-                over = scene.over | (scene.gap <= 0)
-                scene = scene._replace(visible=np.array(False), over=over)
+                scene = _unseen(scene)
             collisions = contacts.count(world, motion.hits, scene)
             # SUMO misses contacts in some places, such as between lanes. Contacts with bodies on
             # tracks follow from their geometry, and need no check.
@@ -153,6 +140,58 @@ def drive(
         centre_to_centre=points[0].scenario.centre_to_centre,
         allowed_impact_speed=np.asarray(per_vehicle(allowed_impacts, group_size)),
     )
+
+
+class _RunLimits(NamedTuple):
+    """What the scenarios of N runs say of their contacts and of their end; each has shape (N,).
+
+    Attributes
+    ----------
+    is_tested
+        Whether only contacts with the front of the vehicle count.
+    may_go_on
+        Whether a run goes on at its end while the vehicle closes in on a body.
+    last_sample
+        The number of the last sample.
+    """
+
+    is_tested: BoolArray
+    may_go_on: BoolArray
+    last_sample: IntArray
+
+
+def _limits_of_runs(
+    points: Sequence[Point], group_size: int, step: float
+) -> _RunLimits:
+    """The limits of the runs at K points, of which each has a group of `group_size` runs."""
+    n = group_size * len(points)
+    is_tested = np.zeros(n, bool)
+    may_go_on = np.zeros(n, bool)
+    last_sample = np.zeros(n, int)
+    for k, point in enumerate(points):
+        group = slice(k * group_size, (k + 1) * group_size)
+        is_tested[group] = point.scenario.is_hit_in_front
+        may_go_on[group] = point.scenario.goes_on
+        last_sample[group] = np.round(last_sample_of(point, step))
+    return _RunLimits(is_tested, may_go_on, last_sample)
+
+
+def _most_samples(last_sample: IntArray, may_go_on: BoolArray, step: float) -> int:
+    """The largest number of samples that runs can have, with the extension of those that may go
+    on.
+    """
+    number = int(last_sample.max()) + 1
+    if may_go_on.any():
+        number += round(OVERTIME / step)
+    return number
+
+
+def _unseen(scene: Scene) -> Scene:
+    """The scene of a driving system that sees nobody. This system would drive on: a run ends when
+    the vehicle reaches the body.
+    """
+    over = scene.over | (scene.gap <= 0)
+    return scene._replace(visible=np.array(False), over=over)
 
 
 def _extend_runs(

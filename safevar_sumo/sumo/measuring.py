@@ -72,33 +72,53 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
     named = _Named(lookup, {*RESULT_COLUMNS, *metrics, *study.domains}, computed)
 
     for name in study.metrics.also:
-        if name in METRICS:
-            raise InputError(
-                "",
-                f"metrics.also = {study.metrics.also}: every study has {name!r}",
-                f"{one_of(OPTIONAL_METRICS)}, or package.module:Name",
-            )
-        if named.look_up(name, "metrics.also", metrics).of == "settings":
-            raise InputError(
-                "", f"metrics.also = {name!r} measures settings", "a measure of runs"
-            )
-
+        _add_metric(name, study, named, metrics)
     if (bound := own_criterion(study).bound) is not None:
         measures = OPTIONAL_METRICS | named.computed
         problem = f"{study.unsafe.criterion!r}: there is no metric {bound.measure!r}"
         check_name("", f"{CRITERION_KEY} = {problem}", bound.measure, measures)
         named.computed.setdefault(bound.measure, measures[bound.measure])
 
-    shipped = {**metrics, **OBJECTIVES}
+    objectives = _objectives(study, named, {**metrics, **OBJECTIVES})
+    if IMPACT_EXCESS.name in named.computed:
+        # Sentences about the impact excess state the impact speed, too.
+        named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)
+    of_runs = tuple(
+        measure.facts for measure in named.computed.values() if measure.of == "runs"
+    )
+    return Measuring(
+        named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives))
+    )
+
+
+def _add_metric(
+    name: str, study: Study, named: _Named, metrics: Mapping[str, Measure]
+) -> None:
+    """Look up a metric that a study names in addition. A metric of every study, and a measure of
+    settings, are refused.
+    """
+    if name in METRICS:
+        raise InputError(
+            "",
+            f"metrics.also = {study.metrics.also}: every study has {name!r}",
+            f"{one_of(OPTIONAL_METRICS)}, or package.module:Name",
+        )
+    if named.look_up(name, "metrics.also", metrics).of == "settings":
+        raise InputError(
+            "", f"metrics.also = {name!r} measures settings", "a measure of runs"
+        )
+
+
+def _objectives(
+    study: Study, named: _Named, shipped: Mapping[str, Measure]
+) -> list[Measure]:
+    """Look up the objectives of a study. Two names of one objective are refused."""
     objectives = []
     texts = dict[str, list[str]]()
     for text in study.search.objectives:
         objective = named.look_up(text, OBJECTIVES_KEY, shipped).facts
         objectives.append(objective)
         texts.setdefault(objective.name, []).append(repr(text))
-    if IMPACT_EXCESS.name in named.computed:
-        # Sentences about the impact excess state the impact speed, too.
-        named.computed.setdefault(IMPACT_SPEED.name, IMPACT_SPEED)
     for names in texts.values():
         if len(names) > 1:
             raise InputError(
@@ -106,12 +126,7 @@ def measuring_of(study: Study, lookup: Lookup, *, has_stops: bool) -> Measuring:
                 f"{OBJECTIVES_KEY}: {' and '.join(names)} are the same objective",
                 "each objective once",
             )
-    of_runs = tuple(
-        measure.facts for measure in named.computed.values() if measure.of == "runs"
-    )
-    return Measuring(
-        named.computed, Scoring(metrics=of_runs, objectives=tuple(objectives))
-    )
+    return objectives
 
 
 def own_criterion(study: Study) -> Unsafe:

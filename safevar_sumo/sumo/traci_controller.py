@@ -56,8 +56,8 @@ class TraciController(Ads):
 
     def __init__(self, create: Callable[[], Controller]) -> None:
         self._create = create
-        self._world: SumoWorld
-        self._sensors: Sensors
+        self.world: SumoWorld
+        self.sensors: Sensors
 
     def in_world(self, world: VehicleWorld, sensors: Sensors) -> TraciController:
         """The same controller in a world of SUMO, with the vehicles' sensors as the weather limits
@@ -65,14 +65,14 @@ class TraciController(Ads):
         """
         assert isinstance(world, SumoWorld)
         controller = copy.copy(self)
-        controller._world = world
-        controller._sensors = sensors
+        controller.world = world
+        controller.sensors = sensors
         return controller
 
     def start(self, n: int, nominal: Nominal, step: float) -> _Memory:
-        world = self._world
+        world = self.world
         drivers = []
-        traffic = SensedTraffic(world, self._sensors, step)
+        traffic = SensedTraffic(world, self.sensors, step)
         with substitute_traci():
             for vehicle in range(n):
                 view = TraciView(world, vehicle, traffic)
@@ -116,7 +116,7 @@ class TraciController(Ads):
 
     def _call(self, view: TraciView, function: Callable[..., None]) -> None:
         """Call a function of the user's controller, whose calls of traci go to `view`."""
-        global _active_view
+        global _active_view  # noqa: PLW0603 - controllers call functions of one module
         _active_view = view
         try:
             with user_errors(subject()), np.errstate():

@@ -48,7 +48,8 @@ def started(typed: str, batch: int | None = None, **options: object) -> Process:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
-            preexec_fn=None
+            # Only this test's own thread starts processes.
+            preexec_fn=None  # noqa: PLW1509
             if os.name == "nt"
             else lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
             **options,

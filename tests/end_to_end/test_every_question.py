@@ -65,7 +65,9 @@ def answered(typed: str, *, must: bool = False) -> str:
 
 def assert_one_screen(text: str) -> None:
     """One table, in which no column says the same in each row, and no pairs `key: value`."""
-    rows = [re.split("[│┃]", line)[1:-1] for line in re.findall("^│.*", text, re.M)]
+    rows = [
+        re.split("[│┃]", line)[1:-1] for line in re.findall("^│.*", text, re.MULTILINE)
+    ]
     assert text.count("Valid for: ") <= 1
     assert not re.search(r"^\w+: [^;]*; \w+: [^;]*; \w+: ", text, re.MULTILINE), "pairs"
     assert "More: --details" in text

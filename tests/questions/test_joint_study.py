@@ -183,29 +183,25 @@ def test_a_search_without_a_solution_says_why_and_suggests_nothing_that_is_refus
 
 WORN = {
     "wear": {
-        **{
-            "treadDepth": 5.58,
-            "brakeTorque": 0.88,
-            "brakeResponse": 0.112,
-            "payload": 242,
-        },
-        **{"payloadCentre": 2.2, "sensorRange": 23.8},
+        "treadDepth": 5.58,
+        "brakeTorque": 0.88,
+        "brakeResponse": 0.112,
+        "payload": 242,
+        "payloadCentre": 2.2,
+        "sensorRange": 23.8,
     },
     "sun": {
-        **{
-            "max_rpm": 6404,
-            "dampRateFullT": 0.141,
-            "dampRateZeroT_CE": 1.83,
-            "dampRateZeroT_CD": 0.278,
-        },
-        **{
-            "clutchStrength": 10.42,
-            "mass": 2367.6,
-            "dragCoeff": 0.2,
-            "tireFric": 3.833,
-            "dampRate": 0.215,
-        },
-        **{"radius": 35.39, "maxBrakeTorque": 1466},
+        "max_rpm": 6404,
+        "dampRateFullT": 0.141,
+        "dampRateZeroT_CE": 1.83,
+        "dampRateZeroT_CD": 0.278,
+        "clutchStrength": 10.42,
+        "mass": 2367.6,
+        "dragCoeff": 0.2,
+        "tireFric": 3.833,
+        "dampRate": 0.215,
+        "radius": 35.39,
+        "maxBrakeTorque": 1466,
     },
 }
 """Vehicles within limits that version 0.3 printed, which no corner broke, though each collides in a

@@ -57,7 +57,7 @@ def test_rq1_is_small_where_solutions_are_more_unsafe() -> None:
     assert frame["metric"].tolist() == ["safety_degree", "tet", "tit", "ave_dece"]
     assert frame[
         ["effect_size", "magnitude", "n1", "n2"]
-    ].drop_duplicates().values.tolist() == [[0, "large", 5, 5]]
+    ].drop_duplicates().to_numpy().tolist() == [[0, "large", 5, 5]]
     safer = rq1(made_up(*(row(sd=3, tet=0.5, tit=0.1, ave_dece=7) for _ in range(5))))
     assert safer["effect_size"].tolist() == [1, 1, 1, 1]
 

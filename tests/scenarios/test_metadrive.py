@@ -31,7 +31,7 @@ def test_repeats_are_bit_equal_in_any_order_and_in_a_new_process() -> None:
 
 
 def test_the_page_says_what_the_driver_does(page: str) -> None:
-    rows = re.findall(r"^\| `(\S+) = (\S+)`.* \| (\S+) \|$", page, re.M)
+    rows = re.findall(r"^\| `(\S+) = (\S+)`.* \| (\S+) \|$", page, re.MULTILINE)
     assert rows
     for name, value, degree in rows:
         answer = json_of(f"simulate curve.toml --set {name}={value}")
@@ -48,5 +48,5 @@ def test_the_calls_of_the_page_fit_the_client_of_carla(in_tmp: Path) -> None:
     source = (ROOT / "docs" / "my_carla.py").read_text()
     write("my_carla.py", source.replace(".load_world(", ".load_wurld("))
     printed = api.run(["--strict", "--config-file=", "my_carla.py"])[0]
-    faults = re.findall("^my_carla.*error: (.*?);", printed, re.M)
+    faults = re.findall("^my_carla.*error: (.*?);", printed, re.MULTILINE)
     assert faults == ['"Client" has no attribute "load_wurld"']

@@ -799,7 +799,7 @@ def test_threads_and_exit_functions_of_a_simulator_keep_no_command(
         "--jobs",
         "1",
     ]
-    assert subprocess.run([*command, "--out", "results"], timeout=200).returncode == 0
+    subprocess.run([*command, "--out", "results"], check=True, timeout=200)
     assert Path("results/solutions.csv").exists()
 
 

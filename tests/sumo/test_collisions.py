@@ -182,20 +182,18 @@ def test_the_corners_of_a_car_are_not_cut_off_by_its_shape(tmp_path: Path) -> No
     """
     network = own_network(tmp_path / "pedestrian_crossing", "pedestrian_crossing")
     settings = {
-        **{
-            "max_rpm": 5906.0,
-            "dampRateFullT": 0.145,
-            "dampRateZeroT_CE": 1.0,
-            "dampRateZeroT_CD": 0.3339,
-        },
-        **{
-            "gearSwitchTime": 0.5013,
-            "clutchStrength": 10.39,
-            "mass": 2405.0,
-            "dragCoeff": 0.2784,
-            "tireFric": 1.162,
-        },
-        **{"dampRate": 0.2509, "radius": 35.59, "maxBrakeTorque": 1211.0},
+        "max_rpm": 5906.0,
+        "dampRateFullT": 0.145,
+        "dampRateZeroT_CE": 1.0,
+        "dampRateZeroT_CD": 0.3339,
+        "gearSwitchTime": 0.5013,
+        "clutchStrength": 10.39,
+        "mass": 2405.0,
+        "dragCoeff": 0.2784,
+        "tireFric": 1.162,
+        "dampRate": 0.2509,
+        "radius": 35.59,
+        "maxBrakeTorque": 1211.0,
     }
     expected = simulated("rain", network, settings)
     assert expected.outcome == "collision"

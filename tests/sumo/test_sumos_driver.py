@@ -184,7 +184,7 @@ def test_between_two_actions_sumos_driver_asks_for_what_he_decided(
     """A lag lets through a part of it in the first step, and more in the next ones."""
     vehicle = {
         **NO_DELAYS,
-        "characteristics": {**NO_DELAY, **{"actuatorLag": {"original": 0.2}}},
+        "characteristics": {**NO_DELAY, "actuatorLag": {"original": 0.2}},
     }
     for action in ("0.1", "1"):
         traffic = with_attributes(

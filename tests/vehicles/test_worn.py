@@ -313,7 +313,10 @@ def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(
 @SLOW
 def test_the_shipped_constants_are_what_the_script_prints() -> None:
     printed = subprocess.run(
-        [sys.executable, "calibration/wet_friction.py"], capture_output=True, text=True
+        [sys.executable, "calibration/wet_friction.py"],
+        check=True,
+        capture_output=True,
+        text=True,
     ).stdout
     constants = (Path(wet_road.__file__).parent / "wet_friction.toml").read_text(
         encoding="utf-8"

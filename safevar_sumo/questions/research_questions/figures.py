@@ -380,9 +380,8 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     errors = []
     drawings = {COUNTS_FIGURE: partial(draw_change_counts, cases)}
     for case, (name, draw) in product(cases, FIGURES_OF_ONE_CASE.items()):
-        if len(cases) > 1:
-            name = f"{case.name}-{name}"
-        drawings[name] = partial(draw, case)
+        key = f"{case.name}-{name}" if len(cases) > 1 else name
+        drawings[key] = partial(draw, case)
     for name, draw_figure in drawings.items():
         try:
             figures[name] = draw_figure()
@@ -408,8 +407,7 @@ def save_figures(cases: Sequence[Case], directory: Path) -> None:
     figures = draw_figures(cases)
     make_directory(directory)
     for name, figure in figures.items():
-        if len(cases) == 1:
-            name = f"{cases[0].name}-{name}"
-        file_name = re.sub(r"[^\w.-]", "-", name).strip("-")
+        full_name = f"{cases[0].name}-{name}" if len(cases) == 1 else name
+        file_name = re.sub(r"[^\w.-]", "-", full_name).strip("-")
         for ending in ("png", "pdf"):
             save(figure, directory / f"{file_name}.{ending}", "figures")
