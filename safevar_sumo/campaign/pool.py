@@ -7,6 +7,7 @@ A job is a plain function with its arguments. Both are sent to the worker. `carr
 
 from __future__ import annotations
 
+import logging
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -26,6 +27,7 @@ from safevar_sumo.records import Evaluations, JsonObject
 
 Look = Callable[[Sequence[int]], None]
 """A function that gets the numbers of the jobs that have just ended."""
+LOGGER = logging.getLogger(__name__)
 SECONDS_BETWEEN_LOOKS = 0.5
 """Longest time between two calls of a `Look` [s]."""
 
@@ -152,6 +154,7 @@ class Pool:
             elif cause := self._started[place].cause_of_death(error):
                 self._started.pop(place).end()
                 deaths[number] += 1
+                LOGGER.warning("worker %d was lost in job %d: %s", place, number, cause)
                 if deaths[number] > MAX_DEATHS + (MAX_DEATHS + 1) * self._skipped():
                     raise WorkerLostError(number, cause)
                 waiting.appendleft(number)
@@ -189,6 +192,7 @@ class Pool:
             with suppress(BrokenExecutor):
                 return self._started[place].submit(function, *job)
             self._started.pop(place).end()
+        LOGGER.debug("worker %d of %d starts", place, self.workers)
         self._started[place] = self._start(place)
         return self._started[place].submit(function, *job)
 

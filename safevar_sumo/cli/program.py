@@ -17,6 +17,7 @@ from typing import Any, NoReturn, cast
 
 import click
 
+from safevar_sumo.cli.log import WARNINGS
 from safevar_sumo.errors import (
     INTERRUPT_EXIT_CODE,
     INTERRUPTS,
@@ -205,9 +206,7 @@ def run_command_line() -> None:
     """
     # A warning becomes one line, without its place in the code. A signal to end (SIGTERM) is an
     # interruption like Ctrl-C.
-    warnings.showwarning = lambda message, *_, **__: click.echo(
-        f"warning: {printable(str(message))}", err=True
-    )
+    warnings.showwarning = _show_warning
     if in_main_thread():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     # After a crash of compiled code, Python prints the line of the crash. This fails if standard
@@ -237,6 +236,13 @@ def run_command_line() -> None:
             raise
         _exit_with_error("user code has closed standard output", 1)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    """Print a warning as one line, and log it."""
+    text = printable(str(message))
+    click.echo(f"warning: {text}", err=True)
+    WARNINGS.warning(text)
 
 
 def _error_in_two_lines(error: click.ClickException) -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from safevar_sumo.records import NamedValues
 from safevar_sumo.terminal import Progress
 
+LOGGER = logging.getLogger(__name__)
 OVERRUN = 0.18
 """In a phase with an unknown number of rounds, at least this share of its simulations so far is
 expected to follow, because nobody knows whether a round is the last.
@@ -42,6 +45,8 @@ class Phases:
         """
         self._waiting = 0
         """Number of simulations that the present part still has to do."""
+        self._begun_at = time.monotonic()
+        """The time at which the present phase began [s]."""
 
     def plan(self, settings: NamedValues, points: int = 1) -> None:
         """Plan the phases: `settings` holds the expected number of settings of each phase. A
@@ -105,6 +110,7 @@ class Phases:
         """Begin a phase, if it comes after the present phase."""
         if name not in self._later and self._name:
             return
+        self.log_end()
         planned = 0.0
         while name in self._later:
             planned = self._later.pop(next(iter(self._later)))
@@ -113,6 +119,14 @@ class Phases:
         self._before = self._done
         self._waiting = 0
         self._expected = planned if settings is None else self._points * settings
+
+    def log_end(self) -> None:
+        """Log that the present phase ends, with its simulations and its time."""
+        seconds = time.monotonic() - self._begun_at
+        if self._name:
+            simulations = self._done - self._before
+            LOGGER.info("%s: %d simulations, %.1f s", self._name, simulations, seconds)
+        self._begun_at = time.monotonic()
 
     def expect(self, settings: float) -> None:
         """Expect that `settings` settings follow in the present phase."""
