@@ -192,7 +192,7 @@ class PerVehicleAds(Ads):
         values = np.empty((len(observation), n))
         for row, value in enumerate(observation):
             values[row] = value
-        observations = list(map(Observation._make, values.T.tolist()))
+        observations = [Observation._make(row) for row in values.T.tolist()]
         pedals = [(0.0, 0.0)] * n
         # The driver of a vehicle whose run has ended is not called: the vehicle may be in a state
         # that the driver does not expect.

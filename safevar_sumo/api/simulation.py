@@ -412,7 +412,9 @@ def simulate_with_original(
     runs = drive_all(
         replace(at_point, in_sumo=True),
         settings,
-        lambda values: observations.append(Observation._make(map(np.copy, values))),
+        lambda values: observations.append(
+            Observation._make(np.copy(value) for value in values)
+        ),
     )
     pair = Pair(point, at_point, runs, score(at_point, settings, runs), observations)
 

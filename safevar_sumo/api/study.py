@@ -244,7 +244,7 @@ def directory_name(study: Study) -> str:
     """
     origin = study.origin
     parts = (study.name, "ranges" * origin.ranges, origin.point, origin.up_to)
-    return re.sub(r"[^A-Za-z0-9_.=-]+", "_", "-".join(filter(None, parts)))
+    return re.sub(r"[^A-Za-z0-9_.=-]+", "_", "-".join(part for part in parts if part))
 
 
 def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -> Study:
@@ -254,7 +254,7 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
         name: value for name, value in numbers.items() if value is not None
     }
     if algorithms is not None:
-        names = map(str.strip, algorithms.split(","))
+        names = (name.strip() for name in algorithms.split(","))
         changes["algorithms"] = [search.labels.get(name, name) for name in names]
     return replace_in(study, search=replace_in(search, **changes))
 

@@ -205,7 +205,9 @@ class Unsafe:
         speed of the collision. With repeats, the worst run counts.
         """
         repeats = self._repeats(evaluations)
-        return np.asarray(np.min(list(map(self._robustness, repeats)), axis=0))
+        return np.asarray(
+            np.min([self._robustness(repeat) for repeat in repeats], axis=0)
+        )
 
     def _robustness(self, evaluations: Evaluations) -> FloatArray:
         """The robustness of evaluations that are not repeated."""

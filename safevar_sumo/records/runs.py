@@ -239,7 +239,7 @@ class SimulationRuns:
             if isinstance(value, Trace):
                 return value.of(vehicles)
             if isinstance(value, Encounter | Contact):
-                return type(value)(*map(select, value))
+                return type(value)(*(select(item) for item in value))
             if isinstance(value, Mapping):
                 return {name: select(item) for name, item in value.items()}
             if np.ndim(value):

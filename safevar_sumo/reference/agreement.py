@@ -94,7 +94,9 @@ def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
     measures = table.loc[
         table["metric"] == SAFETY_DEGREE, ["spearman", "mean_absolute_error", "bias"]
     ]
-    order, error, bias = map(two_decimals, measures.to_numpy(float)[0])
+    order, error, bias = (
+        two_decimals(measure) for measure in measures.to_numpy(float)[0]
+    )
     verdict = (
         f"The safety degrees of {numbers['rows']} vehicles have a rank correlation of {order} with"
         f" the published data (mean error {error} m, bias {bias} m)."

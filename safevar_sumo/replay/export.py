@@ -355,7 +355,7 @@ def write_files(
         files[SCENARIO] = template.render(
             title=f"{comparison.title}, {handle}: {comparison.verdict(comparison.rows[-1])}",
             road=ROAD,
-            actors=[ego, *map(_with_next_place, actors)],
+            actors=[ego, *(_with_next_place(actor) for actor in actors)],
             end=float(ego.time[-1]),
             wheelbase=WHEELBASE,
         )

@@ -139,7 +139,7 @@ def _points(system: System, setting: FloatArray) -> tuple[AnswerTable, list[str]
     the points at which a setting fails.
     """
     results = list(simulate_all_points(system, setting[None]))
-    records = map(point_record, results)
+    records = (point_record(result) for result in results)
     # A contact is a record in a record: its side and its place become columns.
     points = pd.DataFrame([{**row, **row.get("contact", {})} for row in records])
     worst = np.argsort(points[SAFETY_DEGREE], kind="stable").tolist()
@@ -227,5 +227,5 @@ def _remarks_of(system: System) -> list[str]:
         *remarks,
         *without_effect(system),
         *vehicle_remarks(system),
-        *filter(None, [pre_crash]),
+        *([pre_crash] if pre_crash else []),
     ]

@@ -185,7 +185,9 @@ class Packed:
         # A question must neither write a file nor take for ever.
         words = split(" ".join(self.packed.questions).replace("=", " "))
         numbers = [int(word) for word in words if WHOLE_NUMBER.fullmatch(word.strip())]
-        total = sum(map(abs, [*numbers, *self.packed.simulations.values()]))
+        total = sum(
+            abs(number) for number in [*numbers, *self.packed.simulations.values()]
+        )
         if total > MAX_ASKED:
             raise InputError(
                 "ask",
@@ -197,7 +199,9 @@ class Packed:
                 raise InputError(
                     "ask", f"{text!r} writes a file", "a question without --out"
                 )
-        named = list(filter(None, map(list_in, self.packed.questions)))
+        named = [
+            name for question in self.packed.questions if (name := list_in(question))
+        ]
         packed = [name for name in self.files if name.startswith(f"{LISTS}/")]
         if sorted(named) != sorted(packed):
             raise ValueError(
@@ -449,7 +453,7 @@ def count_outcomes(case: Case) -> dict[str, int]:
     runs = pd.MultiIndex.from_frame(case.evaluations[["algorithm", "run"]])
     outcomes = case.evaluations["outcome"][runs.isin(case.finished_runs)]
     counts = outcomes.value_counts(sort=False).sort_index()
-    return dict(zip(map(str, counts.index), counts.tolist(), strict=True))
+    return dict(zip((str(name) for name in counts.index), counts.tolist(), strict=True))
 
 
 def count_solutions(solutions: pd.DataFrame, runs: Sequence[RunName]) -> list[int]:
@@ -458,7 +462,7 @@ def count_solutions(solutions: pd.DataFrame, runs: Sequence[RunName]) -> list[in
     """
     counts = Counter(zip(solutions["algorithm"], solutions["run"], strict=True))
     distinct = solutions.drop_duplicates()
-    return [*map(counts.__getitem__, runs), len(solutions), len(distinct)]
+    return [*(counts[run] for run in runs), len(solutions), len(distinct)]
 
 
 def compare_claim(study: str, claim: Claim) -> tuple[str, ...]:

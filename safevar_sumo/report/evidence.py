@@ -141,7 +141,7 @@ def evidence(
 
     command = f"evidence {results} {ask} {unsafe}"
     workers = {"jobs": jobs, "cluster": cluster}
-    directories = dict.fromkeys(map(Path, results))
+    directories = dict.fromkeys(Path(result) for result in results)
     studies = []
     files = {}
     with open_progress(progress) as show, keep_simulations(command, fresh=fresh):
@@ -266,7 +266,7 @@ def _files_of_user(
         path_beside = os.path.abspath(Path(places[0], name))
         if not Path(path_beside).is_relative_to(places[0]):
             outside.append(path_beside)
-    for name in [*outside, *filter(os.path.isabs, names)]:
+    for name in [*outside, *(name for name in names if os.path.isabs(name))]:
         raise InputError(
             name,
             "lies outside the study's folders, so that no pack can hold it",
@@ -287,9 +287,11 @@ def _files_of_user(
     modules = [
         text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]
     ]
-    folders = list(filter(None, (*places, os.getcwd(), *sys.path)))
+    folders = [folder for folder in (*places, os.getcwd(), *sys.path) if folder]
     for path in code_files(modules, places):
-        folder = max(filter(path.is_relative_to, folders), key=len)
+        folder = max(
+            (folder for folder in folders if path.is_relative_to(folder)), key=len
+        )
         paths[path.relative_to(folder).as_posix()] = path
     return {f"{CODE}/{name}": path.read_bytes() for name, path in sorted(paths.items())}
 
@@ -393,7 +395,7 @@ def verify(
     return Answer(
         question="verify",
         study=next(iter(studies.values())).case.study,
-        verdict=Verdict(map(answer, sentences)),
+        verdict=Verdict(answer(sentence) for sentence in sentences),
         numbers={
             "passed": counts[SAME] + counts[UNCHECKED] == number,
             "sha256": digest_of(path),

@@ -207,10 +207,11 @@ def read_pack(path: Path) -> tuple[Description, FileContents]:
         if described.versions.get(name) != present[name]
     ]
     if changed:
+        versions = [f"{name} {version}" for name, version in present.items()]
         raise InputError(
             path,
             f"was made with {', '.join(changed)}",
-            f"a pack of this version: {', '.join(map(' '.join, present.items()))}",
+            f"a pack of this version: {', '.join(versions)}",
         )
     return described, files
 

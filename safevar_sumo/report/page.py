@@ -171,7 +171,9 @@ def report(
     ):
         by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
         questions = (
-            [alone] * len(cases) if ask else list(map(usual_questions, by_criterion))
+            [alone] * len(cases)
+            if ask
+            else [usual_questions(unsafe) for unsafe in by_criterion]
         )
         texts_of = list(map(with_speed_part, questions, by_criterion))
         texts = [*chain(*texts_of), *joint]
@@ -236,7 +238,7 @@ def _cases_asked_about(
     if point is not None:
         cases = [case_at(case, point) for case in cases]
     if quick:
-        return list(map(with_own_set, cases))
+        return [with_own_set(case) for case in cases]
     return list(cases)
 
 
@@ -339,7 +341,7 @@ def make_page(
 ) -> str:
     """The HTML of the page about studies; `shared` are the answers about all studies together."""
     names = ", ".join(study.case.name for study in studies)
-    commands = list(chain(*map(page_commands, studies)))
+    commands = list(chain(*(page_commands(study) for study in studies)))
     for answer in shared:
         if answer.command:
             commands.append((f"The answer {answer.question}", answer.command))

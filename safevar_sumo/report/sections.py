@@ -122,7 +122,7 @@ class ReportedStudy:
     def chosen_solutions(self) -> pd.DataFrame:
         """The rows of the solutions in `choices`, by their handles."""
         solutions = self.case.solutions
-        handles = pd.Index(map(str, handles_of(solutions)))
+        handles = pd.Index(str(handle) for handle in handles_of(solutions))
         return solutions.set_index(handles).loc[list(self.choices)]
 
     @property
@@ -153,14 +153,14 @@ def tested(study: ReportedStudy) -> Answer:
     facts = attrgetter(
         "name", "unit", "original", "lower", "upper", "threshold", "words"
     )
-    rows = map(facts, case.characteristics)
+    rows = (facts(item) for item in case.characteristics)
     remarks = [*case.remarks, *vehicle_remarks(study.system)]
     sentences = [*models, _scenario(study), *counted_in_words(case.study)]
     sentences += [_search(study), pre_crash_sentence(study.system.points)]
     return Answer(
         question="what was tested",
         study=case.study,
-        verdict=Verdict(map(answer, sentences)),
+        verdict=Verdict(answer(sentence) for sentence in sentences),
         numbers={},
         tables={
             "characteristics": tabulate(
@@ -297,7 +297,7 @@ def trust(study: ReportedStudy) -> Answer:
     return Answer(
         question="limits and trust",
         study=case.study,
-        verdict=Verdict(map(answer, sentences)),
+        verdict=Verdict(answer(sentence) for sentence in sentences),
         numbers={},
         tables=tables,
     )

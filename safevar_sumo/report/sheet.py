@@ -111,7 +111,7 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         "reasons": reasons,
         "vehicle": name_and_sentence(VEHICLES, limits.study.vehicle.model),
         "ads": name_and_sentence(ADS, limits.study.ads.model),
-        "tests": list(map(_tests_in_words, tests)),
+        "tests": [_tests_in_words(test) for test in tests],
         "road": road,
         "in_ranges": ranges,
         "command": limits.command,
@@ -173,7 +173,7 @@ def with_answers(
     about the greatest speed of vehicles within these limits, because the sheet states this speed
     even if nobody asked for it.
     """
-    study = replace(study, answers=list(map(ask, questions)))
+    study = replace(study, answers=[ask(question) for question in questions])
     values = speed_values(study)
     if not values:
         return study

@@ -117,7 +117,7 @@ def answer_about(  # noqa: PLR0913 - options of the command `report`
                 f"{len(question.others) + 1} results directories",
             )
         command = question.command_line(
-            list(map(str, directories)), {"point": point}, options
+            [str(directory) for directory in directories], {"point": point}, options
         )
         answer = question.answer(
             cases,

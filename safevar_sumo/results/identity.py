@@ -106,7 +106,7 @@ def _without_ranges(tables: Tables) -> JsonObject:
     if matrix := tables.get("matrix"):
         result["matrix"] = dict(matrix)
         if tests := matrix.get("tests"):
-            result["matrix"]["tests"] = list(map(lists, tests))
+            result["matrix"]["tests"] = [lists(test) for test in tests]
     if constraints := result.pop("constraints", None):
         names = tables["vehicle"]["characteristics"].keys()
         constraints = [item for item in constraints if item["sum"].keys() <= names]

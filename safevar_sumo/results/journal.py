@@ -368,7 +368,7 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
     """The batch of evaluations in a line. Raises an error if a column is missing or wrong, or if
     columns have different lengths.
     """
-    if len(set(map(len, line.values()))) > 1:
+    if len({len(value) for value in line.values()}) > 1:
         raise ValueError
     columns = {
         name: np.array(values, float)
@@ -376,16 +376,16 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
         if name not in (POSITION, OUTCOME, REASON, POINT)
     }
     # Each `pop` takes a column that is no metric: the columns that remain are metrics.
-    settings = np.stack(list(map(columns.pop, characteristics)), axis=1)
+    settings = np.stack([columns.pop(name) for name in characteristics], axis=1)
     reasons = zip(
-        map(np.ndarray.tobytes, settings),
+        (setting.tobytes() for setting in settings),
         line.get(REASON, [None] * len(settings)),
         strict=True,
     )
     worst_points = None
     if POINT in line:
         worst_points = np.array(line[POINT], np.intp)
-    speed, f_diff, f_num_diff = map(columns.pop, FIXED_COLUMNS)
+    speed, f_diff, f_num_diff = (columns.pop(name) for name in FIXED_COLUMNS)
     return Evaluations(
         settings=settings,
         outcome=np.array(line[OUTCOME], "U16"),

@@ -165,7 +165,7 @@ def handles_of(solutions: pd.DataFrame) -> list[SolutionId]:
 
     runs = solutions.get("run", pd.Series(0, index=solutions.index))
     rows = solutions.groupby([solutions["algorithm"], runs], sort=False).cumcount()
-    columns = map(str, solutions["algorithm"]), runs, rows
+    columns = (str(algorithm) for algorithm in solutions["algorithm"]), runs, rows
     return list(starmap(SolutionId, zip(*columns, strict=True)))
 
 

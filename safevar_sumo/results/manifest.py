@@ -216,5 +216,6 @@ def folders_of(directory: Path, manifest: JsonObject) -> tuple[str, ...]:
     """
     base = directory.resolve()
     folders = [os.path.abspath(base / folder) for folder in manifest.get("folders", ())]
-    places = [*filter(os.path.isdir, folders), *map(str, base.parents[:2])]
+    places = [folder for folder in folders if os.path.isdir(folder)]
+    places += [str(parent) for parent in base.parents[:2]]
     return tuple(dict.fromkeys(places))

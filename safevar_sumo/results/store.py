@@ -184,7 +184,7 @@ def stored_journals(
     search = study["search"]
     characteristics = list(convert_table(study, Study).domains)
     digest = identity_digest(manifest)
-    labels = dict.fromkeys(map(label_of, search["algorithms"]))
+    labels = dict.fromkeys(label_of(algorithm) for algorithm in search["algorithms"])
     for algorithm, run in product(labels, range(search["runs"])):
         name = run_name(algorithm, run)
         path = journal_file(directory, name)

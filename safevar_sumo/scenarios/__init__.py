@@ -149,7 +149,9 @@ def pre_crash_sentence(points: Iterable[Point]) -> str:
     type.
     """
     points = tuple(points)
-    types = dict.fromkeys(filter(None, (point.scenario.pre_crash for point in points)))
+    types = dict.fromkeys(
+        point.scenario.pre_crash for point in points if point.scenario.pre_crash
+    )
     light = " and ".join(dict.fromkeys(f"by {point.weather.light}" for point in points))
     if not types:
         return ""

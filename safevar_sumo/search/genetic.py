@@ -8,7 +8,7 @@ import random
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
-from itertools import compress, filterfalse
+from itertools import compress
 from operator import attrgetter
 from threading import Lock
 from typing import Annotated
@@ -109,7 +109,7 @@ class Nsga2(Algorithm, Table, frozen=True, kw_only=True):
             generation = problem.uniform(
                 min(problem.population, problem.evaluations), rng
             )
-        offspring = list(map(Individual, generation.tolist()))
+        offspring = [Individual(setting) for setting in generation.tolist()]
         survivors = Individuals()
         used = 0
 
@@ -208,9 +208,8 @@ class Reproduction:
             self._misses = 0
         if self._misses > MAX_MISSES:
             self._misses = 0
-            return list(
-                map(Individual, self._problem.repaired(np.array(children)).tolist())
-            )
+            settings = self._problem.repaired(np.array(children))
+            return [Individual(setting) for setting in settings.tolist()]
         return list(compress(children, feasible))
 
 
@@ -247,15 +246,15 @@ def select_survivors(individuals: Individuals, number: int) -> Individuals:
     violations (constrained domination, Deb et al. 2002). Each infeasible individual has a rank of
     its own.
     """
-    by_violation = attrgetter("violation")
-    infeasible = sorted(filter(by_violation, individuals), key=by_violation)
+    feasible: list[Individual] = []
+    infeasible: list[Individual] = []
+    for individual in individuals:
+        group = infeasible if individual.violation else feasible
+        group.append(individual)
+    infeasible.sort(key=attrgetter("violation"))
     for place, individual in enumerate(infeasible):
         individual.standing = len(individuals) + place, 0.0
-    best_first = sorted(
-        filterfalse(by_violation, individuals),
-        key=attrgetter("fitness.wvalues"),
-        reverse=True,
-    )
+    best_first = sorted(feasible, key=attrgetter("fitness.wvalues"), reverse=True)
     best = []
     for rank, front in enumerate(sort_into_fronts(best_first)):
         tools.emo.assignCrowdingDist(front)

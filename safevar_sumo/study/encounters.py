@@ -420,10 +420,10 @@ class StudyEncounters(Table, frozen=True, kw_only=True):
             for name in self.ranges_of(test):
                 if name in test.over:
                     domains[name] = []
-        for alternatives in map(self.ranges_of, self._tests_or_none):
-            for name, domain in alternatives.items():
+        for test_or_none in self._tests_or_none:
+            for name, domain in self.ranges_of(test_or_none).items():
                 domains.setdefault(name, []).append(domain)
-        return dict(zip(domains, map(_widest, domains.values()), strict=True))
+        return {name: _widest(ranges) for name, ranges in domains.items()}
 
     def points_of(self, test: MatrixTest) -> list[MatrixTest]:
         """Split a test into tests of a single test case: one test for each combination of its

@@ -290,7 +290,7 @@ class Study(StudyEncounters, frozen=True, kw_only=True):
         check_variation(self.domains, self.variation)
         check_limits(rows, self.limits, table="limits.")
         check_unmeasured(rows, self.unmeasured_values)
-        lengths = {*map(len, self.spread.values())}
+        lengths = {len(values) for values in self.spread.values()}
         if len(lengths) > 1 or 0 in lengths:
             raise InputError(
                 "",
@@ -366,7 +366,7 @@ def _without_defaults(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _without_defaults(item) for key, item in value.items()}
     if isinstance(value, list):
-        return list(map(_without_defaults, value))
+        return [_without_defaults(item) for item in value]
     if not isinstance(value, Table):
         return value
     config = value.__struct_config__

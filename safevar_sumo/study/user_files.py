@@ -78,7 +78,9 @@ def data_files(study: Study) -> dict[str, str]:
     ):
         for name in names:
             candidates = (Path(place, name) for place in places)
-            path = next(filter(Path.exists, candidates), None)
+            path = next(
+                (candidate for candidate in candidates if candidate.exists()), None
+            )
             if path is None:
                 raise InputError(
                     study.source,

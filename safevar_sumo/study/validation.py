@@ -115,7 +115,7 @@ def _mistake(raw: Any, table: Any, prefix: Sequence[str], message: str) -> Input
         return _missing_key(place, field[1])
     if problem.startswith("Invalid enum value"):
         return unknown_name(
-            "", place.text, place.value, filter(None, get_args(place.kind))
+            "", place.text, place.value, (name for name in get_args(place.kind) if name)
         )
     # The value belongs to the key that names the kind of table, such as `distribution`.
     if problem.startswith("Invalid value"):
@@ -200,7 +200,7 @@ def _intended_type(kind: Any, value: Any) -> Any:
         is_table = _is_record(member) or get_origin(member) is dict
         if member is not NoneType and is_table == isinstance(value, dict):
             kinds.append(member)
-    for record in filter(_is_record, kinds):
+    for record in (kind for kind in kinds if _is_record(kind)):
         config = record.__struct_config__
         if value.get(config.tag_field or "") == config.tag:
             return record

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import reduce
-from operator import itemgetter
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -83,8 +82,10 @@ class Body(NamedTuple):
         """Join M bodies into columns: `middle` and `along` have the shape (M, 2), the other columns
         have the shape (M,).
         """
-        columns = map(itemgetter, range(len(cls._fields)))
-        return cls._make(np.array(list(map(column, bodies))) for column in columns)
+        columns = []
+        for field in range(len(cls._fields)):
+            columns.append(np.array([body[field] for body in bodies]))
+        return cls._make(columns)
 
 
 class BodyPairs(NamedTuple):

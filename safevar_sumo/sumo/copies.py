@@ -130,7 +130,7 @@ def write_demand(roots: Sequence[ElementTree.Element], n: int, file: Path) -> No
         for time, text in traffics[copy % len(roots)]:
             departures.append((time, text.replace(_COPY_PLACEHOLDER, str(copy))))
     departures.sort(key=itemgetter(0))
-    _write(roots[0], map(itemgetter(1), departures), file)
+    _write(roots[0], (element for _, element in departures), file)
 
 
 def _departures(root: ElementTree.Element) -> Iterable[tuple[float, str]]:
@@ -174,7 +174,7 @@ def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:
                 ", ".join(ids),
             )
         for name in set(ids[part.tag]) & part.attrib.keys():
-            marked_ids = map(_marked_id, part.attrib[name].split())
+            marked_ids = (_marked_id(name) for name in part.attrib[name].split())
             part.set(name, " ".join(marked_ids))
     return ElementTree.tostring(element, encoding="unicode")
 

@@ -96,7 +96,7 @@ def _check_corners(study: Study, point: Point, ranges: Domains) -> None:
     corners = [dict(zip(ranges, corner, strict=True)) for corner in product(*ends)]
     constraints = (*study.shared_constraints, *point.constraints)
     for constraint in constraints:
-        corners = list(filter(constraint.allows, corners))
+        corners = [corner for corner in corners if constraint.allows(corner)]
     try:
         scenarios = [encounter(point, corner).scenario for corner in corners]
         if scenarios and scenarios[0].mover.has("roads"):

@@ -204,7 +204,11 @@ def own_options(stated: Mapping[str, str]) -> dict[str, str]:
     """The options that overrule the options `stated` by a network's file: `OWN_OPTIONS`, and no
     file for each option that names a file to write.
     """
-    return OWN_OPTIONS | dict.fromkeys(filter(OUTPUT.fullmatch, stated), NO_FILE)
+    options = dict(OWN_OPTIONS)
+    for option in stated:
+        if OUTPUT.fullmatch(option):
+            options[option] = NO_FILE
+    return options
 
 
 def step_of(stated: Mapping[str, str]) -> float:

@@ -163,7 +163,9 @@ def _points_of(
             _check_listed(
                 {**table.parameters, **dict.fromkeys(ranges, None)}, constraints
             )
-        (weather,) = map(weather_of, alone.weathers or [study.weather])
+        (weather,) = (
+            weather_of(weather) for weather in alone.weathers or [study.weather]
+        )
         words = [test.name, *(f"{key} {value}" for key, value in over.items())]
         words += [weather.name] if scenario.mover.has("weather") else []
         parameters = {"test": test.name, **over, "weather": weather.name}

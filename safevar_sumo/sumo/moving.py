@@ -220,7 +220,7 @@ def _joined(tracks: Sequence[Track], width: int) -> Track:
     columns = []
     for values in zip(*(track[2:] for track in tracks), strict=True):
         parts = [np.atleast_2d(np.asarray(value, float)) for value in values]
-        length = max(map(len, parts))
+        length = max(len(part) for part in parts)
         widened = [
             np.broadcast_to(part, (length, max(width, part.shape[1]))) for part in parts
         ]

@@ -179,7 +179,7 @@ def _sources_of(file: Path) -> list[str]:
     names = list[str]()
     for option, value in options_in(file).items():
         if SOURCE_OPTION.fullmatch(option):
-            names += map(str.strip, value.split(","))
+            names += (name.strip() for name in value.split(","))
     return names
 
 

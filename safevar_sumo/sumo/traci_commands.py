@@ -209,7 +209,7 @@ class CommandedSpeed:
                 )
 
         # Random results could not be repeated, and the vehicle models know only one lane.
-        value, *durations = map(float, values)
+        value, *durations = (float(value) for value in values)
         if name == "setImperfection" and value:
             raise InputError(
                 "traci.vehicle.setImperfection",

@@ -65,7 +65,7 @@ def refused(domain: str, name: str, problem: str) -> InputError:
     """The error for a call that a controller must not make. `domain` is "" for a function of the
     module traci itself.
     """
-    function = ".".join(filter(None, ("traci", domain, name)))
+    function = ".".join(part for part in ("traci", domain, name) if part)
     if function == "traci.vehicle.setType":
         return InputError(
             function,
@@ -370,7 +370,8 @@ class TraciView:
         if domain not in SENSED:
             return tuple(
                 dict.fromkeys(
-                    map(_original_ids, getattr(self._api, domain).getIDList())
+                    _original_ids(name)
+                    for name in getattr(self._api, domain).getIDList()
                 )
             )
         ids = [VUT] if domain == "vehicle" else []
@@ -406,7 +407,7 @@ class TraciView:
         """
         functions = {_constant(name): function for name, function in VARIABLES.items()}
         if requested is None:
-            requested = map(_constant, DEFAULT_VARIABLES)
+            requested = (_constant(name) for name in DEFAULT_VARIABLES)
         variables = {}
         for number in requested:
             if functions.get(number) not in CALLS[domain]:
@@ -455,7 +456,7 @@ def _original_ids(value: Value) -> Value:
         return re.sub(r"^([:!]?)\d+\.", r"\1", value)
     # TraCI's own classes derive from tuple, but have other constructors: they stay as they are.
     if type(value) in (list, tuple):
-        return type(value)(map(_original_ids, value))
+        return type(value)(_original_ids(item) for item in value)
     return value
 
 

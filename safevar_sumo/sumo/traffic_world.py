@@ -119,7 +119,7 @@ class TrafficWorld(SumoWorld):
         self._move_person = function_of(api, "person", "moveToXY")
         self._move_vehicle = function_of(api, "vehicle", "moveToXY")
         self._set_previous_speed = function_of(api, "vehicle", "setPreviousSpeed")
-        self._routes = list(map(api.vehicle.getRoute, self.ids(VUT)))
+        self._routes = [api.vehicle.getRoute(name) for name in self.ids(VUT)]
         self._edges = [str(route[0]) for route in self._routes]
         """The edges on which the vehicles under test depart."""
 
@@ -190,7 +190,9 @@ class TrafficWorld(SumoWorld):
         ends.
         """
         for actor in self._actors:
-            places = map(self._of_copies, (actor.x, actor.y, actor.angle))
+            places = (
+                self._of_copies(values) for values in (actor.x, actor.y, actor.angle)
+            )
             placed = zip(actor.ids, self._edges, *places, strict=True)
             if actor.is_person:
                 for id_, edge, x, y, angle in placed:
@@ -225,8 +227,10 @@ class TrafficWorld(SumoWorld):
             get_position = self._get_position
             if actor.is_person:
                 get_position = self._get_person_position
-            expected = np.stack(list(map(self._at_copies, (actor.x, actor.y))), axis=1)
-            actual = np.array(list(map(get_position, actor.ids)))
+            expected = np.stack(
+                [self._at_copies(values) for values in (actor.x, actor.y)], axis=1
+            )
+            actual = np.array([get_position(name) for name in actor.ids])
             places[f"actor {actor.track.name!r}"] = expected, actual
         for name, (expected, actual) in places.items():
             distances = np.abs(actual - expected)

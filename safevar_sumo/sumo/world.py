@@ -108,8 +108,10 @@ class SumoWorld:
                 self._set(vehicletype.setTau, types.tau)
         emergency_decel = decel
         if keeps_drivers:
-            decel = np.array(list(map(vehicletype.getDecel, ids)))
-            emergency_decel = np.array(list(map(vehicletype.getEmergencyDecel, ids)))
+            decel = np.array([vehicletype.getDecel(name) for name in ids])
+            emergency_decel = np.array(
+                [vehicletype.getEmergencyDecel(name) for name in ids]
+            )
         self._set_decelerations(
             np.maximum(decel, INSERTION_DECELERATION),
             np.maximum(emergency_decel, INSERTION_DECELERATION),
@@ -172,8 +174,8 @@ class SumoWorld:
         self._speeds = self._speeds.copy()
         self._fronts = self._fronts.copy()
         copies = list(self.driving.values())
-        self._speeds[copies] = list(map(self._get_speed, self.driving))
-        self._fronts[copies] = list(map(self._get_position, self.driving))
+        self._speeds[copies] = [self._get_speed(name) for name in self.driving]
+        self._fronts[copies] = [self._get_position(name) for name in self.driving]
         return VehicleStates(self._fronts, self._speeds, self._hits(is_open))
 
     def _hits(self, is_open: BoolArray) -> Hits:
@@ -246,13 +248,13 @@ class SumoWorld:
     def vehicle_positions(self, actor: str) -> FloatArray:
         if actor == VUT:
             return self._fronts
-        return np.array(list(map(self._get_position, self.ids(actor))))
+        return np.array([self._get_position(name) for name in self.ids(actor)])
 
     def person_positions(self, actor: str) -> FloatArray:
         ids = self.ids(actor)
         copies = list(self.driving.values())
         try:
-            positions = np.array(list(map(self._get_person_position, ids)))
+            positions = np.array([self._get_person_position(name) for name in ids])
         # A person has left the road in a copy: ask SUMO only where a vehicle is still driving.
         except self.api.TraCIException:
             positions = self._persons.get(actor, np.zeros((self.n, 2))).copy()

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
 from numbers import Real
-from operator import attrgetter
 from typing import Any
 
 import msgspec
@@ -77,7 +76,7 @@ class Characteristic:
         counterpart = ""
         if self.counterpart:
             counterpart = f"counterpart: {self.counterpart}"
-        return "; ".join(filter(None, (self.meaning, counterpart)))
+        return "; ".join(text for text in (self.meaning, counterpart) if text)
 
     @property
     def is_for_workshop(self) -> bool:
@@ -289,7 +288,7 @@ class CharacteristicSet:
         """The columns of this set, shape (N, n), in settings of a larger set of `characteristics`,
         shape (N, m).
         """
-        return settings[:, list(map(characteristics.names.index, self.names))]
+        return settings[:, [characteristics.names.index(name) for name in self.names]]
 
     def with_original_vehicle(self, settings: FloatArray) -> FloatArray:
         """The settings of the original vehicle in the encounters of `settings`; both have the shape
@@ -331,7 +330,9 @@ class CharacteristicSet:
 
     def _column(self, attribute: str) -> FloatArray:
         """One attribute of all characteristics as a read-only array, shape (n,)."""
-        values = np.array(list(map(attrgetter(attribute), self.members)), float)
+        values = np.array(
+            [getattr(member, attribute) for member in self.members], float
+        )
         values.flags.writeable = False
         return values
 

@@ -36,7 +36,8 @@ RPM_PER_RAD_S = np.array(30 / math.pi)  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
 WHEELS = 4
 GEAR_RATIOS = np.array([4.17, 3.14, 2.11, 1.67, 1.28, 1.0, 0.84, 0.67])  # VehicleSMI
-FIRST_GEAR, LAST_GEAR = map(np.array, (1.0, len(GEAR_RATIOS)))
+FIRST_GEAR = np.array(1.0)
+LAST_GEAR = np.array(float(len(GEAR_RATIOS)))
 FINAL_RATIO = np.array(2.56)  # VehicleSMI
 SHIFT_DELAY = np.array(0.7)  # s, minimum time between two shifts; VehicleSMI
 # Engine speeds above and below which the gearbox shifts, over maxRpm (assumption).
@@ -48,13 +49,15 @@ RPM_RATE = 20.0
 TRACTION_START = 1 - 0.675
 # N m/s, rate at which the allowed torque rises and falls; VehicleSMI, at 50 Hz.
 TRACTION_RATE = 6.75 / 0.02
-AIR_DRAG, DOWNFORCE = map(np.array, (1.0, 2.0))  # N s^2/m^2; VehicleSMI
+AIR_DRAG = np.array(1.0)  # N s^2/m^2; VehicleSMI
+DOWNFORCE = np.array(2.0)  # N s^2/m^2; VehicleSMI
 # Forward friction of Unity's WheelCollider over slip: it rises to an extremum at PEAK_SLIP, and
 # falls to an asymptote, SLIDING_FRICTION of the extremum, at SLIDING_SLIP.
-PEAK_SLIP, SLIDING_SLIP, SLIDING_FRICTION = map(np.array, (0.4, 0.8, 0.5))
-SLIDING_RANGE, FRICTION_LOSS = map(
-    np.array, (SLIDING_SLIP - PEAK_SLIP, 1 - SLIDING_FRICTION)
-)
+PEAK_SLIP = np.array(0.4)
+SLIDING_SLIP = np.array(0.8)
+SLIDING_FRICTION = np.array(0.5)
+SLIDING_RANGE = np.array(SLIDING_SLIP - PEAK_SLIP)
+FRICTION_LOSS = np.array(1 - SLIDING_FRICTION)
 FRICTION = 1.0  # at the extremum
 # m/s, smallest speed by which a slip speed is divided (assumption, as in PhysX).
 SLIP_FLOOR = np.array(4.0)

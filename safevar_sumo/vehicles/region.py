@@ -100,7 +100,7 @@ class FeasibleRegion:
         return bool(self.bounds)
 
     def __str__(self) -> str:
-        return "; ".join(map(str, self.bounds))
+        return "; ".join(str(bound) for bound in self.bounds)
 
     def violation(self, settings: FloatArray) -> FloatArray:
         """The sum of a setting's violations of all constraints, shape (N,); 0 if it is feasible. A
@@ -173,7 +173,7 @@ class FeasibleRegion:
         batches = [np.zeros((0, len(self.characteristics)))]
         draws = 0
         while (
-            shortage := number - sum(map(len, batches))
+            shortage := number - sum(len(batch) for batch in batches)
         ) and draws < REJECTIONS * number:
             # If few settings are feasible, each batch doubles the number of draws.
             settings = draw(max(shortage, min(draws, LARGEST_DRAW)))
