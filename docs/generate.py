@@ -18,13 +18,14 @@ from msgspec.inspect import type_info
 
 from safevar_sumo import ads
 from safevar_sumo.ads import ADS
-from safevar_sumo.cli.command import COMMON_NAMES
-from safevar_sumo.cli.program import COMMANDS_BY_GROUP, commands
+from safevar_sumo.cli.command import COMMON_NAMES, ENDED_OPTIONS
+from safevar_sumo.cli.program import COMMANDS_BY_GROUP, ENDED_COMMANDS, commands
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, PUBLISHED_SCORING
 from safevar_sumo.results import FILES
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study, study_names
+from safevar_sumo.study.file import ENDED_KEYS, ENDED_STUDIES
 from safevar_sumo.vehicles import VEHICLES
 
 DOCS = Path(__file__).parent
@@ -341,6 +342,22 @@ def published_systems() -> str:
     )
 
 
+def ended() -> str:
+    """What earlier releases had, and what replaces it, as the refusals of commands say it."""
+    kinds = {
+        "command or option": {**ENDED_COMMANDS, **ENDED_OPTIONS},
+        "key of a study": ENDED_KEYS,
+        "shipped study": ENDED_STUDIES,
+    }
+    return "\n".join(
+        _table(
+            (kind, "use instead"),
+            [(f"`{name}`", instead) for name, instead in replacements.items()],
+        )
+        for kind, replacements in kinds.items()
+    )
+
+
 LISTS: dict[str, Callable[[], str]] = {
     "readme": readme,
     "commands": command_list,
@@ -352,6 +369,7 @@ LISTS: dict[str, Callable[[], str]] = {
     "algorithms": models(ALGORITHMS),
     "metric_columns": metric_columns,
     "results_files": results_files,
+    "ended": ended,
 }
 
 if __name__ == "__main__":

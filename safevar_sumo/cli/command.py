@@ -57,9 +57,24 @@ COMMON_NAMES = {
 it.
 """
 ENDED_OPTIONS = {
+    "check --ego": "no such option: no scenario is read from a file of OpenSCENARIO",
+    "explain --limit": "--simulations N, or --quick",
+    "import --original": "[published] of the study",
+    "report --paper": "tables DIR --figures DIR",
+    "simulate --fewest": "--solution fewest",
+    "simulate --most-severe": "--solution most-severe",
+    "simulate --no-filter": "no such option: `simulate` filters no change",
+    "simulate --slower": "no such option: sumo-gui has a field for its delay",
+    "simulate --smallest": "--solution smallest",
     "simulate --spread": "the page of `report`, which has the band, or simulate --fit K",
+    "study --batch": "no such option: batches changed no result",
     "study --dry-run": "no such option: the bar of a search shows the time that is left",
+    "study --only": "sv.run(study, only=...)",
     "study --shard": "sv.run(study, only=...), or --cluster",
+    "tables --all": "--details",
+    "tolerance --attack": "--simulations N, or --quick",
+    "tolerance --by": "the command permit, or --up-to NAME=V",
+    "tolerance --together": "no such option: joint limits are always part of the answer",
 }
 """Options of earlier releases, with the text that says what replaces each option."""
 CONDITION = re.compile(rf"\s*([^\s<>=]+)\s*(<=|>=|<|>)\s*({NUMBER_PATTERN})\s*")

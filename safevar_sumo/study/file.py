@@ -53,14 +53,12 @@ ENDED_KEYS = {
 _IN_RANGES = 'with --ranges or encounters = "ranges"'
 ENDED_STUDIES = {
     "wear_joint": f"wear, {_IN_RANGES}",
-    "wear_fleet": f"wear, {_IN_RANGES}",
     "sun_joint": f"sun, {_IN_RANGES}",
     "alks_joint": f"alks at --point cut_in, {_IN_RANGES}",
     "alks_joint_cut_out": f"alks at --point cut_out, {_IN_RANGES}",
     "alks_joint_following": f"alks at --point following, {_IN_RANGES}",
     "comfort": "sun, with a metric of your own (docs/tutorials/own_metric.md)",
     "euro_ncap_rating": "euro_ncap_pedestrian or euro_ncap_car_to_car, Euro NCAP's tests",
-    "metadrive_expert": "a study with the class of docs/simulators.md",
 }
 """Shipped studies of earlier releases, with the text that says what replaces each study."""
 

@@ -20,6 +20,7 @@ from rich.console import Console
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.cli.command import ENDED_OPTIONS
 from safevar_sumo.cli.program import COMMANDS, command_function, commands
 from safevar_sumo.questions.answer import contents_of
 from safevar_sumo.questions.ask import QUESTIONS
@@ -51,6 +52,11 @@ def test_the_help_lists_every_command_with_the_first_sentence_of_its_function() 
         found = commands.get_command(None, name)  # type: ignore[arg-type]
         sentence, _, _ = (found.help or "").partition("\n\n")
         assert f" {name} {' '.join(sentence.split())}" in output
+
+
+@pytest.mark.parametrize("typed", ENDED_OPTIONS)
+def test_an_option_that_ended_is_refused_with_what_replaces_it(typed: str) -> None:
+    refused(typed, "is an option of releases before 0.5", ENDED_OPTIONS[typed])
 
 
 @pytest.mark.parametrize("command", list(COMMANDS))
