@@ -121,6 +121,13 @@ def test_the_version_of_setup_cfg_is_that_of_results_citation_and_changelog() ->
     )
 
 
+def test_the_changelog_is_short_enough_to_be_read() -> None:
+    sections = (ROOT / "CHANGELOG.md").read_text("utf-8").split("\n## ")
+    newest, *older = [len(section.splitlines()) for section in sections[1:]]
+    assert newest <= 120
+    assert sum(older) <= 150
+
+
 @pytest.mark.parametrize("name", study_names())
 def test_every_shipped_characteristic_is_explained(name: str) -> None:
     for key, row in load_study(name).vehicle.characteristics.items():
