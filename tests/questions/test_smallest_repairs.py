@@ -1,0 +1,231 @@
+"""Smallest changes of a made-up driving system, which brakes at a gap: repairs, their order, their
+proof and what nobody repairs are formulas.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from safevar_sumo.api.simulation import load_study
+from safevar_sumo.campaign.evaluation import Task, evaluate_settings
+from safevar_sumo.metrics import METRICS
+from safevar_sumo.questions import cases, repair as question
+from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.repair import answer as answers, problem, survivors
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject, NamedValues
+from safevar_sumo.study import CharacteristicTable, FreeParameter, Study
+from safevar_sumo.sumo.system import assemble
+from tests.in_process import InlinePool
+from tests.made_up import made_up_evaluations
+
+SPEED, SEEN_FROM, MARGIN = 20.0, 60.0, 0.25
+"""Speed [m/s] of the vehicle, the gap [m] from which it sees the obstacle, and the clearance [m] to
+keep.
+"""
+WEAR = [1.0, 0.9, 1.1]
+"""Shares of the grip in the parameter sets."""
+SHARE = 0.01
+"""Share of unsafe vehicles that a proof excludes."""
+CHANGEABLE = {
+    "gap": FreeParameter(lower=4.0, upper=64.0, unit="m", meaning="gap to brake at"),
+    "more": FreeParameter(lower=0.0, upper=60.0, unit="m", meaning="further gap"),
+    "always": FreeParameter(lower=0.0, upper=1.0, unit="-", meaning="brakes at once"),
+}
+
+
+def braking_way(grip: Any) -> Any:
+    """The way [m] on which a vehicle brakes to a standstill."""
+    return SPEED**2 / (2 * grip)
+
+
+class Brakes(InlinePool):
+    """Simulates vehicles that brake at the gap `gap` + `more`, or at once if `always` is at least
+    0.5. Full braking begins at once.
+    """
+
+    def compute(self, function: Any, *arguments: Any) -> Any:
+        return self.evaluate(*arguments) if function is evaluate_settings else ""
+
+    def evaluate(self, task: Task, rows: FloatArray) -> Evaluations:
+        study = task.study
+        values: NamedValues = dict(study.ads.parameters)
+        values |= dict(zip(task.selection.parameters, rows[:, 2:].T, strict=True))
+        grip = study.vehicle.parameters["wear"] * rows[:, 0]
+        gap = np.full(len(rows), SEEN_FROM)
+        if study.ads.model != "full_braking":
+            at_gap = np.minimum(values["gap"] + values["more"], SEEN_FROM)
+            gap = np.where(np.asarray(values["always"]) >= 0.5, SEEN_FROM, at_gap)
+        rest = gap - braking_way(grip)
+        collides = rest < 0
+        impact = np.minimum(SPEED, np.sqrt(2 * grip * np.abs(rest)))
+        degree = np.where(collides, -impact, rest)
+        return made_up_evaluations(
+            degree,
+            settings=rows,
+            outcome=np.where(collides, "collision", "stopped").astype("U16"),
+            collision_speed=np.where(collides, impact, np.nan),
+            metrics={
+                **dict.fromkeys(METRICS, np.full(len(rows), np.nan)),
+                "safety_degree": degree,
+            },
+        )
+
+
+def planted(**today: float) -> Study:
+    """The study of these vehicles; `today` has the present parameters."""
+    smoke = load_study("smoke", scenario={"over": False, "margin": 0.3})
+    row = {"unit": "m/s^2", "original": 8.0, "lower": 3.0, "upper": 9.0}
+    paint = {"unit": "-", "original": 1.0, "lower": 0.5, "upper": 2.0}
+    return replace(
+        smoke,
+        name="made-up",
+        spread={"vehicle.parameters.wear": WEAR},
+        vehicle=replace(
+            smoke.vehicle,
+            parameters={"wear": WEAR[0]},
+            characteristics={
+                "grip": CharacteristicTable(**row),
+                "paint": CharacteristicTable(**paint),
+            },
+        ),
+        ads=replace(
+            smoke.ads, parameters={"gap": 12.0, "more": 0.0, "always": 0.0, **today}
+        ),
+        repair=replace(smoke.repair, parameters=CHANGEABLE),
+    )
+
+
+def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonObject:
+    """A price: `more` costs less than `gap`, and who always brakes does so needlessly."""
+    today = study.ads.parameters
+    earlier = values.get("gap", today["gap"]) - today["gap"]
+    earlier += 0.5 * values.get("more", 0.0)
+    needless = 4 if values.get("always", 0.0) >= 0.5 else 0
+    return {
+        "metres_earlier": earlier,
+        "metres_earlier_mean": earlier,
+        "seconds_earlier": earlier / SPEED,
+        "most_at": None,
+        "largest_deceleration": 8.0,
+        "needless_braking": needless,
+        "needless_braking_today": 0,
+        "benign_scenes": 4,
+    }
+
+
+@pytest.fixture(autouse=True)
+def _few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+    smoke = assemble(load_study("smoke"))
+    monkeypatch.setattr(problem, "assemble", lambda study: smoke)
+    monkeypatch.setattr(answers, "price_of", price_of)
+    monkeypatch.setattr(cases, "USUAL_BUDGET", 300)
+    monkeypatch.setattr(survivors, "MAX_SHARE_REPAIRED", SHARE)
+    monkeypatch.setattr(question, "SOBOL_VEHICLES", 32)
+
+
+def repaired(study: Study, **options: Any) -> Answer:
+    evaluator = Evaluator(study, Brakes())
+    return question.repair.compute(study, evaluator, margin=MARGIN, **options)
+
+
+def rows_of(answer: Answer) -> list[JsonObject]:
+    return answer.tables["repairs"].to_dict("records")
+
+
+GRIP = ["grip >= 5"]
+NEEDED = MARGIN + braking_way(5)
+"""Gap [m] at which the weakest promised vehicle has to brake, with the study's own set."""
+NEEDED_IN_SETS = braking_way(min(WEAR) * 5)
+"""The same in all parameter sets: with another set than its own, the vehicle may just not
+collide.
+"""
+
+
+@pytest.mark.parametrize(("fits", "needed"), [(0, NEEDED), (None, NEEDED_IN_SETS)])
+def test_the_smallest_repair_is_the_gap_of_the_weakest_promised_vehicle(
+    fits: int | None, needed: float
+) -> None:
+    answer = repaired(planted(), promise=GRIP, change=["gap"], fits=fits)
+    (repair,) = rows_of(answer)
+    gap = repair["parameters"]["gap"]
+    assert needed <= gap <= needed + 0.1
+    assert repair["largest_change"] == pytest.approx((gap - 12) / 60, abs=0.001)
+    assert repair["changed"] == 1
+    sets = 1 if fits == 0 else len(WEAR)
+    assert repair["fits"] == answer.numbers["fits"] == sets
+    assert answer.numbers["fits_tried"] == sets
+    impact = math.sqrt(2 * 5 * (braking_way(5) - 12))
+    assert answer.numbers["worst_today"] == pytest.approx(-impact)
+    assert answer.numbers["promise"] == {"grip": [5.0, 9.0]}
+    assert not answer.numbers["not_repairable"]
+    # The least number of safe vehicles that excludes the share, in the first of all tests.
+    samples = math.ceil(math.log(0.025) / math.log(1 - SHARE))
+    assert (repair["proof_samples"], repair["proof_failures"]) == (samples, 0)
+    assert repair["at_most"] == pytest.approx(1 - 0.05 ** (1 / samples))
+
+
+def test_the_first_repair_brakes_least_without_need_and_then_least_early() -> None:
+    """Always braking is a small change with a price; two parameters share what one cannot."""
+    answer = repaired(planted(gap=8.0), promise=GRIP, fits=0)
+    two, one = rows_of(answer)
+    assert set(one["parameters"]) == {"always"}
+    assert one["largest_change"] == pytest.approx(0.5, abs=0.001)
+    assert one["needless_braking"] == 4
+    assert set(two["parameters"]) == {"gap", "more"}
+    further = NEEDED - 8
+    together = two["parameters"]["gap"] - 8 + two["parameters"]["more"]
+    assert further <= together <= further + 0.2
+    assert two["largest_change"] == pytest.approx(further / 2 / 60, abs=0.002)
+    assert (two["changed"], two["needless_braking"]) == (2, 0)
+    # Today's value of a parameter that does not change stays exactly as it is.
+    alone = repaired(planted(gap=8.0), promise=GRIP, fits=0, change=["more"])
+    (repair,) = rows_of(alone)
+    assert further <= repair["parameters"]["more"] <= further + 0.1
+
+
+@pytest.mark.parametrize("above", [-0.1, 0.0, 0.1])
+def test_a_promise_that_is_kept_today_needs_no_repair(above: float) -> None:
+    """Exactly the margin is enough."""
+    today = NEEDED + above
+    answer = repaired(planted(gap=today), promise=GRIP, change=["gap"], fits=0)
+    assert answer.numbers["kept_today"] == (above >= 0)
+    assert answer.numbers["repairs"] == len(rows_of(answer)) == (above < 0)
+    assert answer.numbers["worst_today"] == pytest.approx(today - braking_way(5))
+
+
+def test_no_repair_is_found_where_no_value_suffices() -> None:
+    study = planted()
+    bounded = {"gap": replace(CHANGEABLE["gap"], upper=NEEDED - 0.1)}
+    study = replace(study, repair=replace(study.repair, parameters=bounded))
+    answer = repaired(study, promise=GRIP, fits=0)
+    assert answer.numbers["repairs"] == len(rows_of(answer)) == 0
+    assert (answer.numbers["kept_today"], answer.numbers["fits"]) == (False, 0)
+
+
+def test_sets_in_which_no_repair_holds_are_named() -> None:
+    """The gap suffices with the own set and with more grip, but not with less grip."""
+    study = planted()
+    bounded = {"gap": replace(CHANGEABLE["gap"], upper=NEEDED_IN_SETS - 0.5)}
+    study = replace(study, repair=replace(study.repair, parameters=bounded))
+    answer = repaired(study, promise=GRIP)
+    (repair,) = rows_of(answer)
+    assert NEEDED <= repair["parameters"]["gap"] <= NEEDED + 0.1
+    assert (answer.numbers["fits"], answer.numbers["fits_tried"]) == (2, 3)
+    assert "parameter set 1" in answer.tested
+
+
+def test_wear_that_nobody_can_keep_safe_is_named_and_left_out() -> None:
+    """Full braking stops the grip from 400 / 2 / (60 - 0.25) m/s^2 on."""
+    answer = repaired(planted(), promise=["grip >= 3"], change=["gap"], fits=0)
+    (cause,) = answer.numbers["not_repairable"]
+    least = SPEED**2 / 2 / (SEEN_FROM - MARGIN)
+    assert cause == {"grip": pytest.approx(least, abs=0.02)}
+    (repair,) = rows_of(answer)
+    assert SEEN_FROM - 0.5 <= repair["parameters"]["gap"] <= SEEN_FROM + 0.1
+    assert answer.verdict.count("grip below") == 1
