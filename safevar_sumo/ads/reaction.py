@@ -114,10 +114,6 @@ class Reaction(NamedTuple):
         return self.leader_deceleration > ANY_BRAKING + DECELERATION_ROUNDING
 
 
-Reacted = tuple[Command, Reaction]
-"""The driver's command in a step, and the driver's memory for the next step."""
-
-
 class Danger(NamedTuple):
     """The danger that a reference driver sees now, and how the driver brakes; arrays have shape
     (N,).
@@ -206,7 +202,7 @@ class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):
         memory: Reaction,
         danger: Danger,
         start: StartThrottle = (),
-    ) -> Reacted:
+    ) -> tuple[Command, Reaction]:
         """Hold the cruise speed, or answer a danger.
 
         The driver releases the accelerator when it sees a danger, and brakes when the reaction time

@@ -20,12 +20,17 @@ from safevar_sumo.ads.reaction import (
     HARDEST_BRAKING,
     LEAST_DIVISOR,
     Danger,
-    Reacted,
     Reaction,
     ReferenceDriver,
     StartThrottle,
 )
-from safevar_sumo.records import KMH_PER_MS, FloatArray, Observation, clip_to_share
+from safevar_sumo.records import (
+    KMH_PER_MS,
+    Command,
+    FloatArray,
+    Observation,
+    clip_to_share,
+)
 
 UNLIMITED_BRAKING = 1e6
 """A deceleration that no brake reaches [m/s^2]: a driver who wants it presses the pedal fully."""
@@ -49,7 +54,9 @@ class FullBraking(ReferenceDriver, frozen=True, kw_only=True):
 
     start_throttle: StartThrottle = ()
 
-    def drive(self, observation: Observation, memory: Reaction) -> Reacted:
+    def drive(
+        self, observation: Observation, memory: Reaction
+    ) -> tuple[Command, Reaction]:
         is_in_way = is_in_the_way(observation, self.corridor)
         memory = self.watch_leader(observation, memory, is_in_way)
         is_present = is_in_way & (observation.closing_speed > 0)
@@ -82,7 +89,9 @@ class R157(ReferenceDriver, frozen=True, kw_only=True):
     reaction_time: NonNegativeParameter = 0.35
     margin: NonNegativeParameter = 0.1
 
-    def drive(self, observation: Observation, memory: Reaction) -> Reacted:
+    def drive(
+        self, observation: Observation, memory: Reaction
+    ) -> tuple[Command, Reaction]:
         depth = depth_in_the_way(observation, self.corridor)
 
         # If the obstacle does not brake, the time to collision decides.
@@ -144,7 +153,9 @@ class Rss(ReferenceDriver, frozen=True, kw_only=True):
     braking: PositiveParameter = HARDEST_BRAKING
     leader_deceleration: PositiveParameter = HARDEST_BRAKING
 
-    def drive(self, observation: Observation, memory: Reaction) -> Reacted:
+    def drive(
+        self, observation: Observation, memory: Reaction
+    ) -> tuple[Command, Reaction]:
         depth = depth_in_the_way(observation, self.corridor)
         memory = self.watch_leader(observation, memory, depth >= 0)
         lacking = (
@@ -197,7 +208,9 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
     leader_deceleration: PositiveParameter = 7.0
     margin: NonNegativeParameter = 2.0
 
-    def drive(self, observation: Observation, memory: Reaction) -> Reacted:
+    def drive(
+        self, observation: Observation, memory: Reaction
+    ) -> tuple[Command, Reaction]:
         depth = depth_in_the_way(observation, self.corridor)
         memory = self.watch_leader(observation, memory, depth >= 0)
         gap = np.where(depth >= 0, observation.gap, np.inf)

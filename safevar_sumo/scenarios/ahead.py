@@ -7,7 +7,7 @@ or brakes (CCRb); a motorcyclist stands (CMRs) or brakes (CMRb).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Quantity
-from safevar_sumo.scenarios.base import NamedScenarios, PreCrash
+from safevar_sumo.scenarios.base import PreCrash, Scenario
 from safevar_sumo.scenarios.euro_ncap import (
     SAME_DIRECTION,
     Direction,
@@ -159,7 +159,7 @@ class Along(TargetAhead, frozen=True, kw_only=True):
     acceleration_distance: Metres | None = None
     time_to_impact: Seconds = 6.0
 
-    def benign(self) -> NamedScenarios:
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
         """The target moves along beside the vehicle's path, or a car stands in the next lane."""
         for place in BESIDE:
             name = f"{self.test}, {self.speed:g} km/h, beside at {place:g} %"
@@ -279,7 +279,7 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         """Gap to the target at the start [m]."""
         return self.parameter("headway") * self.speed * KMH
 
-    def benign(self) -> NamedScenarios:
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
         """A car stands in the next lane."""
         return next_lane(self)
 
@@ -371,7 +371,9 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         ]
 
 
-def next_lane(test: LaneTest, headways: Sequence[float] = HEADWAYS) -> NamedScenarios:
+def next_lane(
+    test: LaneTest, headways: Sequence[float] = HEADWAYS
+) -> Iterable[tuple[str, Scenario]]:
     """Benign scenes of a test: a car stands in the next lane at these headways [s]. Each scene has
     a description.
     """

@@ -186,10 +186,6 @@ ScenarioMemory = Any
 """What a scenario remembers of a run between two steps: an object of the scenario's own class."""
 
 
-Quantities = Mapping[str, Quantity]
-"""Values of a scenario's parameters by name: numbers, or arrays with a value for each encounter."""
-
-
 class Layout(NamedTuple):
     """The places of the actors of N runs, if a study searches parameters that move actors.
 
@@ -301,7 +297,7 @@ class Scenario:
         """By default true for a test in which a robot holds the speed."""
         return self.test_speed is not None
 
-    def at(self, values: Quantities) -> Scenario:
+    def at(self, values: Mapping[str, Quantity]) -> Scenario:
         """A new scenario of the same class, with other values of these parameters."""
         create: Any = dataclasses.replace
         if isinstance(self, msgspec.Struct):
@@ -325,7 +321,7 @@ class Scenario:
         """Remarks for the user on the scenario's parameters."""
         return []
 
-    def benign(self) -> NamedScenarios:
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
         """Similar scenes in which nobody needs to brake, each with a description; none by
         default.
         """
@@ -334,10 +330,6 @@ class Scenario:
     def obstacle(self) -> str:
         """What the vehicle hits in a collision, in words."""
         return OBSTACLES.get(self.pre_crash, "the obstacle")
-
-
-NamedScenarios = Iterable[tuple[str, Scenario]]
-"""Scenarios, each with a description in words."""
 
 
 class WorldScenario(Scenario):

@@ -4,6 +4,7 @@ junction.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from msgspec.structs import replace
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.ahead import HEADWAYS, next_lane
-from safevar_sumo.scenarios.base import NamedScenarios, PreCrash
+from safevar_sumo.scenarios.base import PreCrash, Scenario
 from safevar_sumo.scenarios.euro_ncap import (
     FROM_LEFT,
     FROM_RIGHT,
@@ -312,7 +313,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True):
             return [crossing]
         return [crossing, *self._parked_cars(impact)]
 
-    def benign(self) -> NamedScenarios:
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
         """Scenes in which nobody needs to brake: a pedestrian stops before the vehicle's path, a
         pedestrian leaves this path in time, or a car stands in the next lane.
         """

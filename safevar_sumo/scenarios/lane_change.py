@@ -7,6 +7,7 @@ lane to the middle of the next lane. Bodies stay parallel to the lanes.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Literal
 
 import numpy as np
@@ -15,7 +16,7 @@ from msgspec import Meta
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.ahead import LANE_WIDTH, VEHICLE_SPEED, next_lane
-from safevar_sumo.scenarios.base import NamedScenarios, PreCrash, XmlChanges
+from safevar_sumo.scenarios.base import PreCrash, Scenario, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import Seconds
 from safevar_sumo.scenarios.roads import Roads
 from safevar_sumo.scenarios.tracks import (
@@ -67,7 +68,7 @@ class LaneChange(LaneTest, frozen=True, kw_only=True):
         departure = {**(changes[DEPARTURE] or {}), "departLane": f"{self.sign < 0:d}"}
         return {**changes, DEPARTURE: departure}
 
-    def benign(self) -> NamedScenarios:
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
         """A car stays in the next lane in each benign scene."""
         return next_lane(self)
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from safevar_sumo.records import Quantity
-from safevar_sumo.scenarios.base import Quantities, Scenario
-from safevar_sumo.study import Constraint, Domains, Weather
+from safevar_sumo.scenarios.base import Scenario
+from safevar_sumo.study import Constraint, Domain, Weather
 
 SPEED_DIMENSION = "speed"
 """The parameter by which `permit` asks by default, and that the scope of an answer names first."""
@@ -38,16 +39,16 @@ class Point(NamedTuple):
     parameters: tuple[tuple[str, Any], ...] = ()
     allowed_impact_speed: float = 0.0
     phase: Quantity = 0.0
-    ranges: Domains | None = None
+    ranges: Mapping[str, Domain] | None = None
     constraints: tuple[Constraint, ...] = ()
 
-    def own(self, values: Quantities) -> dict[str, Quantity]:
+    def own(self, values: Mapping[str, Quantity]) -> dict[str, Quantity]:
         """The values that belong to parameters of this point."""
         if self.ranges is None:
             return dict(values)
         return {name: value for name, value in values.items() if name in self.ranges}
 
-    def meets(self, values: Quantities) -> Quantity:
+    def meets(self, values: Mapping[str, Quantity]) -> Quantity:
         """Return whether encounters with these values belong to this point: an array of shape (N,),
         or a single truth value for all encounters.
         """
@@ -58,7 +59,3 @@ class Point(NamedTuple):
         for constraint in self.constraints:
             holds &= constraint.allows(values)
         return holds
-
-
-Points = tuple[Point, ...]
-"""The points of a matrix. A study without a matrix has a single point."""

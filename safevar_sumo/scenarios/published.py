@@ -4,6 +4,7 @@ block both lanes.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import product
 from typing import Annotated, NamedTuple
 
@@ -27,8 +28,8 @@ from safevar_sumo.scenarios.base import (
     VUT,
     Grade,
     Layout,
-    NamedScenarios,
     PreCrash,
+    Scenario,
     Scene,
     WorldScenario,
     XmlChanges,
@@ -188,7 +189,7 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
             return None
         return approach(roads).crossing_position(roads, CROSSING_LANE) - self.distance
 
-    def benign(self) -> NamedScenarios:
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
         """Scenes with a pedestrian of the same speed, and vehicles at the `SLOW_SPEEDS`. The
         pedestrian stops before the vehicle's path, or leaves the path in time.
         """
@@ -373,7 +374,7 @@ class LeadVehicleStopped(WorldScenario, Table, frozen=True, kw_only=True):
             return VUT_FRONT
         return PARKED_POSITION - PARKED_LENGTH - self.distance
 
-    def benign(self) -> NamedScenarios:
+    def benign(self) -> Iterable[tuple[str, Scenario]]:
         """A car stands in the next lane."""
         for speed in CITY_SPEEDS:
             yield from CarToCar(speed=speed).benign()

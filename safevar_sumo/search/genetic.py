@@ -75,10 +75,6 @@ class Individual(list[float]):
     has_failed: bool = False
 
 
-Individuals = list[Individual]
-"""A population, or a part of a population."""
-
-
 class Nsga2(Algorithm, Table, frozen=True, kw_only=True):
     """Elitist search by Pareto rank and crowding distance, with as many offspring as individuals.
 
@@ -110,7 +106,7 @@ class Nsga2(Algorithm, Table, frozen=True, kw_only=True):
                 min(problem.population, problem.evaluations), rng
             )
         offspring = [Individual(setting) for setting in generation.tolist()]
-        survivors = Individuals()
+        survivors = list[Individual]()
         used = 0
 
         while offspring:
@@ -164,11 +160,13 @@ class Reproduction:
                 self._random_state = random.getstate()
                 random.setstate(state_of_caller)
 
-    def draw_offspring(self, population: Individuals, number: int) -> Individuals:
+    def draw_offspring(
+        self, population: list[Individual], number: int
+    ) -> list[Individual]:
         """Draw `number` new individuals in pairs: two tournaments choose the parents, then
         crossover and mutation change the pair.
         """
-        offspring = Individuals()
+        offspring = list[Individual]()
         operators = self._operators
         domains = (self._lower, self._upper)
         with self._randomness():
@@ -191,7 +189,7 @@ class Reproduction:
                 offspring += self._feasible_children(pair)
         return offspring[:number]
 
-    def _feasible_children(self, children: Individuals) -> Individuals:
+    def _feasible_children(self, children: list[Individual]) -> list[Individual]:
         """The children that satisfy the study's constraints. The caller draws again for missing
         children.
 
@@ -238,7 +236,7 @@ def request_evaluations(
     return len(individuals)
 
 
-def select_survivors(individuals: Individuals, number: int) -> Individuals:
+def select_survivors(individuals: list[Individual], number: int) -> list[Individual]:
     """Select the best `number` individuals, and set the `standing` of each individual.
 
     The order is that of DEAP's `selNSGA2`, which is slower: first the rank, from 0, then the larger
@@ -266,7 +264,7 @@ def select_survivors(individuals: Individuals, number: int) -> Individuals:
     return [*best, *infeasible][:number]
 
 
-def sort_into_fronts(individuals: Sequence[Individual]) -> list[Individuals]:
+def sort_into_fronts(individuals: Sequence[Individual]) -> list[list[Individual]]:
     """Group individuals by their rank of non-domination. Each group keeps the given order."""
     if not individuals:
         return []
@@ -274,13 +272,13 @@ def sort_into_fronts(individuals: Sequence[Individual]) -> list[Individuals]:
     ranks = moocore.pareto_rank(
         [individual.fitness.wvalues for individual in individuals], maximise=True
     ).tolist()
-    fronts: list[Individuals] = [[] for _ in range(max(ranks) + 1)]
+    fronts: list[list[Individual]] = [[] for _ in range(max(ranks) + 1)]
     for individual, rank in zip(individuals, ranks, strict=True):
         fronts[rank].append(individual)
     return fronts
 
 
-def run_tournament(population: Individuals, size: int = 2) -> Individual:
+def run_tournament(population: list[Individual], size: int = 2) -> Individual:
     """The best of `size` individuals, drawn without replacement, by `standing`. Chance decides
     between equal individuals.
     """

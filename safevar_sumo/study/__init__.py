@@ -4,7 +4,6 @@ from safevar_sumo.study.characteristics import (
     CharacteristicTable as CharacteristicTable,
     Constraint as Constraint,
     Domain as Domain,
-    Domains as Domains,
     Interval as Interval,
     PositiveProportion as PositiveProportion,
     Precision as Precision,

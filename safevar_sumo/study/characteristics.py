@@ -68,8 +68,6 @@ class Domain(Table, frozen=True, kw_only=True):
 
 Interval = tuple[float, float]
 """The smallest and the largest value of a range."""
-Domains = Mapping[str, Domain]
-"""Domains by the names of their characteristics."""
 
 
 class Precision(Table, frozen=True, kw_only=True):
@@ -113,7 +111,7 @@ def number_within(lower: float, upper: float, row: Domain) -> str:
     return f"a number in [{lower:g}, {upper:g}]{unit_text(row.unit)}"
 
 
-def check_characteristic(key: str, name: str, rows: Domains) -> None:
+def check_characteristic(key: str, name: str, rows: Mapping[str, Domain]) -> None:
     check_name("", f"{key}{name}: there is no such characteristic", name, rows)
 
 
@@ -170,7 +168,9 @@ class Fixed(_Distribution, frozen=True, kw_only=True, tag="fixed"):
 Distribution = Uniform | Normal | Triangular | Lognormal | Fixed
 
 
-def check_variation(rows: Domains, variation: Mapping[str, Distribution]) -> None:
+def check_variation(
+    rows: Mapping[str, Domain], variation: Mapping[str, Distribution]
+) -> None:
     """Refuse distributions that do not fit the characteristics' domains."""
     for name, distribution in variation.items():
         check_characteristic("variation.", name, rows)
@@ -256,7 +256,7 @@ class Constraint(Table, frozen=True, kw_only=True):
         low, high = self.ends
         return (total >= low) & (total <= high)
 
-    def unit_of(self, rows: Domains) -> str:
+    def unit_of(self, rows: Mapping[str, Domain]) -> str:
         """The unit of the sum: the stated unit, or that of its first characteristic among
         `rows`.
         """
@@ -264,7 +264,7 @@ class Constraint(Table, frozen=True, kw_only=True):
             return self.unit
         return next((rows[name].unit for name in self.sum if name in rows), "-")
 
-    def bounds_in_words(self, rows: Domains) -> str:
+    def bounds_in_words(self, rows: Mapping[str, Domain]) -> str:
         """The bounds in words."""
         unit = unit_text(self.unit_of(rows))
         bounds = {"at least": self.at_least, "at most": self.at_most}
@@ -293,7 +293,9 @@ def check_bounds(at_least: float | None, at_most: float | None) -> None:
         )
 
 
-def check_constraints(rows: Domains, constraints: Sequence[Constraint]) -> None:
+def check_constraints(
+    rows: Mapping[str, Domain], constraints: Sequence[Constraint]
+) -> None:
     """Refuse constraints that name unknown characteristics or add quantities of different units."""
     for index, constraint in enumerate(constraints):
         key = f"constraints[{index}]"
@@ -324,7 +326,7 @@ class UnmeasuredValue(Table, frozen=True, kw_only=True):
     source: LongText = ""
 
 
-def check_unmeasured(rows: Domains, values: Mapping[str, float]) -> None:
+def check_unmeasured(rows: Mapping[str, Domain], values: Mapping[str, float]) -> None:
     """Refuse values of unknown characteristics, or outside of their domains."""
     for name, value in values.items():
         check_characteristic("unmeasured.", name, rows)

@@ -4,7 +4,7 @@ ranges.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import product
 from typing import Annotated, Any, Final, Literal, NamedTuple, Self
 
@@ -15,7 +15,6 @@ from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.study.characteristics import (
     Constraint,
     Domain,
-    Domains,
     ShortText,
     check_constraints,
     mistake,
@@ -108,10 +107,6 @@ class AxisTable(Table, frozen=True, kw_only=True):
         return Domain(**fields)
 
 
-AxisTables = dict[str, AxisTable]
-"""Axes by their names, all as tables."""
-
-
 def axis_of(domain: Domain) -> AxisTable:
     """An axis that has the range of a domain, and lists no values."""
     return AxisTable(**asdict(domain))
@@ -181,7 +176,7 @@ def are_numbers(values: Iterable[object]) -> bool:
     return all(type(value) in (int, float) for value in values)
 
 
-def as_axes(over: Parameters) -> AxisTables:
+def as_axes(over: Parameters) -> dict[str, AxisTable]:
     """Convert axes to tables: an axis that is a list becomes the key `at` of a table."""
     axes = dict(over)
     for name, at in over.items():
@@ -190,12 +185,12 @@ def as_axes(over: Parameters) -> AxisTables:
     return axes
 
 
-def _ranges_of(axes: Iterable[tuple[str, AxisTable]]) -> Domains:
+def _ranges_of(axes: Iterable[tuple[str, AxisTable]]) -> Mapping[str, Domain]:
     """The ranges of all axes that have a range."""
     return {name: axis.range for name, axis in axes if axis.range is not None}
 
 
-def _lists_of(axes: AxisTables) -> Axes:
+def _lists_of(axes: dict[str, AxisTable]) -> Axes:
     """The lists of all axes that list values."""
     return {name: axis.at for name, axis in axes.items() if axis.at}
 
@@ -232,7 +227,7 @@ class MatrixTest(Table, frozen=True, kw_only=True):
                 raise mistake(f"{name} is in parameters and in over", "one of them")
 
     @property
-    def axes(self) -> AxisTables:
+    def axes(self) -> dict[str, AxisTable]:
         """The axes that the test states under `over`, as tables."""
         return as_axes(self.over)
 
@@ -306,7 +301,7 @@ class StudyEncounters(Table, frozen=True, kw_only=True):
         """The metric that `aggregate` states; None if the safety degree decides."""
         return DecidingMetric.of(self.matrix.aggregate) if self.matrix else None
 
-    def check_axes(self, characteristics: Domains) -> None:
+    def check_axes(self, characteristics: Mapping[str, Domain]) -> None:
         """Refuse axes that contradict the rest of the study.
 
         An axis must not share its name with a characteristic, and must not lack values. Ranges and
@@ -374,7 +369,7 @@ class StudyEncounters(Table, frozen=True, kw_only=True):
         """The tests; [None] for a study without a matrix, whose only encounter is its scenario."""
         return list(self.tests) or [None]
 
-    def axes_of(self, test: MatrixTest | None) -> AxisTables:
+    def axes_of(self, test: MatrixTest | None) -> dict[str, AxisTable]:
         """The axes of a test: first its own axes, then the axes of [scenario.over] that the test
         does not state itself. The weathers of a test replace axes of the weather. For None: the
         axes of [scenario.over].
@@ -394,7 +389,7 @@ class StudyEncounters(Table, frozen=True, kw_only=True):
         axes = self.axes_of(test).items()
         return {name: axis.at for name, axis in axes if axis.at and name not in ranges}
 
-    def ranges_of(self, test: MatrixTest | None) -> Domains:
+    def ranges_of(self, test: MatrixTest | None) -> Mapping[str, Domain]:
         """The axes of a test on which any value in a range may occur; none if encounters are
         listed.
         """
@@ -408,7 +403,7 @@ class StudyEncounters(Table, frozen=True, kw_only=True):
         return bool(_ranges_of(self._named_axes))
 
     @property
-    def ranges(self) -> Domains:
+    def ranges(self) -> Mapping[str, Domain]:
         """The parameters of the encounter that are part of each setting, after the values of the
         vehicle.
 
@@ -442,7 +437,7 @@ class StudyEncounters(Table, frozen=True, kw_only=True):
                 points.append(point)
         return points
 
-    def mapped(self, change: Callable[[AxisTables], Axes]) -> Self:
+    def mapped(self, change: Callable[[dict[str, AxisTable]], Axes]) -> Self:
         """The study with changed axes. `change` maps the axes of each test, and the axes of
         [scenario.over]. An axis that has nothing but a list becomes a list again.
         """

@@ -11,7 +11,6 @@ from typing import Any
 from safevar_sumo.errors import InputError
 from safevar_sumo.study.characteristics import (
     Domain,
-    Domains,
     Interval,
     LongText,
     check_bounds,
@@ -57,7 +56,7 @@ class Limit(Table, frozen=True, kw_only=True):
 
 def limits_of(
     texts: Iterable[str],
-    rows: Domains,
+    rows: Mapping[str, Domain],
     stated: Mapping[str, Limit] | None = None,
 ) -> dict[str, Limit]:
     """Combine typed and stated limits into one limit for each characteristic, in the order of
@@ -92,7 +91,9 @@ def limits_of(
     return {name: limits[name] for name in rows if name in limits}
 
 
-def check_limits(rows: Domains, limits: Mapping[str, Limit], table: str = "") -> None:
+def check_limits(
+    rows: Mapping[str, Domain], limits: Mapping[str, Limit], table: str = ""
+) -> None:
     """Refuse limits of unknown characteristics, limits outside the domain, and limits that exclude
     the original value. `table` is the prefix of names in errors.
     """

@@ -11,11 +11,11 @@ import msgspec
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
+from safevar_sumo.study import Domain
 from safevar_sumo.study.characteristics import (
     CharacteristicTable,
     Constraint,
     Distribution,
-    Domains,
     PositiveNumber,
     UnmeasuredValue,
     check_unmeasured,
@@ -317,7 +317,7 @@ class Study(StudyEncounters, frozen=True, kw_only=True):
         ]
 
     @property
-    def domains(self) -> Domains:
+    def domains(self) -> Mapping[str, Domain]:
         """The domains that a search varies: the vehicle's characteristics, then parameters of
         encounters.
         """

@@ -29,9 +29,6 @@ from safevar_sumo.scenarios.roads import NETWORK_KEY, Frame, World
 from safevar_sumo.scenarios.tracks import CORNERS, corners_of
 from safevar_sumo.vehicles import SumoType
 
-Hits = dict[int, float]
-"""Speeds of the vehicles that hit somebody [m/s], by the number of the vehicle."""
-
 
 class VehicleStates(NamedTuple):
     """The motion of N vehicles under test at one sample: the positions of their front bumpers,
@@ -41,7 +38,7 @@ class VehicleStates(NamedTuple):
 
     fronts: FloatArray
     speeds: FloatArray
-    hits: Hits
+    hits: dict[int, float]
 
 
 class Body(NamedTuple):
@@ -135,10 +132,6 @@ class Film(NamedTuple):
         return np.arctan2(self.motion[..., 3], self.motion[..., 2])
 
 
-Films = dict[str, Film]
-"""The films of actors by their names."""
-
-
 class VehicleWorld(Protocol):
     """The contract of a world of N vehicles under test: a lane, a recorded scene or SUMO."""
 
@@ -219,7 +212,9 @@ class FirstContacts:
         self._was_inside = np.zeros(n, bool)
         self.first = Contact(np.full(n, "", "U5"), nans(n), np.zeros(n))
 
-    def count(self, world: VehicleWorld, hits: Hits, scene: Scene) -> Hits:
+    def count(
+        self, world: VehicleWorld, hits: dict[int, float], scene: Scene
+    ) -> dict[int, float]:
         """Note the first contacts among the hits of one sample, and return the hits that are
         collisions.
         """

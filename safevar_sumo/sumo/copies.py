@@ -18,12 +18,7 @@ import platformdirs
 from safevar_sumo.errors import EnvironmentFault, InputError
 from safevar_sumo.output import temporary_folder
 
-IdAttributes = Mapping[str, tuple[str, ...]]
-"""Attributes that contain ids, by element; an attribute may contain several ids, separated by
-spaces.
-"""
-
-ROAD_IDS: IdAttributes = {
+ROAD_IDS: Mapping[str, tuple[str, ...]] = {
     "edge": ("id", "from", "to", "crossingEdges", "bidi"),
     "lane": ("id",),
     "neigh": ("lane",),
@@ -41,7 +36,7 @@ SHARED_ELEMENTS = ("location", "type", "prohibition")
 """Elements of a built network that all copies share. SUMO does not read prohibitions from a built
 network, because junctions state them, too.
 """
-DEMAND_IDS: IdAttributes = {
+DEMAND_IDS: Mapping[str, tuple[str, ...]] = {
     "vType": ("id",),
     "route": ("id", "edges"),
     "vehicle": ("id", "type", "route", "via"),
@@ -164,7 +159,9 @@ def parse_seconds(text: str) -> float | None:
     return None
 
 
-def _marked_xml(element: ElementTree.Element, ids: IdAttributes) -> str:
+def _marked_xml(
+    element: ElementTree.Element, ids: Mapping[str, tuple[str, ...]]
+) -> str:
     """The XML of an element, with a placeholder in every id. The element itself is changed."""
     for part in element.iter():
         if part.tag not in ids:

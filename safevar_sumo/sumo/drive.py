@@ -30,7 +30,7 @@ from safevar_sumo.records import (
     nans,
 )
 from safevar_sumo.scenarios import VUT, Point, Scene
-from safevar_sumo.sumo.bodies import FirstContacts, Hits, VehicleStates, VehicleWorld
+from safevar_sumo.sumo.bodies import FirstContacts, VehicleStates, VehicleWorld
 from safevar_sumo.sumo.driving_robot import DrivingRobot
 from safevar_sumo.sumo.perception import (
     Observer,
@@ -367,7 +367,7 @@ class _Outcomes:
         self,
         speed: FloatArray,
         over: BoolArray,
-        collisions: Hits,
+        collisions: dict[int, float],
         is_last: BoolArray | bool,
     ) -> BoolArray:
         """Process one sample. Returns whether the sample is part of each run, shape (N,)."""

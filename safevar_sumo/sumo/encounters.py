@@ -9,7 +9,7 @@ the N scenes: each vehicle starts at another place, and meets a target that move
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING
@@ -35,10 +35,8 @@ from safevar_sumo.scenarios import (
     WorldScenario,
     searchable_in,
 )
-from safevar_sumo.scenarios.base import Quantities
-from safevar_sumo.scenarios.point import Points
 from safevar_sumo.scenarios.roads import Frame
-from safevar_sumo.study import PHASE, Domains, Study, unit_text
+from safevar_sumo.study import PHASE, Domain, Study, unit_text
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.network import networks_for
 from safevar_sumo.sumo.recording import Recording
@@ -47,7 +45,7 @@ if TYPE_CHECKING:
     from safevar_sumo.sumo.system import System
 
 
-def check_domains(study: Study, points: Points) -> None:
+def check_domains(study: Study, points: tuple[Point, ...]) -> None:
     """Refuse ranges in which not every encounter can be simulated.
 
     Raises
@@ -90,7 +88,7 @@ def check_domains(study: Study, points: Points) -> None:
         _check_corners(study, point, ranges)
 
 
-def _check_corners(study: Study, point: Point, ranges: Domains) -> None:
+def _check_corners(study: Study, point: Point, ranges: Mapping[str, Domain]) -> None:
     """Refuse ranges of a point in which the encounter at a corner is impossible."""
     ends = [(domain.lower, domain.upper) for domain in ranges.values()]
     corners = [dict(zip(ranges, corner, strict=True)) for corner in product(*ends)]
@@ -110,7 +108,7 @@ def _check_corners(study: Study, point: Point, ranges: Domains) -> None:
         ) from None
 
 
-def encounter(point: Point, values: Quantities) -> Point:
+def encounter(point: Point, values: Mapping[str, Quantity]) -> Point:
     """The point with other values of those parameters that it has. A value is a number, or an array
     of shape (N,) for N vehicles.
 
@@ -129,21 +127,21 @@ def encounter(point: Point, values: Quantities) -> Point:
     return point._replace(scenario=scenario, weather=weather, phase=phase)
 
 
-def original_encounter(point: Point, ranges: Domains) -> Point:
+def original_encounter(point: Point, ranges: Mapping[str, Domain]) -> Point:
     """The point with the original value of each parameter that has a range. The ranges are those of
     the point's test; `ranges` (those of the study) if the point states none.
     """
     return encounter(point, _originals(_ranges_of(point, ranges)))
 
 
-def _ranges_of(point: Point, ranges: Domains) -> Domains:
+def _ranges_of(point: Point, ranges: Mapping[str, Domain]) -> Mapping[str, Domain]:
     """The ranges of the point's test; `ranges` (those of the study) if the point states none."""
     if point.ranges is None:
         return ranges
     return point.ranges
 
 
-def _originals(ranges: Domains) -> dict[str, Quantity]:
+def _originals(ranges: Mapping[str, Domain]) -> dict[str, Quantity]:
     return {name: domain.original for name, domain in ranges.items()}
 
 

@@ -23,7 +23,6 @@ from safevar_sumo.records import (
     finite_or_none,
 )
 from safevar_sumo.scenarios import Point, TrackScenario
-from safevar_sumo.scenarios.point import Points
 from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import ORIGINAL_DEGREE, PHASE, SAFETY_DEGREE
 from safevar_sumo.sumo.batch import drive_all, reason_against_scenes, score
@@ -256,7 +255,7 @@ def _simulate_unordered(system: System, settings: FloatArray) -> Iterator[PointR
     """
     number = len(settings)
 
-    groups: Iterable[Points] = ((point,) for point in system.points)
+    groups: Iterable[tuple[Point, ...]] = ((point,) for point in system.points)
     searched = {*system.characteristics.scenario.names}
     are_met = all(met_at(point, system, settings).all() for point in system.points)
     # Points share a simulation only if all settings meet them. A range of any parameter but the
@@ -287,7 +286,7 @@ def worst_point(system: System, setting: FloatArray) -> Point:
     return system.points[int(worst_points(system, at_points)[0])]
 
 
-def _group_points(system: System, size: int) -> Iterator[Points]:
+def _group_points(system: System, size: int) -> Iterator[tuple[Point, ...]]:
     """Yield groups of at most `size` points that may share a batch, sorted by duration.
 
     Points share a batch if their scenarios are tracks around vehicles of equal size; any other

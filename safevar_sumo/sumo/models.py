@@ -35,7 +35,6 @@ from safevar_sumo.scenarios import (
     weather_of,
 )
 from safevar_sumo.scenarios.base import check_fields
-from safevar_sumo.scenarios.point import Points
 from safevar_sumo.scenarios.tracks import LEGAL_FIELDS
 from safevar_sumo.study import (
     Constraint,
@@ -114,7 +113,7 @@ def _create_traci_controller(table: ModelTable, lookup: Lookup) -> Ads:
     return TraciController(create)
 
 
-def matrix_points(study: Study, lookup: Lookup) -> Points:
+def matrix_points(study: Study, lookup: Lookup) -> tuple[Point, ...]:
     """The points of a study's matrix; raises an error if several points share a name."""
     points: list[Point] = []
     shared = study.shared_constraints

@@ -21,7 +21,6 @@ from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.sumo.bodies import (
     Body,
     BodyPairs,
-    Hits,
     VehicleStates,
     distance_covered,
     find_overlaps,
@@ -187,7 +186,7 @@ class RecordedWorld:
 
     turn_back = walk
 
-    def _hits(self, is_open: BoolArray) -> Hits:
+    def _hits(self, is_open: BoolArray) -> dict[int, float]:
         """Speeds [m/s] of the vehicles whose body overlaps the body of an actor, by vehicle number.
         Vehicles whose runs have ended (not `is_open`) are left out.
 

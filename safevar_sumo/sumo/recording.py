@@ -23,7 +23,7 @@ from safevar_sumo.records import FloatArray, IntArray, Quantity
 from safevar_sumo.scenarios import VUT, Lane, Point, Scenario, WorldScenario
 from safevar_sumo.scenarios.roads import Coordinates, lane_through
 from safevar_sumo.shipped import PACKAGE
-from safevar_sumo.sumo.bodies import Films
+from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.copies import copied_id, copy_and_name, ensure_cached
 from safevar_sumo.sumo.engine import open_world, step_of
 from safevar_sumo.sumo.network import (
@@ -107,7 +107,7 @@ class Recording:
     along: FloatArray
     lanes: dict[str, tuple[Coordinates, ...]]
     first_lanes: dict[str, str]
-    tracks: Films
+    tracks: dict[str, Film]
 
     def lane(self, lane: str) -> Lane:
         """A lane by its id."""
@@ -249,11 +249,11 @@ def _play(
         )
 
 
-def _tracks(scenario: WorldScenario, world: SumoWorld) -> Films:
+def _tracks(scenario: WorldScenario, world: SumoWorld) -> dict[str, Film]:
     """The motion of all actors except the vehicle under test, until the end of the scenario."""
     length = round(scenario.duration / world.step_length) + 1
 
-    tracks = Films()
+    tracks = dict[str, Film]()
     memory = world.begin(scenario)
     for sample in range(length):
         world.film(tracks, sample, length)

@@ -26,7 +26,6 @@ from safevar_sumo.scenarios import (
 )
 from safevar_sumo.scenarios.base import Mover, Part
 from safevar_sumo.scenarios.declared import with_ranges
-from safevar_sumo.scenarios.point import Points
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import MetricsTable, Study
 from safevar_sumo.study.encounters import DecidingMetric
@@ -81,7 +80,7 @@ class System:
     characteristics: CharacteristicSet
     vehicle: Vehicle
     ads: Ads
-    points: Points
+    points: tuple[Point, ...]
     metrics_table: MetricsTable
     nominal: Nominal
     measuring: Measuring
@@ -98,7 +97,7 @@ class System:
     criterion: Unsafe
 
     @property
-    def matrix(self) -> Points:
+    def matrix(self) -> tuple[Point, ...]:
         """The points of a matrix, which have names; none in a study with a single scenario."""
         return tuple(point for point in self.points if point.name)
 
@@ -223,7 +222,7 @@ def assemble(study: Study) -> System:
         return _assemble(study)
 
 
-def _original_points(study: Study, lookup: Lookup, single: Point) -> Points:
+def _original_points(study: Study, lookup: Lookup, single: Point) -> tuple[Point, ...]:
     """The points of a study whose encounters are ranges, each in its original encounter; () for
     other studies. `single` is the only point of a study without a matrix.
 

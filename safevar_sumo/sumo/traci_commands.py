@@ -10,9 +10,7 @@ from typing import Any
 
 from safevar_sumo.errors import InputError
 
-Names = Mapping[str, tuple[str, ...]]
-"""Names of arguments by function, or of functions by domain."""
-DRIVER_COMMANDS: Names = {
+DRIVER_COMMANDS: Mapping[str, tuple[str, ...]] = {
     "setAccel": ("accel",),
     "setDecel": ("decel",),
     "setEmergencyDecel": ("decel",),
@@ -22,7 +20,7 @@ DRIVER_COMMANDS: Names = {
     "setSpeedFactor": ("factor",),
 }
 """Commands that change attributes of SUMO's driver: SUMO carries them out."""
-COMMANDS: Names = {
+COMMANDS: Mapping[str, tuple[str, ...]] = {
     "setSpeed": ("speed",),
     "slowDown": ("speed", "duration"),
     "setAcceleration": ("acceleration", "duration"),
@@ -42,7 +40,7 @@ MOTION = (
     "getLaneID",
     "getLanePosition",
 )
-SENSED: Names = {
+SENSED: Mapping[str, tuple[str, ...]] = {
     "vehicle": (
         *MOTION,
         "getLaneIndex",
@@ -88,7 +86,7 @@ OWN = (
 )
 """Functions that a controller may call for the vehicle under test, but for no other actor."""
 SUBSCRIPTIONS = ("subscribe", "getSubscriptionResults", "getAllSubscriptionResults")
-CALLS: Names = {
+CALLS: Mapping[str, tuple[str, ...]] = {
     "vehicle": (*LISTS, *SENSED["vehicle"], *CONSTANT, *OWN, *COMMANDS, *SUBSCRIPTIONS),
     "person": (*LISTS, *MOTION, *CONSTANT, *SUBSCRIPTIONS),
     "simulation": (

@@ -26,7 +26,6 @@ from safevar_sumo.sumo.bodies import (
     TOUCH,
     Body,
     BodyPairs,
-    Hits,
     VehicleStates,
     distance_between,
     find_overlaps,
@@ -287,7 +286,7 @@ class Traffic:
 
     def hits(
         self, sample: int, front: FloatArray, speed: FloatArray, is_open: BoolArray
-    ) -> Hits:
+    ) -> dict[int, float]:
         """Make `sample` the current sample, and return the speeds [m/s] of vehicles that touch a
         body, by vehicle number. Vehicles whose runs have ended (not `is_open`) are left out.
         """

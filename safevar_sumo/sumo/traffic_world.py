@@ -18,7 +18,7 @@ from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios import VUT, Track
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import PERSONS, SCREEN
-from safevar_sumo.sumo.bodies import BodyPairs, Films, Hits, VehicleStates
+from safevar_sumo.sumo.bodies import BodyPairs, Film, VehicleStates
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.moving import Sampled, at_sample
@@ -148,10 +148,10 @@ class TrafficWorld(SumoWorld):
     def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
         return self._lane.bodies(vehicles)
 
-    def _hits(self, is_open: BoolArray) -> Hits:
+    def _hits(self, is_open: BoolArray) -> dict[int, float]:
         return {}
 
-    def film(self, tracks: Films, sample: int, length: int) -> None:
+    def film(self, tracks: dict[str, Film], sample: int, length: int) -> None:
         """Write the motion of all actors; see `SumoWorld.film`. An actor without a size is not
         there: its motion is NaN.
         """

@@ -14,7 +14,7 @@ from safevar_sumo.records import BoolArray, FloatArray, FloatOrArray, nans
 from safevar_sumo.scenarios import VUT, Lane, WorldScenario
 from safevar_sumo.scenarios.base import ScenarioMemory
 from safevar_sumo.scenarios.roads import Coordinates, Frame, lane_through
-from safevar_sumo.sumo.bodies import Body, BodyPairs, Film, Films, Hits, VehicleStates
+from safevar_sumo.sumo.bodies import Body, BodyPairs, Film, VehicleStates
 from safevar_sumo.sumo.copies import copied_id, copy_and_name
 from safevar_sumo.vehicles import SumoType
 
@@ -178,7 +178,7 @@ class SumoWorld:
         self._fronts[copies] = [self._get_position(name) for name in self.driving]
         return VehicleStates(self._fronts, self._speeds, self._hits(is_open))
 
-    def _hits(self, is_open: BoolArray) -> Hits:
+    def _hits(self, is_open: BoolArray) -> dict[int, float]:
         """Speeds [m/s] of the vehicles under test that collide in this step, by copy. Vehicles
         whose runs have ended (not `is_open`) are left out.
 
@@ -274,7 +274,7 @@ class SumoWorld:
             for id_ in domain.getIDList()
         }
 
-    def film(self, tracks: Films, sample: int, length: int) -> None:
+    def film(self, tracks: dict[str, Film], sample: int, length: int) -> None:
         """Write the motion of all actors on the road into `tracks`, which has a film of `length`
         samples for each name, at one of these samples.
         """

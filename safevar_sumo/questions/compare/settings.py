@@ -20,8 +20,7 @@ from safevar_sumo.questions.pairs import Criteria, Runs
 from safevar_sumo.questions.sampling import Interval, sobol_points
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.results import handles_of
-from safevar_sumo.study import Limit, Study
-from safevar_sumo.study.characteristics import Domains
+from safevar_sumo.study import Domain, Limit, Study
 from safevar_sumo.study.encounters import Axes, AxisTable
 from safevar_sumo.study.limits import check_limits
 
@@ -179,7 +178,7 @@ class CommonDomain(NamedTuple):
         return [side.evaluate(of_side, BOTH_STAGE) for side, of_side in pairs]
 
 
-def within(limits: Restriction, name: str, domains: Domains) -> Interval:
+def within(limits: Restriction, name: str, domains: Mapping[str, Domain]) -> Interval:
     """The ends of the domain of the characteristic `name` within the user's limits."""
     domain = domains[name]
     if name in limits:
