@@ -114,6 +114,7 @@ def describe(
     settings: Mapping[str, FloatArray],
     box: Box | None = None,
     single_names: Mapping[str, str] = MappingProxyType({}),
+    further: Sequence[int] = FURTHER_DIGITS,
 ) -> dict[str, Failure]:
     """Describe how unsafe settings of a model fail at their worst points, by the settings' names.
 
@@ -127,16 +128,18 @@ def describe(
         A value within this box stays in it when it is rounded; None for no box.
     single_names
         By a setting's name, the only characteristic that is rounded.
+    further
+        Numbers of digits beyond the digits of a limit, in the order in which they are tried.
     """
     failures = {}
     waiting = dict(settings)
-    for further in FURTHER_DIGITS:
+    for number in further:
         if not waiting:
             break
         members = model.characteristics
         rows = np.array(
             [
-                as_printed(members, setting, further, box, single_names.get(name, ""))
+                as_printed(members, setting, number, box, single_names.get(name, ""))
                 for name, setting in waiting.items()
             ]
         )
@@ -148,13 +151,16 @@ def describe(
 
 
 def values_as_printed(
-    model: Model, vehicles: Sequence[NamedValues], single_names: Sequence[str] = ()
+    model: Model,
+    vehicles: Sequence[NamedValues],
+    single_names: Sequence[str] = (),
+    further: Sequence[int] = FURTHER_DIGITS,
 ) -> list[NamedValues]:
     """The values of unsafe vehicles as `describe` rounds them. All characteristics without a value
     are as in the original vehicle. A vehicle that no rounding leaves unsafe keeps its values.
 
     `single_names` are the only characteristics that are rounded, one for each vehicle; () if all
-    are rounded.
+    are rounded. `further` are the numbers of further digits that `describe` tries.
     """
     members = model.characteristics
     settings = {
@@ -162,7 +168,7 @@ def values_as_printed(
         for row, vehicle in enumerate(vehicles)
     }
     names = dict(zip(settings, single_names, strict=False))
-    printed = describe(model, settings, single_names=names)
+    printed = describe(model, settings, single_names=names, further=further)
     settings |= {name: failure.setting for name, failure in printed.items()}
     return list(map(members.named, settings.values()))
 

@@ -14,6 +14,7 @@ from hypothesis import given, strategies as st
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.causes import Cause
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.combinations import enumerate_causes, staircase
 from safevar_sumo.questions.explain.smallest import Smallest
@@ -163,8 +164,9 @@ def test_a_beginning_is_rounded_to_the_unsafe_side() -> None:
     smallest, verdict = smallest_of(2, lambda rows: way(rows)[:, 0] > 0.3007)
     assert smallest.table["begins_at"].tolist() == [0.31]
     assert "a at 6.55 N m, 31 % of the way" in verdict
-    assert "if each change goes 10 to 30 % of the way" in verdict
-    assert "the cause has these values: a at 10 N m." in verdict
+    assert "at 10 to 30 % of the way to the ends" in verdict
+    assert "The checks of similar vehicles use these values: a at 10 N m." in verdict
+    assert "parameter set" not in verdict
 
 
 def test_a_cause_begins_where_none_of_its_parts_is_unsafe() -> None:
@@ -280,7 +282,7 @@ def test_the_verdict_claims_no_more_than_was_simulated() -> None:
     assert "1 of the 24 combinations of two changes causes a collision." in sentences
     assert "1 of the 28 combinations of three changes causes a collision." in sentences
     assert (
-        "None of 480 simulated combinations (up to four changes) causes a collision"
+        "None of 480 simulated combinations of up to four changes causes a collision at"
         in sentences
     )
 
@@ -320,3 +322,81 @@ def test_what_is_left_of_few_simulations_explains_a_sampled_failure() -> None:
         "simulated combinations of two changes cause a collision (145 such"
         in answer.verdict
     )
+
+
+def leading_of(region: Region, sampled: list[dict[str, float]]) -> tuple[Smallest, str]:
+    """The answer about a region of three characteristics with causes of sampled vehicles."""
+    evaluator = made_up_evaluator(3, region)
+    causes = [Cause(changes, "collision", -1.0, {}) for changes in sampled]
+    smallest = Smallest.of(evaluator, COLLISION, 0, causes)
+    return smallest, Verdict(smallest_sentences(smallest, evaluator, COLLISION))
+
+
+def test_an_island_that_only_sampled_vehicles_hit_leads() -> None:
+    """One change at 43.2 to 43.8 % of the way, and two changes at the ends."""
+
+    def region(settings: FloatArray) -> BoolArray:
+        share = way(settings)
+        is_island = np.abs(share[:, 2] - 0.435) < 0.003
+        return is_island | (share[:, :2].min(axis=1) > 0.95)
+
+    smallest, verdict = leading_of(region, [{"c": 7.176}, {"c": 7.172}])
+    first, second = smallest.table.to_dict("records")
+    assert (first["size"], second["size"]) == (1, 2)
+    assert 7.16 < first["boundary"]["c"] < 7.19
+    assert 0.432 <= first["begins_at"] <= 0.4344
+    assert first["safe_again"] == 0.44
+    value = first["boundary"]["c"]
+    assert verdict.startswith(f"One change is enough for a collision: c at {value} N m")
+    assert first["robust_share"] < 0.8
+    assert "The cause is borderline" in verdict
+    assert "includes" not in verdict
+
+
+def test_a_sampled_vehicle_shows_that_a_known_cause_begins_nearer() -> None:
+    """One change at its end, and at 20.2 to 20.8 % of the way."""
+
+    def region(settings: FloatArray) -> BoolArray:
+        share = way(settings)[:, 0]
+        return (np.abs(share - 0.205) < 0.003) | (share > 0.9)
+
+    smallest, _ = leading_of(region, [{"a": 6.025}])
+    (row,) = smallest.table.to_dict("records")
+    assert row["causes"] == {"a": 10.0}
+    assert region(np.array([[row["boundary"]["a"], ORIGINAL, ORIGINAL]]))[0]
+    assert 0.202 <= row["begins_at"] <= 0.205
+    assert (row["safe_again"], row["robust_share"]) == (0.21, 1.0)
+
+
+def test_sampled_changes_at_different_shares_are_told_without_a_share() -> None:
+    """Two changes, one of them small, and the ends are safe."""
+
+    def region(settings: FloatArray) -> BoolArray:
+        share = way(settings)
+        is_first = (share[:, 0] > 0.15) & (share[:, 0] < 0.25)
+        return is_first & (share[:, 1] > 0.6) & (share[:, 1] < 0.68)
+
+    smallest, verdict = leading_of(region, [{"a": 6.0, "b": 8.3}])
+    (row,) = smallest.table.to_dict("records")
+    assert np.isnan(row["begins_at"])
+    boundary = row["boundary"]
+    assert region(np.array([[boundary["a"], boundary["b"], ORIGINAL]]))[0]
+    assert verdict.startswith(
+        "Two changes together are enough for a collision: a at"
+        f" {boundary['a']} N m and b at {boundary['b']} N m. All other"
+    )
+    assert "includes c." in verdict
+
+
+def test_causes_with_fewer_changes_come_first_and_then_the_more_robust() -> None:
+    """One change just at its end, another one from half of its way on, and a pair."""
+
+    def region(settings: FloatArray) -> BoolArray:
+        share = way(settings)
+        pair = (share[:, 2] > 0.5) & (share[:, 0] < -0.5)
+        return (share[:, 0] > 0.999) | (share[:, 1] > 0.5) | pair
+
+    smallest, _ = leading_of(region, [])
+    table = smallest.table
+    assert [list(changes) for changes in table["causes"]] == [["b"], ["a"], ["a", "c"]]
+    assert table["robust_share"][0] > table["robust_share"][1]

@@ -5,6 +5,7 @@ have avoided it.
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import TYPE_CHECKING, Annotated
 
 import pandas as pd
@@ -163,12 +164,9 @@ def explain(
     # ranges, the original may still be safe in the encounter of a failure.
     is_caused = bool(study.ranges or not population.unsafe.of(population.original)[0])
 
-    # Of a study, the smallest changes are found first. With few simulations, the minimal causes of
-    # failures get a half (of results: a quarter) of what is left.
-    has_smallest = of_study and is_caused
-    smallest = Smallest.of(evaluator, population.unsafe, fits) if has_smallest else None
+    # With few simulations, the minimal causes of failures get a quarter of what is left.
     if evaluator.left is not None:
-        limit = evaluator.left // (2 if of_study else 4) * len(evaluator.system.points)
+        limit = evaluator.left // 4 * len(evaluator.system.points)
     top = 0 if of_study else top
     reasons, sample, causes, complete = choose_failures(
         population, evaluator, limit, top
@@ -177,6 +175,10 @@ def explain(
         causes = {row: [] for row in causes}
     of_chosen = [causes[row] for row in reasons]
     of_sample = [causes[row] for row in sample]
+    smallest = None
+    if of_study and is_caused:
+        sampled = list(chain.from_iterable(of_sample))
+        smallest = Smallest.of(evaluator, population.unsafe, fits, sampled)
     changed = evaluator.characteristics.changed(runs.settings[sample])
     necessity = count_needed(
         evaluator.characteristics, changed, of_sample, len(population.rows)

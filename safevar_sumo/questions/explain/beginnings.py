@@ -11,6 +11,11 @@ import numpy as np
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.boundary import on_lines
+from safevar_sumo.questions.cause_limits import (
+    PARTS,
+    find_cause_limits,
+    settings_of_line,
+)
 from safevar_sumo.questions.causes import (
     BOUNDARIES,
     Cause,
@@ -37,12 +42,12 @@ class Beginning(NamedTuple):
     ----------
     cause
         The cause, with its values at the ends of the domain or, if these are safe, nearer to the
-        original.
+        original. The checks of similar vehicles and of other parameter sets use these values.
     begins_at
         The smallest share of the way to the ends at which it was found to be a cause; NaN if the
-        values are at the ends and others were not simulated.
+        changes are at different shares, or if smaller changes were not simulated.
     boundary
-        The values of the changes at this share.
+        The smallest values of the changes that were found to be a cause.
     safe_again
         The smallest share above it at which these changes are safe again; NaN if there is none.
     """
@@ -74,6 +79,91 @@ def find_beginnings(
         causes = [beginning.cause for beginning in beginnings]
         pending = _smallest(members, causes, smaller)
     return beginnings
+
+
+def with_sample(
+    evaluator: Evaluator, unsafe: Unsafe, known: Sequence[Beginning], sampled: Causes
+) -> list[Beginning]:
+    """The known beginnings, and those of causes of sampled vehicles that have fewer changes, or as
+    many changes as the smallest known cause. Of causes with the same changes in the same
+    directions, the one that begins nearest to the original counts.
+    """
+    members = evaluator.characteristics
+    beginnings = {
+        directions(members, beginning.cause.changes): beginning for beginning in known
+    }
+    sampled = [cause for cause in sampled if cause.changes]
+    causes = [*(beginning.cause for beginning in known), *sampled]
+    fewest = min((len(cause.changes) for cause in causes), default=0)
+
+    def share_of(cause: Cause) -> float:
+        """The share of the way to the ends within which all changes of a cause lie."""
+        return max(shares_of_way(members, cause.changes))
+
+    nearest = dict[tuple[str, ...], Cause]()
+    for cause in sorted(sampled, key=share_of):
+        kind = directions(members, cause.changes)
+        begins_at = np.inf
+        if kind in beginnings:
+            # Without a share, the known cause is at the ends.
+            begins_at = np.nan_to_num(beginnings[kind].begins_at, nan=1.0)
+        if len(cause.changes) == fewest and share_of(cause) + 1 / STEPS < begins_at:
+            nearest.setdefault(kind, cause)
+
+    # Each cause has a line for all its changes, and one for each change.
+    price = (1 + fewest) * (settings_of_line(PARTS) + STEPS)
+    number = evaluator.at_most(price * len(nearest), 4) // price
+    chosen = list(nearest.values())[:number]
+    limits = find_cause_limits(evaluator, chosen, unsafe)
+    for cause, limit in zip(chosen, limits, strict=True):
+        kind = directions(members, cause.changes)
+        begins_at = safe_again = np.nan
+        if fewest == 1:
+            (begins_at,) = shares_of_way(members, limit.boundary)
+            safe_again = _first_safe_share(evaluator, unsafe, cause, begins_at)
+        # The checks keep the values of a known cause, which are farther in the unsafe range.
+        checked = beginnings[kind].cause if kind in beginnings else cause
+        beginnings[kind] = Beginning(checked, begins_at, limit.boundary, safe_again)
+    return list(beginnings.values())
+
+
+def shares_of_way(members: CharacteristicSet, changes: NamedValues) -> list[float]:
+    """For each change, the share of the way from the original value to the end of the domain."""
+    shares = []
+    for item in members:
+        if item.name in changes:
+            change = changes[item.name] - item.original
+            end = item.upper if change > 0 else item.lower
+            shares.append(change / (end - item.original))
+    return shares
+
+
+def _first_safe_share(
+    evaluator: Evaluator, unsafe: Unsafe, cause: Cause, begins_at: float
+) -> float:
+    """The smallest of `STEPS` shares of the way to the ends above `begins_at` at which the changes
+    of a cause are safe; NaN if there is none.
+    """
+    members = evaluator.characteristics
+    shares = np.arange(1, STEPS + 1) / STEPS
+    shares = shares[shares > begins_at]
+    starts, ends = _lines_to_ends(members, settings_of(members, [cause]))
+    (settings,) = on_lines(starts, ends, shares[np.newaxis])
+    runs = evaluator.evaluate(settings, BOUNDARIES)
+    return float(min(shares[runs.valid & ~unsafe.of(runs)], default=np.nan))
+
+
+def _lines_to_ends(
+    members: CharacteristicSet, settings: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The original vehicle in the encounters of M settings, and the vehicle with the changes of
+    each setting at the ends of their domains; both have the shape (M, n).
+    """
+    starts = members.with_original_vehicle(settings)
+    ends = np.select(
+        [settings > starts, settings < starts], [members.upper, members.lower], starts
+    )
+    return starts, ends
 
 
 def _smallest(
@@ -115,11 +205,7 @@ def _begin(
 
     # `settings` lie on lines from the original to the ends of the domain, shape (K, steps, n).
     members = evaluator.characteristics
-    values = settings_of(members, causes[:number])
-    starts = members.with_original_vehicle(values)
-    ends = np.select(
-        [values > starts, values < starts], [members.upper, members.lower], starts
-    )
+    starts, ends = _lines_to_ends(members, settings_of(members, causes[:number]))
     shares = np.arange(1, steps + 1) / steps
     settings = on_lines(starts, ends, np.tile(shares, (number, 1)))
     runs = evaluator.evaluate(settings.reshape(-1, len(members)), BOUNDARIES)

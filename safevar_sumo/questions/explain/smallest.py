@@ -1,6 +1,7 @@
-"""The smallest changes that make the vehicle of a study unsafe, as `explain` prints them. For each
-cause at the ends of the domain, the answer says where the cause begins, and how sure it is. The
-staircase is the least number of unsafe changes at each share of the way to the ends.
+"""The smallest changes that make a vehicle unsafe, as `explain` of a study prints them. The search
+tries the ends of the domain, shares of the way to the ends, and sampled vehicles. For each cause,
+the answer says where the cause begins, and how sure it is. The staircase is the least number of
+unsafe changes at each share of the way to the ends.
 """
 
 from __future__ import annotations
@@ -12,8 +13,14 @@ import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.causes import Causes
+from safevar_sumo.questions.counterexamples import FURTHER_DIGITS, values_as_printed
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.beginnings import find_beginnings
+from safevar_sumo.questions.explain.beginnings import (
+    Beginning,
+    find_beginnings,
+    with_sample,
+)
 from safevar_sumo.questions.explain.combinations import (
     CountBySize,
     Enumeration,
@@ -26,6 +33,7 @@ from safevar_sumo.questions.explain.tables import (
     STAIRCASE_COLUMNS,
     sureness,
 )
+from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tables import AnswerTables, tabulate
 from safevar_sumo.records import JsonObject
 
@@ -38,7 +46,13 @@ the same number again.
 """
 CURES = 4
 """Combinations that contain a cause may take `MAX_SETTINGS` / `CURES` settings."""
-TITLE = "The smallest unsafe changes, each at an end of its domain"
+DIGITS_OF_SHARES = FURTHER_DIGITS[1:]
+"""Numbers of digits beyond the digits of a limit. A value has at least one further digit, so that
+the share of the way at which a cause begins is also that of the printed value.
+"""
+TITLE = (
+    "The smallest unsafe changes, with the values at which the vehicle becomes unsafe"
+)
 
 SMALLEST_NUMBERS = (
     "tried",
@@ -62,18 +76,26 @@ class Smallest(NamedTuple):
         The causes at each share of the way to the ends; the first step is `at_ends`.
     cures
         By size, the number of combinations that are safe although they contain a cause.
+    sampled
+        Causes of the failures of sampled vehicles.
     table
-        A row of `SMALLEST_COLUMNS` for each cause, the most robust cause first.
+        A row of `SMALLEST_COLUMNS` for each cause, ordered by the number of changes. Of causes with
+        the same number of changes, the most robust comes first.
     """
 
     at_ends: Enumeration
     steps: Sequence[Enumeration]
     cures: CountBySize
+    sampled: Causes
     table: pd.DataFrame
 
     @classmethod
-    def of(cls, evaluator: Evaluator, unsafe: Unsafe, fits: int) -> Self:
-        """Find the smallest unsafe changes, and check them in `fits` parameter sets."""
+    def of(
+        cls, evaluator: Evaluator, unsafe: Unsafe, fits: int, sampled: Causes = ()
+    ) -> Self:
+        """Find the smallest unsafe changes, and check them in `fits` parameter sets. `sampled` are
+        the causes of the failures of sampled vehicles.
+        """
         # With few simulations, half of them enumerate the combinations at the ends, because only
         # causes that are found there can be made smaller. A third of the remaining simulations
         # finds the staircase. The rest checks how sure the causes are.
@@ -86,7 +108,18 @@ class Smallest(NamedTuple):
         cures = count_cures(
             evaluator, unsafe, at_ends, evaluator.at_most(MAX_SETTINGS // CURES, 8)
         )
-        return cls(at_ends, steps, cures, _table(evaluator, unsafe, steps, fits))
+        known = find_beginnings(evaluator, unsafe, steps)
+        beginnings = with_sample(evaluator, unsafe, known, sampled)
+        table = _table(evaluator, unsafe, beginnings, fits)
+        return cls(at_ends, steps, cures, sampled, table)
+
+    @property
+    def changed(self) -> set[str]:
+        """The names of the characteristics that some known cause changes."""
+        names = {name for changes in self.table["causes"] for name in changes}
+        for cause in [*self.at_ends.causes, *self.sampled]:
+            names.update(cause.changes)
+        return names
 
     @property
     def containing(self) -> tuple[int, int, int]:
@@ -182,10 +215,10 @@ def draw_staircase(answer: Answer) -> Figure:
 
 
 def _table(
-    evaluator: Evaluator, unsafe: Unsafe, steps: Sequence[Enumeration], fits: int
+    evaluator: Evaluator, unsafe: Unsafe, beginnings: Sequence[Beginning], fits: int
 ) -> pd.DataFrame:
-    """The frame with a row of `SMALLEST_COLUMNS` for each cause, the most robust cause first."""
-    beginnings = find_beginnings(evaluator, unsafe, steps)
+    """The frame with a row of `SMALLEST_COLUMNS` for each cause."""
+    beginnings = _as_printed(evaluator, unsafe, beginnings)
     causes = [beginning.cause for beginning in beginnings]
     robust, holds, number_of_sets = sureness(evaluator, causes, unsafe, fits)
     rows = [
@@ -204,6 +237,38 @@ def _table(
     ]
     frame = pd.DataFrame(rows, columns=list(SMALLEST_COLUMNS))
     in_order = frame.astype({"holds": "Int64", "fits": "Int64"}).sort_values(
-        ["robust_share", "holds", "size"], ascending=[False, False, True]
+        ["size", "robust_share", "holds", "begins_at"],
+        ascending=[True, False, False, True],
     )
     return in_order.reset_index(drop=True)
+
+
+def _as_printed(
+    evaluator: Evaluator, unsafe: Unsafe, beginnings: Sequence[Beginning]
+) -> list[Beginning]:
+    """The beginnings with values as they are printed, rounded to the unsafe side. With too few
+    simulations they stay as they are, because a rounded vehicle is simulated again.
+    """
+    vehicles = []
+    for beginning in beginnings:
+        encounter = beginning.cause.encounter
+        vehicles += [
+            beginning.boundary | encounter,
+            beginning.cause.changes | encounter,
+        ]
+    left = evaluator.left
+    if left is not None and left < 2 * len(DIGITS_OF_SHARES) * len(vehicles):
+        return list(beginnings)
+    model = Model(0, evaluator, unsafe)
+    printed = iter(values_as_printed(model, vehicles, further=DIGITS_OF_SHARES))
+    rounded = []
+    for beginning in beginnings:
+        at_boundary = next(printed)
+        checked = next(printed)
+        names = beginning.boundary
+        cause = beginning.cause._replace(
+            changes={name: checked[name] for name in names}
+        )
+        values = {name: at_boundary[name] for name in names}
+        rounded.append(beginning._replace(cause=cause, boundary=values))
+    return rounded

@@ -67,7 +67,7 @@ def smallest_sentences(
             yield _of_size(smallest.at_ends, unsafe, size)
     yield from _steps(smallest.steps[1:], unsafe)
     yield from _containing(smallest)
-    yield from _in_none(smallest.at_ends, members)
+    yield from _in_none(smallest, members)
     if encounters := len(evaluator.critical_encounters):
         yield words.SCOPE(number=encounters)
 
@@ -75,8 +75,8 @@ def smallest_sentences(
 def _leading_of_study(
     smallest: Smallest, members: CharacteristicSet, unsafe: Unsafe
 ) -> Sentences:
-    """Yield the sentences on the leading cause, and on how sure it is. The leading cause has the
-    fewest changes and, among several such causes, begins nearest to the original.
+    """Yield the sentences on the leading cause, and on how sure it is. The leading cause is the
+    first of the table: it has the fewest changes and, among several such causes, is most robust.
     """
     table = smallest.table
     if not smallest.at_ends.tried:
@@ -89,26 +89,49 @@ def _leading_of_study(
             changes=_size_in_words(largest),
         )
         return
-    fewest = table[table["size"] == table["size"].min()]
-    in_order = fewest.sort_values("begins_at", kind="stable")
-    leading = in_order.to_dict("records")[0]
+    leading = table.to_dict("records")[0]
     if not leading["size"]:
         yield words.UNSAFE_IN_ENCOUNTER
         return
     share = leading["begins_at"]
-    templates = words.ON_THE_WAY if share < 1 else words.AT_ENDS
+    templates = _templates(members, leading["boundary"], share)
     yield _enough(templates, members, unsafe, leading["boundary"], share)
-    if number_of_others := len(fewest) - 1:
+    if number_of_others := int((table["size"] == leading["size"]).sum()) - 1:
         yield words.OTHERS(causes=number_of(number_of_others, "further cause"))
 
     if pd.notna(leading["safe_again"]):
         yield words.GAP(share=percentage(leading["safe_again"]))
-    is_checked = pd.notna(leading["robust_share"])
-    if is_checked and leading["causes"] != leading["boundary"]:
-        yield words.CHECKED_WITH(changes=values_in_words(members, leading["causes"]))
     if leading["unsafe_runs"] < 1:
         yield words.RUNS(share=percentage(leading["unsafe_runs"]))
+    if leading["causes"] != leading["boundary"]:
+        yield from _checked(members, leading)
     yield from _sureness(leading)
+
+
+def _checked(members: CharacteristicSet, row: Mapping[Any, Any]) -> Sentences:
+    """Say with which values the cause in a row of the table was checked."""
+    if pd.notna(row["robust_share"]):
+        checks = "similar vehicles"
+        if pd.notna(row["holds"]):
+            checks += " and of other parameter sets"
+        changes = values_in_words(members, row["causes"])
+        yield words.CHECKED_WITH(checks=checks, changes=changes)
+
+
+def _templates(
+    members: CharacteristicSet, values: NamedValues, begins_at: float
+) -> Sequence[Sentence]:
+    """The sentences that say where a cause begins: at ends of the domain, at a share of the way to
+    the ends, or (if the share is NaN) at certain values.
+    """
+    are_ends = all(
+        values[item.name] in (item.lower, item.upper)
+        for item in members
+        if item.name in values
+    )
+    if are_ends:
+        return words.AT_ENDS
+    return words.CHANGES if np.isnan(begins_at) else words.ON_THE_WAY
 
 
 def _enough(
@@ -125,7 +148,7 @@ def _enough(
         unsafe=unsafe.event,
         number=_count(len(changes)),
         changes=values_in_words(members, changes),
-        share=f"{100 * share:.12g}",
+        share=percentage(share),
     )
 
 
@@ -169,15 +192,14 @@ def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Sentences:
                 unsafe=unsafe.event,
             )
             continue
-        changes = _size_in_words(largest)
-        if alike[0].is_cut:
-            changes += ", as there are too many larger ones"
         yield words.STEP_WITHOUT(
             shares=shares,
             tried=sum(step.tried for step in alike),
-            changes=changes,
+            changes=_size_in_words(largest),
             causes=unsafe.effects[0],
         )
+        if alike[0].is_cut:
+            yield words.LARGER_LEFT_OUT
 
 
 def _containing(smallest: Smallest) -> Sentences:
@@ -189,12 +211,12 @@ def _containing(smallest: Smallest) -> Sentences:
         yield words.CURES(count=count_in_words(cures, simulated))
 
 
-def _in_none(at_ends: Enumeration, members: CharacteristicSet) -> Sentences:
-    """Say which characteristics are in no cause, up to the number of changes up to which all
-    combinations were simulated.
+def _in_none(smallest: Smallest, members: CharacteristicSet) -> Sentences:
+    """Say which characteristics are in no known cause, up to the number of changes up to which all
+    combinations of ends were simulated.
     """
-    size = at_ends.complete_up_to
-    changed = {name for cause in at_ends.causes for name in cause.changes}
+    size = smallest.at_ends.complete_up_to
+    changed = smallest.changed
     names = [item.short_name for item in members.vehicle if item.name not in changed]
     if names and changed and size:
         yield words.IN_NONE(

@@ -76,10 +76,7 @@ BEYOND = evidence("{count} vehicles that were tested with {larger} {collide}.")
 GAP = evidence(
     "The unsafe range has a gap: at {share} % of the way to the ends, the vehicle is safe again."
 )
-CHECKED_WITH = evidence(
-    "In the checks with similar vehicles and with other parameter sets of the vehicle model, the"
-    " cause has these values: {changes}."
-)
+CHECKED_WITH = evidence("The checks of {checks} use these values: {changes}.")
 RUNS = evidence("The vehicle is unsafe in {share} % of its repeated runs.")
 SETS = evidence(
     "The same cause was found in {holds} of {fits} parameter sets of the vehicle model"
@@ -103,8 +100,11 @@ STEP = note(
     " domain."
 )
 STEP_WITHOUT = note(
-    "None of {tried:,} simulated combinations ({changes}) {causes} if each change goes {shares} %"
-    " of the way to an end of its domain."
+    "None of {tried:,} simulated combinations of {changes} {causes} at {shares} % of the way to the"
+    " ends of the domains."
+)
+LARGER_LEFT_OUT = note(
+    "Combinations of more changes were not simulated there, because they are too many."
 )
 CONTAINING = condition(
     "The counts of combinations leave out {combinations} with a smaller cause (fewer changes that"
@@ -113,7 +113,9 @@ CONTAINING = condition(
 CURES = condition(
     "Another change prevents the failure in {count} simulated combinations with a smaller cause."
 )
-IN_NONE = condition("No cause with {changes} includes {names}.")
+IN_NONE = condition(
+    "No cause with {changes}, each at an end of its domain, includes {names}."
+)
 SCOPE = note(
     "Valid for: the original encounter and the {number} encounters in which the original vehicle"
     " is least safe."
