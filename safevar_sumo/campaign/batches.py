@@ -29,6 +29,7 @@ from safevar_sumo.campaign.evaluation import (
     Task,
     carry_out,
     evaluate_settings,
+    home_of,
     repeat_first_batch,
     system_of,
     verify_settings,
@@ -249,7 +250,7 @@ def repeat_first_batches(study: Study, pool: Pool) -> None:
     """
     if user_code_names(study):
         limit = pool.spare and pool.spare[1] // simulations_of_setting(system_of(study))
-        pool.everywhere(repeat_first_batch, study, limit=limit)
+        pool.everywhere(repeat_first_batch, study, home=home_of(study), limit=limit)
 
 
 def opened_by(study: Study, pool: Pool) -> list[str]:
@@ -366,7 +367,9 @@ def compile_vehicle(study: Study, pool: Pool, progress: Progress) -> None:
 
 
 def _compile_vehicle(task: Task, only_load: bool) -> bool:
-    return bool(system_of(task.study).vehicle.compile(only_load=only_load))
+    system = system_of(task.study)
+    with system.modules.active():
+        return bool(system.vehicle.compile(only_load=only_load))
 
 
 def ask_why_no_verdict(

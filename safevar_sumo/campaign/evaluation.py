@@ -5,6 +5,7 @@ settings determine the results: they are the same in any process on any machine.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -17,7 +18,7 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.ads.varied import VariedAds
 from safevar_sumo.campaign.local import Work
-from safevar_sumo.campaign.pool import Look, Pool, WorkerLostError
+from safevar_sumo.campaign.pool import Home, Look, Pool, WorkerLostError
 from safevar_sumo.errors import (
     EnvironmentFault,
     SafevarError,
@@ -106,13 +107,27 @@ class Task(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def system_of(study: Study) -> System:
-    """Return the system of a study. This process assembles the system only once."""
-    return _assemble_packed(msgspec.msgpack.encode(study))
+    """Return the system of a study. This process assembles the system only once, and again after an
+    edit of its user code.
+    """
+    packed_study = msgspec.msgpack.encode(study)
+    system = _assemble_packed(packed_study)
+    if system.modules.are_edited:
+        _assemble_packed.cache_clear()
+        return _assemble_packed(packed_study)
+    return system
 
 
 @lru_cache(maxsize=KNOWN_SYSTEMS)
 def _assemble_packed(packed_study: bytes) -> System:
     return assemble(msgspec.msgpack.decode(packed_study, type=Study))
+
+
+def home_of(study: Study) -> Home:
+    """The folders of a study with user code; () for other studies."""
+    if not user_code_names(study):
+        return ()
+    return (*study.origin.places, os.getcwd())
 
 
 def carry_out(
@@ -122,15 +137,16 @@ def carry_out(
     look: Look = lambda ended: None,
 ) -> list[Any]:
     """Call a function with the arguments of each job in the pool, and return the results. The first
-    argument of a job is its task.
+    argument of a job is its task; the tasks of all jobs are of one study.
 
     Raises
     ------
     SafevarError
         If two workers die in the same job; the error names the study, the job and user code.
     """
+    home = home_of(jobs[0][0].study) if jobs else ()
     try:
-        return pool.map(function, jobs, look)
+        return pool.map(function, jobs, look, home)
     except WorkerLostError as error:
         task, *arguments = jobs[error.job]
         work = "the check of user code"
@@ -163,7 +179,8 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
     if len(rows) > task.batch_size:
         batches = np.array_split(rows, math.ceil(len(rows) / task.batch_size))
         evaluate = partial(evaluate_settings, task)
-        return Evaluations.concatenate(list(map(evaluate, batches)))
+        with system_of(task.study).modules.active():
+            return Evaluations.concatenate(list(map(evaluate, batches)))
     try:
         return evaluate_batch(task, rows)
     except (SimulationError, UserCodeError) as error:
@@ -202,7 +219,8 @@ def evaluate_batch(task: Task, rows: FloatArray) -> Evaluations:
     if task.in_sumo:
         system = replace(system, in_sumo=True)
     # Compilation comes first, because it may take longer than the time limit of a batch.
-    system.vehicle.compile()
+    with system.modules.active():
+        system.vehicle.compile()
     # With a simulator that takes long, each run has the time limit instead of the batch.
     limit = end_if_longer(task.study.search.time_limit)
     with nullcontext() if system.mover.takes_long else limit:
@@ -267,7 +285,8 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
         group = np.flatnonzero(set_of_row.ravel() == number)
         parameters = dict(zip(selection.parameters, parameter_set, strict=True))
         study = with_parameters(task.study, parameters)
-        driven = replace(system, ads=assemble(study).ads)
+        varied_system = assemble(study)
+        driven = replace(system, ads=varied_system.ads, modules=varied_system.modules)
         evaluations = drive_and_score(driven, settings[group], with_originals=False)
         groups.append(replace(evaluations, settings=rows[group]))
         rows_of_groups.append(group)

@@ -74,13 +74,20 @@ def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
     network_files = {
         network.path(name) for network in opened for name, _ in network.digests
     }
-    fmus = {
-        Path(file_beside(name, places or [os.getcwd()])) for _, name in fmus_of(study)
-    }
     data = {
         file for path in data_files(study).values() for file in files_in(Path(path))
     }
-    files = network_files | code_files(user_modules(study), places) | fmus | data
-    return dict(
-        sorted((digests_by_name(used, places) | digests(files, places)).items())
-    )
+    files = digests(network_files | data, places) | code_of(study, used)
+    return dict(sorted(files.items()))
+
+
+def code_of(study: Study, used: Iterable[str] = ()) -> Files:
+    """The digests, by name, of the user code and FMUs of a study, and of the files with the names
+    `used` that exist.
+    """
+    places = study.origin.places
+    fmus = {
+        Path(file_beside(name, places or [os.getcwd()])) for _, name in fmus_of(study)
+    }
+    files = code_files(user_modules(study), places) | fmus
+    return digests_by_name(used, places) | digests(files, places)

@@ -27,6 +27,10 @@ from safevar_sumo.records import Evaluations, JsonObject
 
 Look = Callable[[Sequence[int]], None]
 """A function that gets the numbers of the jobs that have just ended."""
+Home = tuple[str, ...]
+"""The folders of a study with user code. Whatever user code does to its process, it does to no
+process of another home. () for studies without user code, which any worker carries out.
+"""
 LOGGER = logging.getLogger(__name__)
 SECONDS_BETWEEN_LOOKS = 0.5
 """Longest time between two calls of a `Look` [s]."""
@@ -94,6 +98,7 @@ class Pool:
         self.workers = workers
         self._start = start
         self._started = dict[int, Worker]()
+        self._homes = dict[int, Home]()
         self.opened = dict[tuple[frozenset[str], tuple[str, ...]], list[str]]()
         self.inputs = dict[bytes, JsonObject]()
         self.verified = Counter[bytes]()
@@ -111,9 +116,11 @@ class Pool:
         function: Work,
         jobs: Sequence[tuple[Any, ...]],
         look: Look = lambda ended: None,
+        home: Home = (),
     ) -> list[Any]:
         """Call a function with the arguments of each job, and return the results in the order of
-        the jobs. A job whose worker dies is carried out once more.
+        the jobs. A job whose worker dies is carried out once more. Only workers that run no user
+        code of another `home` carry out the jobs.
 
         `look` is called with the numbers of the jobs that have just ended, and at least twice a
         second.
@@ -133,8 +140,9 @@ class Pool:
             while waiting and idle:
                 place = idle.popleft()
                 number = waiting.popleft()
-                future = self._begin(place, function, jobs[number])
-                under_way[future] = place, number
+                worker = self._worker_at(place, home)
+                future = self._begin(worker, function, jobs[number])
+                under_way[future] = place, worker, number
                 future.add_done_callback(ended.put)
 
             try:
@@ -142,7 +150,7 @@ class Pool:
             except Empty:
                 look([])
                 continue
-            place, number = under_way.pop(future)
+            place, worker, number = under_way.pop(future)
             idle.appendleft(place)
 
             # The worker may have died by chance. Therefore its job is carried out again, up to a
@@ -151,10 +159,12 @@ class Pool:
             if error is None:
                 results[number] = future.result()
                 look([number])
-            elif cause := self._started[place].cause_of_death(error):
-                self._started.pop(place).end()
+            elif cause := self._started[worker].cause_of_death(error):
+                self._started.pop(worker).end()
                 deaths[number] += 1
-                LOGGER.warning("worker %d was lost in job %d: %s", place, number, cause)
+                LOGGER.warning(
+                    "worker %d was lost in job %d: %s", worker, number, cause
+                )
                 if deaths[number] > MAX_DEATHS + (MAX_DEATHS + 1) * self._skipped():
                     raise WorkerLostError(number, cause)
                 waiting.appendleft(number)
@@ -170,11 +180,17 @@ class Pool:
         return sum(len(list(folder.iterdir())) > MAX_DEATHS for folder in folders)
 
     def everywhere(
-        self, function: Work, *arguments: Any, limit: int | None = None
+        self, function: Work, *arguments: Any, home: Home, limit: int | None = None
     ) -> None:
-        """Call a function in each living worker, or in `limit` of them."""
-        places = list(self._started)[:limit]
-        futures = [self._begin(place, function, arguments) for place in places]
+        """Call a function in each living worker that runs user code of a `home`, or in `limit` of
+        them.
+        """
+        workers = [
+            number for number in self._started if self._homes.get(number) == home
+        ]
+        futures = [
+            self._begin(number, function, arguments) for number in workers[:limit]
+        ]
         for future in futures:
             future.result()
 
@@ -183,18 +199,25 @@ class Pool:
         while self._started:
             self._started.popitem()[1].end()
 
-    def _begin(self, place: int, function: Work, job: tuple[Any, ...]) -> Future[Any]:
-        """Begin a job at a place of the pool, in its worker or, if this worker is dead, in a new
-        one.
+    def _worker_at(self, place: int, home: Home) -> int:
+        """The number of the worker that carries out jobs at a place of the pool. User code of each
+        home has a worker of its own there: the first one has the number of the place.
         """
-        if place in self._started:
+        worker = place
+        while home and self._homes.setdefault(worker, home) != home:
+            worker += self.workers
+        return worker
+
+    def _begin(self, worker: int, function: Work, job: tuple[Any, ...]) -> Future[Any]:
+        """Begin a job in the worker with this number or, if this worker is dead, in a new one."""
+        if worker in self._started:
             # The process of the worker may have died between two jobs.
             with suppress(BrokenExecutor):
-                return self._started[place].submit(function, *job)
-            self._started.pop(place).end()
-        LOGGER.debug("worker %d of %d starts", place, self.workers)
-        self._started[place] = self._start(place)
-        return self._started[place].submit(function, *job)
+                return self._started[worker].submit(function, *job)
+            self._started.pop(worker).end()
+        LOGGER.debug("worker %d starts", worker)
+        self._started[worker] = self._start(worker)
+        return self._started[worker].submit(function, *job)
 
 
 def available_cores() -> int:
@@ -226,7 +249,7 @@ def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[P
             folder = stack.enter_context(temporary_folder())
             pool = Pool(
                 jobs or available_cores(),
-                lambda place: local.ProcessWorker(folder / f"{place}.txt"),
+                lambda number: local.ProcessWorker(folder / f"{number}.txt"),
             )
             pool.attempts = folder / local.ATTEMPTS
         else:

@@ -149,7 +149,7 @@ def check_algorithms(study: Study, system: System) -> None:
     )
     for name in search.labels:
         algorithm = algorithm_of(name, study)
-        with about(study.source):
+        with system.modules.active(), about(study.source):
             algorithm.try_out(problem)
 
 

@@ -30,7 +30,6 @@ from safevar_sumo.campaign.runs import (
     random_generator_of,
 )
 from safevar_sumo.errors import InputError, SafevarError, UserCodeError, about
-from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results import (
     MANIFEST,
@@ -155,7 +154,7 @@ def _begin(task: Task, share: Share, key: RunKey) -> Run:
         identity_digest(share.manifest), str(key), system.characteristics.names
     )
     problem = problem_of(study, system, share.original)
-    with user_errors(study.source):
+    with system.user_code():
         search = algorithm_of(key.algorithm, study).search(
             problem, random_generator_of(study, key)
         )

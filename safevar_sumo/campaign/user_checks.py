@@ -23,7 +23,7 @@ from safevar_sumo.campaign.evaluation import (
 from safevar_sumo.campaign.inputs import manifest_now
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import UserCodeError
-from safevar_sumo.plugins import record_opened, unload_user_modules
+from safevar_sumo.plugins import record_opened
 from safevar_sumo.plugins.process import REPRODUCED_BY
 from safevar_sumo.records import FloatArray, differences
 from safevar_sumo.results import identity_digest
@@ -149,7 +149,6 @@ def _refuse_defects(task: Task, limit: int | None = None) -> tuple[list[str], in
     # This import is slow, and rarely needed.
     from safevar_sumo.check import refuse_defects
 
-    unload_user_modules()
     start = KEPT.simulated
     with record_opened(task.study.origin.places) as opened:
         refuse_defects(task.study, limit)

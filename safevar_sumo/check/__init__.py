@@ -21,7 +21,7 @@ from safevar_sumo.check.trials import (
     try_simulations,
 )
 from safevar_sumo.errors import UserCodeError, about
-from safevar_sumo.plugins import Lookup, unload_user_modules
+from safevar_sumo.plugins import Lookup
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
 from safevar_sumo.study import WHOLE, Study, keys_with, user_code, without_skipping
@@ -158,7 +158,6 @@ def find_defects(study: Study, **how: Any) -> Findings:
     """Find the first defect of all simulated user code, and the first defect of each user's
     algorithm. For `how` see `try_simulations`.
     """
-    unload_user_modules()
     names = user_code(study)
     simulated = {key: name for key, name in names if key != "search.algorithms"}
     yield from _first_defect(study, simulated, try_simulations(study, **how))

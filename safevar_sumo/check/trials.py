@@ -14,7 +14,6 @@ from numpy.random import default_rng
 
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins import Lookup, instance_of
-from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.records import (
     QUANTITIES,
     FloatArray,
@@ -213,14 +212,14 @@ def try_original(system: System, runs: SimulationRuns) -> Findings:
     for measure in system.measuring.measures.values():
         if measure.of == "settings":
             continue
-        with user_errors(system.source):
+        with system.user_code():
             values = measure.of_runs(runs, system.metrics_table)
         for quantity in QUANTITIES:
             if quantity in measure.quantities:
                 continue
             variants = (runs.with_all(quantity, value) for value in TRIED_VALUES)
             try:
-                with user_errors(system.source):
+                with system.user_code():
                     is_read = not all(
                         np.array_equal(
                             values,
@@ -382,7 +381,7 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
             member, parameters, f"search.algorithms = {name!r}", f"search.{label}"
         )
         # If `search` is no generator, its code already runs in this call.
-        with user_errors(study.source):
+        with system.user_code():
             search = algorithm.search(problem, default_rng(seed))
         settings = []
         try:

@@ -26,12 +26,16 @@ from safevar_sumo.plugins.files import (
     is_of_shipped_network as is_of_shipped_network,
 )
 from safevar_sumo.plugins.lookup import (
-    ImportPath as ImportPath,
     Lookup as Lookup,
     Member as Member,
-    add_import_folders as add_import_folders,
     instance_of as instance_of,
+)
+from safevar_sumo.plugins.modules import (
+    ONE_AT_A_TIME as ONE_AT_A_TIME,
+    ImportPath as ImportPath,
+    Modules as Modules,
+    add_import_folders as add_import_folders,
     only_from as only_from,
-    unload_user_modules as unload_user_modules,
+    running_modules as running_modules,
 )
 from safevar_sumo.plugins.process import record_opened as record_opened

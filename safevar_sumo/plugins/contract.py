@@ -30,6 +30,7 @@ from safevar_sumo.errors import (
     describe_error,
 )
 from safevar_sumo.plugins.files import is_user_file
+from safevar_sumo.plugins.modules import Modules
 from safevar_sumo.plugins.process import (
     Interrupt,
     find_damage,
@@ -175,11 +176,12 @@ TRUTH = Legal(kinds="b")
 
 class UserCode(NamedTuple):
     """User code, as errors name it: `name` is its key and name in the study, such as `ads.model =
-    'my_ads:Careful'`. `target` is the class, function or record.
+    'my_ads:Careful'`. `target` is the class, function or record, and `modules` are its modules.
     """
 
     name: str
     target: Any = None
+    modules: Modules = Modules(())
 
     def definition(self, method: str = "") -> str:
         """The file and line at which a method begins, or else the class or function. "" if Python
@@ -188,7 +190,10 @@ class UserCode(NamedTuple):
         target = getattr(self.target, "function", self.target)
         function = inspect.unwrap(getattr(target, method, target))
         try:
-            return f"{inspect.getfile(function)}:{inspect.getsourcelines(function)[1]}"
+            # Python finds the file of a class by its module, which must be loaded.
+            with self.modules.active():
+                line = inspect.getsourcelines(function)[1]
+                return f"{inspect.getfile(function)}:{line}"
         except (OSError, TypeError):
             return ""
 

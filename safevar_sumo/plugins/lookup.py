@@ -10,8 +10,8 @@ import importlib.util
 import inspect
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import chdir, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext, suppress
 from types import MappingProxyType, ModuleType
 from typing import Any, NamedTuple
 
@@ -38,9 +38,10 @@ from safevar_sumo.plugins.contract import (
     violation,
 )
 from safevar_sumo.plugins.files import is_user_file
+from safevar_sumo.plugins.modules import Modules
 from safevar_sumo.plugins.process import file_of_module, this_process
 from safevar_sumo.plugins.time_limit import end_if_longer
-from safevar_sumo.study import Study, convert_table, data_files
+from safevar_sumo.study import Study, convert_table, data_files, free_parameters
 from safevar_sumo.study.encounters import Parameters
 
 A_DAY = 86_400.0
@@ -74,6 +75,7 @@ class Lookup:
         time_limit: float = A_DAY,
     ) -> None:
         self._time_limit = time_limit
+        self.modules = Modules.of(folders)
         self.folders = folders
         self.files = files
         self._classes = dict[tuple[str, tuple[type, ...]], Member]()
@@ -112,17 +114,19 @@ class Lookup:
             problem = f"{key} = {name!r}{did_you_mean(name, shipped)}"
             raise InputError("", problem, expected)
 
-        code = UserCode(f"{key} = {name!r}")
-        module = self._import(module_name, code.name)
-        module_name = module.__name__
-        this_process.named_files.add(file_of_module(module_name))
+        code = UserCode(f"{key} = {name!r}", modules=self.modules)
+        self.modules.is_used = True
+        with self.modules.active():
+            module = self._import(module_name, code.name)
+            file = file_of_module(module.__name__)
+            self.modules.note_files()
+        this_process.named_files.add(file)
         try:
             target = getattr(module, attribute)
         except AttributeError:
             raise InputError(
                 "",
-                f"{code.name} cannot be imported: {file_of_module(module_name)} has no"
-                f" {attribute!r}",
+                f"{code.name} cannot be imported: {file} has no {attribute!r}",
                 expected,
             ) from None
         return Member(target, code._replace(target=target), self._time_limit)
@@ -156,6 +160,10 @@ class Lookup:
         member = self._classes[name, bases] = member._replace(
             target=checked_class(member.code, base)
         )
+        # Annotations are evaluated while the class's module is loaded. Names that only type
+        # checkers know are an error only if somebody asks for these parameters.
+        with self.modules.active(), suppress(NameError, AttributeError, TypeError):
+            free_parameters(member.target)
         return member
 
     def with_paths(
@@ -214,11 +222,6 @@ class Lookup:
         # A module beside the study wins over a module of the same name in the working directory.
         folders = list(dict.fromkeys((*self.folders, os.getcwd())))
         importlib.invalidate_caches()
-        add_import_folders(folders)
-        modules_before = set(sys.modules)
-        dont_write_bytecode = sys.dont_write_bytecode
-        sys.dont_write_bytecode = True
-
         try:
             with (
                 user_errors(subject()),
@@ -236,9 +239,6 @@ class Lookup:
                 getattr(error, "legal", "")
                 or f"a module in {' or '.join(folders)}, or an installed one",
             ) from error
-        finally:
-            sys.dont_write_bytecode = dont_write_bytecode
-            this_process.modules |= sys.modules.keys() - modules_before
 
 
 def _import_beside(name: str, folders: Sequence[str]) -> ModuleType | None:
@@ -284,85 +284,6 @@ def _has_some(candidate: Any, base: type) -> bool:
     )
 
 
-def unload_user_modules() -> None:
-    """Unload all modules with user code, so that the next lookup loads the modules again."""
-    for name in this_process.modules:
-        if is_user_file(file_of_module(name)):
-            del sys.modules[name]
-    this_process.modules.clear()
-
-
-def add_import_folders(folders: Iterable[str]) -> None:
-    """Let modules import from `folders` and the working directory. The folders are inserted into
-    Python's path just before the working directory. Entries before this place still win.
-    """
-    sys.path[:] = [
-        folder for folder in sys.path if folder not in this_process.added_folders
-    ]
-    added = [
-        folder
-        for folder in dict.fromkeys((*folders, os.getcwd()))
-        if folder not in sys.path
-    ]
-    this_process.added_folders = added
-    indices = (i for i, folder in enumerate(sys.path) if folder in ("", os.getcwd()))
-    start = next(indices, len(sys.path))
-    sys.path[start:start] = added
-
-
-class ImportPath(NamedTuple):
-    """Python's path (`folders`), and the entries that `add_import_folders` has inserted
-    (`added`).
-    """
-
-    folders: list[str]
-    added: list[str]
-
-    @classmethod
-    def here(cls) -> ImportPath:
-        """The present path of this process."""
-        return cls(sys.path[:], this_process.added_folders)
-
-    def inherit(self) -> None:
-        """Set Python's path of this process to this path."""
-        sys.path[:], this_process.added_folders = self
-
-
-@contextmanager
-def only_from(folder: str) -> Iterator[None]:
-    """Within the block, find user code and its files in one folder only, which becomes the working
-    directory. Other folders only provide libraries. Processes that start within the block do the
-    same.
-    """
-    path = ImportPath.here()
-    names = {*sys.modules}
-    user_names = _modules_of_user(names - {"__main__"})
-    user_modules = {name: sys.modules.pop(name) for name in user_names}
-    ImportPath([*filter(_is_of_libraries, path.folders), folder], []).inherit()
-    try:
-        with chdir(folder):
-            yield
-    finally:
-        path.inherit()
-        for name in _modules_of_user(sys.modules.keys() - names):
-            del sys.modules[name]
-        sys.modules.update(user_modules)
-
-
-def _modules_of_user(names: Iterable[str]) -> list[str]:
-    """The modules of user code among imported ones, before any of them is removed: a folder without
-    `__init__.py` has no path without its parent.
-    """
-    return [name for name in names if is_user_file(file_of_module(name))]
-
-
-def _is_of_libraries(entry: str) -> bool:
-    """Return whether an entry of Python's path has libraries, but no user code. "" stands for the
-    working directory, which may have user code.
-    """
-    return bool(entry) and not is_user_file(os.path.join(entry, ""))
-
-
 def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> Any:
     """An instance of a class.
 
@@ -379,6 +300,7 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> 
         If the class does not take the parameters.
     """
     with (
+        member.code.modules.active() if member.code else nullcontext(),
         user_errors(subject()),
         np.errstate(),
         end_if_longer(member.time_limit, "`__init__`"),

@@ -11,9 +11,10 @@ import time
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from importlib.util import source_from_cache
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 from uuid import uuid4
 
 import platformdirs
@@ -21,6 +22,9 @@ import platformdirs
 from safevar_sumo.errors import INTERRUPTS, in_main_thread
 from safevar_sumo.plugins.files import CACHE, is_user_file, name_of_file
 from safevar_sumo.shipped import PACKAGE
+
+if TYPE_CHECKING:
+    from safevar_sumo.plugins.modules import Modules
 
 SYSTEM_FOLDERS = ("/usr/", "/etc/", "/lib", "/proc/", "/sys/", "/dev/", "/var/")
 """Folders of the system. Libraries read files there, such as time zones, that are no files of the
@@ -39,8 +43,8 @@ class _Process:
     ----------
     added_folders
         Folders that were added to Python's path for user code.
-    modules
-        Names of all modules that user code has loaded, as far as this process knows.
+    shown_modules, running_modules
+        The modules of user code in `sys.modules`, and those of the code that runs now.
     named_files
         Files of the modules that studies name. Errors also quote lines of installed modules, if a
         study names them.
@@ -65,7 +69,8 @@ class _Process:
     """
 
     added_folders: list[str] = field(default_factory=list)
-    modules: set[str] = field(default_factory=set)
+    shown_modules: Modules | None = None
+    running_modules: Modules | None = None
     named_files: set[str] = field(default_factory=set)
     opened: set[str] | None = None
     is_listening: bool = False
@@ -75,6 +80,11 @@ class _Process:
     attempts: Path | None = None
     mark: str = field(default_factory=lambda: uuid4().hex)
     descriptor: int = field(default_factory=lambda: os.open(os.devnull, os.O_RDONLY))
+
+    @property
+    def is_worker(self) -> bool:
+        """Whether this process is a worker of a pool."""
+        return self.last_words is not None
 
 
 this_process = _Process()
@@ -231,13 +241,11 @@ def record_opened(folders: Sequence[str]) -> Iterator[list[str]]:
 
     start = time.time()
     names = list[str]()
-    modules = set(sys.modules)
     opened = this_process.opened = set[str]()
     try:
         yield names
     finally:
         this_process.opened = None
-    this_process.modules |= sys.modules.keys() - modules
 
     own_folders = tuple(
         f"{os.path.abspath(folder)}{os.sep}" for folder in (*folders, os.getcwd())
@@ -273,7 +281,11 @@ def _listen(event: str, arguments: tuple[Any, ...]) -> None:
     path, mode, flags = arguments if event == "open" else (_database(*arguments), "", 0)
     is_read = not (set(mode or "") & set("wax+") or (flags or 0) & WRITING)
     if is_read and isinstance(path, str | bytes) and _is_from_user_code():
-        this_process.opened.add(os.path.abspath(os.fsdecode(path)))
+        name = os.path.abspath(os.fsdecode(path))
+        # A module may have been compiled by an earlier process: its source counts.
+        if f"{os.sep}{CACHE}{os.sep}" in name and name.endswith(".pyc"):
+            name = source_from_cache(name)
+        this_process.opened.add(name)
 
 
 def _database(name: Any) -> Any:

@@ -30,9 +30,11 @@ from safevar_sumo.campaign.evaluation import (
     evaluate_settings,
     system_of,
 )
+from safevar_sumo.campaign.inputs import code_of
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, SimulationError, about
 from safevar_sumo.metrics import F_SAFE, METRICS, Unsafe
+from safevar_sumo.plugins import Files
 from safevar_sumo.questions.between import in_phases
 from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.price import (
@@ -112,6 +114,11 @@ class Evaluator:
     def system(self) -> System:
         """The models of the study, assembled."""
         return assemble(self.study)
+
+    @cached_property
+    def code(self) -> Files:
+        """The digests, by name, of the study's user code and of the files that this code opens."""
+        return code_of(self.study, opened_by(self.study, self._pool))
 
     @cached_property
     def in_phases(self) -> Evaluator | None:

@@ -194,7 +194,8 @@ class _Declared:
         member = self._lookup.class_of(
             SCENARIOS, model, "scenario.model", *SCENARIO_BASES
         )
-        default = stated.get(name, _defaults(member.target).get(name))
+        with self._lookup.modules.active():
+            default = stated.get(name, _defaults(member.target).get(name))
         return free_parameters(member.target).get(name), default
 
 

@@ -113,7 +113,7 @@ def check_search(
     budget = problem.evaluations
     answer = None
     while True:
-        with user_errors(subject()), np.errstate():
+        with code.modules.active(), user_errors(subject()), np.errstate():
             try:
                 output = search.send(answer)
             except StopIteration as end:

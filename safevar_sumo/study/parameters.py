@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from functools import lru_cache
 from typing import Any, get_args, get_type_hints
+from weakref import WeakKeyDictionary
 
 import msgspec
 from msgspec import Meta
@@ -23,9 +23,9 @@ PHASE_DECIMALS = 4
 step.
 """
 
-_hints_of = lru_cache(get_type_hints)
-"""The types of a class's fields. Without the cache, Python would evaluate the annotations each
-time.
+_hints = WeakKeyDictionary[type, dict[str, Any]]()
+"""The types of classes' fields. Python evaluates the annotations in the class's module, which may
+be loaded only while user code runs.
 """
 
 
@@ -64,7 +64,7 @@ def free_parameters(model: type) -> dict[str, FreeParameter]:
     if not (issubclass(model, msgspec.Struct) or dataclasses.is_dataclass(model)):
         return {}
     parameters = {}
-    for name, kind in _hints_of(model, include_extras=True).items():
+    for name, kind in _hints_of(model).items():
         for meta in _metas_in(kind):
             extra = meta.extra or {}
             if "free" in extra:
@@ -77,6 +77,13 @@ def free_parameters(model: type) -> dict[str, FreeParameter]:
                     meaning=meta.description or name,
                 )
     return parameters
+
+
+def _hints_of(model: type) -> dict[str, Any]:
+    """The types of a class's fields. They are evaluated only once."""
+    if model not in _hints:
+        _hints[model] = get_type_hints(model, include_extras=True)
+    return _hints[model]
 
 
 def _metas_in(kind: Any) -> Iterator[Meta]:

@@ -10,7 +10,6 @@ from functools import partial
 
 import numpy as np
 
-from safevar_sumo.plugins import user_errors
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import Evaluations, FloatArray, Outcome, SimulationRuns
 from safevar_sumo.scenarios import (
@@ -50,7 +49,7 @@ def score(system: System, settings: FloatArray, runs: SimulationRuns) -> Evaluat
 
     # In an invalid test the vehicle misses the test's speed: metrics of its run mean nothing.
     metrics = {}
-    with user_errors(system.source):
+    with system.user_code():
         for name, measure in system.measuring.measures.items():
             if measure.of == "settings":
                 metrics[name] = measure.function(settings, system.characteristics)
@@ -123,7 +122,7 @@ def drive_all(
     scenario = on_road.points[0].scenario
     # Compilation may take longer than a simulation: it must not count in the time limit.
     system.vehicle.compile()
-    with user_errors(system.source), end_if_longer(system.time_limit):
+    with system.user_code(), end_if_longer(system.time_limit):
         # SUMO is slow. So it simulates only if neither tracks nor a recorded scene suffice; among
         # tracks all points are simulated at once.
         if reason_against_scenes(system):

@@ -11,11 +11,12 @@ from copy import Error, copy, deepcopy
 from inspect import getattr_static
 from pathlib import Path
 from random import Random
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
+from safevar_sumo.plugins import Modules, running_modules
 from safevar_sumo.plugins.process import end_children, this_process
 from safevar_sumo.scenarios import Simulator
 
@@ -26,6 +27,17 @@ open connection, may pass from run to run.
 """
 
 
+class _Handle(NamedTuple):
+    """A handle, the class that opened it, the modules of its code, and its edition: its file with
+    the time of the last edit or, of a class that opens nothing, the class itself.
+    """
+
+    edition: object
+    kind: type[Simulator]
+    modules: Modules
+    handle: Any
+
+
 class Kept:
     """The objects that this process keeps: for each class of a user's simulator, the handle that
     `open_worker` returned, and the object that simulated last. `simulated` counts simulations.
@@ -33,7 +45,7 @@ class Kept:
 
     def __init__(self) -> None:
         self._last = dict[str, Simulator]()
-        self._handles = dict[str, tuple[int, type[Simulator], Any]]()
+        self._handles = dict[str, _Handle]()
         self.simulated = 0
 
     def at(self, scenario: Simulator) -> Simulator:
@@ -45,17 +57,7 @@ class Kept:
         has_worker = (
             getattr_static(kind, "open_worker") is not Simulator.__dict__["open_worker"]
         )
-        edited = (
-            Path(inspect.getfile(kind.open_worker)).stat().st_mtime_ns
-            if has_worker
-            else id(kind)
-        )
-        if name in self._handles and self._handles[name][0] != edited:
-            self._close(name)
-        if name not in self._handles:
-            handle = kind.open_worker(this_process.worker)
-            self._handles[name] = edited, kind, handle
-        handle = self._handles[name][2]
+        handle = self._opened(kind, name, has_worker=has_worker)
 
         # A run must not change the scenario, which later runs copy, too. Without `open_worker`,
         # this object inherits connections that the last run opened and stored in its object.
@@ -82,6 +84,24 @@ class Kept:
         self._last[name] = simulator
         return simulator
 
+    def _opened(self, kind: type[Simulator], name: str, *, has_worker: bool) -> Any:
+        """The handle of a class. A handle of other or older code is closed before."""
+        # Another study may have a class of the same name, in another file.
+        edition: object = kind
+        if has_worker:
+            file = inspect.getfile(kind.open_worker)
+            edition = file, Path(file).stat().st_mtime_ns
+        kept = self._handles.get(name)
+        if kept is not None and (
+            kept.edition != edition or (has_worker and kept.modules.are_edited)
+        ):
+            self._close(name)
+        if name not in self._handles:
+            modules = running_modules()
+            handle = kind.open_worker(this_process.worker)
+            self._handles[name] = _Handle(edition, kind, modules, handle)
+        return self._handles[name].handle
+
     def close(self) -> None:
         """End all simulators."""
         for name in list(self._handles):
@@ -89,10 +109,11 @@ class Kept:
 
     def _close(self, name: str) -> None:
         simulator = self._last.pop(name, None)
-        _, kind, handle = self._handles.pop(name)
-        if simulator is not None:
-            simulator.close()
-        kind.close_worker(handle)
+        kept = self._handles.pop(name)
+        with kept.modules.active():
+            if simulator is not None:
+                simulator.close()
+            kept.kind.close_worker(kept.handle)
 
 
 def _attributes(simulator: Simulator) -> dict[str, Any]:

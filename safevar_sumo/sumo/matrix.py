@@ -127,7 +127,8 @@ def drive_and_score(
     if len(settings) > size:
         batches = np.split(settings, range(size, len(settings), size))
         score_batch = partial(drive_and_score, system, with_originals=with_originals)
-        return Evaluations.concatenate(list(map(score_batch, batches)))
+        with system.modules.active():
+            return Evaluations.concatenate(list(map(score_batch, batches)))
 
     vehicles = settings
     if takes_pairs:

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import msgpack, to_builtins
 
 from safevar_sumo.errors import subject
-from safevar_sumo.plugins import user_errors
+from safevar_sumo.plugins import Modules, user_errors
 from safevar_sumo.records import FloatArray, IntArray, Quantity
 from safevar_sumo.scenarios import VUT, Lane, Point, Scenario, WorldScenario
 from safevar_sumo.scenarios.roads import Coordinates, lane_through
@@ -116,11 +116,14 @@ class Recording:
 
 class Scenes:
     """The scenes of a study. Each scene is recorded when it is first needed, with the study's time
-    step [s] (None: the time step of the network).
+    step [s] (None: the time step of the network). `modules` are those of the study's user code.
     """
 
-    def __init__(self, step_length: float | None = None) -> None:
+    def __init__(
+        self, step_length: float | None = None, modules: Modules | None = None
+    ) -> None:
         self.step = step_length
+        self._modules = modules or Modules(())
         self._source = subject()
         self._recorded: dict[WorldScenario, Recording | str] = {}
 
@@ -144,7 +147,7 @@ class Scenes:
             If a user's scenario fails.
         """
         if scenario not in self._recorded:
-            with user_errors(self._source):
+            with self._modules.active(), user_errors(self._source):
                 self._recorded[scenario] = _scene_of(scenario, self.step)
         return self._recorded[scenario]
 

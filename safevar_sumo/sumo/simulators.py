@@ -18,7 +18,7 @@ import portalocker
 from safevar_sumo.errors import UserCodeError
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS, UNSAFE_SHARE, Unsafe
 from safevar_sumo.output import ALONE
-from safevar_sumo.plugins import UserCode, user_errors
+from safevar_sumo.plugins import UserCode
 from safevar_sumo.plugins.process import (
     MARK,
     MAX_DEATHS,
@@ -93,7 +93,7 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
         ).scenario
         with (
             temporary_entries(os.environ, {MARK: this_process.mark}),
-            user_errors(system.source),
+            system.user_code(),
             _attempt(f"{command} {point.name}", system),
             end_if_longer(system.time_limit),
         ):
@@ -152,7 +152,7 @@ def unread_characteristics(system: System, settings: FloatArray) -> set[str]:
         )
         scenario: Any = encounter(system.points[0], searched).scenario
         setting = _Setting(dict(zip(names, vehicle.tolist(), strict=True)))
-        with user_errors(system.source):
+        with system.user_code():
             KEPT.at(scenario).simulate(setting)
         unread &= setting.unread
     return unread

@@ -4,17 +4,17 @@ checks that the parts fit each other.
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from threading import RLock
 
 import msgspec
 
 from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import Unsafe
-from safevar_sumo.plugins import Lookup, unload_user_modules, user_errors
+from safevar_sumo.plugins import ONE_AT_A_TIME, Lookup, Modules, user_errors
 from safevar_sumo.records import FloatArray, Nominal
 from safevar_sumo.scenarios import (
     VUT,
@@ -27,7 +27,7 @@ from safevar_sumo.scenarios import (
 from safevar_sumo.scenarios.base import Mover, Part
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.study import MetricsTable, Study
+from safevar_sumo.study import MetricsTable, Study, user_code_names
 from safevar_sumo.study.encounters import DecidingMetric
 from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.encounters import check_domains, encounter, original_encounter
@@ -50,11 +50,6 @@ from safevar_sumo.vehicles import (
     region_of,
 )
 
-_ONE_AT_A_TIME = RLock()
-"""Lock for assembling a system: it unloads users' modules and may start SUMO, so that two threads
-must not do it at the same time.
-"""
-
 
 @dataclass(frozen=True, kw_only=True)
 class System:
@@ -74,6 +69,7 @@ class System:
       `simulator-error`. Otherwise such a failure is an error.
     - `command` simulates the original vehicle of the study.
     - With `in_sumo` SUMO moves the vehicles, also where recorded scenes suffice.
+    - `modules` are the modules of the study's user code.
     - With `sees_nobody` the ADS sees no other actor, and a run ends at the place of the encounter.
     """
 
@@ -95,6 +91,15 @@ class System:
     command: str
     skips_failed: bool
     criterion: Unsafe
+    modules: Modules
+
+    @contextmanager
+    def user_code(self) -> Iterator[None]:
+        """Within the block, user code of this system runs: with its own modules, and with errors
+        that name the study.
+        """
+        with self.modules.active(), user_errors(self.source):
+            yield
 
     @property
     def matrix(self) -> tuple[Point, ...]:
@@ -160,6 +165,7 @@ class System:
 
         recording = self.scenes.of(scenario)
         with ExitStack() as stack:
+            stack.enter_context(self.user_code())
             world: SceneWorld
             if isinstance(recording, str):
                 network = copied_network(network_for(scenario), 1)
@@ -218,8 +224,12 @@ def assemble(study: Study) -> System:
     InputError
         The error names the study, the key, the value and the legal values.
     """
-    with user_errors(study.source), _ONE_AT_A_TIME:
-        return _assemble(study)
+    with user_errors(study.source), ONE_AT_A_TIME:
+        # User code is loaded anew: a system must not share state with another, nor have old code.
+        modules = Modules.begin(study.origin.places)
+        modules.is_used = bool(user_code_names(study))
+        with modules.active():
+            return _assemble(study)
 
 
 def _original_points(study: Study, lookup: Lookup, single: Point) -> tuple[Point, ...]:
@@ -244,8 +254,6 @@ def _original_points(study: Study, lookup: Lookup, single: Point) -> tuple[Point
 
 
 def _assemble(study: Study) -> System:
-    # User code is loaded anew: a system must not share state with another, nor have old code.
-    unload_user_modules()
     lookup = Lookup.of(study)
     scenario = create_scenario(study.scenario, lookup)
     vehicle, ads = create_driven(study, lookup, scenario)
@@ -285,13 +293,14 @@ def _assemble(study: Study) -> System:
         measuring=measuring,
         region=region,
         source=study.source,
-        scenes=Scenes(study.step_length),
+        scenes=Scenes(study.step_length, lookup.modules),
         time_limit=study.search.time_limit,
         deciding=study.deciding,
         repeats=study.scenario.repeats,
         command=simulate_command(study),
         criterion=own_criterion(study),
         skips_failed=study.search.failed == "skip",
+        modules=lookup.modules,
     )
     if not study.ranges or study.scenario.margin is None:
         return system

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError
-from safevar_sumo.plugins import user_errors
 from safevar_sumo.records import (
     ROUNDING,
     FloatArray,
@@ -62,7 +61,7 @@ def drive_again(
     point = on_road.points[0]
     traffic = traffic_of(system, encounters, OVERTIME)
     with (
-        user_errors(system.source),
+        system.user_code(),
         open_points_world(system, encounters, traffic, start) as world,
     ):
         motion = enter(on_road, vehicles, world).motion

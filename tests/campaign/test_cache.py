@@ -24,7 +24,6 @@ from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all
 from safevar_sumo.campaign.cache import keep_simulations, simulate_anew
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.errors import InputError
-from safevar_sumo.plugins import unload_user_modules
 from safevar_sumo.questions.catalogue import list_models
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import Evaluations, FloatArray
@@ -242,7 +241,6 @@ def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_conti
     with pytest.raises(KeyboardInterrupt):
         ask("risk own", after=40)
     write("own.py", OWN_ADS + "# changed\n")
-    unload_user_modules()
     ask("risk own")
     assert sum(simulated) == 64
     write("own.py", OWN_ADS)

@@ -235,7 +235,8 @@ def test_each_setting_alone_gives_the_bytes_of_a_batch(wall: Path) -> None:
 def test_one_simulator_is_kept_its_fields_are_set_and_it_is_closed(wall: Path) -> None:
     search = {"speed": {"lower": 10.0, "upper": 20.0}, "gap": {}}
     system = system_of(wall, scenario={"over": search}, encounters="ranges")
-    module = __import__("sys").modules["models"]
+    with system.modules.active():
+        module = sys.modules["models"]
     rows = np.array([[8.0, 0.0, 10.0, 40.0], [8.0, 0.0, 20.0, 60.0]])
     found = drive_and_score(system, rows)
     stops = [gap - v * 0.5 - v**2 / 16 for _, _, v, gap in rows]
@@ -362,7 +363,8 @@ def test_each_setting_has_an_object_that_was_created_with_its_fields(
         assert degrees == [pytest.approx([rest] * 2, abs=2e-3) for rest in rests]
         assert len({*degrees[0]}) == 1
     if name == "Derives":
-        assert __import__("sys").modules["keeps"].LOG == ["engine"]
+        with system.modules.active():
+            assert sys.modules["keeps"].LOG == ["engine"]
 
 
 @pytest.mark.parametrize("name", ["Served", "Struct"])

@@ -77,7 +77,7 @@ from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.tolerance.asked import usual_alone
 from safevar_sumo.questions.words import UNSAFE_MEANS, counted_in_words, join_phrases
-from safevar_sumo.records import JsonObject
+from safevar_sumo.records import JsonObject, differences as differing_rows
 from safevar_sumo.study import limits_of
 
 RELEASE = "RELEASE"
@@ -206,6 +206,9 @@ def compare(
     }
     summary = summary_of(numbers, tested.pairs.frame, titles)
     table = _table(common, settings)
+    remarks = []
+    if not differences:
+        remarks = list(_remarks_on_code(evaluators, [originals, pairs.runs], titles))
     reason = second.no_verdict if second.no_verdict != evaluator.no_verdict else ""
     notes = [criterion.remark, *counted_in_words(study, pairs.number_infeasible)]
     verdict = Verdict(
@@ -213,6 +216,7 @@ def compare(
             answer(reason),
             *why,
             *_basis(criterion, common, limits, titles),
+            *remarks,
             *map(note, notes),
         ]
     )
@@ -409,6 +413,27 @@ def _test_in_words(tested: _PairedTest, titles: Titles) -> str:
         a12=tested.a12,
         **titles,
     ).text
+
+
+def _remarks_on_code(
+    evaluators: Evaluators, runs_of_both: Sequence[Runs], titles: Titles
+) -> Sentences:
+    """Yield a remark if the user code of the versions differs, although all runs are equal."""
+    for a, b in runs_of_both:
+        if a.metrics.keys() != b.metrics.keys() or [
+            *differing_rows(a.results, b.results)
+        ]:
+            return
+    code_of_a, code_of_b = (side.code for side in evaluators)
+    files = sorted(
+        name
+        for name in code_of_a.keys() | code_of_b.keys()
+        if code_of_a.get(name) != code_of_b.get(name)
+    )
+    if len(files) > MAX_REASONS:
+        files[MAX_REASONS:] = [f"{len(files) - MAX_REASONS} more files"]
+    if files:
+        yield words.EQUAL_RESULTS(files=join_phrases(files), **titles)
 
 
 def _basis(

@@ -58,6 +58,11 @@ ORIGINALS_DIFFER = condition(
     " original vehicle are compared."
 )
 
+EQUAL_RESULTS = note(
+    "The code of {a} and {b} differs in {files}, but every simulated vehicle has equal results in"
+    " both. Check whether {b} uses the changed code."
+)
+
 # The statistical test.
 NO_TEST = note("No statistical test is possible, because there is no pair of results.")
 TEST = note(

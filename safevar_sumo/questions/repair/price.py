@@ -11,7 +11,6 @@ import numpy as np
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.campaign.evaluation import with_parameters
-from safevar_sumo.plugins import user_errors
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.records import FloatArray, JsonObject, NamedValues
 from safevar_sumo.scenarios import Point
@@ -96,7 +95,7 @@ def benign_scenes(study: Study, system: System) -> list[Point]:
     searched = system.characteristics.scenario
     ends = [searched.original, searched.lower, searched.upper]
     scenes = dict[str, Point]()
-    with user_errors(system.source):
+    with system.user_code():
         for values, listed_point in product(map(searched.named, ends), system.points):
             point = encounter(listed_point, values)
             for description, scenario in point.scenario.benign():
