@@ -120,6 +120,10 @@ class SimulationError(SafevarError):
     """SUMO failed while a simulation ran."""
 
 
+class NobodyMoved(SafevarError):
+    """No changed vehicle moved in any simulation of a question, so that no verdict is possible."""
+
+
 class EnvironmentFault(SafevarError):
     """A simulation failed for a reason other than its setting: a disk, memory, netconvert, or the
     start of SUMO.

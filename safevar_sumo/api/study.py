@@ -233,7 +233,11 @@ def _found(
         answer,
         verdict=reason or Verdict(sentences),
         next=advice,
-        numbers={"driven": not reason, **answer.numbers},
+        numbers={
+            "driven": not reason,
+            "never_moved": number_standing(results),
+            **answer.numbers,
+        },
         tables=tables,
     )
 
@@ -257,6 +261,18 @@ def _with_options(study: Study, algorithms: str | None, **numbers: int | None) -
         names = (name.strip() for name in algorithms.split(","))
         changes["algorithms"] = [search.labels.get(name, name) for name in names]
     return replace_in(study, search=replace_in(search, **changes))
+
+
+def number_standing(results: Results) -> int:
+    """The number of different vehicles that never moved in the search; 0 if the original vehicle
+    never moves, either.
+    """
+    if results.original["outcome"] == Outcome.NEVER_MOVED:
+        return 0
+    simulated = results.evaluations
+    standing = simulated[simulated["outcome"] == Outcome.NEVER_MOVED]
+    names = list(results.case.characteristics.names)
+    return len(standing.drop_duplicates(names))
 
 
 def _breach_of_original(case: Case) -> str:
@@ -298,6 +314,9 @@ def _verdict(
     if failed := len(case.failures):
         vehicles = number_of(failed, "vehicle")
         sentences.append(words.NOT_SIMULATED(failed=vehicles))
+    if standing := number_standing(results):
+        vehicles = number_of(standing, "simulated vehicle")
+        sentences.append(words.NEVER_MOVED(vehicles=vehicles))
     fewest = fewest_changes(case, jobs)
     if fewest is None:
         return sentences, []

@@ -30,6 +30,10 @@ UNSAFE = evidence(
 NOT_SIMULATED = condition(
     "The search could not simulate {failed}, and no result has them."
 )
+NEVER_MOVED = note(
+    "Remark: {vehicles} never moved. The search counts the safety degree of such a vehicle like any"
+    " other."
+)
 NO_PROOF = note(
     'The search does not prove that fewer changes are safe. The command "explain {study}" tries'
     " single changes and combinations of changes, each at an end of its domain (its range of"

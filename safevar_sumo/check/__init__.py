@@ -16,7 +16,7 @@ from safevar_sumo.ads import ADS
 from safevar_sumo.check.trials import (
     Finding,
     Findings,
-    find_unused,
+    inspect_sample,
     try_algorithm,
     try_simulations,
 )
@@ -66,6 +66,10 @@ CHECKS: Mapping[str, str] = {
         "read each value of the setting by its name, spelled as in `UNITS`, or leave out the"
         " characteristic"
     ),
+    "standing": (
+        "find out with `simulate` why a changed vehicle never moves: read each value of the setting"
+        " in its unit, compare numbers by `<` instead of `==`, and start with any of them"
+    ),
     "original": (
         "find out with `simulate` why the original vehicle fails: check signs and units of what the"
         " code reads and commands; changes of a vehicle that is unsafe as it is explain nothing"
@@ -102,9 +106,9 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
     if findings:
         return findings
     system = assemble(study)
-    unused = list(_first_defect(study, dict(user_code(study)), find_unused(study)))
-    if unused:
-        return unused
+    shown = list(_first_defect(study, dict(user_code(study)), inspect_sample(study)))
+    if shown:
+        return shown
     problems = find_problems(system)
     where = _definition(study, "ads.model", study.ads.model)
     if problems:

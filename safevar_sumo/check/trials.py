@@ -18,6 +18,7 @@ from safevar_sumo.records import (
     QUANTITIES,
     FloatArray,
     IntArray,
+    Outcome,
     ResultColumns,
     SimulationRuns,
     differences,
@@ -236,15 +237,21 @@ def try_original(system: System, runs: SimulationRuns) -> Findings:
                 yield Finding("contract", got, "", "the original vehicle", expected)
 
 
-def find_unused(study: Study) -> Findings:
-    """Find metrics of the study that are undefined in all of a few runs, and characteristics that a
-    simulator of the user's own never reads.
+def inspect_sample(study: Study) -> Findings:
+    """Find what a few runs show: changed vehicles that never move, although the original vehicle
+    does; metrics of the study that are undefined in all runs; and characteristics that a simulator
+    of the user's own never reads.
     """
     system = _system(study)
     number = FEW_UNUSED if system.mover.takes_long else MANY_UNUSED
     settings = system.region.repaired(_settings(system.characteristics, number))
     sample = f"{len(settings)} vehicles: the original, and others up to the ends of the domains"
     results = drive_and_score(system, settings).results
+    stands = results["outcome"] == Outcome.NEVER_MOVED
+    changed = (settings != settings[0]).any(axis=1)
+    if changed.any() and stands[changed].all() and not stands[0]:
+        problem = "no changed vehicle moves, although the original vehicle does"
+        yield Finding("standing", problem, "", sample, "changed vehicles that drive")
     for name in map(label_of, (*study.metrics.also, *study.search.objectives)):
         if name in results and np.isnan(results[name].astype(float)).all():
             expected = "a value in some run"

@@ -104,7 +104,7 @@ def _without_ellipsis(names: DeclaredNames) -> list[str]:
     return [name for name in names if isinstance(name, str)]
 
 
-OF_ALL = ("driven", "rough", "simulations")
+OF_ALL = ("driven", "never_moved", "rough", "simulations")
 """Numbers that any answer may have."""
 
 

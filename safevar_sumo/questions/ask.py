@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.console import Console
 
-from safevar_sumo.errors import InputError, unknown_name, warn
+from safevar_sumo.errors import InputError, NobodyMoved, unknown_name, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.plugins.contract import user_errors
@@ -84,6 +84,15 @@ ROUGH_OF_FEW = answer(
 )
 """The first sentence of a rough answer, with `--quick` and with `--simulations`."""
 CRITERION_OF_STUDY = note("Criterion: {criterion} ({source}).")
+STANDING = note(
+    "Remark: {count} never moved, although the original vehicle moves in the same encounter. The"
+    " answer counts such a vehicle neither as safe nor as unsafe."
+)
+NOBODY_MOVED = answer(
+    "No verdict is possible, because no changed vehicle moved. {count} never moved, although the"
+    " original vehicle moves in the same encounter. Find out why such a vehicle stands: {command}"
+)
+"""Sentences on vehicles that never moved; the second one if there are no others."""
 NOT_SIMULATED = note("Not simulated: {parts}.")
 """Notes on the criterion that a study states: its source, and the parts that are not simulated."""
 
@@ -267,7 +276,6 @@ class Question:
         questions
             Number of questions that share the time, such as all questions of a page.
         """
-        from safevar_sumo.questions.answer import Answer
         from safevar_sumo.questions.by_criterion import subject_by
         from safevar_sumo.questions.case import Case
 
@@ -296,12 +304,7 @@ class Question:
                 evaluator = evaluator.for_study(study)
                 evaluator.use(unsafe)
 
-            with user_errors(self.name):
-                result = self.compute(subjects[0], evaluator, *subjects[1:], **values)
-            if not isinstance(result, Answer):
-                raise InputError(
-                    self.name, f"returns {type(result).__name__}", "an Answer"
-                )
+            result = self._computed(subjects, evaluator, values)
 
             # If the driving system fails by itself, the answer begins with a sentence that says so.
             if result.study is not study:
@@ -319,14 +322,54 @@ class Question:
         if self.has_rough_answer:
             numbers["rough"] = bool(beginning[1:] or numbers.get("rough"))
         sentences = [*beginning, *Verdict.of(result.verdict).sentences, *cites]
-        undefined = note(account.undefined_in_words)
+        sentences.append(note(account.undefined_in_words))
+        numbers["never_moved"] = len(account.standing)
+        if account.standing and numbers["driven"]:
+            sentences.append(STANDING(count=account.standing_in_words))
         limit = account.allowance if account.limit is None else account.limit
         return replace(
             result,
-            verdict=Verdict([*sentences, undefined]),
+            verdict=Verdict(sentences),
             numbers=numbers,
             next=self._next(subjects[0], evaluator, called, values) or result.next,
             command="" if limit is None else f" --simulations {limit}",
+        )
+
+    def _computed(
+        self, subjects: Sequence[Any], evaluator: Evaluator, values: JsonObject
+    ) -> Answer:
+        """What the question's function returns, or an answer without a verdict if no changed
+        vehicle moved.
+        """
+        from safevar_sumo.questions.answer import Answer
+
+        subject, *others = subjects
+        try:
+            with user_errors(self.name):
+                result = self.compute(subject, evaluator, *others, **values)
+        except NobodyMoved:
+            return self._no_verdict(evaluator)
+        if not isinstance(result, Answer):
+            problem = f"returns {type(result).__name__}"
+            raise InputError(self.name, problem, "an Answer")
+        return result
+
+    def _no_verdict(self, evaluator: Evaluator) -> Answer:
+        """The answer if no changed vehicle moved."""
+        from safevar_sumo.questions.answer import Answer
+
+        study = evaluator.study
+        reason = NOBODY_MOVED(
+            count=evaluator.account.standing_in_words,
+            command=f"{PROGRAM_COMMAND} check {study.words}",
+        )
+        return Answer(
+            question=self.name,
+            study=study,
+            verdict=Verdict([reason]),
+            numbers={"driven": False},
+            tables={},
+            failures=(reason.text,),
         )
 
     def _criterion(

@@ -15,13 +15,14 @@ from safevar_sumo.questions.box import Box
 from safevar_sumo.questions.causes import find_minimal_causes
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.words import EXACT, join_phrases
+from safevar_sumo.questions.words import EXACT, OUTCOME_VERBS, join_phrases
 from safevar_sumo.records import (
     KMH_PER_MS,
     Evaluations,
     FloatArray,
     JsonObject,
     NamedValues,
+    Outcome,
 )
 from safevar_sumo.results import choose_handle, row_of_handle
 from safevar_sumo.scenarios import (
@@ -242,19 +243,23 @@ def as_printed(
 
 
 def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
-    """The failures of the unsafe settings among M settings, by their row."""
+    """The failures of those of M settings that are unsafe, or never move, by their row."""
     points = model.evaluator.system.points
     members = model.characteristics
     runs = model.evaluate(settings, BEYOND_STAGE)
     failures = {}
-    for row in np.flatnonzero(model.robustness_by(runs) < 0).tolist():
+    is_told = (model.robustness_by(runs) < 0) | runs.standing
+    for row in np.flatnonzero(is_told).tolist():
         setting = settings[row]
         point = points[runs.points[row]]
         values = members.encounter_of(setting)
         scenario = encounter(point, values).scenario
-        breach = model.unsafe.breach_in_words(runs.take(np.array([row])))
         collided = bool(runs.collided[row])
-        event = _event_in_words(scenario, model.unsafe, collided)
+        if runs.standing[row]:
+            event = breach = OUTCOME_VERBS[Outcome.NEVER_MOVED]
+        else:
+            breach = model.unsafe.breach_in_words(runs.take(np.array([row])))
+            event = _event_in_words(scenario, model.unsafe, collided)
         impact = ""
         speed = -KMH_PER_MS * float(runs.f_safe[row])
         if collided and model.unsafe.is_of_impacts:

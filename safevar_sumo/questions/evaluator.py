@@ -47,7 +47,13 @@ from safevar_sumo.questions.price import (
 )
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.sampling import sobol_settings
-from safevar_sumo.records import Evaluations, FloatArray, NamedValues, Outcome
+from safevar_sumo.records import (
+    BoolArray,
+    Evaluations,
+    FloatArray,
+    NamedValues,
+    Outcome,
+)
 from safevar_sumo.results.store import record, refuse_other_original
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.sumo.simulators import simulations_of_setting
@@ -102,6 +108,8 @@ class Evaluator:
         self._pool = pool
         self._verified = verified
         self.simulated = 0
+        self._stays = dict[tuple[Selection, bytes], bool]()
+        """Whether the original vehicle never moves, by selection and encounter."""
         self.account = account or Account(Phases(progress))
         self.phases = self.account.phases
 
@@ -265,17 +273,60 @@ class Evaluator:
             begin=self._compile,
         )
         self.simulated += total
+        counted = evaluations
+        if selection == EVERYTHING:
+            counted = self._without_unsafe_originals(evaluations)
+        counted = self._without_standing(counted, selection)
         if measure := self.account.measure:
-            is_safe = evaluations.valid & ~evaluations.collided
+            is_safe = evaluations.valid & ~evaluations.collided & ~counted.standing
             is_undefined = np.isnan(evaluations.column(measure)) & is_safe
             self.account.undefined += int(np.count_nonzero(is_undefined))
             self.account.judged += len(evaluations)
-        if selection != EVERYTHING:
-            return evaluations
-        return self._without_unsafe_originals(evaluations)
+        return counted
 
     def _compile(self) -> None:
         compile_vehicle(self.study, self._pool, self.phases.say)
+
+    def _without_standing(
+        self, evaluations: Evaluations, selection: Selection
+    ) -> Evaluations:
+        """The evaluations, with undefined metrics of vehicles that never moved, although the
+        original vehicle moves in the same encounter. Such a vehicle has the largest safety degree,
+        and has not been tested. Where the original vehicle stands, too, standing is right.
+        """
+        stands = evaluations.outcome == Outcome.NEVER_MOVED
+        settings = evaluations.settings[:, : len(self.characteristics)]
+        if stands.any():
+            stands[stands] = ~self._original_stays(settings[stands], selection)
+            evaluations = evaluations.keep_only(~stands, Outcome.NEVER_MOVED)
+            evaluations = replace(evaluations, stands=stands)
+        of_vehicle = self.characteristics.of_vehicle
+        changed = (settings != self.characteristics.original)[:, of_vehicle].any(axis=1)
+        self.account.has_moved |= bool((changed & evaluations.valid).any())
+        self.account.standing |= {
+            row.tobytes() for row in settings[stands][:, of_vehicle]
+        }
+        return evaluations
+
+    def _original_stays(self, settings: FloatArray, selection: Selection) -> BoolArray:
+        """In the encounters of which of M settings, shape (M, n), the original vehicle never moves,
+        shape (M,). It drives with the study's own driving system. With too few simulations left,
+        the original vehicle counts as one that moves.
+        """
+        originals = self.characteristics.with_original_vehicle(settings)
+        selection = replace_in(selection, parameters=())
+        keys = [(selection, row.tobytes()) for row in originals]
+        rows = {key: row for row, key in enumerate(keys) if key not in self._stays}
+        price = len(rows) * self._each
+        if rows and price <= self.account.left:
+            self.account.spend(price)
+            unknown = originals[list(rows.values())]
+            runs = evaluate_all(
+                self.study, unknown, self._pool, verified=0, selection=selection
+            )
+            stays = runs.outcome == Outcome.NEVER_MOVED
+            self._stays |= dict(zip(rows, stays.tolist(), strict=True))
+        return np.array([self._stays.get(key, False) for key in keys])
 
     def _without_unsafe_originals(self, evaluations: Evaluations) -> Evaluations:
         """The evaluations, with undefined results (outcome `infeasible`, metrics NaN) of settings
@@ -311,7 +362,10 @@ class Evaluator:
         )
         pairs = np.where(of_vehicle, settings[:, None], encounters)
         evaluations = self.evaluate(pairs.reshape(-1, settings.shape[1]), stage)
-        robustness = unsafe.robustness(evaluations).reshape(-1, len(encounters))
+        robustness = unsafe.robustness(evaluations)
+        # An unsafe encounter comes first, then one in which the vehicle never moved.
+        robustness = np.where(evaluations.standing, 0.0, robustness)
+        robustness = robustness.reshape(-1, len(encounters))
         first_rows = np.arange(len(settings)) * len(encounters)
         return evaluations.take(first_rows + robustness.argmin(axis=1))
 

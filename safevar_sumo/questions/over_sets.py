@@ -16,9 +16,13 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.model_spread import other_sets
 from safevar_sumo.questions.models import models_of
 from safevar_sumo.questions.sampling import share_with_interval
-from safevar_sumo.questions.sentence import Sentences, condition
+from safevar_sumo.questions.sentence import Sentences, condition, evidence
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.questions.words import interval_in_words, percentage
+from safevar_sumo.questions.words import (
+    count_in_words,
+    interval_in_words,
+    percentage,
+)
 from safevar_sumo.records import (
     BoolArray,
     Evaluations,
@@ -40,6 +44,9 @@ ONE_SET = condition(
     "This share was computed with parameter set 0 of the vehicle model (the calibration that the"
     " study uses). Other parameter sets (alternative calibrations) were not simulated.",
 )
+OF_MOVING = evidence(
+    "The share counts only vehicles that moved: {count} sampled vehicles never moved."
+)
 SHARES = condition(
     "The share of unsafe vehicles ranges from {least} to {greatest} over the {sets} parameter sets"
     " of the vehicle model (alternative calibrations; at most {most} vehicles with each set).",
@@ -57,16 +64,26 @@ def simulate_sample(
 
     Raises
     ------
+    NobodyMoved
+        If no vehicle moved.
     SimulationError
         If no vehicle could be simulated.
     """
     vehicles = model.draw(number, np.random.default_rng(evaluator.seed))
     evaluations = evaluator.evaluate(vehicles, stage)
+    evaluator.account.refuse_standing()
     if not evaluations.valid.any():
         raise SimulationError(
             f"study {evaluator.study.name!r}: none of {number} vehicles could be simulated"
         )
     return evaluations
+
+
+def moving_in_words(evaluations: Evaluations) -> Sentences:
+    """Say how many sampled vehicles a share leaves out, because they never moved."""
+    standing = int(evaluations.standing.sum())
+    if standing:
+        yield OF_MOVING(count=count_in_words(standing, len(evaluations)))
 
 
 def planned_over_sets(

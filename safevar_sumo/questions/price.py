@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import timedelta
 
 import numpy as np
@@ -20,8 +20,9 @@ from safevar_sumo.campaign.evaluation import (
     evaluate_settings,
 )
 from safevar_sumo.campaign.pool import Pool
-from safevar_sumo.errors import InputError
+from safevar_sumo.errors import InputError, NobodyMoved
 from safevar_sumo.questions.progress import Phases
+from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.simulators import simulations_of_setting
@@ -83,6 +84,11 @@ class Account:
         Number of settings without a collision for which this metric is undefined.
     judged
         Number of all settings that were judged by this metric.
+    standing
+        The vehicles (as bytes) that never moved in an encounter in which the original vehicle
+        moves.
+    has_moved
+        Whether some changed vehicle had a valid simulation.
     """
 
     phases: Phases
@@ -96,6 +102,8 @@ class Account:
     measure: str = ""
     undefined: int = 0
     judged: int = 0
+    standing: set[bytes] = field(default_factory=set)
+    has_moved: bool = False
 
     @property
     def is_limited(self) -> bool:
@@ -116,6 +124,22 @@ class Account:
             return ""
         of_all = f"{self.undefined:,} of {self.judged:,} simulated settings, which count as safe"
         return f"Remark: {self.measure} is undefined, without a collision, in {of_all}."
+
+    @property
+    def standing_in_words(self) -> str:
+        """The number of vehicles that never moved, such as `3 simulated vehicles`."""
+        return number_of(len(self.standing), "simulated vehicle")
+
+    def refuse_standing(self) -> None:
+        """Refuse a verdict if every changed vehicle stood.
+
+        Raises
+        ------
+        NobodyMoved
+            If some vehicle never moved, and no changed vehicle moved.
+        """
+        if self.standing and not self.has_moved:
+            raise NobodyMoved("no changed vehicle moved")
 
     def spend(self, simulations: int) -> None:
         """Count `simulations` that are about to begin.

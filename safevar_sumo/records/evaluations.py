@@ -22,6 +22,8 @@ from safevar_sumo.study import SAFETY_DEGREE
 
 COLUMNS = ("settings", "outcome", "collision_speed", "f_diff", "f_num_diff")
 """The arrays that all evaluations have. Each array has a row for each setting."""
+OF_SOME = ("worst_points", "stands")
+"""Further arrays, which only some evaluations have."""
 ResultColumns = Mapping[str, npt.NDArray[np.generic]]
 """Results by name, as arrays with an element for each setting."""
 ROUNDING = 1e-9
@@ -51,6 +53,9 @@ class Evaluations:
         For the bytes of a setting: the reason why it could not be simulated.
     worst_points
         The numbers of the points at which the settings were worst; None without a matrix.
+    stands
+        Which vehicles never moved, although the original vehicle moves in the same encounter. Only
+        questions ask this; None in a search, where such a vehicle counts like others.
     """
 
     settings: FloatArray
@@ -61,6 +66,7 @@ class Evaluations:
     f_num_diff: FloatArray
     reasons: Mapping[bytes, str] = field(default_factory=dict)
     worst_points: IntArray | None = None
+    stands: BoolArray | None = None
 
     def __len__(self) -> int:
         return len(self.settings)
@@ -112,12 +118,18 @@ class Evaluations:
 
     @property
     def valid(self) -> BoolArray:
-        """Which settings can be scored: they are feasible, their test is valid, and their
-        simulation did not fail.
+        """Which settings can be scored: they are feasible, their test is valid, their simulation
+        did not fail, and the vehicle does not stand where the original vehicle moves.
         """
-        return np.asarray(
-            ~self.failed & (self.outcome != Outcome.INVALID_TEST) & ~self.infeasible
-        )
+        is_scored = ~self.failed & (self.outcome != Outcome.INVALID_TEST)
+        return np.asarray(is_scored & ~self.infeasible & ~self.standing)
+
+    @property
+    def standing(self) -> BoolArray:
+        """`stands`, or no vehicle if nobody has asked."""
+        if self.stands is None:
+            return np.zeros(len(self), bool)
+        return self.stands
 
     @property
     def infeasible(self) -> BoolArray:
@@ -170,8 +182,9 @@ class Evaluations:
         columns["metrics"] = {
             name: values[rows] for name, values in self.metrics.items()
         }
-        if self.worst_points is not None:
-            columns["worst_points"] = self.worst_points[rows]
+        for name in OF_SOME:
+            if getattr(self, name) is not None:
+                columns[name] = getattr(self, name)[rows]
         # User code gets the reasons as a read-only view, which cannot be sent to another process.
         return replace(self, **columns, reasons=dict(self.reasons))
 
@@ -229,12 +242,13 @@ class Evaluations:
         metrics = {}
         for name in names:
             metrics[name] = np.concatenate([batch.column(name) for batch in batches])
-        worst_points = None
         if any(batch.worst_points is not None for batch in batches):
-            worst_points = np.concatenate([batch.points for batch in batches])
-        return cls(
-            **columns, metrics=metrics, reasons=reasons, worst_points=worst_points
-        )
+            columns["worst_points"] = np.concatenate(
+                [batch.points for batch in batches]
+            )
+        if any(batch.stands is not None for batch in batches):
+            columns["stands"] = np.concatenate([batch.standing for batch in batches])
+        return cls(**columns, metrics=metrics, reasons=reasons)
 
 
 def differences(

@@ -187,6 +187,8 @@ def compare(
     lacks = list(missing_in_words(*evaluators, titles))
     number_of_better = sum(difference.is_better for difference in differences)
     decision, why = _decide(differences, titles, of_originals, lacks)
+    if decision == RELEASE:
+        evaluator.account.refuse_standing()
     numbers = {
         **({"driven": False} if second.no_verdict else {}),
         "decision": decision.lower(),

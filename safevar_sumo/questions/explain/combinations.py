@@ -53,13 +53,15 @@ class Enumeration(NamedTuple):
     causes
         The causes, the smallest first.
     simulated
-        By size, the number of combinations that were simulated.
+        By size, the number of combinations that were simulated, without vehicles that never moved.
     existing
         By size, the number of combinations that contain no smaller cause and violate no constraint.
     containing
         By size, the combinations that contain a smaller cause and violate no constraint.
     is_cut
         Whether combinations were left out because they are too many.
+    standing
+        The number of combinations that were simulated, but whose vehicle never moved.
     """
 
     share: float
@@ -68,6 +70,7 @@ class Enumeration(NamedTuple):
     existing: CountBySize
     containing: dict[int, Combinations]
     is_cut: bool
+    standing: int
 
     @property
     def tried(self) -> int:
@@ -125,6 +128,7 @@ def enumerate_causes(
     containing = {}
     unsafe_ones = Combinations()
     is_cut = False
+    standing = 0
 
     for size in range(1, len(columns) + 1):
         # Stop at a size with too many combinations to put in order.
@@ -152,10 +156,11 @@ def enumerate_causes(
         )
         chosen = candidates[:room]
         room -= len(chosen)
-        existing[size] = len(candidates)
-        simulated[size] = len(chosen)
         containing[size] = larger
-        robustness, as_causes = _robustness(evaluator, unsafe, chosen)
+        robustness, as_causes, never_moved = _robustness(evaluator, unsafe, chosen)
+        existing[size] = len(candidates)
+        simulated[size] = len(chosen) - never_moved
+        standing += never_moved
         if size == 1:
             single_changes = chain.from_iterable(chosen)
             effects |= zip(single_changes, robustness, strict=True)
@@ -164,7 +169,7 @@ def enumerate_causes(
             unsafe_ones.append(chosen[index])
         if is_cut:
             break
-    return Enumeration(share, causes, simulated, existing, containing, is_cut)
+    return Enumeration(share, causes, simulated, existing, containing, is_cut, standing)
 
 
 def count_cures(
@@ -213,7 +218,7 @@ def staircase(
         step = enumerate_causes(evaluator, unsafe, budget, share, only_fewest=True)
         if not step.tried:
             break
-        limit -= step.tried * encounters
+        limit -= (step.tried + step.standing) * encounters
         steps.append(step)
     return steps
 
@@ -253,14 +258,15 @@ def _settings(members: CharacteristicSet, chosen: Combinations) -> FloatArray:
 
 def _robustness(
     evaluator: Evaluator, unsafe: Unsafe, chosen: Combinations
-) -> tuple[FloatArray, list[Cause]]:
+) -> tuple[FloatArray, list[Cause], int]:
     """The robustness of each of M combinations (below 0: unsafe), shape (M,), infinite without a
-    valid simulation; and each combination as a cause, in its worst encounter.
+    valid simulation; each combination as a cause, in its worst encounter; and the number of
+    combinations whose vehicle never moved.
     """
     members = evaluator.characteristics
     names = members.names
     if not chosen:
-        return np.zeros(0), []
+        return np.zeros(0), [], 0
     runs = evaluator.evaluate_over_encounters(
         _settings(members, chosen), unsafe, COMBINATIONS
     )
@@ -275,4 +281,5 @@ def _robustness(
         causes.append(
             Cause(changes, str(outcome), float(degree), encounter, float(of_runs))
         )
-    return Model(0, evaluator, unsafe).robustness_by(runs), causes
+    robustness = Model(0, evaluator, unsafe).robustness_by(runs)
+    return robustness, causes, int(np.count_nonzero(runs.standing))

@@ -115,6 +115,8 @@ def gather_failures(
     ------
     InputError
         If the criterion or a handle cannot be read, or a handle is no solution of the results.
+    NobodyMoved
+        If no vehicle moved.
     """
     named = list(map(SolutionId.parse, solutions))
     original = evaluator.evaluate_original()
@@ -131,6 +133,7 @@ def gather_failures(
 
     # Solutions are simulated again, because other files or versions may give other outcomes.
     evaluations = evaluator.evaluate(settings, TO_EXPLAIN)
+    evaluator.account.refuse_standing()
     unsafe = (
         evaluator.checked(criterion)
         if criterion
@@ -140,15 +143,18 @@ def gather_failures(
 
     omissions = 0
     over_sets = None
+    is_counted = ~evaluations.standing
+    if named:
+        is_counted[:] = True
     if isinstance(subject, Study):
         omissions = int(evaluations.infeasible.sum())
-        is_met = ~evaluations.infeasible
-        evaluations = evaluations.take(is_met)
-        names = list(compress(names, is_met))
+        is_counted &= ~evaluations.infeasible
         vehicles = VariationModel(subject).draw(
             VEHICLES, default_rng(subject.search.seed)
         )
         over_sets = SharesOverSets.of(evaluator, unsafe, vehicles, fits=fits)
+    evaluations = evaluations.take(is_counted)
+    names = list(compress(names, is_counted))
 
     # A solution that the user names is explained even if it is safe.
     rows = (

@@ -62,7 +62,7 @@ def smallest_sentences(
     """
     members = evaluator.characteristics
     yield from _leading_of_study(smallest, members, unsafe)
-    for size, number in smallest.at_ends.existing.items():
+    for size, number in smallest.at_ends.simulated.items():
         if number:
             yield _of_size(smallest.at_ends, unsafe, size)
     yield from _steps(smallest.steps[1:], unsafe)

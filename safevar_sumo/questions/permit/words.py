@@ -29,6 +29,7 @@ ROUGH_NEED = (
 # The reasons for which a car may drive no faster.
 NOT_AT_ALL = answer("Already at {low}, {event}.")
 IN_FIXED_TEST = answer("In a test with a {name} of its own, {event}.")
+NEVER_MOVES = answer("No {name} can be given, because {event}.")
 SAFE_TO_TOP = answer("The car is safe {reach}, the highest {name} that was simulated.")
 UNSAFE_BEYOND = answer("At a higher {name}, {event}.")
 NEED_REACHED = answer("The car is safe {reach}, and {need} is needed.")

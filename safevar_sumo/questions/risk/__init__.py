@@ -37,6 +37,7 @@ from safevar_sumo.questions.over_sets import (
     BY_SET,
     INTERVALS,
     SharesOverSets,
+    moving_in_words,
     planned_over_sets,
     simulate_sample,
 )
@@ -150,7 +151,9 @@ def risk(
     }
 
     omissions = int(evaluations.infeasible.sum())
-    sentences = _share_in_words(study, criterion, numbers, samples - total - omissions)
+    failed = samples - total - omissions - int(evaluations.standing.sum())
+    sentences = _share_in_words(study, criterion, numbers, failed)
+    sentences += moving_in_words(evaluations)
     if not has_design and total < LEAST_VEHICLES:
         sentences.append(words.UNKNOWN_INFLUENCE(least=LEAST_VEHICLES))
     else:

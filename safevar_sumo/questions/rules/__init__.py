@@ -29,6 +29,7 @@ from safevar_sumo.questions.over_sets import (
     BY_SET,
     INTERVALS,
     SharesOverSets,
+    moving_in_words,
     planned_over_sets,
     simulate_sample,
 )
@@ -162,6 +163,7 @@ def rules(
             share=percentage(share),
             interval=interval_in_words(low, high),
         ),
+        *moving_in_words(evaluations),
         *over_sets.sentences(),
         *notes_on(criterion, *counted, *constraints_in_words(study)),
     ]
