@@ -10,19 +10,17 @@ import secrets
 import shutil
 import stat
 import tempfile
-import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from glob import escape
 from pathlib import Path
+from typing import IO
 
 import portalocker
 
 from safevar_sumo.errors import InputError
 
 ALONE = portalocker.LOCK_EX | portalocker.LOCK_NB
-SETTLING_TIME = 0.1
-"""Time within which a process locks a temporary file that it has created [s]."""
 PREFIX = "safevar-"
 """Beginning of the names of temporary folders."""
 LOCK = "lock"
@@ -61,26 +59,40 @@ def whole_file(path: Path, option: str = "") -> Iterator[Path]:
     # If `path` is a link, its target is replaced, and the link stays.
     target = Path(os.path.realpath(path))
     is_stream = target.exists() and not target.is_file()
+    try:
+        with nullcontext(path) if is_stream else _replacement(target) as file:
+            yield file
+    except OSError as error:
+        if option:
+            raise unwritable(path, option, error) from None
+        raise
+
+
+@contextmanager
+def _replacement(target: Path) -> Iterator[Path]:
+    """Give the path of a temporary file that replaces the file `target` after the block."""
     # File systems limit the length of names: a long name would not leave space for the suffix.
     short_stem = target.stem[:100]
-    file = path
-    if not is_stream:
+    pattern = f".{escape(short_stem)}.????????.tmp{escape(target.suffix)}"
+    _remove_left_behind(target.parent.glob(pattern))
+    lock = None
+    while lock is None:
         file = target.with_name(
             f".{short_stem}.{secrets.token_hex(4)}.tmp{target.suffix}"
         )
+        lock = _create_locked(file)
     try:
-        pattern = f".{escape(short_stem)}.????????.tmp{escape(target.suffix)}"
-        with nullcontext() if is_stream else _owned(file, file.parent.glob(pattern)):
+        with lock:
             yield file
-        if not is_stream:
             with open(file, "rb+") as stream:
                 os.fsync(stream.fileno())
+            # Without the lock, another process would remove the file before it replaces `target`.
+            # Windows, which has no such lock, does not rename a file that is open.
+            if os.name == "nt":
+                lock.close()
             os.replace(file, target)
-    except BaseException as error:
-        if not is_stream:
-            file.unlink(missing_ok=True)
-        if option and isinstance(error, OSError):
-            raise unwritable(path, option, error) from None
+    except BaseException:
+        file.unlink(missing_ok=True)
         raise
 
 
@@ -89,39 +101,51 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     """Give a temporary folder, which is removed after the block. Folders that killed processes have
     left are removed, too.
     """
-    with tempfile.TemporaryDirectory(
-        prefix=PREFIX, dir=parent, ignore_cleanup_errors=True
-    ) as text:
-        folder = Path(text)
-        with _owned(folder / LOCK, folder.parent.glob(f"{PREFIX}*/{LOCK}")):
-            yield folder
+    place = parent or Path(tempfile.gettempdir())
+    _remove_left_behind(place.glob(f"{PREFIX}*/{LOCK}"))
+    with ExitStack() as stack:
+        lock = None
+        while lock is None:
+            new_folder = tempfile.TemporaryDirectory(
+                prefix=PREFIX, dir=place, ignore_cleanup_errors=True
+            )
+            folder = Path(stack.enter_context(new_folder))
+            lock = _create_locked(folder / LOCK)
+        stack.enter_context(lock)
+        yield folder
 
 
-@contextmanager
-def _owned(file: Path, neighbours: Iterable[Path]) -> Iterator[None]:
-    """Create a temporary file, and lock it within the block. Remove the neighbours that no process
-    has locked: their processes were killed.
+def _create_locked(file: Path) -> IO[bytes] | None:
+    """Create a temporary file, and lock it until it is closed. None if another process removed the
+    file before it was locked, because it looked like a file that a killed process has left.
     """
-    with open(file, "xb") as stream:
-        # On Windows, a lock would also prevent this process from writing.
-        if os.name != "nt":
-            for neighbour in neighbours:
-                if neighbour != file:
-                    _remove_left_behind(neighbour)
-            # Some file systems have no locks: the file is then used without a lock.
-            with suppress(portalocker.LockException):
-                portalocker.lock(stream, ALONE)
-        yield
+    stream = open(file, "xb")  # noqa: SIM115
+    # On Windows, a lock would also prevent this process from writing.
+    if os.name != "nt":
+        # This process waits for the lock while another process removes the file. Some file systems
+        # have no locks: the file is then used without a lock, and no process removes it.
+        with suppress(portalocker.LockException):
+            portalocker.lock(stream, portalocker.LOCK_EX)
+        if not file.exists():
+            stream.close()
+            return None
+    return stream
 
 
-def _remove_left_behind(file: Path) -> None:
-    """Remove a temporary file that no process has locked, or, for the file `LOCK`, its folder. A
-    new file stays, because its process may not have locked it yet.
+def _remove_left_behind(files: Iterable[Path]) -> None:
+    """Remove temporary files that no process has locked, because their processes were killed. If
+    such a file has the name `LOCK`, its folder is removed.
     """
-    with suppress(OSError, portalocker.LockException), open(file, "rb+") as stream:
-        portalocker.lock(stream, ALONE)
-        if time.time() - os.fstat(stream.fileno()).st_mtime > SETTLING_TIME:
-            shutil.rmtree(file.parent) if file.name == LOCK else file.unlink()
+    # On Windows, no process locks its temporary files.
+    if os.name == "nt":
+        return
+    for file in files:
+        with suppress(OSError, portalocker.LockException), open(file, "rb+") as stream:
+            portalocker.lock(stream, ALONE)
+            if file.name == LOCK:
+                shutil.rmtree(file.parent)
+            else:
+                file.unlink()
 
 
 def check_writable(

@@ -59,6 +59,8 @@ COMMANDS = "commands"
 """Name of the folder for simulations of commands with user code."""
 DAY = 86_400.0
 """Time within which an interrupted command can be continued [s]."""
+GUARD = "guard.lock"
+"""Name of the file that a process locks while it looks at the locks of commands."""
 NUMBER = b"number"
 """The key of the entry that counts the settings whose results a cache has."""
 METRIC = "metric "
@@ -241,19 +243,16 @@ class CommandCache:
             self._folder / sha256(key + self._command.encode()).hexdigest()
         )
         try:
-            # Folders older than a day are removed, because no command continues from them.
             self._folder.mkdir(parents=True, exist_ok=True)
-            for old in self._folder.iterdir():
-                if time.time() - old.stat().st_mtime > DAY:
-                    (shutil.rmtree if old.is_dir() else Path.unlink)(old)
-
-            # The operating system releases the lock when the process ends, even if the process is
-            # killed.
-            lock_file = self._own_folder.with_suffix(".lock")
-            lock = portalocker.Lock(lock_file, "a", timeout=0, fail_when_locked=True)
-            lock.acquire()
-            self._lock = lock
+            # One process at a time looks at the locks. Otherwise a process that only looks whether
+            # somebody has a lock would take the lock from the process that needs it.
+            with (self._folder / GUARD).open("a") as guard:
+                portalocker.lock(guard, portalocker.LOCK_EX)
+                self._remove_old()
+                self._lock = _lock_of(self._own_folder)
         except (OSError, portalocker.LockException):
+            return
+        if self._lock is None:
             return
         if self._is_fresh:
             shutil.rmtree(self._own_folder, ignore_errors=True)
@@ -264,6 +263,38 @@ class CommandCache:
         if begin is not None and (number := self._own.number_kept()):
             at = time.strftime("%H:%M", time.localtime(begin))
             warn(f"continues: {number:,} simulated at {at}")
+
+    def _remove_old(self) -> None:
+        """Remove caches into which nobody has written for a day, because no command continues from
+        them. The cache of a running command stays.
+        """
+        paths = [path for path in self._folder.iterdir() if path.name != GUARD]
+        for folder in {path.with_suffix("") for path in paths}:
+            lock = _lock_of(folder)
+            if lock is None:
+                continue
+            lock_file = Path(lock.filename)
+            last_written = max(
+                path.stat().st_mtime for path in (lock_file, *folder.glob("*"))
+            )
+            lock.release()
+            if time.time() - last_written > DAY:
+                shutil.rmtree(folder, ignore_errors=True)
+                lock_file.unlink()
+
+
+def _lock_of(folder: Path) -> portalocker.Lock | None:
+    """Lock the cache of a command; None if another process has locked it. The operating system
+    releases the lock when the process ends, even if the process is killed.
+    """
+    lock = portalocker.Lock(
+        folder.with_suffix(".lock"), "a", timeout=0, fail_when_locked=True
+    )
+    try:
+        lock.acquire()
+    except portalocker.AlreadyLocked:
+        return None
+    return lock
 
 
 _cache = ContextVar[CommandCache | None]("cache", default=None)

@@ -302,9 +302,9 @@ class Simulator(Scenario):
         """Open what takes long to start, such as the simulator, once in a process. Objects of the
         class find the returned object as `self.worker`.
 
-        `worker` is the number of this process. Processes that simulate on one machine at the same
-        time have different numbers, from 0 on. A process that replaces a dead process gets its
-        number.
+        `worker` is the number of this process. Processes of one command that simulate on one
+        machine at the same time have different numbers, from 0 on. A process that replaces a dead
+        process gets its number.
         """
         return None
 

@@ -206,7 +206,8 @@ def _has_died(attempt: Path) -> bool:
         suppress(FileNotFoundError, portalocker.LockException),
         attempt.open("r+") as file,
     ):
-        portalocker.lock(file, ALONE)
+        # Another process may look at the same time, and must not take this process for the owner.
+        portalocker.lock(file, portalocker.LOCK_SH | portalocker.LOCK_NB)
         return attempt.exists()
     return False
 

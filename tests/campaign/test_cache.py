@@ -21,7 +21,11 @@ from numpy.testing import assert_array_equal
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import batches, cache
 from safevar_sumo.campaign.batches import ask_why_no_verdict, evaluate_all
-from safevar_sumo.campaign.cache import keep_simulations, simulate_anew
+from safevar_sumo.campaign.cache import (
+    CommandCache,
+    keep_simulations,
+    simulate_anew,
+)
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.catalogue import list_models
@@ -247,6 +251,31 @@ def test_simulations_of_user_code_are_kept_for_the_running_command_and_its_conti
     monkeypatch.setattr(cache, "DAY", -1.0)
     ask("risk own")
     assert sum(simulated) == 64
+
+
+def test_the_cache_of_a_running_command_is_not_removed_however_old_it_is(
+    folder: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another command removes what is older than a day, but nothing that is in use."""
+    write("own.py", OWN_ADS)
+    write("threshold.py", "TTC = 1.5\n")
+    study = load_study("smoke", ads={"model": "own:Own"})
+    monkeypatch.setattr(cache, "DAY", -1.0)
+    commands = [CommandCache(folder, name, is_fresh=False) for name in "ab"]
+    first, second = [command.of(study, ()) for command in commands]
+    assert first is not None
+    assert second is not None
+    first.put(b"key", b"content")
+    assert CommandCache(folder, "a", is_fresh=False).of(study, ()) is None
+    assert first.get(b"key") == b"content"
+
+    # What an interrupted command has left is removed.
+    for command in commands:
+        command.end(is_interrupted=True)
+    other = CommandCache(folder, "c", is_fresh=False)
+    assert other.of(study, ()) is not None
+    assert len([path for path in (folder / "commands").iterdir() if path.is_dir()]) == 1
+    other.end(is_interrupted=False)
 
 
 def test_an_altered_entry_is_simulated_again(

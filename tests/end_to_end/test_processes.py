@@ -19,7 +19,6 @@ import pytest
 
 from safevar_sumo.campaign import batches
 from safevar_sumo.campaign.pool import open_pool
-from safevar_sumo.output import SETTLING_TIME
 from safevar_sumo.results import load_runs, write_whole
 from tests.end_to_end.conftest import (
     ended,
@@ -156,12 +155,59 @@ def test_a_temporary_folder_is_removed_once_its_process_was_killed(
     ]
     holders[0].kill()
     holders[0].wait()
-    time.sleep(2 * SETTLING_TIME)
     with open_pool(1):
         assert len({*tmp_path.glob("safevar-*")} - {*folders}) == 1
         assert [folder.exists() for folder in folders] == [False, True]
     holders[1].communicate("", timeout=60)
     assert not [*tmp_path.glob("safevar-*")]
+
+
+MANY = """
+import sys
+from pathlib import Path
+import portalocker
+from safevar_sumo.output import ALONE, LOCK, temporary_folder, whole_file
+
+sys.stdin.read()  # until all processes have started
+for number in range(30):
+    with temporary_folder() as folder, (folder / LOCK).open("rb+") as lock:
+        try:
+            portalocker.lock(lock, ALONE)
+            print("has no lock:", folder)
+        except portalocker.AlreadyLocked:
+            Path(folder, "0.txt").write_text("a worker's last words")
+    with whole_file(Path("page.html")) as file:
+        file.write_text("whole")
+"""
+
+
+def test_no_temporary_folder_in_use_is_removed_when_24_processes_work_at_once(
+    in_tmp: Path,
+) -> None:
+    """Each process removes what killed processes have left, while all others begin."""
+    Path("temporary").mkdir()
+    environment = {**os.environ, "TMPDIR": str(in_tmp / "temporary")}
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", MANY],
+            text=True,
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+        for _ in range(24)
+    ]
+    for process in processes:
+        assert process.stdin
+        process.stdin.close()
+    for process in processes:
+        assert process.stdout
+        assert process.stdout.read() == ""
+        assert process.wait() == 0
+    assert not [*Path("temporary").iterdir()]
+    assert [path.name for path in in_tmp.glob(".page*")] == []
+    assert Path("page.html").read_text() == "whole"
 
 
 @SLOW

@@ -762,6 +762,11 @@ def test_an_attempt_counts_as_a_death_only_when_its_process_has_died(
         pass
     assert {path.name for path in folder.iterdir()} == {"dead-0", "dead-1"}
 
+    # A process that only looks is not taken for the owner of what it looks at.
+    with (folder / "dead-0").open("r+") as file:
+        simulators.portalocker.lock(file, simulators.portalocker.LOCK_SH)
+        assert simulators._has_died(folder / "dead-0")
+
     # A disk without locks.
     refused_lock = Mock(side_effect=simulators.portalocker.LockException)
     monkeypatch.setattr(simulators.portalocker, "lock", refused_lock)
