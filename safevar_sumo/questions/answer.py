@@ -130,7 +130,7 @@ def contents(
         def with_lead(*arguments: Any, **options: Any) -> Answer:
             """The function, whose answer gets the declared leading table if it states none."""
             answer = function(*arguments, **options)
-            return replace(answer, lead=answer.lead or lead)
+            return replace(answer, lead=lead if answer.lead == "" else answer.lead)
 
         names = tuple(dict.fromkeys((*OF_ALL, *numbers)))
         vars(with_lead)["contents"] = Contents(names, tables, lead, next)

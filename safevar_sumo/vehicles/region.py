@@ -210,15 +210,18 @@ def region_of(study: Study) -> FeasibleRegion:
             otherwise="; the original vehicle must satisfy every constraint",
         )
 
-    # Searches start from random settings: enough of these must be feasible.
+    # Searches filter random settings, and questions do not: enough of both must be feasible.
     probes = np.random.default_rng(0).uniform(
         characteristics.lower, characteristics.upper, (N_PROBES, len(characteristics))
     )
-    if np.mean(region.feasible(characteristics.filter(probes))) < LEAST_SHARE:
+    share = np.mean(region.feasible(probes))
+    share_after_filter = np.mean(region.feasible(characteristics.filter(probes)))
+    if min(share, share_after_filter) < LEAST_SHARE:
         raise InputError(
             "",
             f"constraints: fewer than {LEAST_SHARE * 1000:g} in 1,000 random settings satisfy them:"
             f" {region}",
-            "narrower domains, or inequalities with wider bounds",
+            "narrower domains or wider bounds, or one characteristic less, whose value your class"
+            " computes from the others",
         )
     return region

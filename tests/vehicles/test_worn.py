@@ -290,7 +290,7 @@ def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(
     asked = asked_of(
         Models((Model(0, evaluator, unsafe),), ()), unsafe, columns, {}, at_tests=True
     )
-    alone = alone_with_own_set(
+    alone, _ = alone_with_own_set(
         asked._replace(effort=asked.effort._replace(alone=0)),
         Alone(asked.lower, asked.upper),
     )

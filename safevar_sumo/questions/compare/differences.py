@@ -174,7 +174,7 @@ def _safe_alone(request: Asked, limits: Restriction) -> list[Interval] | list[No
     members = request.bench.vehicle.members
     if model.are_unsafe(model.characteristics.original_settings, "original vehicle")[0]:
         return [None] * len(members)
-    alone = alone_with_own_set(request, Alone(request.lower, request.upper))
+    alone, _ = alone_with_own_set(request, Alone(request.lower, request.upper))
     ends = np.column_stack([alone.lower, alone.upper]).tolist()
     intervals = []
     for item, safe in zip(members, ends, strict=True):

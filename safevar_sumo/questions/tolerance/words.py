@@ -101,6 +101,11 @@ TOO_FEW = answer(
     " more simulations (--simulations)."
 )
 
+UNTESTED_REASON = (
+    "hardly any simulated vehicle satisfies the constraints in an encounter that counts"
+)
+UNTESTED = answer(f"No joint limits can be given, because {UNTESTED_REASON}.")
+
 # The wider ranges of a study.
 RANGES_HOLD = evidence(
     "In the wider ranges of encounters that the study states, {number:,} simulations found no"
@@ -117,6 +122,10 @@ RANGES_UNKNOWN = evidence(
 # Each characteristic alone.
 NONE_ALONE = condition(
     "No single characteristic was found that makes the vehicle unsafe when it changes alone."
+)
+NO_SINGLE_CHANGE = condition(
+    "No characteristic has a limit alone, because no simulated change of a single characteristic"
+    " satisfies the constraints."
 )
 ALONE = condition(
     "A change of {names} alone can make the vehicle unsafe, with all other characteristics as in"
