@@ -278,7 +278,12 @@ def open_and_lock(path: Path) -> IO[bytes]:
     with disk_errors(path, "opened"):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            return lock.acquire()
+            file = lock.acquire()
+            # The process that had the lock before may have removed the file meanwhile.
+            while os.fstat(file.fileno()).st_nlink == 0:
+                lock.release()
+                file = lock.acquire()
+            return file
         except portalocker.AlreadyLocked:
             raise SafevarError(f"{path}: another process works on this run") from None
         except portalocker.LockException as error:

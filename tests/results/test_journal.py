@@ -6,8 +6,10 @@ import json
 import os
 import subprocess
 import sys
+import time
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,12 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.records import Evaluations, differences
 from safevar_sumo.results import Journal, JournalReader, journal_head
-from safevar_sumo.results.journal import JournalContent, read_journal
+from safevar_sumo.results.journal import (
+    SECONDS_BETWEEN_ATTEMPTS,
+    JournalContent,
+    open_and_lock,
+    read_journal,
+)
 from tests.in_process import SLOW
 
 BATCHES = 4
@@ -306,6 +313,19 @@ def test_a_run_has_one_owner_and_the_lock_ends_with_the_process(path: Path) -> N
     other.kill()
     Journal(path, HEAD).close()  # waits until the other has ended
     other.communicate()
+
+
+def test_a_journal_that_is_removed_while_another_process_waits_for_it_is_made_anew(
+    path: Path,
+) -> None:
+    first = open_and_lock(path)
+    with ThreadPoolExecutor() as threads:
+        waiting = threads.submit(open_and_lock, path)
+        time.sleep(2 * SECONDS_BETWEEN_ATTEMPTS)
+        path.unlink()
+        first.close()
+        with waiting.result() as second:
+            assert os.path.samestat(os.fstat(second.fileno()), path.stat())
 
 
 def test_a_retry_drops_the_first_batch_that_failed_and_all_after_it(
