@@ -139,10 +139,14 @@ def _missing_key(place: _Place, key: str) -> InputError:
         for name, table in place.siblings.items()
         if isinstance(table, dict) and key in table
     ]
-    keys = ", ".join(
+    required = [
         field.name for field in msgspec.structs.fields(place.kind) if field.required
-    )
-    legal = f"{keys} for what is new here"
+    ]
+    # The key that names the kind of table, such as `distribution`, is no field of a kind.
+    if key not in required:
+        tags = [kind.__struct_config__.tag for kind in get_args(place.declared[-1])]
+        required.insert(0, f"{key} ({one_of(tags)})")
+    legal = f"{', '.join(required)} for what is new here"
     hint = ""
     if names:
         hint = did_you_mean(place.path[-1], names)
