@@ -34,6 +34,7 @@ from safevar_sumo.questions.sentence import Sentence, Verdict
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.questions.tables import Rows, shipped_columns
 from safevar_sumo.questions.words import (
+    ALREADY_UNSAFE,
     EXACT,
     change_texts,
     count_in_words,
@@ -220,7 +221,7 @@ def _found(
     if system.meets_nobody and not (unsafe or results.study.unsafe.criterion):
         advice = ""
     if breach := _breach_of_original(case):
-        sentences = [words.ALREADY_UNSAFE(breach=breach)]
+        sentences = [ALREADY_UNSAFE(breach=breach)]
         advice = ""
     else:
         sentences, changes = _verdict(results, case, jobs, study)

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from safevar_sumo.questions.sentence import answer, condition, evidence, note
 
-ALREADY_UNSAFE = answer(
-    "The original vehicle is already unsafe: it {breach}. A failure needs no change of the"
-    " vehicle."
-)
 NOTHING_RETURNED = answer("The search returned no vehicle: {reason}.")
 NOTHING_UNSAFE = answer(
     "The search did not find {unsafe.event}: none of the {total:,} different vehicles that the"

@@ -323,6 +323,7 @@ class Question:
             numbers["rough"] = bool(beginning[1:] or numbers.get("rough"))
         sentences = [*beginning, *Verdict.of(result.verdict).sentences, *cites]
         sentences.append(note(account.undefined_in_words))
+        sentences.append(note(account.collided_in_words))
         numbers["never_moved"] = len(account.standing)
         if account.standing and numbers["driven"]:
             sentences.append(STANDING(count=account.standing_in_words))
@@ -331,7 +332,7 @@ class Question:
             result,
             verdict=Verdict(sentences),
             numbers=numbers,
-            next=self._next(subjects[0], evaluator, called, values) or result.next,
+            next=result.next or self._next(subjects[0], evaluator, called, values),
             command="" if limit is None else f" --simulations {limit}",
         )
 

@@ -277,6 +277,7 @@ class Evaluator:
         if selection == EVERYTHING:
             counted = self._without_unsafe_originals(evaluations)
         counted = self._without_standing(counted, selection)
+        self.account.count(evaluations)
         if measure := self.account.measure:
             is_safe = evaluations.valid & ~evaluations.collided & ~counted.standing
             is_undefined = np.isnan(evaluations.column(measure)) & is_safe
@@ -486,6 +487,8 @@ class Evaluator:
         without a value of this metric. Raises the errors of `checked`.
         """
         self.checked(unsafe)
+        if not unsafe.is_collision:
+            self.account.criterion = unsafe
         if unsafe.bound:
             self.account.measure = unsafe.bound.measure
             self.check_measured(unsafe.bound.measure)

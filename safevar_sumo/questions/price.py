@@ -21,6 +21,7 @@ from safevar_sumo.campaign.evaluation import (
 )
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, NobodyMoved
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.words import number_of
 from safevar_sumo.records import Evaluations, FloatArray
@@ -84,6 +85,10 @@ class Account:
         Number of settings without a collision for which this metric is undefined.
     judged
         Number of all settings that were judged by this metric.
+    criterion
+        The question's criterion, if a collision alone does not meet it; else None.
+    met, collided, evaluated
+        Numbers of settings that meet this criterion, that collide, and that were simulated.
     standing
         The vehicles (as bytes) that never moved in an encounter in which the original vehicle
         moves.
@@ -102,6 +107,10 @@ class Account:
     measure: str = ""
     undefined: int = 0
     judged: int = 0
+    criterion: Unsafe | None = None
+    met: int = 0
+    collided: int = 0
+    evaluated: int = 0
     standing: set[bytes] = field(default_factory=set)
     has_moved: bool = False
 
@@ -124,6 +133,25 @@ class Account:
             return ""
         of_all = f"{self.undefined:,} of {self.judged:,} simulated settings, which count as safe"
         return f"Remark: {self.measure} is undefined, without a collision, in {of_all}."
+
+    def count(self, evaluations: Evaluations) -> None:
+        """Count evaluations that meet the question's criterion, and that collide."""
+        if self.criterion is not None:
+            self.met += int(np.count_nonzero(self.criterion.of(evaluations)))
+            self.collided += int(np.count_nonzero(evaluations.collided))
+            self.evaluated += len(evaluations)
+
+    @property
+    def collided_in_words(self) -> str:
+        """A sentence on vehicles that collide, although no vehicle meets the criterion; "" without
+        such vehicles.
+        """
+        if self.met or not self.collided or self.criterion is None:
+            return ""
+        return (
+            f"Remark: {self.collided:,} of the {self.evaluated:,} simulated vehicles collide,"
+            f" although no vehicle is unsafe by the criterion ({self.criterion.description})."
+        )
 
     @property
     def standing_in_words(self) -> str:

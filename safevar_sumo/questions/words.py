@@ -8,7 +8,7 @@ from shlex import quote
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.sampling import CONFIDENCE
-from safevar_sumo.questions.sentence import Sentence, note
+from safevar_sumo.questions.sentence import Sentence, answer, note
 from safevar_sumo.records import NamedValues, Outcome
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -27,6 +27,10 @@ OUTCOME_VERBS = {
 """How a run ended, as the verb of a sentence. A collision is described with its speed instead."""
 
 
+ALREADY_UNSAFE = answer(
+    "The original vehicle is already unsafe: it {breach}. A failure needs no change of the"
+    " vehicle."
+)
 VALID_FOR = note("Valid for: {scope}.")
 UNSAFE_MEANS = note("Unsafe means: {description}.")
 EXACT = ".15g"
@@ -268,3 +272,8 @@ def constraints_in_words(study: Study) -> list[str]:
     )
     sentence = f"A vehicle counts only if it satisfies the constraints of the study: {conditions}."
     return [sentence] if conditions else []
+
+
+def simulation_of(study: Study) -> str:
+    """The command that simulates the original vehicle of a study."""
+    return f"{PROGRAM_COMMAND} simulate {study.words}"

@@ -47,7 +47,7 @@ def test_a_margin_that_the_original_does_not_keep_ends_the_question() -> None:
     answer = tolerance.compute(study, evaluator, margin=30)
     assert evaluator.simulated <= 2
     assert answer.verdict.startswith(
-        "No limit can be given, because the original vehicle is already unsafe: it keeps 0.88 m"
+        "The original vehicle is already unsafe: it keeps 0.88 m"
     )
     assert answer.numbers["kept"] is False
 

@@ -441,7 +441,8 @@ def test_an_unsafe_original_keeps_no_limit_and_says_what_it_has() -> None:
         answer = answer_of(2, nowhere, unsafe="safety_degree < 8.5", limits=limits)
         (refusal,) = answer.failures
         assert "is already unsafe: it has a" in refusal, "a limit is not blamed"
-        assert f"because {refusal}. Ask again with a weaker" in answer.verdict
+        told = f"{refusal} Therefore no limit can be given. Ask again with a weaker"
+        assert told in answer.verdict
         assert answer.numbers["kept"] is False
         assert answer.tables["limits"]["kept"].tolist() == (
             [False, None] if limits else [None, None]

@@ -91,3 +91,64 @@ def test_limits_with_a_wider_constraint_hold_for_every_vehicle_that_satisfies_it
     degree = 5 - np.abs(front - 0.6) * 20 - np.abs(rear - 0.3) * 2 - engine
     assert len(vehicles) > 1000
     assert degree.min() >= 0
+
+
+WALL = """
+class Wall:
+    UNITS = {"mass": "kg", "force": "N"}
+    version = "1"
+
+    def simulate(self, setting):
+        deceleration = setting["force"] / setting["mass"]
+        left = 35 - 15**2 / (2 * deceleration)
+        if left > 0:
+            return {"outcome": "stopped", "safety_degree": left}
+        return {"outcome": "collision", "safety_degree": -((-2 * deceleration * left) ** 0.5)}
+"""
+WALL_STUDY = """
+name = "wall"
+title = "A standing truck"
+scenario.model = "wall:Wall"
+metrics.ttc_threshold = 1.5
+search = { algorithms = ["rs"], population = 20, evaluations = 40, runs = 1, seed = 1 }
+[vehicle.characteristics]
+mass = { unit = "kg", original = 2000, lower = 1500, upper = 2200 }
+force = { unit = "N", original = ORIGINAL, lower = 4000, upper = 12000 }
+"""
+
+
+def write_wall(force: float) -> None:
+    """Write a study of a car with this original brake force [N]; 6428.6 N just suffice."""
+    write("wall.py", WALL)
+    write("wall.toml", WALL_STUDY.replace("ORIGINAL", str(force)))
+
+
+def test_explain_and_tolerance_say_the_same_of_an_unsafe_original_vehicle(
+    in_tmp: Path,
+) -> None:
+    write_wall(5000)
+    speed = (2 * 2.5 * (15**2 / 5 - 35)) ** 0.5
+    for command in ("explain", "tolerance"):
+        printed = run(f"{command} wall.toml --quick", expect=3).stdout
+        text = " ".join(printed.split())
+        assert (
+            f"The original vehicle is already unsafe: it collides at {speed:.2f} m/s."
+            in text
+        )
+        assert "Next: python -m safevar_sumo simulate wall.toml" in text
+        assert "┏" not in printed, "a table without content"
+
+
+@pytest.mark.parametrize(
+    "command", ["risk", "explain", "tolerance", "rules --samples 500"]
+)
+def test_collisions_are_named_where_no_vehicle_meets_the_criterion(
+    command: str, in_tmp: Path
+) -> None:
+    write_wall(12000)
+    name, _, flags = command.partition(" ")
+    rest = f"wall.toml {flags} --simulations 2000 --details"
+    told = "simulated vehicles collide, although no vehicle is unsafe by the criterion"
+    with_criterion = run(f"{name} {rest} --unsafe 'safety_degree < -40'", expect=None)
+    assert told in " ".join(with_criterion.stdout.split())
+    assert told not in " ".join(run(f"{name} {rest}", expect=None).stdout.split())

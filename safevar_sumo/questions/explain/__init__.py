@@ -65,6 +65,7 @@ from safevar_sumo.questions.preventability import (
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.questions.tables import tabulate
+from safevar_sumo.questions.words import ALREADY_UNSAFE, simulation_of
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
 
@@ -215,12 +216,18 @@ def explain(
         numbers |= smallest.numbers
         leading = smallest_sentences(smallest, evaluator, population.unsafe)
     notes = other_sentences(study, population, complete, verdicts)
+    failures = []
+    if not is_caused:
+        breach = population.unsafe.breach_in_words(population.original)
+        failures.append(ALREADY_UNSAFE(breach=breach).text)
     return Answer(
         question="explain",
         study=study,
         verdict=Verdict([*leading, *notes]),
         numbers=numbers,
         tables=tables,
+        failures=tuple(failures),
+        next="" if is_caused else simulation_of(study),
         draw=draw_staircase if smallest is not None else draw_needed,
     )
 

@@ -21,6 +21,7 @@ from safevar_sumo.questions.preventability import FULL, LETTER
 from safevar_sumo.questions.sentence import Sentence, Sentences, answer
 from safevar_sumo.questions.variation import sampled_in_words
 from safevar_sumo.questions.words import (
+    ALREADY_UNSAFE,
     constraints_in_words,
     count_in_words,
     counted_in_words,
@@ -241,7 +242,7 @@ def failure_sentences(
     unsafe = population.unsafe
     original = population.original
     if not evaluator.study.ranges and unsafe.of(original)[0]:
-        yield words.ALREADY_UNSAFE(breach=unsafe.breach_in_words(original))
+        yield ALREADY_UNSAFE(breach=unsafe.breach_in_words(original))
         yield answer(unsafe.smaller_demand(original))
         return
     if causes.empty and unsafe.number(population.evaluations):

@@ -44,10 +44,6 @@ UNSAFE_IN_ENCOUNTER = answer(
 )
 
 # The causes of failures in results.
-ALREADY_UNSAFE = answer(
-    "The original vehicle is already unsafe: it {breach}. A failure needs no change of the"
-    " vehicle."
-)
 NONE_UNSAFE = answer(
     "No cause was found, because none of the examined vehicles is unsafe."
 )

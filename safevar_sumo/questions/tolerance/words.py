@@ -9,11 +9,10 @@ from __future__ import annotations
 from safevar_sumo.questions.sentence import answer, condition, evidence, note
 
 # The original vehicle, and the specified limits.
-ORIGINAL_UNSAFE = "the original vehicle is already unsafe: it {breach}"
 BROKEN = "the specified limit of {name} does not hold"
 ROUGH = "a rough answer confirms no limit; ask again without --quick, or for more simulations"
 """The reason for which a gate (a command that must succeed) fails on a rough answer."""
-REFUSAL = answer("No limit can be given, because {reason}.")
+NO_LIMIT = answer("Therefore no limit can be given.")
 DO_NOT_RELEASE = answer("DO NOT RELEASE: the specified limits do not hold.")
 OUTSIDE = answer(
     "With {name} at {value}, {event}. The specified limit is {outside} beyond the last safe value."
