@@ -250,14 +250,9 @@ class Simulation:
         """How the simulation ended, in words. With repeats, the text says how many runs are
         unsafe.
         """
-        runs = runs_in_words(self.pair.system.criterion.runs(self.evaluation)[:, 0])
-        is_breach = (
-            self.pair.system.criterion.of(self.evaluation)[0]
-            and self.evaluation.collided[0]
-        )
-        if runs and not is_breach:
-            return f"{self._ending}, unsafe{runs}"
-        return f"{self._ending}{runs}"
+        criterion = self.pair.system.criterion
+        runs = runs_in_words(criterion.failing_runs(self.evaluation)[:, 0])
+        return " and ".join(filter(None, (self._ending, runs)))
 
     @property
     def _ending(self) -> str:

@@ -180,6 +180,12 @@ class Unsafe:
     def _repeats(self, evaluations: Evaluations) -> list[Evaluations]:
         return evaluations.repeats or [evaluations]
 
+    def failing_runs(self, evaluations: Evaluations) -> BoolArray:
+        """Return which of the R runs of each of M evaluations fail, shape (R, M). A criterion for
+        the share of failing runs is none for a run.
+        """
+        return self.runs(evaluations)
+
     def number(self, evaluations: Evaluations) -> float:
         """The number of unsafe evaluations. With repeats, an evaluation adds its share of unsafe
         runs.
@@ -237,9 +243,8 @@ class Unsafe:
         3.21 m/s`, `keeps 0.04 m of clearance, less than 0.3 m`. With repeats the text also says how
         many runs are unsafe.
         """
-        return (
-            f"{self._breach_in_words(vehicle)}{runs_in_words(self.runs(vehicle)[:, 0])}"
-        )
+        runs = runs_in_words(self.failing_runs(vehicle)[:, 0])
+        return " and ".join(filter(None, (self._breach_in_words(vehicle), runs)))
 
     def _breach_in_words(self, vehicle: Evaluations) -> str:
         """What an unsafe vehicle does, in words, without the number of runs."""
@@ -490,6 +495,9 @@ class UnsafeShare(UnsafeMetric):
 
     def _repeats(self, evaluations: Evaluations) -> list[Evaluations]:
         return [evaluations]
+
+    def failing_runs(self, evaluations: Evaluations) -> BoolArray:
+        return Unsafe().runs(evaluations)
 
 
 METRIC_KINDS = {IMPACT_EXCESS.name: UnsafeImpact, UNSAFE_SHARE.name: UnsafeShare}

@@ -11,10 +11,14 @@ from safevar_sumo.records import KMH_PER_MS, BoolArray
 ALLOWED_ROUNDING = 0.01
 """An impact is not allowed at all if its allowed speed is below this number [km/h]."""
 
+LEAST_WITHOUT_DECIMALS = 9.95
+"""A percentage from this number on is printed without decimals, others with two digits."""
+
 
 def runs_in_words(fails: BoolArray) -> str:
-    """The number of unsafe runs of a setting, in words, with the exact interval of their share
-    (Clopper and Pearson). `fails` says which runs are unsafe, shape (R,). "" for a single run.
+    """The number of unsafe runs of a setting, with the exact interval of their share (Clopper and
+    Pearson), such as `fails in 3 of 5 repeated runs (95 %: 15 to 95 %)`. `fails` says which runs
+    are unsafe, shape (R,). "" for a single run.
     """
     # The import takes a second.
     import scipy
@@ -23,8 +27,12 @@ def runs_in_words(fails: BoolArray) -> str:
         return ""
     count = int(fails.sum())
     low, high = scipy.stats.binomtest(count, len(fails)).proportion_ci(method="exact")
-    interval = f"95 % confidence interval {100 * low:.0f} to {100 * high:.0f} %"
-    return f" in {count} of {len(fails)} runs ({interval})"
+    ends = [
+        f"{value:.0f}" if value >= LEAST_WITHOUT_DECIMALS else f"{value:.2g}"
+        for value in (100 * low, 100 * high)
+    ]
+    interval = f"95 %: {ends[0]} to {ends[1]} %"
+    return f"fails in {count} of {len(fails)} repeated runs ({interval})"
 
 
 def impact_in_words(speed: float, excess: float) -> str:

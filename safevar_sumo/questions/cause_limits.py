@@ -137,7 +137,7 @@ def _first_unsafe_shares(
     boundaries = find_boundaries(
         starts,
         ends,
-        lambda rows: unsafe.of(evaluator.evaluate(rows, BOUNDARIES)),
+        lambda rows: evaluator.confirmed(evaluator.evaluate(rows, BOUNDARIES), unsafe),
         parts,
         lowest,
     )

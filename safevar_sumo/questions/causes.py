@@ -103,6 +103,7 @@ def find_minimal_causes(
                     partial[columns] = settings[row, columns]
                 evaluations = evaluator.evaluate(partial_settings, SUBSETS)
                 of_runs = unsafe.runs(evaluations).mean(axis=0)
+                of_runs[~evaluator.confirmed(evaluations, unsafe)] = 0.0
                 for index in np.flatnonzero(of_runs).tolist():
                     row, columns = chunk[index]
                     values = settings[row].tolist()

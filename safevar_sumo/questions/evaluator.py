@@ -69,6 +69,8 @@ FIRST_SETTINGS = 64
 """Number of these settings that are simulated first: one collision among them decides already."""
 ENCOUNTERS = 16
 """Largest number of critical encounters in which vehicles drive, if encounters are ranges."""
+FRESH_RUNS = 20
+"""Least number of fresh runs of a vehicle, if the number of simulations is not limited."""
 CANDIDATES = 512
 """Number of encounters over the domain from which the critical encounters are chosen."""
 
@@ -174,6 +176,46 @@ class Evaluator:
         # Restore the order of the settings.
         return evaluations.take(np.argsort(np.argsort(~is_feasible, kind="stable")))
 
+    @property
+    def has_repeats(self) -> bool:
+        """Whether runs of the same vehicle differ, so that each vehicle has several runs."""
+        return self.study.scenario.repeats > 1
+
+    def evaluate_anew(self, settings: FloatArray) -> Evaluations:
+        """Evaluate M settings of a simulator whose runs differ, shape (M, n), in fresh runs: no
+        kept result is read. A setting has at least as many runs as the study repeats, and at least
+        `FRESH_RUNS` if a quarter of the simulations that are left suffices.
+        """
+        repeats = self.study.scenario.repeats
+        runs = max(repeats, FRESH_RUNS)
+        if self.left is not None and self.left * repeats < 4 * runs * len(settings):
+            runs = repeats
+        self.account.spend(len(settings) * self._each * runs // repeats)
+        scenario = replace_in(self.study.scenario, repeats=runs)
+        task = Task(study=replace_in(self.study, scenario=scenario))
+        parts = np.array_split(settings, min(len(settings), 4 * self._pool.workers))
+        jobs = [(task, part) for part in parts]
+        fresh_runs = Evaluations.concatenate(
+            carry_out(evaluate_settings, jobs, self._pool)
+        )
+        counted = self._without_unsafe_originals(fresh_runs)
+        return self._without_standing(counted, EVERYTHING)
+
+    def confirmed(self, evaluations: Evaluations, unsafe: Unsafe) -> BoolArray:
+        """Which of M evaluated settings are unsafe, shape (M,). If runs differ, a setting must also
+        be unsafe in fresh runs: otherwise the unluckiest of many safe settings would count. Without
+        enough simulations for fresh runs, a setting does not count.
+        """
+        is_unsafe = unsafe.of(evaluations)
+        rows = np.flatnonzero(is_unsafe)
+        if not self.has_repeats or not len(rows):
+            return is_unsafe
+        is_unsafe[:] = False
+        if self.left is None or len(rows) <= self.left:
+            fresh_runs = self.evaluate_anew(evaluations.settings[rows])
+            is_unsafe[rows] = unsafe.of(fresh_runs)
+        return is_unsafe
+
     def begin(
         self, settings: NamedValues, minimum: int = 1, *, of_list: bool = False
     ) -> None:
@@ -242,7 +284,8 @@ class Evaluator:
         """
         number = self.scaled(number)
         if self.left is not None:
-            number = min(number, self.left // part)
+            # If runs differ, each unsafe setting is simulated again.
+            number = min(number, self.left // (part * (1 + self.has_repeats)))
         return max(number, 1)
 
     @property

@@ -8,6 +8,7 @@ import pandas as pd
 from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import STOPPING_DISTANCE
 from safevar_sumo.questions.answer import Answer, Column, Columns, tabulate
+from safevar_sumo.questions.sampling import CONFIDENCE
 from safevar_sumo.questions.sentence import Sentence, Verdict, answer, evidence
 from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.words import (
@@ -191,7 +192,9 @@ def _verdict(simulation: Simulation, point_count: int) -> list[Sentence]:
             test=test,
         ),
     ]
-    if is_changed:
+    if is_changed and simulation.evaluation.repeats:
+        sentences += _comparison_of_runs(simulation)
+    elif is_changed:
         sentences.append(_safety_comparison(simulation))
 
     # The comparison is negated, because an undefined safety degree, NaN, does not suffice.
@@ -199,6 +202,37 @@ def _verdict(simulation: Simulation, point_count: int) -> list[Sentence]:
     if demand is not None and not simulation.original.metrics[SAFETY_DEGREE] >= demand:
         sentences.append(words.LEFT_OUT(demand=demand))
     return sentences
+
+
+def _comparison_of_runs(simulation: Simulation) -> list[Sentence]:
+    """Sentences that compare the mean safety degrees of the repeated runs of both vehicles."""
+    samples = [
+        np.array([run.f_safe[0] for run in vehicle.evaluation.repeats])
+        for vehicle in (simulation, simulation.original)
+    ]
+    difference, low, high = difference_of_means(*samples)
+    if np.isnan(difference):
+        return [words.UNDECIDED]
+    conclusion = words.NO_DIFFERENCE
+    if low > 0 or high < 0:
+        conclusion = words.LESS_SAFE if high < 0 else words.SAFER
+    means = words.DIFFERENCE(difference=difference, low=low, high=high)
+    return [means, conclusion]
+
+
+def difference_of_means(
+    first: FloatArray, second: FloatArray
+) -> tuple[float, float, float]:
+    """The difference of the means of two samples, and its 95 % interval (Welch's t)."""
+    # The import takes a second.
+    import scipy
+
+    difference = float(first.mean() - second.mean())
+    if not first.std() and not second.std():
+        return difference, difference, difference
+    test = scipy.stats.ttest_ind(first, second, equal_var=False)
+    interval = test.confidence_interval(CONFIDENCE)
+    return difference, float(interval.low), float(interval.high)
 
 
 def _safety_comparison(simulation: Simulation) -> Sentence:

@@ -24,6 +24,11 @@ STOPPING_DISTANCE = answer(
 LESS_SAFE = answer("The changed vehicle is less safe than the original vehicle.")
 SAFER = answer("The changed vehicle is safer than the original vehicle.")
 EQUALLY_SAFE = answer("Both vehicles are equally safe.")
+DIFFERENCE = answer(
+    "The mean safety degree of the changed vehicle minus that of the original vehicle is"
+    " {difference:+.2f} m (95 %: {low:+.2f} to {high:+.2f} m)."
+)
+NO_DIFFERENCE = answer("The repeated runs do not show which vehicle is safer.")
 UNDECIDED = answer(
     "This simulation cannot tell which vehicle is safer, because a safety degree is undefined."
 )

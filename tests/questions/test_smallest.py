@@ -4,26 +4,33 @@ what the verdict claims of them.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from hypothesis import given, strategies as st
+from msgspec.structs import replace as replace_in
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.campaign.evaluation import Task, evaluate_settings
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.causes import Cause
-from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.evaluator import FRESH_RUNS, Evaluator
 from safevar_sumo.questions.explain.combinations import enumerate_causes, staircase
 from safevar_sumo.questions.explain.smallest import Smallest
 from safevar_sumo.questions.explain.tell import smallest_sentences
 from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.over_sets import VEHICLES
+from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.records import BoolArray, Evaluations, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, json_of, rows_of
@@ -287,26 +294,101 @@ def test_the_verdict_claims_no_more_than_was_simulated() -> None:
     )
 
 
-class Repeated(Plant):
-    """A pool in which each vehicle runs four times, and collides in one run in `region`."""
+class Noisy(Plant):
+    """A pool in which each vehicle runs several times. Each run collides with the probability that
+    `probability` gives the vehicle; batches of many vehicles are those of searches.
+    """
 
-    def evaluate(self, settings: FloatArray) -> Evaluations:
-        evaluations = super().evaluate(settings)
-        degree = evaluations.metrics["safety_degree"]
-        runs = {
-            f"safety_degree_{run}": degree if run == 1 else degree + 3
-            for run in range(1, 5)
-        }
-        return replace(evaluations, metrics={**evaluations.metrics, **runs})
+    def __init__(
+        self,
+        study: Study,
+        probability: Callable[[FloatArray], FloatArray],
+        bad_luck: float = 0.0,
+    ):
+        super().__init__(study, lambda rows: rows[:, 0] < 0)
+        self._probability = probability
+        self._bad_luck = bad_luck
+        self._random = np.random.default_rng(5)
+
+    def compute(self, function: Callable[..., Any], task: Task, *arguments: Any) -> Any:
+        if function is not evaluate_settings:
+            return ""
+        (settings,) = arguments
+        evaluations = self.evaluate(settings)
+        repeats = task.study.scenario.repeats
+        probability = self._probability(settings)
+        if repeats == REPEATS:
+            # Runs of the search, not fresh runs.
+            probability = np.maximum(probability, self._bad_luck)
+        fails = self._random.random((repeats, len(settings))) < probability
+        degrees = np.where(fails, -1.0, 2.0)
+        runs = {f"safety_degree_{number}": row for number, row in enumerate(degrees, 1)}
+        is_unsafe = fails.any(axis=0)
+        return replace(
+            evaluations,
+            outcome=np.where(is_unsafe, "collision", "stopped").astype("U16"),
+            metrics=evaluations.metrics | runs | {"safety_degree": degrees.min(axis=0)},
+        )
 
 
-def test_with_repeats_a_cause_has_the_share_of_its_unsafe_runs() -> None:
+REPEATS = 4
+
+
+def noisy_answer(
+    probability: Callable[[FloatArray], FloatArray], bad_luck: float = 0.0
+) -> tuple[Smallest, str]:
+    """The answer about two characteristics, of vehicles that run four times."""
     study = made_up_study(2)
-    evaluator = Evaluator(study, Repeated(study, lambda rows: rows[:, 0] > 9))
+    scenario = replace_in(study.scenario, repeats=REPEATS)
+    study = replace_in(study, scenario=scenario)
+    evaluator = Evaluator(study, Noisy(study, probability, bad_luck))
     smallest = Smallest.of(evaluator, COLLISION, 0)
-    assert smallest.table["unsafe_runs"].tolist() == [0.25]
-    sentences = Verdict(smallest_sentences(smallest, evaluator, COLLISION))
-    assert "The vehicle is unsafe in 25 % of its repeated runs." in sentences
+    return smallest, Verdict(smallest_sentences(smallest, evaluator, COLLISION))
+
+
+def test_a_cause_that_no_fresh_run_confirms_is_none() -> None:
+    """In the search 5 % of the runs of each vehicle fail, in fresh runs none."""
+    smallest, verdict = noisy_answer(lambda rows: np.zeros(len(rows)), 0.05)
+    assert smallest.table.empty
+    assert verdict.startswith("The search found no cause of a collision")
+
+
+def test_with_repeats_a_cause_has_its_fresh_runs_and_is_not_enough() -> None:
+    """Only changes beyond 60 % of the way ever fail, in 30 % of their runs."""
+    smallest, verdict = noisy_answer(
+        lambda rows: np.where(way(rows)[:, 0] > 0.6, 0.3, 0.0), 0.01
+    )
+    (row,) = smallest.table.to_dict("records")
+    assert row["boundary"]["a"] > 8
+    assert row["runs"] == FRESH_RUNS
+    assert row["unsafe_runs"] == row["failing_runs"] / FRESH_RUNS > 0
+    assert np.isnan(row["safe_again"])
+    low, high = clopper_pearson(row["failing_runs"], FRESH_RUNS)
+    said = re.search(
+        r"With 1 change the vehicle fails in (\d+) of 20 repeated runs \(95 %: (.*) to (.*)"
+        r" %\): a at",
+        verdict,
+    )
+    assert said
+    assert int(said[1]) == row["failing_runs"]
+    assert np.allclose([float(said[2]), float(said[3])], [100 * low, 100 * high], 0.06)
+    assert "enough" not in verdict
+
+
+def test_of_many_noisy_searches_the_interval_holds_the_truth() -> None:
+    """The intervals hold the true share, 25 %, although the search chooses its unluckiest runs."""
+    held = []
+    for seed in range(20):
+        study = made_up_study(2)
+        scenario = replace_in(study.scenario, repeats=REPEATS)
+        study = replace_in(study, scenario=scenario)
+        pool = Noisy(study, lambda rows: np.where(way(rows)[:, 0] > 0.5, 0.25, 0.0))
+        pool._random = np.random.default_rng(seed)
+        smallest = Smallest.of(Evaluator(study, pool), COLLISION, 0)
+        row = smallest.table.to_dict("records")[0]
+        low, high = clopper_pearson(row["failing_runs"], row["runs"])
+        held.append(low <= 0.25 <= high)
+    assert np.mean(held) >= 0.85
 
 
 @SLOW

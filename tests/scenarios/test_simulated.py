@@ -18,6 +18,7 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+import scipy
 from numpy.testing import assert_array_equal
 
 import safevar_sumo as sv
@@ -583,7 +584,9 @@ def test_the_worst_run_and_the_share_of_unsafe_runs_count() -> None:
     assert Unsafe.parse("below=6").runs(found).mean(axis=0).tolist() == [1, 0.25]
     assert Unsafe.parse("unsafe_share > 0.2").of(found).tolist() == [True, False]
     assert Unsafe().number(found) == 0.25
-    words = "collides at 6.00 m/s in 1 of 4 runs (95 % confidence interval 1 to 81 %)"
+    words = (
+        "collides at 6.00 m/s and fails in 1 of 4 repeated runs (95 %: 0.63 to 81 %)"
+    )
     assert Unsafe().breach_in_words(found.take([0])) == words
 
 
@@ -622,7 +625,7 @@ def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
     assert names == ["f_safe", "f_diff"]
     found = json_of("simulate wall.toml --set delay=0.15")
     assert (
-        "collides at 8.00 m/s in 3 of 20 runs (95 % confidence interval 3 to 38 %)"
+        "collides at 8.00 m/s and fails in 3 of 20 repeated runs (95 %: 3.2 to 38 %)"
         in (found["verdict"])
     )
     assert found["numbers"]["unsafe_share"] == 0.15
@@ -1006,3 +1009,51 @@ def test_a_library_of_the_search_counts_if_the_simulator_uses_it(wall: Path) -> 
     for libraries, matters in ([], False), (["numpy"], True):
         (change,) = manifest_differences(stored, {**now, "libraries": libraries})
         assert change[2] is matters
+
+
+UNLUCKY = """
+from models import Wall
+
+
+class Unlucky(Wall):
+    '''Collides in the first four runs of each vehicle with a delay, and never again.'''
+
+    number = {}
+
+    def simulate(self, setting):
+        key = tuple(setting.values())
+        Unlucky.number[key] = n = Unlucky.number.get(key, 0) + 1
+        if n <= 4 and setting["delay"] > 0.3:
+            return {"outcome": "collision", "safety_degree": -8.0}
+        return {"outcome": "stopped", "safety_degree": 2.0 + n % 2 - setting["delay"]}
+"""
+
+
+@SLOW
+def test_failures_that_fresh_runs_do_not_repeat_are_told_by_no_answer(
+    wall: Path,
+) -> None:
+    write("unlucky.py", UNLUCKY)
+    wall.write_text(STUDY.replace('"models:Wall"', '"unlucky:Unlucky"\nrepeats = 4'))
+    sampled = sv.explain(str(wall), pool=InlinePool())
+    assert sampled.tables["causes"].empty
+    assert "enough" not in sampled.verdict
+    run("study wall.toml --out results")
+    summary = json_of("explain results")
+    assert not rows_of(summary, "causes")
+    assert "enough" not in summary["verdict"]
+
+
+def test_simulate_compares_the_means_of_repeated_runs(wall: Path) -> None:
+    write("unlucky.py", UNLUCKY.replace("n <= 4", "n < 0"))
+    wall.write_text(STUDY.replace('"models:Wall"', '"unlucky:Unlucky"\nrepeats = 4'))
+    answer = json_of("simulate wall.toml --set delay=0.4")
+    changed = [3 - 0.4, 2 - 0.4] * 2
+    original = [3.0, 2.0] * 2
+    difference = np.mean(changed) - np.mean(original)
+    # Welch's interval, from its formula: both variances are 1/3, with 6 degrees of freedom.
+    half = scipy.stats.t.ppf(0.975, 6) * np.sqrt(2 * (1 / 3) / 4)
+    assert (
+        f"is {difference:+.2f} m (95 %: {difference - half:+.2f} to"
+        f" {difference + half:+.2f} m). The repeated runs do not show which"
+    ) in answer["verdict"]

@@ -120,7 +120,8 @@ def with_sample(
         begins_at = safe_again = np.nan
         if fewest == 1:
             (begins_at,) = shares_of_way(members, limit.boundary)
-            safe_again = _first_safe_share(evaluator, unsafe, cause, begins_at)
+            if not evaluator.has_repeats:
+                safe_again = _first_safe_share(evaluator, unsafe, cause, begins_at)
         # The checks keep the values of a known cause, which are farther in the unsafe range.
         checked = beginnings[kind].cause if kind in beginnings else cause
         beginnings[kind] = Beginning(checked, begins_at, limit.boundary, safe_again)
@@ -150,7 +151,8 @@ def _first_safe_share(
     starts, ends = _lines_to_ends(members, settings_of(members, [cause]))
     (settings,) = on_lines(starts, ends, shares[np.newaxis])
     runs = evaluator.evaluate(settings, BOUNDARIES)
-    return float(min(shares[runs.valid & ~unsafe.of(runs)], default=np.nan))
+    is_safe = runs.valid & ~unsafe.of(runs)
+    return float(min(shares[is_safe], default=np.nan))
 
 
 def _lines_to_ends(
@@ -209,8 +211,11 @@ def _begin(
     shares = np.arange(1, steps + 1) / steps
     settings = on_lines(starts, ends, np.tile(shares, (number, 1)))
     runs = evaluator.evaluate(settings.reshape(-1, len(members)), BOUNDARIES)
-    is_unsafe = unsafe.of(runs).reshape(settings.shape[:2])
+    is_unsafe = evaluator.confirmed(runs, unsafe).reshape(settings.shape[:2])
     is_safe = runs.valid.reshape(is_unsafe.shape) & ~is_unsafe
+    if evaluator.has_repeats:
+        # Some runs that do not fail are no gap in the unsafe range.
+        is_safe[:] = False
 
     def smaller_causes(settings: FloatArray) -> list[list[Cause]]:
         """For each unsafe setting, the causes that have fewer changes than the setting."""
@@ -222,17 +227,24 @@ def _begin(
 
     # If only some of a cause's changes are enough at its first unsafe share, the whole cause is not
     # minimal there: it begins at a larger share.
-    first_unsafe = is_unsafe.argmax(axis=1)
-    groups = smaller_causes(settings[range(number), first_unsafe])
+    # If no setting on a line was confirmed as unsafe, its first setting says nothing.
+    rows = np.flatnonzero(is_unsafe.any(axis=1))
+    first_unsafe = is_unsafe[rows].argmax(axis=1)
+    groups = smaller_causes(settings[rows, first_unsafe])
     smaller = []
-    for row, (group, at) in enumerate(zip(groups, first_unsafe.tolist(), strict=True)):
+    for row, first, group in zip(
+        rows.tolist(), first_unsafe.tolist(), groups, strict=True
+    ):
+        at = first
         smaller += [(cause, float(shares[at])) for cause in group]
         if group and not is_free:
             continue
         if group:
             (unsafe_at,) = np.nonzero(is_unsafe[row])
             subcauses = smaller_causes(settings[row, unsafe_at])
-            at = unsafe_at[subcauses.index([])]
+            if [] not in subcauses:
+                continue
+            at = int(unsafe_at[subcauses.index([])])
         cause = causes[row]
         named = members.named(settings[row, at])
         # Twelve digits are enough: further digits are rounding errors of the share.

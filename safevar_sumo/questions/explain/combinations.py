@@ -282,4 +282,6 @@ def _robustness(
             Cause(changes, str(outcome), float(degree), encounter, float(of_runs))
         )
     robustness = Model(0, evaluator, unsafe).robustness_by(runs)
+    is_confirmed = evaluator.confirmed(runs, unsafe)
+    robustness[(robustness < 0) & ~is_confirmed] = 0.0
     return robustness, causes, int(np.count_nonzero(runs.standing))

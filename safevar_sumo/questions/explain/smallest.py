@@ -13,7 +13,7 @@ import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.causes import Causes
+from safevar_sumo.questions.causes import Causes, directions, kinds_of
 from safevar_sumo.questions.counterexamples import FURTHER_DIGITS, values_as_printed
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain.beginnings import (
@@ -29,9 +29,11 @@ from safevar_sumo.questions.explain.combinations import (
     staircase,
 )
 from safevar_sumo.questions.explain.tables import (
+    COUNTS,
     SMALLEST_COLUMNS,
     STAIRCASE_COLUMNS,
     sureness,
+    with_fresh_runs,
 )
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tables import AnswerTables, tabulate
@@ -111,6 +113,17 @@ class Smallest(NamedTuple):
         known = find_beginnings(evaluator, unsafe, steps)
         beginnings = with_sample(evaluator, unsafe, known, sampled)
         table = _table(evaluator, unsafe, beginnings, fits)
+        if table.empty and beginnings:
+            # Fresh runs confirmed no cause. Sampled vehicles may have other causes.
+            members = evaluator.characteristics
+            refuted = kinds_of(members, [beginning.cause for beginning in beginnings])
+            sampled_others = [
+                cause
+                for cause in sampled
+                if directions(members, cause.changes) not in refuted
+            ]
+            beginnings = with_sample(evaluator, unsafe, [], sampled_others)
+            table = _table(evaluator, unsafe, beginnings, fits)
         return cls(at_ends, steps, cures, sampled, table)
 
     @property
@@ -236,11 +249,12 @@ def _table(
         )
     ]
     frame = pd.DataFrame(rows, columns=list(SMALLEST_COLUMNS))
-    in_order = frame.astype({"holds": "Int64", "fits": "Int64"}).sort_values(
+    in_order = frame.astype(COUNTS).sort_values(
         ["size", "robust_share", "holds", "begins_at"],
         ascending=[True, False, False, True],
     )
-    return in_order.reset_index(drop=True)
+    frame = in_order.reset_index(drop=True)
+    return with_fresh_runs(evaluator, unsafe, frame, "causes")
 
 
 def _as_printed(

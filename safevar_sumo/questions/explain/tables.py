@@ -4,8 +4,9 @@ drivers that would have avoided them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from itertools import chain
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -60,6 +61,8 @@ MAX_DISTINCT = 10
 interval by Clopper and Pearson if only a sample of the failures was analysed; else both ends are
 the share itself.
 """
+COUNTS = dict.fromkeys(("holds", "fits", "failing_runs", "runs"), "Int64")
+"""The types of columns with whole numbers that may be unknown."""
 OF_ENCOUNTER = ("encounter", "elsewhere")
 """Columns that only a study has whose encounters are ranges."""
 
@@ -159,9 +162,8 @@ def causes_table(
         }
         for index in order.tolist()
     ]
-    frame = pd.DataFrame(rows, columns=list(CAUSE_COLUMNS)).astype(
-        {"holds": "Int64", "fits": "Int64"}
-    )
+    frame = pd.DataFrame(rows, columns=list(CAUSE_COLUMNS)).astype(COUNTS)
+    frame = with_fresh_runs(evaluator, unsafe, frame, "changes")
     columns = {**CAUSE_COLUMNS}
     for name in () if study.ranges else OF_ENCOUNTER:
         del columns[name]
@@ -209,6 +211,48 @@ def printed_limits(
         cells["boundary"] = {name: values[name] for name in cause.changes}
         columns.append(cells)
     return columns
+
+
+def with_fresh_runs(
+    evaluator: Evaluator, unsafe: Unsafe, frame: pd.DataFrame, checked: str
+) -> pd.DataFrame:
+    """The frame of causes with the failing and the fresh runs at the values at which each cause
+    begins. Without repeats, the frame stays as it is.
+
+    If no run fails at these values, the cause is told with the values of the column `checked`,
+    which are farther from the original. A cause without a failing run there is left out.
+    """
+    if not evaluator.has_repeats or frame.empty:
+        return frame
+    rows = frame.to_dict("records")
+    _count_failing_runs(evaluator, unsafe, rows)
+    unconfirmed = [row for row in rows if not row["failing_runs"]]
+    for row in unconfirmed:
+        row["boundary"] = row[checked]
+    _count_failing_runs(evaluator, unsafe, unconfirmed)
+    confirmed = [row for row in rows if row["failing_runs"]]
+    return pd.DataFrame(confirmed, columns=list(frame)).astype(COUNTS)
+
+
+def _count_failing_runs(
+    evaluator: Evaluator, unsafe: Unsafe, rows: Sequence[dict[Hashable, Any]]
+) -> None:
+    """Write the numbers of failing and of fresh runs at the boundary of each cause into its row:
+    0 where too few simulations are left.
+    """
+    members = evaluator.characteristics
+    for row in rows:
+        row["failing_runs"] = row["runs"] = 0
+    chosen = rows if evaluator.left is None else rows[: evaluator.left]
+    if not chosen:
+        return
+    vehicles = [row["boundary"] | (row.get("encounter") or {}) for row in chosen]
+    settings = np.array([members.setting(vehicle, beyond=True) for vehicle in vehicles])
+    fails = unsafe.failing_runs(evaluator.evaluate_anew(settings))
+    for row, of_vehicle in zip(chosen, fails.T, strict=True):
+        row["failing_runs"] = int(of_vehicle.sum())
+        row["runs"] = len(of_vehicle)
+        row["unsafe_runs"] = float(of_vehicle.mean())
 
 
 def sureness(

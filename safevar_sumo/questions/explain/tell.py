@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.metrics.words import runs_in_words
 from safevar_sumo.questions.counterexamples import values_in_words
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import words
@@ -66,7 +67,7 @@ def smallest_sentences(
     for size, number in smallest.at_ends.simulated.items():
         if number:
             yield _of_size(smallest.at_ends, unsafe, size)
-    yield from _steps(smallest.steps[1:], unsafe)
+    yield from _steps(smallest.steps[1:], unsafe, has_repeats=evaluator.has_repeats)
     yield from _containing(smallest)
     yield from _in_none(smallest, members)
     if encounters := len(evaluator.critical_encounters):
@@ -83,6 +84,9 @@ def _leading_of_study(
     if not smallest.at_ends.tried:
         yield words.TOO_FEW
         return
+    if table.empty and smallest.at_ends.causes:
+        yield words.NOT_CONFIRMED
+        return
     if table.empty:
         largest = max(smallest.at_ends.simulated)
         yield words.NOTHING_FOUND(
@@ -95,15 +99,16 @@ def _leading_of_study(
         yield words.UNSAFE_IN_ENCOUNTER
         return
     share = leading["begins_at"]
-    templates = _templates(members, leading["boundary"], share)
-    yield _enough(templates, members, unsafe, leading["boundary"], share)
+    if pd.notna(leading["runs"]):
+        yield _repeated(members, leading)
+    else:
+        templates = _templates(members, leading["boundary"], share)
+        yield _enough(templates, members, unsafe, leading["boundary"], share)
     if number_of_others := int((table["size"] == leading["size"]).sum()) - 1:
         yield words.OTHERS(causes=number_of(number_of_others, "further cause"))
 
     if pd.notna(leading["safe_again"]):
         yield words.GAP(share=percentage(leading["safe_again"]))
-    if leading["unsafe_runs"] < 1:
-        yield words.RUNS(share=percentage(leading["unsafe_runs"]))
     if leading["causes"] != leading["boundary"]:
         yield from _checked(members, leading)
     yield from _sureness(leading)
@@ -117,6 +122,16 @@ def _checked(members: CharacteristicSet, row: Mapping[Any, Any]) -> Sentences:
             checks += " and of other parameter sets"
         changes = values_in_words(members, row["causes"])
         yield words.CHECKED_WITH(checks=checks, changes=changes)
+
+
+def _repeated(members: CharacteristicSet, row: Mapping[Any, Any]) -> Sentence:
+    """Say in how many of its fresh runs the vehicle of a row of the table of causes fails."""
+    fails = np.arange(row["runs"]) < row["failing_runs"]
+    return words.WITH_REPEATS(
+        number=number_of(row["size"], "change"),
+        fails=runs_in_words(fails),
+        changes=values_in_words(members, row["boundary"]),
+    )
 
 
 def _templates(
@@ -176,7 +191,9 @@ def _of_size(at_ends: Enumeration, unsafe: Unsafe, size: int) -> Sentence:
     )
 
 
-def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Sentences:
+def _steps(
+    steps: Sequence[Enumeration], unsafe: Unsafe, *, has_repeats: bool
+) -> Sentences:
     """Say how many changes are needed at each share of the way to the ends. Successive shares with
     equal results share a sentence.
     """
@@ -185,6 +202,10 @@ def _steps(steps: Sequence[Enumeration], unsafe: Unsafe) -> Sentences:
         alike = list(group)
         ends = dict.fromkeys(f"{100 * alike[place].share:.0f}" for place in (-1, 0))
         shares = " to ".join(ends)
+        if size and has_repeats:
+            changes = number_of(size, "change")
+            yield words.STEP_WITH_REPEATS(changes=changes, shares=shares)
+            continue
         if size:
             changes = "1 change is" if size == 1 else f"{_count(size)} changes are"
             yield words.STEP(
@@ -246,7 +267,7 @@ def failure_sentences(
         yield answer(unsafe.smaller_demand(original))
         return
     if causes.empty and unsafe.number(population.evaluations):
-        yield words.TOO_FEW
+        yield words.NOT_CONFIRMED if evaluator.has_repeats else words.TOO_FEW
         return
     if causes.empty:
         degree = float(original.f_safe[0])
@@ -262,7 +283,10 @@ def failure_sentences(
 
     members = evaluator.characteristics
     boundary = leading["boundary"]
-    yield _enough(words.CHANGES, members, unsafe, boundary)
+    if pd.notna(leading["runs"]):
+        yield _repeated(members, leading)
+    else:
+        yield _enough(words.CHANGES, members, unsafe, boundary)
     place = leading.get("encounter", {})
     if values := place_in_words(members, place, are_printed=True):
         yield words.ENCOUNTER(values=values)

@@ -30,6 +30,13 @@ ON_THE_WAY = (
     ),
 )
 """The sentence about one change, and the sentence about several changes."""
+WITH_REPEATS = answer(
+    "With {number} the vehicle {fails}: {changes}. All other characteristics are as in the original"
+    " vehicle."
+)
+NOT_CONFIRMED = answer(
+    "No cause was confirmed: each vehicle that failed in the search was safe in all its fresh runs."
+)
 OTHERS = answer("The table lists {causes} with the same number of changes.")
 NOTHING_FOUND = answer(
     "The search found no cause of {unsafe} with {changes}, each at an end of its domain (its range"
@@ -73,7 +80,6 @@ GAP = evidence(
     "The unsafe range has a gap: at {share} % of the way to the ends, the vehicle is safe again."
 )
 CHECKED_WITH = evidence("The checks of {checks} use these values: {changes}.")
-RUNS = evidence("The vehicle is unsafe in {share} % of its repeated runs.")
 SETS = evidence(
     "The same cause was found in {holds} of {fits} parameter sets of the vehicle model"
     " (alternative calibrations)."
@@ -95,6 +101,10 @@ STEP = note(
     "{changes} enough for {unsafe} if each change goes {shares} % of the way to an end of its"
     " domain."
 )
+STEP_WITH_REPEATS = note(
+    "With {changes}, some of the repeated runs fail at {shares} % of the way to the ends of the"
+    " domains."
+)
 STEP_WITHOUT = note(
     "None of {tried:,} simulated combinations of {changes} {causes} at {shares} % of the way to the"
     " ends of the domains."
@@ -103,8 +113,8 @@ LARGER_LEFT_OUT = note(
     "Combinations of more changes were not simulated there, because they are too many."
 )
 CONTAINING = condition(
-    "The counts of combinations leave out {combinations} with a smaller cause (fewer changes that"
-    " are enough)."
+    "The counts of combinations leave out {combinations} with a smaller cause (fewer unsafe"
+    " changes)."
 )
 CURES = condition(
     "Another change prevents the failure in {count} simulated combinations with a smaller cause."

@@ -36,6 +36,7 @@ NEED_REACHED = answer("The car is safe {reach}, and {need} is needed.")
 AS_NEW = answer(
     "The car may drive as fast as a new car, {new_car}. At a higher {name}, {event}."
 )
+NOT_CONFIRMED = "a vehicle failed in the search, but in none of its fresh runs"
 WITH_CHANGES = "with {changes}, {event}"
 
 # Values of a car that are assumed, or measured inexactly.
