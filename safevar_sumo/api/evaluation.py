@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.errors import InputError, about, check_name
+from safevar_sumo.questions.arguments import checked
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import evaluations_frame
 from safevar_sumo.study import Study, StudyLike, plain_values
@@ -31,6 +32,7 @@ SETTINGS = "settings"
 """The name of the phase of progress."""
 
 
+@checked
 def evaluate(
     study: StudyLike,
     settings: pd.DataFrame | Sequence[Mapping[str, float | None]] | npt.ArrayLike,
@@ -154,6 +156,7 @@ def _read_settings(
             array = np.where(np.isnan(values), characteristics.original, values)
             index = settings.index
         else:
+            _check_no_flags(settings)
             array = np.array(settings, float)
             if array.ndim != 2 or array.shape[1] != len(names):
                 expected = (
@@ -180,6 +183,16 @@ def _read_settings(
     return array, index
 
 
+def _check_no_flags(settings: Any) -> None:
+    """Refuse an array with True or False, which numpy would read as the numbers 1 and 0."""
+    rows = plain_values(settings)
+    if not isinstance(rows, Sequence):
+        return
+    for number, row in enumerate(rows):
+        if isinstance(row, Sequence) and any(isinstance(value, bool) for value in row):
+            raise InputError(f"settings, row {number}", repr(row), "numbers")
+
+
 def _check_numbers(name: str, column: pd.Series) -> None:
     """Refuse a column with a value that is neither a number nor missing, such as a list or a
     text.
@@ -187,7 +200,7 @@ def _check_numbers(name: str, column: pd.Series) -> None:
     if column.dtype.kind in "fiu":
         return
     for row, value in enumerate(column):
-        if not isinstance(value, Real | None):
+        if not isinstance(value, Real | None) or isinstance(value, bool):
             raise InputError(
                 f"settings, row {row}", f"{name} = {value!r}", "a number, or None"
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from safevar_sumo.campaign import RunKey, all_runs, check_algorithms, run_campai
 from safevar_sumo.campaign.campaign import RECORDED
 from safevar_sumo.campaign.pool import Pool, open_pool
 from safevar_sumo.errors import InputError, check_text, warn
+from safevar_sumo.questions.arguments import checked
 from safevar_sumo.questions.research_questions.fronts import why_few_evaluations
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.study import Study, StudyLike
@@ -18,6 +19,7 @@ from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import Progress, open_progress
 
 
+@checked
 def run(
     study: StudyLike,
     out: str | Path | None = None,
@@ -69,13 +71,13 @@ def run(
     loaded_study, system = load_for_search(study)
     keys = all_runs(loaded_study)
     if only is not None:
+        legal = "(algorithm of the study, run from 0 to less than `search.runs`)"
+        if isinstance(only, str) or not isinstance(only, Iterable):
+            raise InputError("only", repr(only), f"a list of {legal}")
         for key in only:
-            if tuple(key) not in keys:
-                raise InputError(
-                    "only",
-                    repr(key),
-                    "(algorithm of the study, run from 0 to less than `search.runs`)",
-                )
+            is_pair = isinstance(key, Sequence) and len(key) == 2
+            if not is_pair or isinstance(key[1], bool) or tuple(key) not in keys:
+                raise InputError("only", repr(key), legal)
         keys = [RunKey(*key) for key in only]
 
     directory = Path("results", loaded_study.name)

@@ -14,6 +14,7 @@ import numpy as np
 from safevar_sumo.errors import about
 from safevar_sumo.metrics import IMPACT_EXCESS, IMPACT_SPEED, Scoring, impact_in_words
 from safevar_sumo.metrics.words import runs_in_words
+from safevar_sumo.questions.arguments import checked
 from safevar_sumo.questions.between import with_set_axes
 from safevar_sumo.questions.words import OUTCOME_VERBS, collision_in_words
 from safevar_sumo.records import (
@@ -308,6 +309,7 @@ class Simulation:
         return f"<Simulation of {self.study.name}: {self.outcome}, {metrics}>"
 
 
+@checked
 def simulate(
     study: StudyLike,
     changes: Mapping[str, float] | None = None,
@@ -349,6 +351,7 @@ def simulate(
     )
 
 
+@checked
 def load_study(study: StudyLike, **changes: Any) -> Study:
     """Read a study strictly, and check the parameters of its shipped models.
 

@@ -23,6 +23,12 @@ from safevar_sumo.errors import InputError, NobodyMoved, unknown_name, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.plugins.contract import user_errors
+from safevar_sumo.questions.arguments import (
+    POOL,
+    PROGRESS,
+    check_kind,
+    unknown_argument,
+)
 from safevar_sumo.questions.options import (
     CARS_FILE,
     CRITERION,
@@ -73,6 +79,8 @@ Criterion = Annotated[Unsafe | None, CRITERION]
 with <, <=, > or >= and a number; by default a collision if any evaluated setting collides, else a
 safety degree below half of the original's.
 """
+SUBJECTS = "a study, or the directory of results"
+"""What a question may be about, for errors."""
 QUICK = "quick"
 """The option that asks for a rough answer. Only some questions have it."""
 ROUGH = answer(
@@ -199,13 +207,18 @@ class Question:
         if UP_TO in options:
             cut = None
             values[UP_TO] = up_to
-        for name in values.keys() - options.keys():
-            raise TypeError(
-                f"{self.name}() got an unexpected keyword argument {name!r}"
-            )
-        if source is None or len(further_sources) != len(self.others):
-            names = ["source", *self.others]
-            raise InputError(f"{self.name}()", f"takes exactly {' and '.join(names)}")
+        if source is None:
+            raise InputError(f"{self.name}()", "source = None", SUBJECTS)
+        how: JsonObject = {"jobs": jobs, "simulations": simulations, "cluster": cluster}
+        how["as_it_is_now"] = as_it_is_now
+        common = {"point": point, "ranges": ranges, "up_to": up_to, "fresh": fresh}
+        for option in COMMON_OPTIONS:
+            if option.name in common | how:
+                option.check((common | how)[option.name])
+        check_kind("pool", pool, POOL)
+        check_kind("progress", progress, PROGRESS)
+        how["pool"] = pool
+        self._check_names(further_sources, values)
         values = {name: options[name].check(value) for name, value in values.items()}
 
         def subject_of(source: StudyLike | Results) -> Subject:
@@ -222,8 +235,6 @@ class Question:
         cuts = {"point": point, "up_to": cut}
         names = [_name(source), *map(_name, further_sources)]
         command = self.command_line(names, cuts, values, ["--ranges"] * ranges)
-        how = {"pool": pool, "jobs": jobs, "simulations": simulations}
-        how |= {"cluster": cluster, "as_it_is_now": as_it_is_now}
         subjects: list[Any] = [subject_of(source)]
         for further, is_file in zip(further_sources, self.others.values(), strict=True):
             subjects.append(Path(str(further)) if is_file else subject_of(further))
@@ -244,6 +255,20 @@ class Question:
                 subjects, values, **how, progress=progress, called=_name(source)
             )
         return replace(answer, command=command + answer.command)
+
+    def _check_names(
+        self, further_sources: Sequence[object], values: JsonObject
+    ) -> None:
+        """Refuse options that the question does not have, and another number of subjects."""
+        names = [option.name for option in self.options]
+        for name in values:
+            if name not in names:
+                common = [option.name for option in COMMON_OPTIONS]
+                known = {"source": None, **dict.fromkeys([*names, *common])}
+                raise unknown_argument(self.name, name, known)
+        if len(further_sources) != len(self.others):
+            names = ["source", *self.others]
+            raise InputError(f"{self.name}()", f"takes exactly {' and '.join(names)}")
 
     def answer(
         self,
@@ -352,7 +377,9 @@ class Question:
             return self._no_verdict(evaluator)
         if not isinstance(result, Answer):
             problem = f"returns {type(result).__name__}"
-            raise InputError(self.name, problem, "an Answer")
+            raise InputError(
+                self.name, problem, "an Answer (safevar_sumo.questions.answer)"
+            )
         return result
 
     def _no_verdict(self, evaluator: Evaluator) -> Answer:
@@ -467,6 +494,8 @@ def question(compute: Callable[..., Answer]) -> Question:
     the question takes only results. Each further positional parameter is a further subject, or a
     file if its type is `Path`.
     """
+    if not callable(compute):
+        raise InputError("question()", repr(compute), "a function")
     return Question(compute)
 
 

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from safevar_sumo.errors import MAX_JOBS, InputError, check_text
 from safevar_sumo.metrics import Unsafe
+from safevar_sumo.questions.arguments import FLAG, check_kind
 
 
 class Range(NamedTuple):
@@ -95,6 +96,8 @@ class Option(NamedTuple):
         The form of a text, as help shows it; None without a form.
     is_repeated
         Whether the option may be given several times.
+    is_optional
+        Whether the value may be None.
     meaning
         The text of the docstring.
     """
@@ -105,6 +108,7 @@ class Option(NamedTuple):
     choices: tuple[str, ...]
     metavar: str | None
     is_repeated: bool
+    is_optional: bool
     default: Any
     meaning: str
 
@@ -120,18 +124,15 @@ class Option(NamedTuple):
         The value of a repeated option becomes a tuple of texts; a mapping becomes texts NAME=VALUE.
         A criterion becomes an `Unsafe`.
         """
+        if value is None and self.is_optional:
+            return value
+        if self.kind is bool:
+            check_kind(self.name, value, FLAG)
+            return value
         if self.is_repeated:
-            if isinstance(value, Mapping):
-                value = [f"{name}={number}" for name, number in value.items()]
-            values = (value,) if isinstance(value, str) else tuple(value)
-            for text in values:
-                if values.count(text) > 1:
-                    raise InputError(
-                        self.name, f"{text!r} is given twice", "each value once"
-                    )
-            return values
+            return self._texts(value)
         is_object = self.metavar == CARS_FILE and not isinstance(value, str)
-        if value is None or is_object or self.kind is bool:
+        if is_object:
             return value
         if self.metavar == CRITERION:
             return Unsafe.parse(value)
@@ -149,6 +150,25 @@ class Option(NamedTuple):
             raise InputError(self.name, repr(value), words)
         return value
 
+    def _texts(self, value: Any) -> tuple[str, ...]:
+        """The values of a repeated option."""
+        texts: list[Any] = [value]
+        if isinstance(value, Mapping):
+            texts = [f"{name}={number}" for name, number in value.items()]
+        elif isinstance(value, Iterable) and not isinstance(value, str):
+            texts = list(value)
+        for text in texts:
+            if not isinstance(text, str):
+                legal = "a text, or a list of texts"
+                if self.metavar:
+                    legal += f" such as {self.metavar}"
+                raise InputError(self.name, repr(value), legal)
+            if texts.count(text) > 1:
+                raise InputError(
+                    self.name, f"{text!r} is given twice", "each value once"
+                )
+        return tuple(texts)
+
 
 SIMULATIONS = Option(
     "simulations",
@@ -157,6 +177,7 @@ SIMULATIONS = Option(
     (),
     None,
     False,
+    True,
     None,
     "the largest number",
 )
@@ -207,6 +228,7 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
         choices,
         metavar,
         is_repeated,
+        parameter.default is None or type(None) in hints,
         parameter.default,
         meaning,
     )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError, did_you_mean, one_of, warn
+from safevar_sumo.questions.arguments import checked
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import (
     MANIFEST,
@@ -92,6 +93,7 @@ class Results:
         )
 
 
+@checked
 def load(directory: str | Path) -> Results:
     """Read a results directory; its runs may be unfinished.
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from safevar_sumo.errors import printable
+from safevar_sumo.errors import InputError, printable
 from safevar_sumo.questions.bars import LEGEND, Bar
 from safevar_sumo.questions.changes import NUMBER_PATTERN
 from safevar_sumo.shipped import shipped_table
@@ -132,6 +132,13 @@ class Frames(dict[str, pd.DataFrame]):
     """The data frames of an answer's tables by name; `records` holds the `AnswerTable` objects."""
 
     def __init__(self, records: Mapping[str, AnswerTable]) -> None:
+        for name, table in records.items():
+            if not isinstance(table, AnswerTable):
+                raise InputError(
+                    "tables",
+                    f"the table {name!r} is a {type(table).__name__}",
+                    "what tabulate(title, columns, rows) returns, with a meaning for each column",
+                )
         super().__init__({name: table.frame for name, table in records.items()})
         self.records = records
 

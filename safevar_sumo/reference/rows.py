@@ -18,6 +18,7 @@ import pandas as pd
 from safevar_sumo.errors import InputError, warn
 from safevar_sumo.metrics import METRICS
 from safevar_sumo.output import read_file
+from safevar_sumo.questions.arguments import checked
 from safevar_sumo.questions.subject import Results, load
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray, Outcome, nans
 from safevar_sumo.results import UNKNOWN, write_imported
@@ -239,6 +240,7 @@ def evaluations_of(
     )
 
 
+@checked
 def import_published(
     study: StudyLike,
     *,

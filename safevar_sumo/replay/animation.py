@@ -16,6 +16,7 @@ from markupsafe import Markup, escape
 
 from safevar_sumo.errors import InputError, printable
 from safevar_sumo.output import whole_file
+from safevar_sumo.questions.arguments import checked
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import COLOURS, ORIGINAL, Comparison
 from safevar_sumo.scenarios import VUT
@@ -113,7 +114,8 @@ class DrawnBody(NamedTuple):
     heading: FloatArray
 
 
-def animate(comparison: Comparison, path: Path) -> None:
+@checked
+def animate(comparison: Comparison, path: str | Path) -> None:
     """Write a comparison as an animation in the format of the file's ending; the same comparison
     gives the same bytes.
 
@@ -125,6 +127,7 @@ def animate(comparison: Comparison, path: Path) -> None:
     from matplotlib.animation import PillowWriter
 
     comparison.refuse_without_position()
+    path = Path(path)
     ending = path.suffix.lower()
     if ending not in ENDINGS:
         raise InputError(

@@ -15,6 +15,7 @@ import numpy as np
 
 from safevar_sumo.api.simulation import Simulation
 from safevar_sumo.metrics import METRICS, Measure
+from safevar_sumo.questions.arguments import checked
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.words import OUTCOME_VERBS, change_texts, collision_in_words
 from safevar_sumo.records import (
@@ -219,6 +220,7 @@ def lane_below(trace: Trace) -> DrawnLane:
     return DrawnLane("road", np.array([[rear, 0.0], [front, 0.0]]), LANE_WIDTH)
 
 
+@checked
 def comparison_of(simulation: Simulation) -> Comparison:
     """The comparison of a simulation with the simulation of the original vehicle, at the same point
     of a matrix.

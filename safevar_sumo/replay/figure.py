@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from safevar_sumo.questions.arguments import checked
 from safevar_sumo.records import STANDSTILL, SimulationRuns
 from safevar_sumo.replay.comparison import COLOURS, Comparison
 
@@ -28,6 +29,7 @@ LINE_LENGTH = 118
 """Length of a line of the heading [characters]."""
 
 
+@checked
 def draw_comparison(comparison: Comparison) -> Figure:
     """Draw a comparison as a figure outside any window."""
     import matplotlib.style

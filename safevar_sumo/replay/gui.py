@@ -11,6 +11,7 @@ from itertools import count
 from pathlib import Path
 
 from safevar_sumo.output import temporary_folder
+from safevar_sumo.questions.arguments import checked
 from safevar_sumo.replay.comparison import COLOURS, Comparison
 from safevar_sumo.scenarios import VUT
 from safevar_sumo.sumo.copies import copied_id
@@ -43,6 +44,7 @@ VIEW_SETTINGS = """<viewsettings>
 """
 
 
+@checked
 def show_in_gui(comparison: Comparison, pictures: Path | None = None) -> None:
     """Play a comparison in SUMO's own window, with pauses at the nearest moments and at the end.
 

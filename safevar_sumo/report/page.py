@@ -23,6 +23,7 @@ from safevar_sumo.errors import InputError, check_text, printable, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer
+from safevar_sumo.questions.arguments import checked
 from safevar_sumo.questions.ask import Question
 from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case, load_cases
@@ -32,6 +33,7 @@ from safevar_sumo.questions.options import (
     Jobs,
     PointName,
     Simulations,
+    options_of,
 )
 from safevar_sumo.questions.subject import Results, case_at, changes_since, with_own_set
 from safevar_sumo.records import JsonObject
@@ -79,6 +81,7 @@ SVG_STYLE = {
 }
 
 
+@checked
 def report(
     *results: Results | str | Path,
     out: str | Path = "report.html",
@@ -149,8 +152,15 @@ def report(
         If a directory holds no results, there is no such question or point, or the file cannot be
         written.
     """
-    if unsafe is not None:
-        unsafe = Unsafe.parse(unsafe)
+    if not results:
+        raise InputError("report()", "no results", "results, or their directories")
+    values: JsonObject = {"ask": ask, "unsafe": unsafe, "point": point, "jobs": jobs}
+    values |= {"cluster": cluster, "simulations": simulations}
+    for option in options_of(report):
+        if option.name in values:
+            values[option.name] = option.check(values[option.name])
+    ask = values["ask"]
+    criterion: Unsafe | None = values["unsafe"]
     out = Path(check_text("out", out))
     check_writable(out, "out", (".html", ".htm"))
 
@@ -163,17 +173,17 @@ def report(
     alone = [text for text in ask if text not in joint]
     later_changes = _later_changes(paths, cases, as_it_is_now=as_it_is_now)
     at_point = _cases_asked_about(cases, point, quick=quick)
-    key = f"report {paths} {point} {ask} {unsafe} {quick}"
+    key = f"report {paths} {point} {ask} {criterion} {quick}"
     with (
         open_progress(progress) as show,
         keep_simulations(key, fresh=fresh),
         ExitStack() as stack,
     ):
-        by_criterion = cases_by(at_point, unsafe, jobs, show_no_progress, cluster)
+        by_criterion = cases_by(at_point, criterion, jobs, show_no_progress, cluster)
         questions = (
             [alone] * len(cases)
             if ask
-            else [usual_questions(unsafe) for unsafe in by_criterion]
+            else [usual_questions(case) for case in by_criterion]
         )
         texts_of = list(map(with_speed_part, questions, by_criterion))
         texts = [*chain(*texts_of), *joint]
@@ -191,10 +201,10 @@ def report(
             """The answer to a question about the results at `places`."""
             question, values = parsed or parse_question(text)
             budget = ChainMap(*budgets[places]).get(text)
-            values = completed(question, values, unsafe, budget, quick=quick)
+            values = completed(question, values, criterion, budget, quick=quick)
             # A question with another criterion than the page, or without any, must not get results
             # that are adapted to the page's criterion.
-            subjects = by_criterion if values.get("unsafe") == unsafe else at_point
+            subjects = by_criterion if values.get("unsafe") == criterion else at_point
             name = f"question {next(numbers)} of {len(texts)}, {question.name}"
             return answer_about(
                 question,

@@ -63,6 +63,12 @@ ENDED_STUDIES = {
 """Shipped studies of earlier releases, with the text that says what replaces each study."""
 
 
+LIKE_A_STUDY = (
+    "the name of a study, the path of its file, its tables, or a Study (sv.load_study)"
+)
+"""What `load_study` reads, for errors."""
+
+
 def study_names() -> list[str]:
     """Names of the shipped studies."""
     return sorted(path.stem for path in STUDIES.glob("*.toml"))
@@ -161,7 +167,12 @@ def _raw_study(study: StudyLike) -> StudyTables:
     if isinstance(study, Study):
         return StudyTables(study.source, tables_of(study), study.origin)
     if isinstance(study, Mapping):
+        for key in study:
+            if not isinstance(key, str):
+                raise InputError("study", f"the key {key!r}", "keys that are texts")
         return _with_base(StudyTables("study", plain_values(study)), Path("."), ())
+    if not isinstance(study, str | os.PathLike):
+        raise InputError("study", repr(study), LIKE_A_STUDY)
     return _read_file(study_path(str(study)), visited_paths=())
 
 

@@ -147,6 +147,8 @@ def _missing_key(place: _Place, key: str) -> InputError:
         tags = [kind.__struct_config__.tag for kind in get_args(place.declared[-1])]
         required.insert(0, f"{key} ({one_of(tags)})")
     legal = f"{', '.join(required)} for what is new here"
+    if not place.path:
+        legal = f"{', '.join(required)}; or extends, with the name of a study"
     hint = ""
     if names:
         hint = did_you_mean(place.path[-1], names)

@@ -192,7 +192,7 @@ class Characteristic:
         InputError
             The error names the value and what is expected.
         """
-        is_number = isinstance(value, Real)
+        is_number = isinstance(value, Real) and not isinstance(value, bool)
         if is_number and self.is_legal(value, beyond=beyond):
             return
         problem = f"{self.name} = {value!r}"

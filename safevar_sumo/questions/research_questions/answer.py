@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import pandas as pd
 
-from safevar_sumo.errors import check_name
+from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.questions.answer import Answer, Columns, contents, tabulate
+from safevar_sumo.questions.arguments import checked
 from safevar_sumo.questions.case import (
     NSGA2,
     Case,
@@ -86,6 +87,7 @@ REMARK = note("Remark: {remark}")
     **{name: table.columns for name, table in TABLES.items()},
     remarks=REMARKS,
 )
+@checked
 def tables(
     *results: Results | str | Path,
     algorithm: str = "",
@@ -118,7 +120,10 @@ def tables(
     table
         Print only this table of the answer. The line "More:" of an answer names the tables.
     """
-    {option.name: option for option in options_of(tables)}["alpha"].check(alpha)
+    values = {"alpha": alpha, "causes": causes, "jobs": jobs}
+    for option in options_of(tables):
+        if option.name in values:
+            option.check(values[option.name])
     if table:
         check_name(
             "table",
@@ -166,6 +171,7 @@ def tables(
     return replace(answer, command=" ".join(words), lead=lead, folded=folded)
 
 
+@checked
 def figures(*results: Results | str | Path) -> dict[str, Figure]:
     """Every figure of results by name, such as "pareto-fronts"; of several results, the case's name
     comes first: "rain-pareto-fronts".
@@ -180,6 +186,8 @@ def figures(*results: Results | str | Path) -> dict[str, Figure]:
 
 def _directories_of(results: Sequence[Results | str | Path]) -> list[Any]:
     """The directory of each of several results, which are given as `Results` or as paths."""
+    if not results:
+        raise InputError("results", "none are given", "results, or their directories")
     return [getattr(source, "directory", source) for source in results]
 
 
