@@ -101,6 +101,15 @@ def test_a_shorter_phase_shortens_the_total_and_rounds_are_foreseen() -> None:
         assert shown[-1] == ("sets, round 2 of 3", 100, 100 + 2 * 25)
 
 
+def test_a_stage_of_more_settings_than_planned_has_those_of_all_points() -> None:
+    shown = Shown()
+    phases = Phases(lambda *one: shown.append(one))
+    phases.plan({"first": 10}, points=2)
+    with phases.stage("first", 30):
+        phases.begin_part("a part of it", 10)
+    assert shown[-1] == ("first", 0, 2 * 30)
+
+
 def test_parts_weigh_at_least_what_is_expected_of_them() -> None:
     shown = Shown()
     parts = Parts(lambda *one: shown.append(one), [100, 50])
