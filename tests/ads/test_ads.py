@@ -129,6 +129,14 @@ def test_a_standing_obstacle_close_ahead_makes_it_brake(name: str) -> None:
     assert pedals[:, 1, 0].max() > 0.1
 
 
+def test_emergency_braking_brakes_at_a_walking_pace_if_the_gap_closes_soon() -> None:
+    """At 0.8 m/s, a gap of 0.2 m closes in 0.25 s, and one of 40 m in 50 s."""
+    speed, gap = np.array([0.8, 0.8]), np.array([0.2, 40.0])
+    brake = approach(Aeb(), CARLA.nominal, speed, gap)[:, 1].max(axis=0)
+    assert brake[0] > 0.1
+    assert brake[1] == 0
+
+
 def test_an_open_road_makes_it_drive(name: str) -> None:
     system = SYSTEMS[name]
     pedals = approach(system.ads, system.nominal, np.array([0.0]), np.array([1e3]))

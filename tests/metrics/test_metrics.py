@@ -441,3 +441,13 @@ def test_without_a_contact_the_excess_is_minus_the_clearance() -> None:
     run = dataclasses.replace(run, allowed_impact_speed=np.array(4.0))
     assert value("impact_excess", run) == -2.0
     assert np.isnan(value("impact_speed", run))
+
+
+def test_the_speed_of_a_contact_is_that_where_a_gap_closes_within_a_step() -> None:
+    """The gap closes from 0.5 m, or it stays open, as in a contact from the side."""
+    speed = np.array([[10.0, 10.0], [8.0, 8.0]])
+    gap = np.array([[0.5, 0.5], [-0.4, 0.4]])
+    runs = made_up_runs(0.1, speed, gap, 8.0)
+    # v^2 = 10^2 + 2 a d, with a = (8 - 10) / 0.1 m/s^2
+    at_contact = np.sqrt(100 - 2 * 20 * 0.5)
+    assert runs.relative_speed == pytest.approx([at_contact, 8.0])

@@ -16,7 +16,7 @@ from safevar_sumo.reference.agreement import (
     rank_correlation,
     shipped_agreement,
 )
-from safevar_sumo.reference.rows import ReferenceData, read_reference
+from safevar_sumo.reference.rows import ReferenceData, package_filter, read_reference
 from safevar_sumo.sumo import drive_worst
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.system import assemble
@@ -224,3 +224,16 @@ def test_vehicles_come_in_the_order_of_the_published_effects(study: str) -> None
         )
         > 0.55
     )
+
+
+def test_the_published_filter_undoes_changes_below_their_share_of_the_domain() -> None:
+    """The share is rounded to three decimals, and a change of exactly beta stays."""
+    members = CharacteristicSet.of(load_study("sun"))
+    width = members.upper - members.lower
+    sign = np.where(members.original + 0.1 * width > members.upper, -1, 1)
+    for beyond, is_kept in ((-0.002, False), (-0.0004, True), (0.0, True)):
+        share = members.threshold / width + beyond
+        changed = (members.original + sign * share * width)[np.newaxis]
+        kept = package_filter(members, changed)
+        expected = changed if is_kept else members.original_settings
+        assert kept == pytest.approx(expected, abs=0)

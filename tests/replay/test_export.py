@@ -21,6 +21,7 @@ from safevar_sumo.api.simulation import load_study, simulate_with_original
 from safevar_sumo.questions.part import at_point
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.comparison import Comparison, comparison_of
+from safevar_sumo.replay.export import Poses
 from safevar_sumo.results import write_imported
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import SLOW, refused, run
@@ -282,3 +283,19 @@ def test_what_carla_has_no_counterpart_of_is_refused(tmp_path: Path) -> None:
         "--to openscenario",
     )
     assert not out.exists()
+
+
+@pytest.mark.parametrize(("kind", "behind"), [("pedestrian", 0.0), ("car", 1.16)])
+def test_a_vehicle_is_placed_by_its_rear_axle_and_a_person_by_the_middle(
+    kind: str, behind: float
+) -> None:
+    """The axles of a car of 4 m are 2.32 m apart, half of it in front of the middle."""
+    heading = np.array([0.0, np.pi / 2, np.pi])
+    zero = np.zeros(3)
+    actor = Poses("a", kind, 4.0, 1.8, np.arange(3.0), zero + 7, zero + 2, heading)
+    assert actor.to_axle == pytest.approx(behind)
+    placed = np.array(actor.places(actor.to_axle))
+    assert placed[:, 0].tolist() == [0, 1, 2]
+    assert placed[:, 1] == pytest.approx([7 - behind, 7, 7 + behind])
+    assert placed[:, 2] == pytest.approx([2, 2 - behind, 2])
+    assert placed[:, 3].tolist() == heading.tolist()
