@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings, strategies as st
 from msgspec.structs import replace
 from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.errors import InputError
 from safevar_sumo.questions.bench import Bench
 from safevar_sumo.questions.cases import LEAST_SIMULATIONS
 from safevar_sumo.questions.drives import Drives, Encounters, Judged
@@ -25,17 +23,15 @@ from safevar_sumo.questions.permit import permit
 from safevar_sumo.questions.permit.encounters import (
     SpeedWorld,
     span_of,
-    speed_bench,
 )
 from safevar_sumo.questions.permit.permits import PermitSearch, Reached
 from safevar_sumo.questions.permit.rows import verdict_of
 from safevar_sumo.questions.permit.speed_search import Cars
-from safevar_sumo.questions.permit.words import ROUGH_NEED
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, json_of, numbers_of, refused, rows_of, run, write
+from tests.in_process import SLOW, numbers_of, write
 from tests.questions.conftest import model_of
 
 SHORT = """
@@ -54,17 +50,11 @@ payloadCentre = 1.4
 sensorRange = { value = 80, source = "assumption" }
 """
 PLACES = np.linspace(25, 75, 21)  # impact locations [%]
-FLEET = """car;note;treadDepth [mm];brakeTorque;payload;brakeResponse;sensorLatency
-new;bought "today";8;1;75;0,1;0,05
-007;;3;0,8;525;0,1;0,05
-slow;;1,6;0,55;525;0,4;0,4
-"""
 
 
 @pytest.fixture
 def short(in_tmp: Path) -> Study:
     write("short.toml", SHORT)
-    write("fleet.csv", FLEET)
     return load_study("short.toml")
 
 
@@ -132,46 +122,6 @@ def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None
 
 
 @SLOW
-def test_the_list_has_the_order_of_the_input_and_the_answer_begins_with_stops(
-    short: Study,
-) -> None:
-    row = json_of("permit short.toml --cars fleet.csv --ignore note --fits 0")
-    cars = rows_of(row, "cars")
-    numbers = row["numbers"]
-    assert cars[0]["car"] == "slow"
-    assert (numbers["cars"], numbers["stop"], numbers["not_driven_above"]) == (3, 1, 45)
-    assert numbers["drive"] + numbers["limited"] + numbers["stop"] == 3
-    by_name = {car["car"]: car for car in cars}
-    assert by_name["slow"]["up_to"] is None
-    assert by_name["slow"]["because"].startswith("Already at 34 km/h, ")
-    assert by_name["new"]["verdict"] == "drive", "as fast as the new car"
-    assert (
-        by_name["new"]["up_to"]
-        == by_name["new"]["new_car_up_to"]
-        > by_name["007"]["up_to"]
-    )
-    assert by_name["007"]["repair_first"] == "brakeTorque"
-    assert by_name["007"]["up_to_after_repair"] == by_name["new"]["up_to"]
-    assert {car["assumed"] for car in cars} == {"payloadCentre 1.4 m, sensorRange 80 m"}
-    assert "longitudinal position of the payload 1.4 m and " in row["verdict"]
-
-    typed = "permit short.toml --ignore note --fits 0 --cars fleet.csv"
-    printed = run(f"{typed} --format csv --out out.csv").stdout
-    listing = pd.read_csv("out.csv", dtype=str)
-    assert printed == Path("out.csv").read_text()
-    assert [*listing["car"]] == ["new", "007", "slow"]
-    assert [*listing.columns][:7] == [*pd.read_csv("fleet.csv", sep=";").columns]
-    assert listing["note"][0] == 'bought "today"'
-    assert listing["up_to"].isna().tolist() == [False, False, True]
-    assert len(listing["study_digest"].unique()) == 1
-    assert Path("fleet.csv").read_text() == FLEET
-    refused(f"{typed} --out fleet.csv", "fleet.csv is the list itself")
-    assert run(f"{typed.replace('fleet', 'out')} --format csv").stdout == printed, (
-        "the written list has the same answer"
-    )
-
-
-@SLOW
 def test_a_car_is_answered_alike_in_any_list_and_with_any_jobs(
     short: Study, worker_processes: None
 ) -> None:
@@ -187,33 +137,6 @@ def test_a_car_is_answered_alike_in_any_list_and_with_any_jobs(
         pd.testing.assert_frame_equal(own, alone.tables[name], check_dtype=False)
 
 
-@SLOW
-def test_the_rough_answer_lets_no_car_drive_and_says_so_in_each_form(
-    short: Study,
-) -> None:
-    cars = {"new": {}, "worn": {"treadDepth": 3}}
-    answer = permit(short, cars=cars, others="new", quick=True)
-    assert answer.numbers["rough"]
-    assert "with one parameter set" in answer.verdict
-    assert answer.numbers["drive"] == answer.numbers["attacked"] == 0
-    needing = permit(short, cars=cars, others="new", quick=True, need="34 km/h")
-    assert needing.failures == (ROUGH_NEED,)
-    table = answer.table()
-    assert set(table["verdict"]) == {"up to"}
-    assert set(table["rough"]) == {True}
-    assert set(table["parameter_sets"]) == {1}
-    assert set(zip(table["margin"], table["unsafe"], strict=True)) == {
-        (0.1, "collision")
-    }
-    assert "rough" in answer.only("cars").render("text")
-    write("rough.csv", answer.render("csv"))
-    assert [*pd.read_csv("rough.csv")["rough"]] == ["yes", "yes"]
-    told = permit(short, cars="rough.csv", others="new", quick=True).verdict
-    assert "the list is a rough answer" in told
-    with pytest.raises(InputError, match="a rough answer is not written"):
-        permit(short, cars=cars, others="new", quick=True, out="out.csv")
-
-
 def test_a_needed_speed_is_no_less_where_the_new_car_is_unsafe_too() -> None:
     for up_to, need, expected in (
         (50, 55, "up to"),
@@ -227,16 +150,6 @@ def test_a_needed_speed_is_no_less_where_the_new_car_is_unsafe_too() -> None:
             up_to,
             need,
         )
-
-
-@SLOW
-def test_a_speed_that_no_scenario_can_move_is_one_that_was_driven() -> None:
-    asked = {"unsafe": "stopping_distance > 50", "quick": True}
-    answer = permit("stop", cars={"a": {"brakeTorque": 0.9}}, others="new", **asked)
-    assert "5 values (30, 50, 80, 100 and 120 km/h)" in answer.tested
-    assert 'The car "a" may drive from 30 up to 80 km/h' in answer.verdict
-    assert "(test stop, driven at 100 km/h)" in answer.verdict
-    assert "at 30, 50, 80, 100 and 120 km/h" in answer.numbers["scope"]
 
 
 @SLOW
@@ -275,56 +188,6 @@ def test_a_car_is_safe_with_all_values_that_its_measured_one_may_have(
     assert found.failure.drive.vehicle[0, column] == pytest.approx(unsafe_at, abs=0.01)
 
 
-@SLOW
-def test_one_car_is_told_which_assumed_value_lowers_its_speed_most(
-    short: Study,
-) -> None:
-    stated = {"brakeTorque": 0.7, "brakeResponse": 0.1, "sensorLatency": 0.05}
-    options: dict[str, Any] = {"others": "new", "fits": 0, "quick": True}
-    told = permit(short, cars={"a": stated}, **options).verdict
-    words = r"matters most is (.*) [a-z]+ \(.*?\): the car would be unsafe already at (\d+) km/h"
-    ((worst, failing),) = re.findall(words, told)
-    two = permit(short, cars={"a": stated, "b": stated}, **options).table()
-    assert {*two["assumed_matters_most"]} == {worst.partition(" ")[0]}
-    assert 'The car "a" may drive from' in told
-
-    # Each of the ends as a car of a list, which has no such sentence.
-    cars = {
-        f"{item.name} {end:g}": {**stated, item.name: end}
-        for item in assemble(short).characteristics.vehicle
-        for end in (item.lower, item.upper)
-        if item.name not in stated
-    }
-    each = permit(short, cars=cars, **options)
-    # A car that is unsafe at the lowest speed, 34 km/h, may drive up to none.
-    up_to = each.table().set_index("car")["up_to"].fillna(33)
-    assert up_to[worst] == up_to.min() == float(failing) - 1
-    assert "lowers" not in each.verdict
-
-
-MATRIX = """
-extends = "wear"
-name = "three"
-title = "Three tests on a wet road"
-[[matrix.tests]]
-name = "CPFA"
-parameters = { test = "CPFA" }
-over = { speed = [20, 30] }
-[[matrix.tests]]
-name = "CPNA"
-parameters = { test = "CPNA" }
-over = { impact_location = [25, 75], speed = [10, 20, 50] }
-[[matrix.tests]]
-name = "CPNCO"
-parameters = { test = "CPNCO", speed = 30 }
-[[matrix.tests]]
-name = "CPLA"
-model = "along"
-parameters = { vut_length = 4.7, vut_width = 1.85 }
-over = { speed = [40, 60] }
-"""
-
-
 LISTED = """
 extends = "wear"
 name = "listed"
@@ -351,59 +214,6 @@ def reached(
     )
     original = Cars.one(own.characteristics.vehicle.original)
     return search.reach([cars or original], [None])[0].least
-
-
-@SLOW
-def test_a_matrix_is_driven_up_to_the_least_of_its_greatest_speeds(
-    in_tmp: Path,
-) -> None:
-    write("three.toml", MATRIX)
-    study = load_study("three.toml")
-    span = span_of(study, None)
-    assert (span.low, span.high, span.unit) == (10, 30, "km/h")
-    assert (span.ending, span.tests_above) == (("CPFA",), ("CPLA",))
-    model = model_of(study)
-    worlds = speed_bench([model], span).worlds
-    ends = [(world.name, world.low, world.high) for world in worlds]
-    assert ends == [("CPNCO", -np.inf, -np.inf), ("CPNA", 10, 30), ("CPFA", 20, 30)]
-    answer = permit(study, cars={"a": {}}, others="new", fits=0, quick=True)
-    assert answer.numbers["margin"] == 0.3, "no axis states a range"
-    assert "CPLA" in answer.verdict
-    assert "Nothing was simulated above 30 km/h" in answer.verdict
-    assert span_of(load_study("alks"), "lateral_speed").unit == "m/s"
-
-
-@SLOW
-@settings(max_examples=25)
-@given(
-    begin=st.floats(10.1, 58),
-    width=st.floats(1.1, 20),
-    place=st.floats(30, 70),
-    share=st.floats(8, 20),
-)
-def test_a_failure_at_some_speed_is_the_end_even_where_faster_is_safe(
-    begin: float, width: float, place: float, share: float
-) -> None:
-    study = load_study("wear", encounters="ranges")
-
-    def drive(self: Bench[SpeedWorld], drives: Drives, stage: str) -> Judged:
-        scores = np.ones(len(drives))
-        for world, rows in self.in_worlds(drives):
-            settings = world.settings(drives[rows])
-            columns = world.model.characteristics.columns(settings)
-            if world.name == "CPLA":
-                beyond = columns["speed"] - begin
-                is_near = abs(columns["impact_location"] - place) <= share
-                fails = (beyond >= 0) & (beyond <= width) & is_near
-                scores[rows[fails]] = -1.0
-        return Judged.of_scores(drives, scores)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Bench, "drive", drive)
-        found = reached(study, budget=2 * LEAST_SIMULATIONS)
-    assert found.failure is not None
-    assert begin - 0.005 <= found.failure.value <= begin + 1.005
-    assert found.safe_value == np.ceil(found.failure.value) - 1
 
 
 def test_where_a_test_lists_speeds_the_answer_is_one_of_them(

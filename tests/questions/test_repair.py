@@ -278,18 +278,6 @@ def test_the_smallest_changes_are_those_of_the_closed_form(
 
 
 @SLOW
-def test_an_impossible_promise_has_no_repair(planted: Path) -> None:
-    planted.write_text(STUDY.replace("upper = 64.0", "upper = 26.0"))
-    found = sv.repair(planted, change=["gap"], pool=InlinePool())
-    assert found.numbers["repairs"] == len(found.table("repairs")) == 0
-    assert (
-        "No repair was found among the changes of one or two parameters."
-        in found.verdict
-    )
-    assert not found.numbers["not_repairable"]  # full braking sees far enough
-
-
-@SLOW
 def test_a_promise_that_is_kept_already_writes_no_file(
     planted: Path, tmp_path: Path
 ) -> None:

@@ -37,19 +37,6 @@ def test_a_repaired_setting_is_the_last_feasible_one_on_the_way_from_the_origina
             5 + (settings[row] - 5) * steps / N_REPAIR_SHARES
         )
     assert repaired[[1, 3]].tolist() == settings[[1, 3]].tolist()
-    # Next to the original, or the original itself.
-    for most, steps in ((10.0, 0), (10.0 + 10 / N_REPAIR_SHARES, 1)):
-        (repaired,) = region(at_most=most).repaired(settings[:1])
-        assert repaired == pytest.approx(5 + 5 * steps / N_REPAIR_SHARES)
-
-
-def test_a_violation_is_a_share_of_the_range_of_the_sum() -> None:
-    bound = region(at_most=12.0)
-    settings = np.array([[10.0, 10.0], [9.0, 3.0], [0.0, 0.0]])
-    assert bound.violation(settings) == pytest.approx([8 / 20, 0, 0])
-    assert bound.feasible(settings).tolist() == [False, True, True]
-    with pytest.raises(InputError, match=r"a \+ b = 20"):
-        bound.check(settings)
 
 
 @pytest.mark.parametrize(("least", "is_refused"), [(19.2, False), (19.6, True)])
