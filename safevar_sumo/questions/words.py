@@ -8,7 +8,7 @@ from shlex import quote
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.sampling import CONFIDENCE
-from safevar_sumo.questions.sentence import Sentence, answer, note
+from safevar_sumo.questions.sentence import Sentence, answer, condition, note
 from safevar_sumo.records import NamedValues, Outcome
 from safevar_sumo.scenarios import distance_in_words
 from safevar_sumo.shipped import PROGRAM_COMMAND
@@ -30,6 +30,14 @@ OUTCOME_VERBS = {
 ALREADY_UNSAFE = answer(
     "The original vehicle is already unsafe: it {breach}. A failure needs no change of the"
     " vehicle."
+)
+OWN_SET_ALONE = condition(
+    "Only the study's own parameter set (calibration) of the vehicle model was driven, and no other"
+    " set of the study."
+)
+SINGLE_SET = condition(
+    "A single parameter set (calibration) of the vehicle model was driven, because the study has no"
+    " others."
 )
 VALID_FOR = note("Valid for: {scope}.")
 UNSAFE_MEANS = note("Unsafe means: {description}.")
@@ -277,3 +285,12 @@ def constraints_in_words(study: Study) -> list[str]:
 def simulation_of(study: Study) -> str:
     """The command that simulates the original vehicle of a study."""
     return f"{PROGRAM_COMMAND} simulate {study.words}"
+
+
+def single_set_in_words(study: Study, driven: int) -> Sentence:
+    """Say that a single parameter set was driven. The sentence is empty if several were, or if the
+    study has a simulator of the user's own, which has no parameter sets.
+    """
+    if driven > 1 or not study.vehicle.model:
+        return condition("")
+    return OWN_SET_ALONE if study.spread else SINGLE_SET

@@ -9,9 +9,23 @@ from __future__ import annotations
 from safevar_sumo.questions.sentence import answer, condition, evidence, note
 
 # The verdicts on cars.
-DRIVING = {"may": "may drive", "may_not": "may not drive"}
-PASSING = {"may": "can pass the test", "may_not": "cannot pass the test"}
-"""Verbs of sentences about cars on roads, and about cars in a test of a regulation."""
+DRIVING = {
+    "may": "may drive",
+    "may_not": "may not drive",
+    "is_safe": "is safe",
+    "would_fail": "would be unsafe",
+    "safe": "Safe",
+}
+PASSING = {
+    "may": "can pass the test",
+    "may_not": "cannot pass the test",
+    "is_safe": "passes the test",
+    "would_fail": "would fail the test",
+    "safe": "Passing",
+}
+"""Verbs of sentences about cars on roads, and about cars in a test of a regulation. A car that
+passes a test need not be safe.
+"""
 NAMED_CAR = 'The car "{name}"'
 CAR = answer("{car} {may} {reach}.")
 CAR_STOPS = answer("{car} {may_not}.")
@@ -30,18 +44,20 @@ ROUGH_NEED = (
 NOT_AT_ALL = answer("Already at {low}, {event}.")
 IN_FIXED_TEST = answer("In a test with a {name} of its own, {event}.")
 NEVER_MOVES = answer("No {name} can be given, because {event}.")
-SAFE_TO_TOP = answer("The car is safe {reach}, the highest {name} that was simulated.")
+SAFE_TO_TOP = answer(
+    "The car {is_safe} {reach}, the highest {name} that was simulated."
+)
 UNSAFE_BEYOND = answer("At a higher {name}, {event}.")
-NEED_REACHED = answer("The car is safe {reach}, and {need} is needed.")
+NEED_REACHED = answer("The car {is_safe} {reach}, and {need} is needed.")
 AS_NEW = answer(
-    "The car may drive as fast as a new car, {new_car}. At a higher {name}, {event}."
+    "The car {may} as fast as a new car, {new_car}. At a higher {name}, {event}."
 )
 NOT_CONFIRMED = "a vehicle failed in the search, but in none of its fresh runs"
 WITH_CHANGES = "with {changes}, {event}"
 
 # Values of a car that are assumed, or measured inexactly.
 MEASURED = condition(
-    "Within its measuring error, the least safe value counts of {names}."
+    "The answer uses the least safe value within the measuring error of {names}."
 )
 ASSUMED = evidence(
     "This answer assumes values that were not measured, as the study states under [unmeasured]:"
@@ -54,8 +70,9 @@ FURTHER_ASSUMED = condition(
     'In {count}, further values are assumed, which the column "assumed" names (--details).'
 )
 WORST_END = evidence(
-    "The assumed value that matters most is {end} (checked at the ends of all domains, with the"
-    " parameter set that limits the car): the car would be unsafe already at {value}."
+    "The assumed {name} matters most: with {end} in place of the assumed {assumed}, the car"
+    " {would_fail} already at {value}. The ends of all domains were tried, with the parameter set"
+    " that limits the car."
 )
 NO_WORST_END = evidence(
     "No assumed value lowers the {name}, not even at an end of its domain (checked at the tested"
@@ -69,18 +86,18 @@ ROUGH_LIST = note(
 ENDING = note("Nothing was simulated above {top}, where these tests end: {tests}.")
 LEFT_OUT = note("Some tests were not driven, because they begin above {top}: {tests}.")
 SAFE_BY_CRITERION = note(
-    "Safe means: the car is not unsafe ({unsafe}) in {sets} of the vehicle model."
+    "{safe} means: the car is not unsafe ({unsafe}) in {sets} of the vehicle model."
 )
 SAFE_WITHOUT_CONTACT = note(
-    "Safe means: the car touches nobody in {sets} of the vehicle model."
+    "{safe} means: the car touches nobody in {sets} of the vehicle model."
 )
 SAFE_WITH_DISTANCE = note(
-    "Safe means: the car keeps at least {below:g} m of clearance in {sets} of the vehicle model."
+    "{safe} means: the car keeps at least {below:g} m of clearance in {sets} of the vehicle model."
 )
 SAFE_WITH_CLEARANCE = (
-    note("Safe means: the car keeps at least {keep:g} m of clearance."),
+    note("{safe} means: the car keeps at least {keep:g} m of clearance."),
     note(
-        "Safe means: the car keeps at least {keep:g} m of clearance with parameter set 0 of the"
+        "{safe} means: the car keeps at least {keep:g} m of clearance with parameter set 0 of the"
         " vehicle model (that of the study). With the {others}, the car touches nobody."
     ),
 )

@@ -24,6 +24,7 @@ from safevar_sumo.questions.words import (
     encounter_in_words,
     join_phrases,
     number_of,
+    single_set_in_words,
 )
 from safevar_sumo.records import Evaluations, FloatArray, JsonObject, NamedValues
 from safevar_sumo.scenarios import distance_in_words
@@ -159,6 +160,8 @@ def _tested(models: Models, survivors: Survivors, proof: JsonObject) -> Sentence
             fits=survivors.fits,
             number=number,
         )
+    if not models.exclusions:
+        yield single_set_in_words(models.own.evaluator.study, number)
     if survivors.broken:
         yield words.BROKEN(sets=fit_names(survivors.broken))
     if models.exclusions and number > 1:

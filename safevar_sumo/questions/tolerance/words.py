@@ -74,10 +74,6 @@ LEFT_OUT = condition(
     "The limits do not cover parameter set {fit} of the vehicle model, because even the original"
     " vehicle fails with this set: {event}."
 )
-ONE_SET = condition(
-    "The limits were computed with one parameter set of the vehicle model, not with the study's"
-    " other sets."
-)
 WITHOUT_ROOM = answer(
     "Keep the original value of {names}, because no safe change was found beside the other joint"
     " limits."
