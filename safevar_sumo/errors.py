@@ -18,8 +18,14 @@ MAX_JOBS = 1024
 """Largest number of worker processes."""
 INTERRUPT_EXIT_CODE = 130
 """Exit code after Ctrl-C: 128 plus the number of the signal, as in shells."""
-INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
-"""Signals that end the program like Ctrl-C."""
+INTERRUPTS = tuple(
+    signal.Signals[name]
+    for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2")
+    if name in signal.Signals.__members__
+)
+"""Signals that end the program like Ctrl-C: those of the keyboard and of a lost terminal, and those
+with which batch systems announce the end of a job. Windows has the first two alone.
+"""
 
 
 def in_main_thread() -> bool:

@@ -23,6 +23,7 @@ import pytest
 from safevar_sumo.campaign import all_runs, evaluation, run_campaign
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.cli.program import run_command_line
+from safevar_sumo.errors import INTERRUPTS
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study, study_names
 from safevar_sumo.sumo.system import System, assemble
@@ -134,7 +135,7 @@ def run(typed: str, *arguments: str, expect: int | None = 0) -> CommandOutput:
     err = io.StringIO()
     code = None
     # a command that fails ignores Ctrl-C, and so would later processes
-    handlers = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {one: signal.getsignal(one) for one in INTERRUPTS}
     loaded_modules = set(sys.modules)
     with (
         redirect_stdout(out),

@@ -133,7 +133,9 @@ def _begin_work(path: ImportPath, last_words: Path, mark: str) -> None:
     for interrupt in INTERRUPTS:
         signal.signal(interrupt, signal.SIG_IGN)
     if CLOSING_SIGNAL is not None:
+        # This process has inherited that interrupts are blocked.
         signal.signal(CLOSING_SIGNAL, _end_in_order)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [CLOSING_SIGNAL])
     # The pool removes this folder at its end. A killed worker could not remove its own files.
     tempfile.tempdir = str(last_words.parent)
     file = open(last_words, "w", encoding="utf-8")  # noqa: SIM115

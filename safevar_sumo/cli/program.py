@@ -204,11 +204,11 @@ def run_command_line() -> None:
     Its exit code is 0, 1 (failed, or `check` has findings), 2 (bad input), 3 (`--fail-if`, or a
     limit is not kept), 4 (a person has to decide) or 130 (interrupted).
     """
-    # A warning becomes one line, without its place in the code. A signal to end (SIGTERM) is an
-    # interruption like Ctrl-C.
+    # A warning becomes one line, without its place in the code. Each signal to end, such as
+    # SIGTERM, is an interruption like Ctrl-C.
     warnings.showwarning = _show_warning
-    if in_main_thread():
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for interrupt in _heeded_interrupts():
+        signal.signal(interrupt, signal.default_int_handler)
     # After a crash of compiled code, Python prints the line of the crash. This fails if standard
     # error is no file.
     with suppress(AttributeError, OSError, ValueError):
@@ -264,15 +264,23 @@ def _exit_on_interrupt() -> Iterator[None]:
         os._exit(INTERRUPT_EXIT_CODE)
 
     handlers = {}
-    if in_main_thread():
-        for interrupt in INTERRUPTS:
-            handlers[interrupt] = signal.signal(interrupt, exit_at_once)
+    for interrupt in _heeded_interrupts():
+        handlers[interrupt] = signal.signal(interrupt, exit_at_once)
     try:
         yield
     finally:
         for interrupt, handler in handlers.items():
             # None stands for a handler that Python has not set, and that Python cannot set again.
             signal.signal(interrupt, handler or signal.default_int_handler)
+
+
+def _heeded_interrupts() -> Iterator[signal.Signals]:
+    """The interrupts that this thread may handle, except those that the caller of the program lets
+    it ignore, as `nohup` does.
+    """
+    for interrupt in INTERRUPTS if in_main_thread() else ():
+        if signal.getsignal(interrupt) is not signal.SIG_IGN:
+            yield interrupt
 
 
 def _exit_with_error(message: str, code: int) -> NoReturn:

@@ -90,16 +90,20 @@ def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
 
 
 @SLOW
-def test_sigterm_ends_everything_as_ctrl_c_does_and_leaves_nothing(
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGUSR1", "SIGUSR2"])
+def test_a_signal_to_end_ends_everything_as_ctrl_c_does_and_leaves_nothing(
+    name: str,
     in_tmp: Path,
 ) -> None:
+    """Also signals of batch systems. The command says how to continue."""
     Path("temporary").mkdir()
     environment = {**os.environ, "TMPDIR": str(in_tmp / "temporary")}
     process = started("study rain --out out --jobs 1 --engine sumo", env=environment)
     until_it_writes(process)
-    process.terminate()
+    process.send_signal(signal.Signals[name])
     errors = ended(process, 130)
     assert "interrupted" in errors
+    assert "run the same command again to continue" in errors
     assert "leaked" not in errors, "a remark on semaphores"
     assert not [*Path("temporary").iterdir()]
 
