@@ -105,8 +105,9 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
     def acceleration_at(
         self, gap: FloatArray, speed: FloatArray, leader_speed: FloatArray
     ) -> FloatArray:
-        """The acceleration by the control law of the mode that applies [m/s^2], shape (N,). Near
-        standstill the desired gap is 2 m larger than by the headway (Xiao et al. 2017).
+        """The acceleration by the control law of the mode that applies [m/s^2], shape (N,), at most
+        that of the mode that holds the speed. Near standstill the desired gap is 2 m larger than by
+        the headway (Xiao et al. 2017).
         """
         excess_speed = speed - self.cruise_speed
         relative_speed = leader_speed - speed
@@ -124,11 +125,10 @@ class Acc(CarFollowing, frozen=True, kw_only=True):
         acceleration = np.where(
             keeps_gap, keeping, np.where(gap_error < 0, avoiding, closing)
         )
-        return np.where(
-            gap - self.standing_gap > FOLLOWING_GAP,
-            SPEED_GAIN * excess_speed,
-            acceleration,
-        )
+        # Behind a leader, too, the vehicle does not exceed its cruise speed.
+        holding = SPEED_GAIN * excess_speed
+        is_free = gap - self.standing_gap > FOLLOWING_GAP
+        return np.where(is_free, holding, np.minimum(acceleration, holding))
 
 
 class Idm(CarFollowing, frozen=True, kw_only=True):
@@ -178,7 +178,9 @@ class Krauss(Ads, Table, frozen=True, kw_only=True):
     """SUMO's default model (Krauss 1998; `MSCFModel_Krauss`).
 
     The model never drives so fast that the original vehicle could not stop before an obstacle ahead
-    (after the reaction time, with the planned deceleration).
+    (after the reaction time, with the planned deceleration). The model takes each obstacle as a
+    standing one, unlike SUMO's: a leader may stop at once, and a pedestrian has no speed along the
+    lane. Behind a leader that drives, the vehicle therefore keeps a larger gap than SUMO's.
 
     Parameters
     ----------

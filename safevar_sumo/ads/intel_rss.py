@@ -62,8 +62,8 @@ class AdRss(ScalarAds):
         sizes = {
             "response_time": response_time,
             "accel_max": accel_max,
-            "brake_min": brake_min,
             "brake_max": brake_max,
+            "brake_min": brake_min,
         }
         for name, value in sizes.items():
             upper_limit = brake_max if name == "brake_min" else MOST

@@ -188,16 +188,26 @@ def values_as_printed(
     return list(map(members.named, settings.values()))
 
 
-def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
-    """The evaluation of the smallest minimal cause of the unsafe solution with the fewest changes.
-    Its values are rounded as they are printed. None if no solution is unsafe, or if the solution is
-    safe in this simulation, or (if runs differ) in all fresh runs.
+def solution_with_fewest_changes(case: Case) -> FloatArray | None:
+    """The unsafe solution with the fewest changes, shape (n,), as a search returned it. None if no
+    solution is unsafe.
     """
     if not case.unsafe.rows(case.solutions).any():
         return None
     handle = choose_handle(case.solutions, case.unsafe, "fewest")
     row = case.solutions.iloc[row_of_handle(case.solutions, handle)]
-    setting = row[list(case.characteristics.names)].to_numpy(dtype=float)
+    setting: FloatArray = row[list(case.characteristics.names)].to_numpy(dtype=float)
+    return setting
+
+
+def fewest_changes(case: Case, jobs: int | None = None) -> Evaluations | None:
+    """The evaluation of the smallest minimal cause of the unsafe solution with the fewest changes.
+    Its values are rounded as they are printed. None if no solution is unsafe, or if the solution is
+    safe in this simulation, or (if runs differ) in all fresh runs.
+    """
+    setting = solution_with_fewest_changes(case)
+    if setting is None:
+        return None
     with open_evaluator(case.study, jobs=jobs) as evaluator:
         (causes,) = find_minimal_causes(evaluator, setting[np.newaxis], case.unsafe)
         if not causes:

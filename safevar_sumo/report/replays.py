@@ -10,7 +10,10 @@ from typing import Any
 
 from safevar_sumo.api.simulation import simulate_with_original
 from safevar_sumo.errors import warn
-from safevar_sumo.questions.counterexamples import fewest_changes
+from safevar_sumo.questions.counterexamples import (
+    fewest_changes,
+    solution_with_fewest_changes,
+)
 from safevar_sumo.questions.words import change_texts, replay_command
 from safevar_sumo.records import JsonObject, NamedValues
 from safevar_sumo.replay.animation import player_of
@@ -45,7 +48,12 @@ def replays(
     limit = None
     if study.system.mover.takes_long:
         limit = study.simulations
-    if limit is None and (fewest := fewest_changes(study.case, jobs=1)) is not None:
+    # To undo changes that the failure does not need takes simulations.
+    if limit is not None:
+        setting = solution_with_fewest_changes(study.case)
+        if setting is not None:
+            settings["Fewest changes"] = setting
+    elif (fewest := fewest_changes(study.case, jobs=1)) is not None:
         settings["Fewest changes"] = fewest.settings[0]
     settings.update(zip(study.choices, study.chosen_settings, strict=True))
 

@@ -52,6 +52,10 @@ LATERAL_START = 5.16
 """The pedestrian's start in the traffic file, to the right of the lane's middle [m]."""
 SLOW_SPEEDS = (10.0, 15.0, 20.0)
 """Speeds of benign scenes, near which vehicles reach the pedestrian [km/h]."""
+BENIGN_TIME = 7.0
+"""Time from the start of a benign scene until the vehicle reaches the pedestrian's path, unless a
+slow pedestrian needs more [s].
+"""
 CITY_SPEEDS = (20.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0)
 """Speeds of benign scenes with a car in the next lane [km/h]. (The tested vehicle starts at
 rest.)
@@ -193,11 +197,14 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
         """Scenes with a pedestrian of the same speed, and vehicles at the `SLOW_SPEEDS`. The
         pedestrian stops before the vehicle's path, or leaves the path in time.
         """
+        speed = self.walking_speed or WALKING_SPEED
+        # A slower pedestrian needs more time from the footpath to the vehicle's path.
+        time = BENIGN_TIME * max(WALKING_SPEED / speed, 1.0)
         adult = Crossing(
-            test="CPNA", target_speed=WALKING_SPEED * KMH_PER_MS, time_to_impact=7.0
+            test="CPNA", target_speed=speed * KMH_PER_MS, time_to_impact=time
         )
-        for walk, speed in product((adult, replace(adult, test="CPFA")), SLOW_SPEEDS):
-            yield from replace(walk, speed=speed).benign()
+        for walk, slow in product((adult, replace(adult, test="CPFA")), SLOW_SPEEDS):
+            yield from replace(walk, speed=slow).benign()
 
     def layout(self, roads: Roads, step: float, samples: int) -> Layout:
         times = np.arange(samples)[:, None]

@@ -153,6 +153,8 @@ def test_without_its_library_the_extra_is_named(
         ("response_time", "-1.0", "a number above 0, up to 1000"),
         ("accel_max", "1e9", "a number above 0, up to 1000"),
         ("brake_min", "9.0", "a number above 0, up to 8"),
+        ("brake_max", "-1.0", "a number above 0, up to 1000"),
+        ("brake_max", "2e3", "a number above 0, up to 1000"),
     ],
 )
 def test_numbers_that_its_library_refuses_are_refused_without_its_log(

@@ -94,7 +94,9 @@ def test_idm_is_sumos(sumo: Any) -> None:
 
 
 def test_acc_is_sumos(sumo: Any) -> None:
-    expected = sumo_accelerations(sumo, "ACC")
+    """At most as it approaches its cruise speed, which a vehicle of SUMO does not exceed either."""
+    holding = 0.4 * (Acc().cruise_speed - SPEEDS)
+    expected = np.minimum(sumo_accelerations(sumo, "ACC"), holding)
     accelerations = Acc().acceleration_at(GAPS, SPEEDS, LEADERS)
     compared = (SPEEDS + accelerations * STEP > 0) & (
         np.abs(expected - accelerations) < 1e-6
@@ -104,6 +106,19 @@ def test_acc_is_sumos(sumo: Any) -> None:
     )  # in danger, SUMO's emergency override brakes harder than the control law
     assert np.all(compared | braked | (SPEEDS + accelerations * STEP <= 0))
     assert np.count_nonzero(compared) > 35
+
+
+@pytest.mark.parametrize("gap", [5.0, 30.0, 90.0, 120.0, 1000.0])
+def test_acc_never_exceeds_its_cruise_speed(gap: float) -> None:
+    """Behind a leader that is faster, too, for which the vehicle would otherwise accelerate."""
+    acc = Acc(cruise_speed=10.0)
+    speed = np.zeros(1)
+    for _ in range(1000):
+        acceleration = acc.acceleration_at(np.full(1, gap), speed, np.full(1, 30.0))
+        speed = np.maximum(speed + STEP * acceleration, 0.0)
+        assert speed[0] <= 10.0 + 1e-9
+    if gap > 30:
+        assert speed[0] == pytest.approx(10.0)
 
 
 def braking(

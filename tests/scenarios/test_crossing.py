@@ -271,3 +271,22 @@ def test_a_parked_vehicle_is_separated_by_centres_and_closed_in_on_by_bumpers() 
     assert encounter.distance[:, 0].tolist() == [3.0, -0.1]
     assert encounter.closing_speed[:, 0].tolist() == [2.0, 2.0]
     assert encounter.in_conflict[:, 0].tolist() == [True, False]
+
+
+@pytest.mark.parametrize("walking_speed", [None, 0.5, 1.2, 2.5])
+def test_benign_scenes_have_the_walking_speed_of_the_study(
+    walking_speed: float | None,
+) -> None:
+    """A pedestrian who leaves the path in time reaches this speed; a slow one gets time for it."""
+    expected = walking_speed or 1.8
+    names = []
+    for name, scene in PedestrianCrossing(walking_speed=walking_speed).benign():
+        if not isinstance(scene, Crossing):
+            continue  # a car stands in the next lane
+        assert scene.target_speed == pytest.approx(3.6 * expected)
+        if "leaves" in name:
+            names.append(name)
+            times = np.arange(0.0, scene.duration, 0.1)[:, None]
+            target = scene.tracks(times)[0]
+            assert np.max(target.speed) == pytest.approx(expected)
+    assert len(names) == 12

@@ -500,6 +500,15 @@ def test_a_figure_and_an_animation_need_the_position(wall: Path) -> None:
 
 
 @SLOW
+def test_a_page_with_few_simulations_has_the_replay_with_the_fewest_changes(
+    wall: Path,
+) -> None:
+    run("study wall.toml --out results --runs 1")
+    run("report results --simulations 400 --out page.html")
+    assert "Fewest changes: " in Path("page.html").read_text()
+
+
+@SLOW
 def test_a_cause_ends_where_the_formula_does_and_weather_is_not_said(
     wall: Path,
 ) -> None:
