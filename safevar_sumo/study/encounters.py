@@ -395,6 +395,10 @@ class StudyEncounters(Table, frozen=True, kw_only=True):
         """
         if self.encounters == TESTS:
             return {}
+        return self.stated_ranges_of(test)
+
+    def stated_ranges_of(self, test: MatrixTest | None) -> Mapping[str, Domain]:
+        """The ranges of a test's axes, also if encounters are listed."""
         return _ranges_of(self.axes_of(test).items())
 
     @property

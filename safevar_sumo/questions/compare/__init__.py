@@ -372,8 +372,8 @@ def _decide(
     - A person decides if B is better in some things and worse in others, or if B is only worse in
       needless braking. A person also decides if needless braking was not measured, although B is
       better or brakes elsewhere.
-    - A person also decides if one version `lacks` tests of the other, unless there is a new
-      collision.
+    - A person also decides if the study of one version asks less than that of the other (`lacks`),
+      unless there is a new collision.
     - Otherwise B is released.
     """
     in_order = sorted(differences, key=lambda difference: -difference.weight)

@@ -1,27 +1,40 @@
-"""Finds the parts of one version's tests that the other version lacks: test cases, weathers, ranges
-and parameter sets; also the vehicles and encounters that a constraint or margin excludes.
+"""Finds what the study of one version asks less of than that of the other version: test cases,
+weathers, ranges and parameter sets that it lacks, vehicles and encounters that its constraints or
+margin exclude, impacts that its tests allow, and another criterion.
 
 A version whose failing tests were deleted would look safer, although nothing shows that it is
-safer.
+safer. All parts of a study count, whether this command uses them or not: `--ranges` uses the ranges
+of a study whose tests are listed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
-from safevar_sumo.questions.compare.words import LACKS
+from safevar_sumo.questions.compare.words import (
+    ALLOWS,
+    CRITERIA,
+    LACKS,
+    LEAVES_OUT,
+    WORST_CASES,
+)
 from safevar_sumo.questions.counterexamples import OF_ENCOUNTER
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.pairs import Titles
 from safevar_sumo.questions.part import points_of_tests
 from safevar_sumo.questions.sentence import Sentences
 from safevar_sumo.questions.words import join_phrases, number_of
+from safevar_sumo.records import KMH_PER_MS
 from safevar_sumo.scenarios import Point
-from safevar_sumo.study import Study, Weather
+from safevar_sumo.study import Study, Weather, unit_text
+from safevar_sumo.study.characteristics import Domain, Interval
 
 MAX_PARTS_NAMED = 4
 """Maximum number of missing parts that a sentence names."""
+DECIMALS = 9
+"""Decimals of changes that count. Differences of rounded values have errors beyond them."""
 OF_VEHICLE = "vehicle."
 """Prefix of the parameters of a parameter set that belong to the vehicle. Versions of a driving
 system have these parameters in common.
@@ -36,33 +49,76 @@ class TestCase(NamedTuple):
     model: str
     parameters: dict[str, Any]
     weather: Weather
-    allowed_impact_speed: float
 
 
-def cases_of(side: Evaluator) -> Iterator[tuple[str, Point, TestCase]]:
-    """Yield the test cases of a version, each with the name of its test (without tests: of its
-    scenario) and its point.
+def cases_of(
+    study: Study, points: Sequence[Point]
+) -> Iterator[tuple[str, Point, TestCase]]:
+    """Yield the test cases at the points of a study, each with the name of its test (without tests:
+    of its scenario) and its point.
     """
-    scenario = side.study.scenario
-    for test, points in points_of_tests(side.study, side.system.points):
+    scenario = study.scenario
+    for test, points_of_test in points_of_tests(study, points):
         model = (test and test.model) or scenario.model
         stated = {**scenario.parameters, **(test.parameters if test else {})}
-        for point in points:
+        for point in points_of_test:
             driven = {
                 key: value for key, value in point.parameters if key not in OF_ENCOUNTER
             }
             parameters = stated | driven
-            case = TestCase(
-                model, parameters, point.weather, point.allowed_impact_speed
-            )
+            case = TestCase(model, parameters, point.weather)
             yield (test.name if test else model), point, case
 
 
-def missing_parts(side: Evaluator, reference: Evaluator) -> list[str]:
+class Coverage(NamedTuple):
+    """What a version is tested with: its study, and its listed test cases as `cases_of` gives
+    them.
+    """
+
+    study: Study
+    cases: list[tuple[str, Point, TestCase]]
+
+    @classmethod
+    def of(cls, side: Evaluator) -> Coverage:
+        """The coverage of a version. Values that an axis lists count even if its range is used."""
+        study = side.study
+        tests = {test.name: test for test in study.tests}
+        cases = []
+        for name, point, case in cases_of(study, side.system.points):
+            test = tests.get(name)
+            axes = study.axes_of(test)
+            lists = {
+                axis: axes[axis].at for axis in study.ranges_of(test) if axes[axis].at
+            }
+            for values in product(*lists.values()):
+                listed = dict(zip(lists, values, strict=True))
+                words = [point.name, *(f"{axis} {listed[axis]}" for axis in listed)]
+                parameters = {**case.parameters, **listed}
+                cases.append(
+                    (
+                        name,
+                        point._replace(name=", ".join(words)),
+                        case._replace(parameters=parameters),
+                    )
+                )
+        return cls(study, cases)
+
+    def counterpart(self, name: str, case: TestCase) -> str | None:
+        """The name of the test that has this name or else this test case; None if there is none."""
+        if any(test == name for test, _, _ in self.cases):
+            return name
+        return next((test for test, _, own in self.cases if own == case), None)
+
+    def ranges_of(self, name: str) -> Mapping[str, Domain]:
+        """The ranges that the study states for a test (without tests: for its scenario)."""
+        tests = {test.name: test for test in self.study.tests}
+        return self.study.stated_ranges_of(tests.get(name))
+
+
+def missing_parts(side: Coverage, reference: Coverage) -> list[str]:
     """The parts of the version `reference` that the version `side` lacks, as phrases."""
     parts = [
         *_missing_cases(side, reference),
-        *_missing_ranges(side, reference),
         *_excluded(side.study, reference.study),
         *_missing_sets(side.study, reference.study),
     ]
@@ -70,31 +126,63 @@ def missing_parts(side: Evaluator, reference: Evaluator) -> list[str]:
 
 
 def missing_in_words(a: Evaluator, b: Evaluator, titles: Titles) -> Sentences:
-    """Yield a sentence for each version that lacks parts of the other version, such as `Version b
-    lacks the test CCRs, which a has.` `titles` are the names of the versions.
+    """Yield sentences on what the study of one version asks less of than the other, such as
+    `Version b lacks the test CCRs, which a has.` `titles` are the names of the versions.
     """
-    for side, reference, names in ((a, b, "ab"), (b, a, "ba")):
-        parts = missing_parts(side, reference)
-        if len(parts) > MAX_PARTS_NAMED:
-            parts[MAX_PARTS_NAMED:] = [f"{len(parts) - MAX_PARTS_NAMED} more"]
-        if parts:
-            version, reference_title = map(titles.__getitem__, names)
-            yield LACKS(
-                version=version,
-                parts=join_phrases(parts),
-                other=reference_title,
+    of_a, of_b = Coverage.of(a), Coverage.of(b)
+    for side, reference, own, other in (
+        (of_a, of_b, titles["a"], titles["b"]),
+        (of_b, of_a, titles["b"], titles["a"]),
+    ):
+        if parts := missing_parts(side, reference):
+            yield LACKS(version=own, other=other, parts=_few(parts))
+        if values := left_out(side, reference):
+            yield LEAVES_OUT(version=own, other=other, values=_few(values))
+        for (speed, least), tests in allowances(side, reference).items():
+            yield ALLOWS(
+                version=own,
+                other=other,
+                tests=_few(tests),
+                speed=f"{speed:g} km/h",
+                least=f"{least:g} km/h" if least else "none",
             )
+    for template, words_of in ((CRITERIA, _criterion), (WORST_CASES, _aggregate)):
+        in_a = words_of(a.study)
+        in_b = words_of(b.study)
+        if in_a != in_b:
+            yield template(in_a=in_a, in_b=in_b, **titles)
 
 
-def _missing_cases(side: Evaluator, reference: Evaluator) -> Iterator[str]:
+def _few(phrases: list[str]) -> str:
+    """At most `MAX_PARTS_NAMED` phrases as a list, and the number of all others."""
+    surplus = len(phrases) - MAX_PARTS_NAMED
+    if surplus > 0:
+        phrases = [*phrases[:MAX_PARTS_NAMED], f"{surplus} more"]
+    return join_phrases(phrases)
+
+
+def _criterion(study: Study) -> str:
+    """The criterion by which a study calls a vehicle unsafe."""
+    return study.unsafe.criterion or "collision"
+
+
+def _aggregate(study: Study) -> str:
+    """What says which test case gives the result of a vehicle, in words."""
+    if study.deciding is None:
+        return "the safety degree"
+    return f"`{study.deciding}`"
+
+
+def _missing_cases(side: Coverage, reference: Coverage) -> Iterator[str]:
     """Yield the weathers, test cases and tests of `reference` that `side` lacks, as phrases."""
-    tests, _, cases = zip(*cases_of(side), strict=True)
+    tests, _, cases = zip(*side.cases, strict=True)
     weathers = {case.weather for case in cases}
-    for test, point, case in cases_of(reference):
+    for test, point, case in reference.cases:
         if case in cases:
             continue
         variants = [case._replace(weather=weather) for weather in weathers]
-        if case.weather not in weathers and any(map(cases.__contains__, variants)):
+        is_driven = any(variant in cases for variant in variants)
+        if case.weather not in weathers and is_driven:
             yield f"the weather {case.weather.name}"
         elif test in tests and point.name:
             yield f"the test case ({point.name})"
@@ -102,22 +190,77 @@ def _missing_cases(side: Evaluator, reference: Evaluator) -> Iterator[str]:
             yield f"the test {test}"
 
 
-def _missing_ranges(side: Evaluator, reference: Evaluator) -> Iterator[str]:
-    """Yield the ranges of `reference` that are no part of a range of `side`, as phrases."""
-    tests = points_of_tests(side.study, side.system.points)
-    by_name = {test and test.name: side.study.ranges_of(test) for test, _ in tests}
-    for test, _ in points_of_tests(reference.study, reference.system.points):
-        # If the version has no test of this name, its ranges for all tests count.
-        ranges = by_name.get(test and test.name, side.study.ranges)
-        for name, domain in reference.study.ranges_of(test).items():
-            narrower = ranges.get(name)
-            if (
-                narrower is None
-                or narrower.lower > domain.lower
-                or narrower.upper < domain.upper
-            ):
-                where = f" in the test {test.name}" if test else ""
-                yield f"the range of {name} from {domain.lower:g} to {domain.upper:g}{where}"
+def left_out(side: Coverage, reference: Coverage) -> list[str]:
+    """The values in ranges of `reference` that are in no range of `side`, as phrases: of
+    characteristics and of encounters.
+    """
+    phrases = []
+    for name, domain in reference.study.vehicle.characteristics.items():
+        own_domain = side.study.vehicle.characteristics[name]
+        if not _has_changes_of(own_domain, domain):
+            for part in _outside(domain, own_domain):
+                phrases.append(_values_in_words(name, part, domain.unit))
+    for test, _, case in reference.cases:
+        # A test that `side` lacks altogether is named elsewhere.
+        counterpart = side.counterpart(test, case)
+        if counterpart is not None:
+            where = f" in the test {test}" if reference.study.tests else ""
+            own_ranges = side.ranges_of(counterpart)
+            ranges = reference.ranges_of(test)
+            phrases += [f"{part}{where}" for part in _outside_of(ranges, own_ranges)]
+    return list(dict.fromkeys(phrases))
+
+
+def _outside_of(
+    ranges: Mapping[str, Domain], own_ranges: Mapping[str, Domain]
+) -> Iterator[str]:
+    """Yield the parts of ranges that are outside of other ranges of the same names, as phrases."""
+    for name, domain in ranges.items():
+        for part in _outside(domain, own_ranges.get(name)):
+            yield _values_in_words(name, part, domain.unit)
+
+
+def _has_changes_of(own: Domain, domain: Domain) -> bool:
+    """Whether a domain has all changes of another domain, each from its own original value."""
+    shift = domain.original - own.original
+    begins = round(own.lower + shift - domain.lower, DECIMALS) <= 0
+    ends = round(own.upper + shift - domain.upper, DECIMALS) >= 0
+    return begins and ends
+
+
+def _values_in_words(name: str, part: Interval, unit: str) -> str:
+    """A part of a range as a phrase, such as `speed from 40 to 60 km/h`."""
+    low, high = part
+    return f"{name} from {low:g} to {high:g}{unit_text(unit)}"
+
+
+def _outside(domain: Domain, own: Domain | None) -> Iterator[Interval]:
+    """Yield the parts of a range that are outside of another range."""
+    if own is None:
+        yield domain.lower, domain.upper
+        return
+    if own.lower > domain.lower:
+        yield domain.lower, min(own.lower, domain.upper)
+    if own.upper < domain.upper:
+        yield max(own.upper, domain.lower), domain.upper
+
+
+def allowances(
+    side: Coverage, reference: Coverage
+) -> dict[tuple[float, float], list[str]]:
+    """The names of the tests of `side` that allow a faster impact than `reference` allows in the
+    same test case, by both allowed speeds [km/h].
+    """
+    tests: dict[tuple[float, float], list[str]] = {}
+    for test, point, case in side.cases:
+        for _, other_point, other_case in reference.cases:
+            allowed = point.allowed_impact_speed * KMH_PER_MS
+            least = other_point.allowed_impact_speed * KMH_PER_MS
+            if other_case == case and allowed > least:
+                names = tests.setdefault((allowed, least), [])
+                if test not in names:
+                    names.append(test)
+    return tests
 
 
 def _excluded(study: Study, reference: Study) -> Iterator[str]:
@@ -136,7 +279,7 @@ def _excluded(study: Study, reference: Study) -> Iterator[str]:
     margin = study.scenario.margin
     reference_margin = reference.scenario.margin
     if (
-        study.ranges
+        study.axes
         and margin is not None
         and (reference_margin is None or margin > reference_margin)
     ):

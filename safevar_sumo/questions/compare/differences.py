@@ -251,7 +251,8 @@ def _new_collisions(evaluators: Evaluators) -> Differences:
     """
     of_a, of_b = map(_collisions_of_original, evaluators)
     cases_of_collisions = [case for case, _, _ in of_a]
-    cases_of_a = [case for _, _, case in cases_of(evaluators[0])]
+    a = evaluators[0]
+    cases_of_a = [case for _, _, case in cases_of(a.study, a.system.points)]
 
     new = [
         (speed, point)
@@ -274,9 +275,10 @@ def _collisions_of_original(side: Evaluator) -> list[tuple[TestCase, Point, floa
     """
     original = side.characteristics.original[np.newaxis]
     results = simulate_all_points(side.system, original)
+    cases = cases_of(side.study, side.system.points)
     return [
         (case, point, float(-result.evaluations.f_safe[0]))
-        for (_, point, case), result in zip(cases_of(side), results, strict=True)
+        for (_, point, case), result in zip(cases, results, strict=True)
         if result.evaluations.collided[0]
     ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from safevar_sumo.questions.sentence import answer, condition, note
 
 # The decision.
-LACKING = answer("DECIDE: {b} and {a} were not simulated in the same encounters.")
+LACKING = answer("DECIDE: {b} and {a} were not tested in the same way.")
 LESS_SAFE = answer("DO NOT RELEASE: {b} is less safe than {a}.")
 LESS_SAFE_BUT_SMOOTHER = answer(
     "DO NOT RELEASE: {b} is less safe than {a}, although it brakes less often without need."
@@ -24,6 +24,18 @@ ALIKE = answer("RELEASE: {b} does not differ from {a} in anything that was measu
 
 # The differences that decide.
 LACKS = answer("Version {version} lacks {parts}, which {other} has.")
+LEAVES_OUT = answer(
+    "Version {version} leaves out values in the ranges of {other}: {values}."
+)
+ALLOWS = answer(
+    "The tests of {version} allow an impact of {speed}, those of {other} {least} ({tests})."
+)
+CRITERIA = answer(
+    "The study {b} calls a vehicle unsafe by the criterion `{in_b}`, and {a} by `{in_a}`."
+)
+WORST_CASES = answer(
+    "The worst test case of a vehicle is chosen by {in_b} in {b}, and by {in_a} in {a}."
+)
 NEW_COLLISION = answer(
     "The original vehicle of {b} collides at {speed:.2f} m/s{place}. The original vehicle of {a}"
     " does not collide in the same test case."
