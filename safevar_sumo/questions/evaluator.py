@@ -184,12 +184,10 @@ class Evaluator:
     def evaluate_anew(self, settings: FloatArray) -> Evaluations:
         """Evaluate M settings of a simulator whose runs differ, shape (M, n), in fresh runs: no
         kept result is read. A setting has at least as many runs as the study repeats, and at least
-        `FRESH_RUNS` if a quarter of the simulations that are left suffices.
+        `FRESH_RUNS` if a quarter of the simulations that are left suffices for this number.
         """
         repeats = self.study.scenario.repeats
-        runs = max(repeats, FRESH_RUNS)
-        if self.left is not None and self.left * repeats < 4 * runs * len(settings):
-            runs = repeats
+        runs = self.number_of_fresh_runs(len(settings))
         self.account.spend(len(settings) * self._each * runs // repeats)
         scenario = replace_in(self.study.scenario, repeats=runs)
         task = Task(study=replace_in(self.study, scenario=scenario))
@@ -200,6 +198,14 @@ class Evaluator:
         )
         counted = self._without_unsafe_originals(fresh_runs)
         return self._without_standing(counted, EVERYTHING)
+
+    def number_of_fresh_runs(self, settings: int) -> int:
+        """The number of fresh runs of each setting, if so many settings are evaluated anew."""
+        repeats = self.study.scenario.repeats
+        runs = max(repeats, FRESH_RUNS)
+        if self.left is not None and self.left * repeats < 4 * runs * settings:
+            return repeats
+        return runs
 
     def confirmed(self, evaluations: Evaluations, unsafe: Unsafe) -> BoolArray:
         """Which of M evaluated settings are unsafe, shape (M,). If runs differ, a setting must also

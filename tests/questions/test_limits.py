@@ -398,7 +398,7 @@ def test_a_box_settles_a_step_further_inwards_after_each_failure() -> None:
     settled = settle(boxes, known, boxes.longest, [search, other])
     assert settled.sides is not None
     assert settled.sides[:, 0].tolist() == [5, pytest.approx(2 - 0.08, abs=0.01)]
-    assert settled.attack == (21, 1, 0.25)
+    assert settled.attack == (21, 1, 0.25, 0)
     assert [scope.upper[0] for scope in scopes] == [10, 5 + settled.sides[1, 0]]
     assert settled.failures.boxes == 1
     assert settled.failures.shares[:, 0].tolist() == [1]

@@ -138,6 +138,9 @@ SEARCH = evidence(
     "{number:,} simulations searched for a counterexample (an unsafe vehicle within the limits)"
     " and found none: the worst vehicle {keeps}."
 )
+FRESH_RUNS = note(
+    "None of {number:,} fresh runs of the worst vehicles within the limits is unsafe."
+)
 EMPTY_SEARCH = evidence(
     "{number:,} simulations searched for a counterexample (an unsafe vehicle within the limits),"
     " but none met an encounter that counts (in which the original vehicle is safe)."
