@@ -51,6 +51,10 @@ SHARES = condition(
     "The share of unsafe vehicles ranges from {least} to {greatest} over the {sets} parameter sets"
     " of the vehicle model (alternative calibrations; at most {most} vehicles with each set).",
 )
+NONE_UNSAFE = condition(
+    "At most {most} of the vehicles were also simulated with each of the {sets} parameter sets of"
+    " the vehicle model (alternative calibrations). None of these vehicles is unsafe.",
+)
 SAME_SHARE = condition(
     "The share of unsafe vehicles is {least} in each of the {sets} parameter sets of the vehicle"
     " model (alternative calibrations; at most {most} vehicles with each set).",
@@ -197,6 +201,8 @@ class SharesOverSets(NamedTuple):
             self._in_words, (np.nanargmin(shares), np.nanargmax(shares))
         )
         template = SAME_SHARE if smallest == greatest else SHARES
+        if np.nanmax(shares) == 0:
+            template = NONE_UNSAFE
         yield template(
             least=smallest,
             greatest=greatest,

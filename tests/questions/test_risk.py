@@ -25,7 +25,7 @@ from safevar_sumo.questions.risk import influence_in_words
 from safevar_sumo.questions.rules import SAMPLED_STAGE
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.variation import VariationModel
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool
@@ -389,3 +389,29 @@ def test_the_other_parameter_sets_are_planned() -> None:
     assert shown[-1][1] <= expected
     bounded = risk("wear", samples=400, simulations=135_000, pool=InlinePool())
     assert "Other parameter sets (alternative calibrations) were not" in bounded.verdict
+
+
+def test_the_first_sentence_of_rules_says_what_lies_outside_of_the_regions() -> None:
+    """Unsafe are a large corner, which becomes a region, and 2 % of the rest, which does not."""
+
+    def region(settings: FloatArray) -> BoolArray:
+        corner = (settings[:, 0] > 6) & (settings[:, 1] > 6)
+        # The last digits of a value say nothing about the rest of the vehicle.
+        return corner | (settings[:, 0] * 1000 % 1 < 0.02)
+
+    answer = rules_of(region, samples=4000)
+    boxes = answer.tables["rules"]
+    said = re.match(
+        r"(\d+) % of all unsafe vehicles lie outside of the", answer.verdict
+    )
+    assert said
+    assert int(said[1]) == round(100 * (1 - boxes["coverage"].sum()))
+    assert 5 < int(said[1]) < 15
+
+
+def test_sets_without_an_unsafe_vehicle_are_told_by_a_count() -> None:
+    shares = np.zeros((20, 1))
+    over_sets = SharesOverSets(load_study("smoke"), shares, np.zeros((20, 1, 2)))
+    (sentence,) = over_sets.sentences()
+    assert "None of these vehicles is unsafe." in sentence.text
+    assert "0 %" not in sentence.text

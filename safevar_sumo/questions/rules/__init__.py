@@ -9,7 +9,7 @@ make it denser. Other vehicles test the rules.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -181,6 +181,12 @@ def rules(
     else:
         box = boxes[denser.index[0]]
         region = conditions(box, characteristics, "short_name")
+        if unsafe_in_test.any():
+            outside = _share_outside(boxes, testing.settings, unsafe_in_test)
+            regions = "the region"
+            if len(boxes) > 1:
+                regions = f"the {len(boxes)} regions"
+            sentences.append(words.OUTSIDE(outside=100 * outside, regions=regions))
         sentences += _region_in_words(denser.iloc[0], region)
     return Answer(
         question="rules",
@@ -201,6 +207,16 @@ def _region_in_words(rule: pd.Series[Any], region: str) -> Sentences:
     density = words.DENSITY_OVER_SETS if is_wider else words.DENSITY
     yield density(**shares)
     yield words.COVERAGE(**shares)
+
+
+def _share_outside(
+    boxes: Sequence[FloatArray], settings: FloatArray, unsafe: FloatArray
+) -> float:
+    """The share of all unsafe settings that lie in none of the boxes. `unsafe` is the unsafe share
+    of each setting's runs, shape (M,).
+    """
+    is_inside = np.any([is_within(box, settings) for box in boxes], axis=0)
+    return float(unsafe[~is_inside].sum() / unsafe.sum())
 
 
 def conditions(

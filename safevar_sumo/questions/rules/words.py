@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from safevar_sumo.questions.sentence import answer, evidence
 
+OUTSIDE = answer(
+    "{outside:.0f} % of all unsafe vehicles lie outside of {regions} that the table lists."
+)
 REGION = answer(
     "Vehicles are unsafe more often in this region than in the rest of the domain (all ranges of"
     " values): {region}."
 )
 DENSITY = answer("{density:.0f} % of the vehicles in this region are unsafe.")
 DENSITY_OVER_SETS = answer(
-    "{density:.0f} % of the vehicles in this region are unsafe ({density_least:.0f} to"
-    " {density_greatest:.0f} % over the parameter sets of the vehicle model, with 95 % confidence"
-    " {density_lowest:.0f} to {density_highest:.0f} %)."
+    "{density:.0f} % of the vehicles in this region are unsafe. Over the parameter sets of the"
+    " vehicle model, this share ranges from {density_least:.0f} to {density_greatest:.0f} %."
 )
 COVERAGE = answer("{coverage:.0f} % of all unsafe vehicles lie in this region.")
 NO_REGION = answer(
