@@ -14,17 +14,9 @@ from msgspec.structs import replace
 from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.questions.bench import Bench
-from safevar_sumo.questions.cases import LEAST_SIMULATIONS
-from safevar_sumo.questions.drives import Drives, Encounters, Judged
+from safevar_sumo.questions.drives import Encounters
 from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.models import Models
 from safevar_sumo.questions.permit import permit
-from safevar_sumo.questions.permit.encounters import (
-    SpeedWorld,
-    span_of,
-)
-from safevar_sumo.questions.permit.permits import PermitSearch, Reached
 from safevar_sumo.questions.permit.rows import verdict_of
 from safevar_sumo.questions.permit.speed_search import Cars
 from safevar_sumo.records import BoolArray, FloatArray
@@ -32,7 +24,6 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, numbers_of, write
-from tests.questions.conftest import model_of
 
 SHORT = """
 extends = "wear"
@@ -161,75 +152,6 @@ def test_a_car_passes_a_test_of_a_regulation() -> None:
     assert '"a" can pass the test up to 40 km/h' in told
     assert "A new car can pass the test up to 40 km/h" in told
     assert "may drive" not in told
-
-
-@pytest.mark.parametrize("unsafe_at", [0.75, 0.8, 0.85])
-def test_a_car_is_safe_with_all_values_that_its_measured_one_may_have(
-    unsafe_at: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A made-up car is unsafe above 20 km/h with one brake torque, at or between the ends."""
-    members = assemble(load_study("wear")).characteristics.vehicle
-    column = members.names.index("brakeTorque")
-
-    def drive(self: Bench[SpeedWorld], drives: Drives, stage: str) -> Judged:
-        scores = np.ones(len(drives))
-        for world, rows in self.in_worlds(drives):
-            settings = world.settings(drives[rows])
-            left = abs(settings[:, column] - unsafe_at) - 0.01
-            scores[rows] = np.where(world.speeds(settings) > 20, left, 1.0)
-        return Judged.of_scores(drives, scores)
-
-    monkeypatch.setattr(Bench, "drive", drive)
-    ends = np.tile(members.original, (2, 1))
-    ends[:, column] = 0.75, 0.85
-    found = reached(load_study("wear", encounters="ranges"), Cars.measured(*ends))
-    assert found.safe_value == 20
-    assert found.failure is not None
-    assert found.failure.drive.vehicle[0, column] == pytest.approx(unsafe_at, abs=0.01)
-
-
-LISTED = """
-extends = "wear"
-name = "listed"
-title = "Full braking from listed speeds, and a pedestrian at any speed"
-[[matrix.tests]]
-name = "stop"
-model = "stop"
-over = { speed = [10, 30, 60] }
-[[matrix.tests]]
-name = "CPFA"
-parameters = { test = "CPFA" }
-over = { speed = [20, 60] }
-"""
-
-
-def reached(
-    study: Study, cars: Cars | None = None, budget: int = LEAST_SIMULATIONS
-) -> Reached:
-    """How far cars, by default the original, are safe with the study's own parameter set."""
-    span = span_of(study, None)
-    own = model_of(study)
-    search = PermitSearch(
-        Models((own,), ()), span, np.arange(span.low, span.high + 1), budget
-    )
-    original = Cars.one(own.characteristics.vehicle.original)
-    return search.reach([cars or original], [None])[0].least
-
-
-def test_where_a_test_lists_speeds_the_answer_is_one_of_them(
-    in_tmp: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write("listed.toml", LISTED)
-
-    def drive(self: Bench[SpeedWorld], drives: Drives, stage: str) -> Judged:
-        scores = np.ones(len(drives))
-        for world, rows in self.in_worlds(drives):
-            speeds = world.speeds(world.settings(drives[rows]))
-            scores[rows[speeds >= 35]] = -1.0
-        return Judged.of_scores(drives, scores)
-
-    monkeypatch.setattr(Bench, "drive", drive)
-    assert reached(load_study("listed.toml"), budget=0).safe_value == 30
 
 
 def test_all_corners_of_five_measured_values_drive_the_grid() -> None:

@@ -20,7 +20,7 @@ from safevar_sumo.questions.drives import Drives, Judged
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.sampling import Stream
-from safevar_sumo.questions.tolerance import asked, boxes
+from safevar_sumo.questions.tolerance import asked, boxes, words
 from safevar_sumo.questions.tolerance.asked import (
     asked_of,
     effort_of,
@@ -447,3 +447,26 @@ def test_an_unsafe_original_keeps_no_limit_and_says_what_it_has() -> None:
         assert answer.tables["limits"]["kept"].tolist() == (
             [False, None] if limits else [None, None]
         )
+
+
+@pytest.mark.usefixtures("coarse", "few_simulations")
+@pytest.mark.parametrize(
+    ("region", "is_unlimited"),
+    [
+        (nowhere, True),
+        (lambda settings: settings[:, 0] > 7, False),
+        (lambda settings: np.abs(settings[:, 0] - 5) > 0.01, False),
+    ],
+    ids=["nowhere", "above 7", "any change"],
+)
+def test_no_limit_is_needed_only_where_no_value_is_unsafe(
+    region: Region, is_unlimited: bool
+) -> None:
+    """Not where a value may change only a little or not at all, and the other one may be any."""
+    evaluator = made_up_evaluator(2, region)
+    answer = tolerance.compute(evaluator.study, evaluator, unsafe=Unsafe())
+    assert (words.UNLIMITED.text in answer.verdict) == is_unlimited
+    limits = answer.tables["limits"].set_index("characteristic")
+    ends = limits.loc["b", ["together_low", "together_high"]]
+    if answer.numbers["box"]:
+        assert [*ends] == [0, 10]
