@@ -136,7 +136,16 @@ class EnvironmentFault(SafevarError):
     """
 
 
-def warn(message: str) -> None:
+class Hint(UserWarning):
+    """A message about another way to a result, or about the time until it: nothing is wrong."""
+
+
+def hint(message: str) -> None:
+    """Show a hint. The program prints it as a note."""
+    warn(message, Hint)
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
     """Show a warning that names the line of user code that called this package."""
     frame = inspect.currentframe()
     level = 1
@@ -147,7 +156,7 @@ def warn(message: str) -> None:
     ):
         frame = frame.f_back
         level += 1
-    warnings.warn(message, stacklevel=level)
+    warnings.warn(message, category, stacklevel=level)
 
 
 MAX_MESSAGE_LENGTH = 500

@@ -28,6 +28,7 @@ from safevar_sumo.records import (
     Outcome,
     SimulationRuns,
     finite_or_none,
+    significant,
 )
 from safevar_sumo.results import record
 from safevar_sumo.scenarios import Point, distance_in_words
@@ -304,7 +305,7 @@ class Simulation:
 
     def __repr__(self) -> str:
         metrics = ", ".join(
-            f"{name}={value:.4g}" for name, value in self.metrics.items()
+            f"{name}={significant(value, 4)}" for name, value in self.metrics.items()
         )
         return f"<Simulation of {self.study.name}: {self.outcome}, {metrics}>"
 

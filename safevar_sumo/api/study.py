@@ -14,7 +14,7 @@ from msgspec.structs import replace as replace_in
 
 from safevar_sumo.api import words
 from safevar_sumo.api.running import load_for_search, run
-from safevar_sumo.errors import InputError, warn
+from safevar_sumo.errors import InputError, hint, warn
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Criterion
@@ -170,9 +170,9 @@ def study(
         study_by(loaded, unsafe)
     for remark in dict.fromkeys(without_effect(system)):
         warn(remark)
-    if system.mover.takes_long:
+    if system.mover.takes_long and not quiet:
         command = f"{PROGRAM_COMMAND} explain {loaded.words}"
-        warn(
+        hint(
             f"{command} --simulations N looks for the smallest changes with N simulations alone"
         )
 

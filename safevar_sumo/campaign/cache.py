@@ -35,7 +35,7 @@ from diskcache.core import MODE_BINARY, MODE_RAW
 
 from safevar_sumo.campaign.evaluation import Selection, system_of
 from safevar_sumo.campaign.inputs import manifest_now
-from safevar_sumo.errors import warn
+from safevar_sumo.errors import hint, warn
 from safevar_sumo.plugins import digests, file_by_name, files_in
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.records.evaluations import COLUMNS
@@ -262,7 +262,7 @@ class CommandCache:
         self._own = Cache(self._own_folder, is_counted=True)
         if begin is not None and (number := self._own.number_kept()):
             at = time.strftime("%H:%M", time.localtime(begin))
-            warn(f"continues: {number:,} simulated at {at}")
+            hint(f"continues: {number:,} simulated at {at}")
 
     def _remove_old(self) -> None:
         """Remove caches into which nobody has written for a day, because no command continues from

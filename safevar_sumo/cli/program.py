@@ -21,6 +21,7 @@ from safevar_sumo.cli.log import WARNINGS
 from safevar_sumo.errors import (
     INTERRUPT_EXIT_CODE,
     INTERRUPTS,
+    Hint,
     InputError,
     SafevarError,
     did_you_mean,
@@ -239,8 +240,11 @@ def run_command_line() -> None:
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """Print a warning as one line, and log it."""
+    """Print a warning as one line, and log it. A hint is printed as a note."""
     text = printable(str(message))
+    if isinstance(message, Hint):
+        click.echo(f"note: {text}", err=True)
+        return
     click.echo(f"warning: {text}", err=True)
     WARNINGS.warning(text)
 

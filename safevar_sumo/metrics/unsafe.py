@@ -31,6 +31,7 @@ from safevar_sumo.records import (
     Outcome,
     Quantity,
     TextArray,
+    significant,
 )
 from safevar_sumo.study import SAFETY_DEGREE
 from safevar_sumo.study.schema import Tables
@@ -416,7 +417,7 @@ class UnsafeDegree(UnsafeStated):
             return super()._breach_in_words(vehicle)
         unit = unit_of_degree(degree)
         text = value_on_side(degree, self.degree, "g", 3)
-        return f"has a safety degree of {text} {unit}, below {self.degree:.3g} {unit}"
+        return f"has a safety degree of {text} {unit}, below {significant(self.degree, 3)} {unit}"
 
 
 class UnsafeMetric(UnsafeStated):
@@ -474,7 +475,7 @@ class UnsafeMetric(UnsafeStated):
 
     def value_in_words(self, value: float) -> str:
         """Such as `has drac 5.9`."""
-        return f"has {self.measure} {value:.3g}"
+        return f"has {self.measure} {significant(value, 3)}"
 
     def _breach_in_words(self, vehicle: Evaluations) -> str:
         if not self._is_beyond(vehicle.column)[0]:

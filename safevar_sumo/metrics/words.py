@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from safevar_sumo.records import KMH_PER_MS, BoolArray
+from safevar_sumo.records import KMH_PER_MS, BoolArray, significant
 
 ALLOWED_ROUNDING = 0.01
 """An impact is not allowed at all if its allowed speed is below this number [km/h]."""
@@ -42,8 +42,10 @@ def impact_in_words(speed: float, excess: float) -> str:
     allowed_speed = KMH_PER_MS * (speed - excess)
     words = "none"
     if allowed_speed >= ALLOWED_ROUNDING:
-        words = f"{allowed_speed:.3g}"
-    return f"impact at {KMH_PER_MS * speed:.3g} km/h where {words} is allowed"
+        words = significant(allowed_speed, 3)
+    return (
+        f"impact at {significant(KMH_PER_MS * speed, 3)} km/h where {words} is allowed"
+    )
 
 
 def unit_of_degree(degree: float) -> str:
@@ -55,7 +57,7 @@ def unit_of_degree(degree: float) -> str:
 
 def degree_in_words(degree: float) -> str:
     """A safety degree with its unit."""
-    return f"{degree:.3g} {unit_of_degree(degree)}"
+    return f"{significant(degree, 3)} {unit_of_degree(degree)}"
 
 
 def value_on_side(value: float, limit: float, kind: str, digits: int) -> str:
@@ -64,7 +66,9 @@ def value_on_side(value: float, limit: float, kind: str, digits: int) -> str:
     """
     side = np.sign(value - limit)
     for number in range(digits, 17):
-        text = f"{value:.{number}{kind}}"
+        text = significant(value, number)
+        if kind == "f":
+            text = f"{value:.{number}f}"
         if np.sign(float(text) - limit) == side:
             return text
     return repr(value)

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.errors import InputError, check_name, warn
+from safevar_sumo.errors import InputError, check_name, hint
 from safevar_sumo.metrics import METRICS, OBJECTIVES, OPTIONAL_METRICS, UNSAFE_SHARE
 from safevar_sumo.plugins import Lookup
 from safevar_sumo.questions.answer import Answer, contents, tabulate
@@ -285,10 +285,10 @@ def check(
     extents = []
 
     def tell(extent: Extent) -> None:
-        """Warn of a check that takes long."""
+        """Say how long a check takes, if it takes long."""
         extents.append(extent)
         if extent.seconds > LONG:
-            warn(
+            hint(
                 f"the check simulates {number_of(extent.vehicles, 'vehicle')}, which takes about"
                 f" {extent.seconds:.0f} s"
             )

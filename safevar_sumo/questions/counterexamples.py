@@ -24,6 +24,7 @@ from safevar_sumo.records import (
     JsonObject,
     NamedValues,
     Outcome,
+    significant,
 )
 from safevar_sumo.results import choose_handle, row_of_handle
 from safevar_sumo.scenarios import (
@@ -361,7 +362,7 @@ def place_of(
     texts = texts_of(point, numbers)
     speed = texts.pop(SPEED_DIMENSION, "")
     if not speed and scenario.test_speed is not None:
-        speed = f"{KMH_PER_MS * scenario.test_speed:.4g} km/h"
+        speed = f"{significant(KMH_PER_MS * scenario.test_speed, 4)} km/h"
     place = ", ".join(f"{name} {text}" for name, text in texts.items())
     return Place(test, speed, place.replace("_", " "), fit)
 
@@ -384,5 +385,5 @@ def _event_in_words(scenario: Scenario, unsafe: Unsafe, collided: bool) -> str:
     if unsafe.bound is not None:
         return f"has {unsafe.bound}"
     measured = FROM_CENTRES if unsafe.contact and unsafe.degree else ""
-    clearance = f"{unsafe.degree or unsafe.distance:.3g} m{measured}"
+    clearance = f"{significant(unsafe.degree or unsafe.distance, 3)} m{measured}"
     return f"keeps less than {clearance} from {scenario.obstacle()}"

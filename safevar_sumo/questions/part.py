@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from safevar_sumo.errors import InputError, check_name, check_text
 from safevar_sumo.questions.options import UP_TO
 from safevar_sumo.questions.words import join_phrases
-from safevar_sumo.records import KMH_PER_MS
+from safevar_sumo.records import KMH_PER_MS, significant
 from safevar_sumo.scenarios import SPEED_DIMENSION, Point, searchable_in, unit_of
 from safevar_sumo.scenarios.declared import with_ranges
 from safevar_sumo.study import RANGES, Domain, MatrixTest, Study, Weather, unit_text
@@ -368,7 +368,7 @@ def _test_speeds_in_words(points: Sequence[Point]) -> str:
     """The speeds at which scenarios are driven that have no axis of speeds; "" without any."""
     stated = {point.scenario.test_speed for point in points}
     speeds = sorted(value for value in stated if value is not None)
-    texts = dict.fromkeys(f"{KMH_PER_MS * value:.4g}" for value in speeds)
+    texts = dict.fromkeys(f"{significant(KMH_PER_MS * value, 4)}" for value in speeds)
     return f"{join_phrases(texts)} km/h" if texts else ""
 
 

@@ -24,7 +24,7 @@ from safevar_sumo.errors import InputError, NobodyMoved
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.words import number_of
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, significant
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System
@@ -241,7 +241,7 @@ class Account:
             self.spent += parts
             price = _price(min(expected, self.limit), seconds).removeprefix("about ")
             words = f"at most {price}, of about {expected:,.0f} in full"
-        words += f" (one takes {seconds:.2g} s"
+        words += f" (one takes {significant(seconds, 2)} s"
         if checked and allowance is None:
             words += f", besides {checked:,} for a check of the class"
         elif checked:

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
-FIRST_WORD = re.compile(r"^[a-z]+\b")
+FIRST_SLOT = re.compile(r"(?:^|(?<=\. ))\{(\w+)\}")
+"""A slot at the beginning of a sentence, in a template of one or several sentences."""
 KINDS = "answer", "evidence", "condition", "note"
 """The kinds of sentences, in the order in which readers see them. A note stands below the table."""
 
@@ -21,10 +22,26 @@ class Sentence(NamedTuple):
     text: str
 
     def __call__(self, **values: object) -> Sentence:
-        """The sentence with values in its slots, and a capital letter at its beginning."""
-        text = self.text.format(**values)
-        # A first word such as `brake_force` or `sensorLatency` is a key: users write it so.
-        return self._replace(text=FIRST_WORD.sub(lambda word: word[0].title(), text))
+        """The sentence with values in its slots. Each sentence begins with a capital letter."""
+
+        def begin(slot: re.Match[str]) -> str:
+            """The value of a slot, as a text that `format` leaves as it is."""
+            text = with_capital(str(values[slot[1]]))
+            return text.replace("{", "{{").replace("}", "}}")
+
+        return self._replace(text=FIRST_SLOT.sub(begin, self.text).format(**values))
+
+
+def with_capital(text: str) -> str:
+    """A text with a capital letter at its beginning. A key such as `brake_force` or `sensorLatency`
+    stays as users write it, after a noun.
+    """
+    word, _, _ = text.partition(" ")
+    if not text[:1].islower():
+        return text
+    if word.replace("-", "").isalpha() and word.islower():
+        return text[0].upper() + text[1:]
+    return f"The characteristic {text}"
 
 
 Sentences = Iterator[Sentence]

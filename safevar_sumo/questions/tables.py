@@ -225,6 +225,7 @@ def cell_text(value: Any, number_format: str = ".4g") -> str:
 
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 """A spreadsheet reads a cell that begins with one of these characters as a formula."""
+ZERO_TEXT = re.compile(r"-?0(\.0+)?")
 SIGNED = re.compile(rf"{NUMBER_PATTERN}|[+-]inf")
 
 
@@ -294,6 +295,11 @@ class _ReaderColumn(NamedTuple):
         """Whether a text of the column is too long for a narrow table."""
         return max(map(len, self.texts), default=0) > LONG_TEXT
 
+    @property
+    def is_zero(self) -> bool:
+        """Whether all cells are 0 or undefined, as far as a reader sees."""
+        return all(text == "-" or ZERO_TEXT.fullmatch(text) for text in self.texts)
+
 
 def reader_columns(table: AnswerTable) -> Iterator[_ReaderColumn]:
     """Yield the columns of a table as readers see them: a value and its interval in one column,
@@ -358,7 +364,7 @@ def lead_table(table: AnswerTable, max_rows: int) -> AnswerTable:
     number = 0
     for column in reader_columns(table.with_rows(lead)):
         is_same = len(lead) > 1 and len(set(column.texts)) == 1
-        says_something = not is_same and not set(column.texts) <= {"-", "0"}
+        says_something = not is_same and not column.is_zero
         is_detail = table.columns[column.names[0]].is_detail
         is_label = not names and len(lead) > 1
         if not is_detail and (is_label or says_something) and number < MAX_LEAD_COLUMNS:
@@ -381,7 +387,12 @@ def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str
     fit beside each other, several tables share the columns. Each of these tables begins with the
     columns of text that name the rows. Long texts stand below the tables, a line for each row.
     """
-    all_columns = list(reader_columns(table))
+    # The first column names the rows. Any other column of zeros says nothing.
+    all_columns = [
+        column
+        for number, column in enumerate(reader_columns(table))
+        if not number or not column.is_zero
+    ]
     columns = [column for column in all_columns if not column.is_long]
     long_columns = [column for column in all_columns if column.is_long]
     least_width = 1 + sum(map(_least_width, columns))

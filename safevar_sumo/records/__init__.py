@@ -27,6 +27,7 @@ from safevar_sumo.records.driving import (
     clip_to_share as clip_to_share,
     finite_or_none as finite_or_none,
     nans as nans,
+    significant as significant,
 )
 from safevar_sumo.records.evaluations import (
     ROUNDING as ROUNDING,

@@ -71,6 +71,20 @@ def finite_or_none(value: float) -> float | None:
     return float(value)
 
 
+LARGE = 100_000
+"""From here on, a rounded number has an exponent."""
+
+
+def significant(value: float, digits: int) -> str:
+    """A number for readers, with `digits` significant digits. A number below `LARGE` keeps the
+    other digits before its decimal point, so that it has no exponent such as in `1.23e+03`.
+    """
+    text = f"{value:.{digits}g}"
+    if "e+" in text and abs(value) < LARGE:
+        return f"{value:.0f}"
+    return text
+
+
 class Observation(NamedTuple):
     """What the sensors of N vehicles observe. Every array has shape (N,), or broadcasts to it.
 

@@ -381,9 +381,10 @@ def verify(
     parts = _not_compared(description, studies.values())
     if counts[UNCHECKED]:
         parts.append("how many simulations had which outcome (--search compares it)")
-    sentences = [
-        f"{count_in_words(counts[SAME], number)} claims of the pack are confirmed."
-    ]
+    confirmed = count_in_words(counts[SAME], number).capitalize()
+    sentences = [f"{confirmed} claims of the pack are confirmed."]
+    if claims.frame["verdict"][0] == DIFFERS:
+        sentences.insert(0, ALTERED)
     if counts[DIFFERS]:
         sentences.append(f"{counts[DIFFERS]} of the {number} claims differ.")
     if counts[CANNOT]:
@@ -404,6 +405,10 @@ def verify(
         },
         tables={"claims": claims},
     )
+
+
+ALTERED = "This pack was altered: its files are not those that its description lists."
+"""The first sentence about a pack whose files have other digests than the pack states."""
 
 
 def _not_compared(description: Description, studies: Iterable[Packed]) -> list[str]:

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Meta
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.records import FloatArray, Quantity
+from safevar_sumo.records import FloatArray, Quantity, significant
 from safevar_sumo.scenarios.ahead import LANE_WIDTH, VEHICLE_SPEED, next_lane
 from safevar_sumo.scenarios.base import PreCrash, Scenario, XmlChanges
 from safevar_sumo.scenarios.euro_ncap import Seconds
@@ -145,7 +145,7 @@ class CutIn(LaneChange, frozen=True, kw_only=True):
                 "",
                 f"gap = {self.gap:g} m is closed before the car is in the lane, after"
                 f" {enters_after:.2f} s",
-                f"a gap above {closed_gap:.4g} m",
+                f"a gap above {significant(closed_gap, 4)} m",
             )
 
     def tracks(self, times: FloatArray) -> list[Track]:

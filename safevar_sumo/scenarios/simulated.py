@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safevar_sumo.plugins import SHARE, Contract, Legal, Returned, UserCode, quoted
-from safevar_sumo.records import FloatArray, NamedValues, Outcome
+from safevar_sumo.records import FloatArray, NamedValues, Outcome, significant
 from safevar_sumo.scenarios.base import Mover, Scenario
 from safevar_sumo.scenarios.trace_ways import contradiction_of_speeds
 from safevar_sumo.study import SAFETY_DEGREE
@@ -177,15 +177,16 @@ def _contradiction(
         reach = (speed.max() + braked + np.abs(obstacle_speeds).max()) * step
         reach += float(np.abs(np.diff(finite)).max(initial=0.0))
         if finite.size and finite.min() > reach + SLACK:
-            return f"a collision at a separation of {finite.min():.3g} m"
+            return f"a collision at a separation of {significant(finite.min(), 3)} m"
         impact = ends[IMPACT_SPEED]
         if np.abs(speed - impact).min() > braked + SLACK:
-            return f"{IMPACT_SPEED} = {impact:.3g} after a speed of {speed[-1]:.3g}"
+            last = significant(speed[-1], 3)
+            return f"{IMPACT_SPEED} = {significant(impact, 3)} after a speed of {last}"
         return ""
     if outcome in ENDS_APART and separation.min() <= 0:
         return f"{outcome!r} with a separation of 0"
     if outcome == Outcome.STOPPED and speed[-1] > max(braked, CREEPS):
-        return f"{outcome!r} at a speed of {speed[-1]:.3g}"
+        return f"{outcome!r} at a speed of {significant(speed[-1], 3)}"
     return ""
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, significant
 
 CREEPS = 1.0
 """Speed up to which a vehicle does not move, or hardly [m/s]."""
@@ -168,8 +168,8 @@ def contradiction_of_speeds(
         if mistake := _mistake(ways):
             expected += f" ({mistake} would explain the difference)"
         return Contradiction(
-            f"{names} and {ways.name} disagree: {driven[compared].sum():.3g} m and"
-            f" {ways.way[compared].sum():.3g} m of way",
+            f"{names} and {ways.name} disagree: {significant(driven[compared].sum(), 3)} m and"
+            f" {significant(ways.way[compared].sum(), 3)} m of way",
             expected,
         )
     return None

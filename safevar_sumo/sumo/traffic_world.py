@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safevar_sumo.errors import SimulationError
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, significant
 from safevar_sumo.scenarios import VUT, Track
 from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.scenarios.tracks import PERSONS, SCREEN
@@ -236,7 +236,8 @@ class TrafficWorld(SumoWorld):
             distances = np.abs(actual - expected)
             if not (distances <= PLACE_TOLERANCE).all():
                 time = self._sample * self.step_length
+                largest = significant(distances.max(), 2)
                 raise SimulationError(
-                    f"SUMO has the {name} {distances.max():.2g} m beside its track at {time:g} s"
+                    f"SUMO has the {name} {largest} m beside its track at {time:g} s"
                 )
         return motion

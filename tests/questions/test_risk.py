@@ -234,7 +234,7 @@ def test_rules_draw_as_the_variation_says() -> None:
         ),
         (
             0.51,
-            "uncertain. a causes 60 % of the variance of the safety degree (95 % confidence",
+            "uncertain. A causes 60 % of the variance of the safety degree (95 % confidence",
         ),
     ],
 )

@@ -7,6 +7,8 @@ import math
 import pytest
 
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.metrics.words import degree_in_words, impact_in_words, value_on_side
+from safevar_sumo.questions.sentence import answer
 from safevar_sumo.questions.tables import cell_text
 from safevar_sumo.questions.words import (
     MAX_POINTS_NAMED,
@@ -16,6 +18,7 @@ from safevar_sumo.questions.words import (
     two_decimals,
     undecidable_in_words,
 )
+from safevar_sumo.records import significant
 from safevar_sumo.vehicles import CharacteristicSet
 
 
@@ -41,6 +44,35 @@ def test_a_share_has_the_digits_that_decide() -> None:
     assert cell_text(1259.0, ".3g") == "1,259", "no exponent"
     values = (None, math.nan, -0.004, 1.006)
     assert [*map(two_decimals, values)] == ["-", "-", "0.00", "1.01"]
+
+
+@pytest.mark.parametrize("digits", [2, 3, 5])
+def test_numbers_up_to_99_999_have_no_exponent(digits: int) -> None:
+    for value in (99.95, 1259.0, -1259.0, 12345.6, 99_999.0, 99_999.4):
+        text = significant(value, digits)
+        assert "e" not in text
+        assert float(text) == pytest.approx(value, rel=10 ** (1 - digits))
+    assert significant(0.123456, digits) == f"{0.123456:.{digits}g}"
+    assert degree_in_words(4321.4) == "4321 m"
+    assert impact_in_words(1000.0, 500.0) == "impact at 3600 km/h where 1800 is allowed"
+    assert value_on_side(1234.4, 1234.0, "g", 3) == "1234.4"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("tyre friction", "Tyre friction"),
+        ("a", "A"),
+        ("ABS delay", "ABS delay"),
+        ("brake_force", "The characteristic brake_force"),
+        ("sensorLatency", "The characteristic sensorLatency"),
+        ("none of the {2}", "None of the {2}"),
+    ],
+)
+def test_each_sentence_begins_with_a_capital_letter(name: str, text: str) -> None:
+    both = answer("{name} is wide. {name} is {size:.1f} times as wide as {name}.")
+    said = both(name=name, size=2)
+    assert said.text == f"{text} is wide. {text} is 2.0 times as wide as {name}."
 
 
 @pytest.mark.parametrize(

@@ -284,6 +284,21 @@ def test_a_pack_holds_a_list_of_cars_without_their_names(
 
 
 @SLOW
+def test_the_verdict_on_an_altered_pack_begins_with_the_alteration(
+    in_tmp: Path,
+) -> None:
+    """The altered file no longer has the digest that the pack states."""
+    searched(load_study("smoke", search={"evaluations": 16}), in_tmp / "results")
+    run("evidence results --ask 'rules --samples 20' --out it.zip")
+    assert "altered" not in run("verify it.zip").stdout
+    texts = texts_of(Path("it.zip"))
+    (answers,) = [path for path in texts if path.endswith("answers.json")]
+    texts[answers] = texts[answers].replace(b'"samples": 20', b'"samples": 21')
+    written(Path("other.zip"), texts, named=False)
+    assert run("verify other.zip", expect=1).stdout.startswith("This pack was altered:")
+
+
+@SLOW
 def test_equal_contents_give_equal_bytes(
     bare: Path, slippery: Path, tmp_path: Path
 ) -> None:

@@ -60,12 +60,12 @@ SETS = evidence(
 SAFE = evidence("No vehicle that was tested within these limits is unsafe ({unsafe}).")
 CLEARANCE = (
     evidence(
-        "Every vehicle that was tested within these limits keeps at least {keep:.3g} m of"
+        "Every vehicle that was tested within these limits keeps at least {keep:g} m of"
         " clearance."
     ),
     evidence(
         "With parameter set 0 (that of the study), every vehicle that was tested within these"
-        " limits keeps at least {keep:.3g} m of clearance. With {others}, no tested vehicle"
+        " limits keeps at least {keep:g} m of clearance. With {others}, no tested vehicle"
         " collides."
     ),
 )
