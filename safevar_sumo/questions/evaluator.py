@@ -241,7 +241,9 @@ class Evaluator:
                     pool.spare = spare(account.allowance, account.minimum)
                 opened_by(self.study, pool)
             seconds = seconds_of_simulation(self.study, system, pool)
-            account.open(expected * self._each, seconds, pool.checked)
+            account.open(
+                expected * self._each, seconds, pool.checked, at_once=pool.workers
+            )
             if seconds is not None:
                 account.spend(MEASURED * self._each)
             elif of_list and not account.is_limited:

@@ -200,7 +200,13 @@ class Account:
                 f"{self.minimum} or more",
             )
 
-    def open(self, expected: float, seconds: float | None, checked: int = 0) -> None:
+    def open(
+        self,
+        expected: float,
+        seconds: float | None,
+        checked: int = 0,
+        at_once: int = 1,
+    ) -> None:
         """Set the limit and the effort of the question, and print its price.
 
         The limit is the number that the user allows. If the user states no number, there is no
@@ -211,11 +217,14 @@ class Account:
         expected
             Number of simulations that the question is expected to need.
         seconds
-            Duration of a simulation [s]; None if simulations are short, and were not measured.
+            Duration of all simulations over their number, with `at_once` simulations at the same
+            time [s]; None if simulations are short, and were not measured.
         checked
             Number of simulations that the check of a simulator's class really did. The account does
             not count this number, but a fixed part of the limit. Otherwise the answer would depend
             on whether an earlier command had already done the check.
+        at_once
+            Number of simulations at the same time.
         """
         # The number that a user states also covers two other parts: the check at the beginning, and
         # the first simulations, which are repeated at the end.
@@ -241,7 +250,9 @@ class Account:
             self.spent += parts
             price = _price(min(expected, self.limit), seconds).removeprefix("about ")
             words = f"at most {price}, of about {expected:,.0f} in full"
-        words += f" (one takes {significant(seconds, 2)} s"
+        words += f" (one takes {significant(seconds * at_once, 2)} s"
+        if at_once > 1:
+            words += f", {at_once} at the same time"
         if checked and allowance is None:
             words += f", besides {checked:,} for a check of the class"
         elif checked:

@@ -233,6 +233,19 @@ def test_what_takes_long_by_default_is_limited_and_said_first(
     assert round_down(0.2) == 1
 
 
+@pytest.mark.parametrize(
+    ("at_once", "told"), [(1, "takes 0.15 s)"), (2, "takes 0.3 s, 2 at the same time)")]
+)
+def test_the_time_of_one_simulation_is_that_of_one(
+    at_once: int, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """100 simulations take 15 s with any number at the same time: the mean is 0.15 s."""
+    Account(Phases(show_no_progress)).open(100, 0.15, at_once=at_once)
+    text = capsys.readouterr().err
+    assert "about 100 simulations, about 0:00:15" in text
+    assert told in text
+
+
 def test_a_slow_simulator_gets_a_rough_answer(
     rig: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
