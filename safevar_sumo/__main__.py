@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 import time
+import warnings
 
 ENDING_TIME = 5.0
 """Time that threads and exit functions of user code get after the end of a command [s]."""
@@ -16,6 +17,7 @@ def main() -> None:
     module, too, and does not need the program.
     """
     _put_installed_modules_first()
+    _filter_warnings()
     from safevar_sumo import cli
 
     try:
@@ -40,6 +42,23 @@ def _put_installed_modules_first() -> None:
     if sys.path[0] in ("", os.getcwd()):
         sys.path.append(sys.path.pop(0))
     os.environ.setdefault("PYTHONSAFEPATH", "1")
+
+
+def _filter_warnings() -> None:
+    """Filter warnings as Python does by default, whatever the environment states: the program
+    prints its own warnings in any case, and no warning is an error.
+    """
+    os.environ.pop("PYTHONWARNINGS", None)
+    sys.warnoptions.clear()
+    warnings.resetwarnings()
+    for_developers = (
+        DeprecationWarning,
+        PendingDeprecationWarning,
+        ImportWarning,
+        ResourceWarning,
+    )
+    for category in for_developers:
+        warnings.simplefilter("ignore", category)
 
 
 if __name__ == "__main__":

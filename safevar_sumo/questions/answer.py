@@ -283,7 +283,10 @@ class Answer:
 
     def figure(self) -> Figure:
         """The answer as a figure."""
-        return (self.draw or _draw_intervals)(self)
+        from safevar_sumo.questions.figures import own_style
+
+        with own_style():
+            return (self.draw or _draw_intervals)(self)
 
     def values(self, key: str) -> list[Any]:
         """The numbers under a key: a number's name, with an index if it is a list (`interval.1`),

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+import os
 import re
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import WRITABLE, whole_file
+from safevar_sumo.plugins.process import temporary_entries
 from safevar_sumo.questions.sampling import Interval
 from safevar_sumo.records import JsonObject
 
@@ -34,6 +39,38 @@ GREY, SKY_BLUE, BLUE, VERMILION = "#bbbbbb", "#56b4e9", "#0072b2", "#d55e00"
 """Grey and colours of Okabe and Ito. Grey and the two blues differ in lightness, so that they
 differ in a print without colours too.
 """
+
+
+@contextmanager
+def own_style() -> Iterator[None]:
+    """Within the block, matplotlib draws with its own defaults, whatever a file matplotlibrc, the
+    environment or the user's code states. After the block, matplotlib's settings are as before.
+    """
+    _import_matplotlib()
+    import matplotlib
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        yield
+
+
+def _import_matplotlib() -> None:
+    """Import matplotlib, which raises an error if it cannot read the user's settings. It is then
+    imported with its own settings.
+    """
+    try:
+        import matplotlib
+    except (ValueError, OSError):
+        (folder,) = cast("Any", find_spec("matplotlib")).submodule_search_locations
+        defaults = str(Path(folder, "mpl-data", "matplotlibrc"))
+        # A part of matplotlib's modules may have been loaded before the error.
+        for name in list(sys.modules):
+            if name.partition(".")[0] == "matplotlib":
+                del sys.modules[name]
+        # Figures of this package need no window, and no other backend than this one.
+        variables = {"MATPLOTLIBRC": defaults, "MPLBACKEND": "agg"}
+        with temporary_entries(os.environ, variables):
+            import matplotlib  # noqa: F401
 
 
 def new_figure(
@@ -85,6 +122,7 @@ def new_panels(
     return figure, list(axes.flat[:number])
 
 
+@own_style()
 def save(figure: Figure, path: Path, option: str = "out") -> None:
     """Write a figure to a png, pdf or svg file; the same figure gives the same bytes.
 

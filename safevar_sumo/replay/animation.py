@@ -17,6 +17,7 @@ from markupsafe import Markup, escape
 from safevar_sumo.errors import InputError, printable
 from safevar_sumo.output import whole_file
 from safevar_sumo.questions.arguments import checked
+from safevar_sumo.questions.figures import own_style
 from safevar_sumo.records import FloatArray
 from safevar_sumo.replay.comparison import COLOURS, ORIGINAL, Comparison
 from safevar_sumo.scenarios import VUT
@@ -115,6 +116,7 @@ class DrawnBody(NamedTuple):
 
 
 @checked
+@own_style()
 def animate(comparison: Comparison, path: str | Path) -> None:
     """Write a comparison as an animation in the format of the file's ending; the same comparison
     gives the same bytes.
@@ -147,6 +149,7 @@ def animate(comparison: Comparison, path: str | Path) -> None:
         file.write_text(printable(text), encoding="utf-8", newline="\n")
 
 
+@own_style()
 def player_of(
     comparison: Comparison,
     number: int,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from safevar_sumo.questions.arguments import checked
+from safevar_sumo.questions.figures import own_style
 from safevar_sumo.records import STANDSTILL, SimulationRuns
 from safevar_sumo.replay.comparison import COLOURS, Comparison
 
@@ -30,6 +31,7 @@ LINE_LENGTH = 118
 
 
 @checked
+@own_style()
 def draw_comparison(comparison: Comparison) -> Figure:
     """Draw a comparison as a figure outside any window."""
     import matplotlib.style

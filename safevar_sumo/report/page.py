@@ -27,6 +27,7 @@ from safevar_sumo.questions.arguments import checked
 from safevar_sumo.questions.ask import Question
 from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case, load_cases
+from safevar_sumo.questions.figures import own_style
 from safevar_sumo.questions.options import (
     CRITERION,
     Cluster,
@@ -415,6 +416,7 @@ def _sections(anchor: str, answers: Iterable[Answer]) -> Iterator[JsonObject]:
         }
 
 
+@own_style()
 def _picture(figure: Figure) -> JsonObject:
     """A figure for the page: a text that describes it, and a link that contains Matplotlib's SVG.
     Equal figures give equal bytes.

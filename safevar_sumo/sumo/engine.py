@@ -7,6 +7,7 @@ through a socket.
 
 from __future__ import annotations
 
+import locale
 import os
 import re
 import sys
@@ -77,7 +78,7 @@ def open_in_process(options: Sequence[str]) -> Iterator[Api]:
     # libsumo prints a warning if pyarrow has another version: stdout is for results alone.
     with redirect_stdout(sys.stderr):
         import libsumo
-    with _open(libsumo, "SUMO"):
+    with _numbers_with_points(), _open(libsumo, "SUMO"):
         try:
             libsumo.start(["sumo", *options])
         except (libsumo.TraCIException, libsumo.FatalTraCIError) as error:
@@ -85,6 +86,19 @@ def open_in_process(options: Sequence[str]) -> Iterator[Api]:
                 f"SUMO does not start: {str(error).strip()}"
             ) from None
         yield libsumo
+
+
+@contextmanager
+def _numbers_with_points() -> Iterator[None]:
+    """Within the block, this process reads and writes numbers as in the C locale. With a locale
+    that user code has set, SUMO may expect a comma in place of the point.
+    """
+    of_user = locale.setlocale(locale.LC_NUMERIC)
+    locale.setlocale(locale.LC_NUMERIC, "C")
+    try:
+        yield
+    finally:
+        locale.setlocale(locale.LC_NUMERIC, of_user)
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from safevar_sumo.questions.figures import (
     escape_dollars,
     new_figure,
     new_panels,
+    own_style,
     save,
 )
 from safevar_sumo.questions.research_questions.changes import (
@@ -363,6 +364,7 @@ FIGURES_OF_ONE_CASE: Mapping[str, Callable[[Case], Figure]] = {
 }
 
 
+@own_style()
 def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     """Every figure of the cases by name; with several cases, names start with the case's name.
 
@@ -396,6 +398,7 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     return figures
 
 
+@own_style()
 def save_figures(cases: Sequence[Case], directory: Path) -> None:
     """Draw every figure into a png and a pdf file.
 
