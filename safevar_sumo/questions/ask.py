@@ -87,10 +87,15 @@ ROUGH = answer(
     "Rough answer (--quick): at most an eighth of the search was simulated, with one parameter set,"
     " and proves nothing."
 )
+ROUGH_WITHOUT_SETS = answer(
+    "Rough answer (--quick): at most an eighth of the search was simulated, and proves nothing."
+)
 ROUGH_OF_FEW = answer(
     "Rough answer (--simulations {most}): fewer simulations than usual were allowed."
 )
-"""The first sentence of a rough answer, with `--quick` and with `--simulations`."""
+"""The first sentence of a rough answer: with `--quick`, of a study with and without further
+parameter sets of its vehicle model, and with `--simulations`.
+"""
 CRITERION_OF_STUDY = note("Criterion: {criterion} ({source}).")
 STANDING = note(
     "Remark: {count} never moved, although the original vehicle moves in the same encounter. The"
@@ -308,6 +313,7 @@ class Question:
         from safevar_sumo.questions.evaluator import open_evaluator
 
         is_quick = bool(values.get(QUICK))
+        has_sets = any(study_in(subject).spread for subject in subjects)
         if is_quick:
             subjects = list(map(with_own_set, subjects))
         study = study_in(subjects[0])
@@ -340,7 +346,7 @@ class Question:
         numbers = {"driven": not reason, **result.numbers}
         beginning = [answer(reason)]
         if is_quick:
-            beginning.append(ROUGH)
+            beginning.append(ROUGH if has_sets else ROUGH_WITHOUT_SETS)
         if account.limit is not None:
             numbers |= {"rough": True, "simulations": account.spent}
             beginning[1:] = [ROUGH_OF_FEW(most=account.limit)]
