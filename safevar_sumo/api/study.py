@@ -188,10 +188,24 @@ def study(
                 cluster=cluster,
                 engine=engine,
             )
+            _refuse_undefined(results)
             return _found(results, system, unsafe, jobs, parts.begin(), loaded.words)
     except KeyboardInterrupt:
         warn(INTERRUPTED.format(directory))
         raise
+
+
+def _refuse_undefined(results: Results) -> None:
+    """Refuse an objective that no simulated vehicle has: the search then has no solutions."""
+    simulated = results.evaluations
+    for objective in results.case.scoring.objectives:
+        if len(simulated) and simulated[objective.name].isna().all():
+            raise InputError(
+                results.study.source,
+                f"search.objectives: {objective.name} is undefined in all"
+                f" {len(simulated):,} simulated vehicles",
+                "objectives that have a value in some run: `check` says more",
+            )
 
 
 def _found(

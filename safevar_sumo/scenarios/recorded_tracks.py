@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, one_of
+from safevar_sumo.errors import InputError, one_of, warn
 from safevar_sumo.output import read_file
 from safevar_sumo.records import FloatArray, Quantity
 from safevar_sumo.scenarios.ahead import VEHICLE_SPEED
@@ -27,6 +28,10 @@ ABOVE_ZERO = ["name", "length", "width"]
 """Columns whose values must not be empty or 0."""
 LONGEST_STEP = 2.0
 """Longest time between two rows of a body, as a multiple of the table's median step [-]."""
+WIDEST_PERSON = 1.2
+"""Largest width of a body that may be a person, and therefore wider than long [m]."""
+APART = 1.0
+"""Distance between two ways that are told from each other [m]."""
 SAME = 1e-6
 """Difference up to which two times count as equal [s]."""
 DIGITS = 9
@@ -69,13 +74,17 @@ class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True)
         )
 
     def check(self) -> None:
-        """Refuse a file in which nobody else moves after the start of `ego`."""
+        """Refuse a file in which nobody else moves after the start of `ego`. Warn of bodies that
+        are wider than long.
+        """
         if self.duration <= 0:
             raise InputError(
                 "",
                 f"{key_of(self.file)}: nobody else is there once {self.ego} is",
                 "rows of another name, and of a later time",
             )
+        for remark in self.remarks():
+            warn(remark)
 
     @property
     def duration(self) -> float:
@@ -101,6 +110,18 @@ class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True)
     def vut_width(self) -> float:
         """Width of `ego` [m]."""
         return float(self._start["width"])
+
+    def remarks(self) -> list[str]:
+        """A remark on bodies that are wider than long, except those that may be persons."""
+        remarks = []
+        for name, rows in self._bodies.items():
+            length, width = rows[["length", "width"]].max()
+            if width > max(length, WIDEST_PERSON):
+                remarks.append(
+                    f"{key_of(self.file)}: {name} is {length:g} m long and {width:g} m wide; length"
+                    " is along its heading"
+                )
+        return remarks
 
     def tracks(self, times: FloatArray) -> list[Track]:
         """The tracks of all bodies except `ego`. A body has no size before its first row and after
@@ -145,8 +166,9 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
 
     # All values are read as texts, so that errors can quote the file.
     try:
+        content = read_file(Path(file))
         table = pd.read_csv(
-            BytesIO(read_file(Path(file))),
+            BytesIO(content),
             dtype=str,
             keep_default_na=False,
             skipinitialspace=True,
@@ -155,13 +177,9 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
         raise InputError(
             "", f"{key_of(file)}: cannot be read: {error}", "a CSV file"
         ) from None
-    for name in COLUMNS:
-        if name not in table:
-            raise InputError(
-                "",
-                f"{key_of(file)}: there is no column {name}",
-                f"the columns {', '.join(COLUMNS)}",
-            )
+    # pandas gives the second column of a name another name.
+    first_line = content.lstrip().partition(b"\n")[0]
+    _check_header(file, first_line.decode("utf-8-sig", "replace"))
 
     # The length of a name replaces the name: an empty name then is an illegal number, like others.
     values = table[COLUMNS].assign(name=table["name"].str.len())
@@ -189,8 +207,59 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
         longest_step = LONGEST_STEP * np.median(np.concatenate(steps))
     for name, rows in bodies.items():
         _check_steps(f"{key_of(file)}: {name}", rows["time"].to_numpy(), longest_step)
+        _check_headings(f"{key_of(file)}: {name}", rows)
         rows["heading"] = np.unwrap(rows["heading"])
     return bodies
+
+
+def _check_header(file: str, line: str) -> None:
+    """Refuse the first line of a table if it lacks a column, has a column twice, or has another
+    separator than commas.
+    """
+    header = [name.strip().strip('"') for name in line.split(",")]
+    if len(header) == 1 and (separator := re.search("[;\\t|]", line)):
+        raise InputError(
+            "",
+            f"{key_of(file)}: its columns are separated by {separator[0]!r}",
+            "commas between columns, and points in numbers",
+        )
+    for name in COLUMNS:
+        if header.count(name) > 1:
+            raise InputError(
+                "", f"{key_of(file)}: the column {name!r} is there twice", "each once"
+            )
+        if name not in header:
+            raise InputError(
+                "",
+                f"{key_of(file)}: there is no column {name}",
+                f"the columns {', '.join(COLUMNS)}",
+            )
+
+
+def _check_headings(body: str, rows: pd.DataFrame) -> None:
+    """Refuse headings in degrees: a body then moves where they point, and not where they would
+    point in rad.
+    """
+    heading = rows["heading"].to_numpy()[:-1]
+    speed = rows["speed"].to_numpy()
+    step = np.diff(rows["time"]) * (speed[1:] + speed[:-1]) / 2
+    way = np.diff(rows["x"]) + 1j * np.diff(rows["y"])
+
+    def apart(headings: FloatArray) -> float:
+        """The distance between the ways by places and by headings, over all steps [m]."""
+        return float(np.abs(way - step * np.exp(1j * headings)).sum())
+
+    least = max(APART, float(np.abs(way).sum()) / 3)
+    for meaning, degrees in (
+        ("degrees", heading),
+        ("degrees clockwise from y", 90.0 - heading),
+    ):
+        if apart(heading) > max(least, 3 * apart(np.radians(degrees))):
+            raise InputError(
+                "",
+                f"{body} moves where its headings point in {meaning}",
+                "heading [rad], counter-clockwise from x",
+            )
 
 
 def _check_steps(body: str, times: FloatArray, longest: float) -> None:

@@ -120,23 +120,39 @@ def check_motion(track: Track, times: FloatArray, step: float) -> None:
             f"at most {MOST_SPEED:g} m/s between two samples",
         )
 
-    # Only the way along the road is compared, because a body may face along the road while it
-    # changes lane. A step counts if the body has a length at its beginning and its end.
-    is_there, x, velocity, _ = np.broadcast_arrays(
-        track.length > 0, track.x, speed * track.along, times
+    # Across the road, a third of the whole way may differ, because a body may face along the road
+    # while it changes lane.
+    along = _way_and_driven(track, track.x, speed * track.along, times)
+    across = _way_and_driven(track, track.y, speed * track.left, times)
+    longer_along = np.maximum(*np.abs(along))
+    longer_way = np.hypot(longer_along, np.maximum(*np.abs(across)))
+    for (way, driven), axis, longer in (
+        (along, "x", longer_along),
+        (across, "y", longer_way),
+    ):
+        refuse(
+            np.abs(way - driven) > np.maximum(APART, longer / 3),
+            way - driven,
+            f"is {{:.3g}} m in {axis} from where its speed takes it",
+            f"a place whose {axis} changes by v{axis}, the speed in {axis}, times the time",
+        )
+
+
+def _way_and_driven(
+    track: Track, place: FloatArray, velocity: FloatArray, times: FloatArray
+) -> FloatArray:
+    """The way of a body by its places, and the way by its velocity, since its start [m]. A step
+    counts if the body has a length at its beginning and its end.
+    """
+    is_there, place, velocity, _ = np.broadcast_arrays(
+        track.length > 0, place, velocity, times
     )
     stays = is_there & np.vstack([is_there[:1], is_there[:-1]])
-    way, driven = (
-        np.cumsum(np.diff(path, axis=0, prepend=path[:1]) * stays, axis=0)
-        for path in (x, travelled(velocity, times))
-    )
-    longer_way = np.maximum(np.abs(way), np.abs(driven))
-    refuse(
-        np.abs(way - driven) > np.maximum(APART, longer_way / 3),
-        way - driven,
-        "is {:.3g} m in x from where its speed takes it",
-        "an x that changes by vx, the speed along the road, times the time",
-    )
+    ways = []
+    for path in (place, travelled(velocity, times)):
+        steps = np.diff(path, axis=0, prepend=path[:1])
+        ways.append(np.cumsum(steps * stays, axis=0))
+    return np.stack(ways)
 
 
 def _refuse(

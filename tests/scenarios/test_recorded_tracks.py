@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, SimulationRuns
-from safevar_sumo.scenarios.recorded_tracks import COLUMNS, RecordedTracks
+from safevar_sumo.scenarios.recorded_tracks import COLUMNS, RecordedTracks, read_tracks
 from safevar_sumo.study import data_files
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, json_of, refused, run
@@ -205,3 +206,46 @@ def test_the_lines_of_the_page_make_a_table_of_a_log_of_esmini(
     assert van.x[:, 0] == pytest.approx(30.0 - 1.4 - 2.5)
     assert van.y[:, 0] == pytest.approx([2.0, 2.5])
     assert van.left[:, 0] == pytest.approx(1.0)
+
+
+HEADER = "time,name,x,y,heading,speed,length,width\n0,ego,0,0,0,11.1,4.6,1.8\n"
+
+
+def rows_of_walker(
+    heading: float, speed: float = 1.5, size: str = "0.5,0.6", way: float = 7.5
+) -> str:
+    return HEADER + "".join(
+        f"{time},walker,45,{y},{heading},{speed},{size}\n"
+        for time, y in ((0.0, -5.0), (5.0, way - 5.0))
+    )
+
+
+@pytest.mark.parametrize(
+    ("heading", "meaning"),
+    [(90.0, "degrees"), (0.0, "degrees clockwise from y"), (1.5708, "")],
+)
+def test_headings_in_degrees_are_named(
+    heading: float, meaning: str, in_tmp: Path
+) -> None:
+    Path("walk.csv").write_text(rows_of_walker(heading))
+    if not meaning:
+        assert {*read_tracks("walk.csv")} == {"ego", "walker"}
+        return
+    with pytest.raises(
+        InputError, match=f"walker moves where its headings point in {meaning}\n"
+    ):
+        read_tracks("walk.csv")
+
+
+@pytest.mark.parametrize(
+    ("size", "is_told"),
+    [("1.8,4.6", True), ("4.6,1.8", False), ("0.5,0.6", False), ("0.5,1.1", False)],
+)
+def test_a_body_that_is_wider_than_long_gets_a_remark_unless_it_may_be_a_person(
+    size: str, is_told: bool, in_tmp: Path
+) -> None:
+    Path("walk.csv").write_text(rows_of_walker(1.5708, size=size))
+    remarks = RecordedTracks(file="walk.csv").remarks()
+    assert ["walker is 1.8 m long and 4.6 m wide" in remark for remark in remarks] == (
+        [True] * is_told
+    )
