@@ -251,7 +251,7 @@ class Evaluator:
                 print_price_of_list(self.study, system, pool, simulations)
         share = 1.0 if self.left is None else self.left / expected
         planned = {name: share * number for name, number in settings.items()}
-        self.phases.plan(planned, len(system.points))
+        self.phases.plan(planned, len(system.points), account.left)
 
     @property
     def left(self) -> int | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,14 +46,19 @@ class Phases:
         """
         self._waiting = 0
         """Number of simulations that the present part still has to do."""
+        self._most = math.inf
+        """Largest number of simulations that the question may do."""
         self._begun_at = time.monotonic()
         """The time at which the present phase began [s]."""
 
-    def plan(self, settings: NamedValues, points: int = 1) -> None:
+    def plan(
+        self, settings: NamedValues, points: int = 1, most: float = math.inf
+    ) -> None:
         """Plan the phases: `settings` holds the expected number of settings of each phase. A
-        setting is simulated at `points` points.
+        setting is simulated at `points` points. At most `most` further simulations may follow.
         """
         self._points = points
+        self._most = self._done + most
         self._later = {
             name: points * number for name, number in settings.items() if number
         }
@@ -144,4 +150,5 @@ class Phases:
             # The more a stage exceeds its plan, the more is expected to follow.
             excess = simulations - self._expected
             remainder = max(remainder, excess, LEAST_SHARE * simulations)
-        return self._done, round(self._done + remainder + sum(self._later.values()))
+        expected = self._done + remainder + sum(self._later.values())
+        return self._done, round(max(min(expected, self._most), self._done))

@@ -158,3 +158,12 @@ def test_the_time_left_is_right_within_a_factor_of_two(
             is_near = abs(left - (end - second)) <= 5
             are_right.append(is_near or 0.5 <= left / (end - second) <= 2)
     assert sum(are_right) >= LEAST_RIGHT.get(command, 1.0) * len(are_right)
+
+
+def test_no_total_exceeds_the_simulations_that_are_allowed() -> None:
+    totals = list[int]()
+    phases = Phases(lambda name, done, total: totals.append(total))
+    phases.plan({"first": 10, "second": 2800}, most=3000)
+    phases.begin_part("first", 2400)
+    phases.add(2400)
+    assert max(totals) == 3000
