@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 import safevar_sumo as sv
+from safevar_sumo.campaign import batches
 from safevar_sumo.questions import models
 from safevar_sumo.study import Study
 from tests.in_process import InlinePool, json_of, refused, rows_of, run, write
@@ -143,8 +144,10 @@ def expected(
 
 @pytest.fixture(autouse=True)
 def _few_simulations(in_tmp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And no check of the class before each question."""
+    monkeypatch.setattr(batches, "check_code", lambda study, pool: [])
     monkeypatch.setattr("safevar_sumo.questions.cases.LEAST_SIMULATIONS", 20)
-    monkeypatch.setattr("safevar_sumo.questions.cases.USUAL_BUDGET", 200)
+    monkeypatch.setattr("safevar_sumo.questions.cases.USUAL_BUDGET", 100)
     write("cars.py", CARS)
 
 
@@ -239,16 +242,12 @@ def test_the_assumed_value_that_matters_most_is_that_of_the_formula() -> None:
 def test_a_needed_speed_decides_the_exit_code() -> None:
     """The exit code is 0 only if each car of the list reaches it."""
     write("walls.toml", STUDY + TESTS)
-    write("fleet.csv", "car,delay [s],decel\nb,1.5,8\na,0.5,5\nnew,0.5,8\n")
-    up_to = [
-        expected({"delay": 1.5}, speeds=EVERY_OTHER).up_to,
-        expected({"decel": 5.0}, speeds=EVERY_OTHER).up_to,
-    ]
-    least = min(up_to)
+    write("fleet.csv", "car,delay [s]\nnew,0.5\nb,1.5\n")
+    least = expected({"delay": 1.5}, speeds=EVERY_OTHER).up_to
     typed = (
         f"permit walls.toml --cars fleet.csv --others new --step 2 --margin {MARGIN}"
     )
-    for need, code, fast in ((least, 0, 3), (least + 1, 3, 2)):
+    for need, code, fast in ((least, 0, 2), (least + 1, 3, 1)):
         answer = json_of(typed, "--need", f"{need:g} m/s", expect=code)
         assert (answer["numbers"]["drive"], answer["numbers"]["need"]) == (fast, need)
     quick = json_of(typed, "--need", f"{least:g} m/s", "--quick", expect=3)
@@ -256,10 +255,6 @@ def test_a_needed_speed_decides_the_exit_code() -> None:
     assert (quick["numbers"]["drive"], quick["numbers"]["attacked"]) == (0, 0)
     reached = [row["up_to"] for row in rows_of(quick, "cars")]
     assert reached == [row["up_to"] for row in rows_of(answer, "cars")]
-    one = json_of(
-        f"permit walls.toml --set delay=1.5 --others new --step 2 --margin {MARGIN}"
-    )
-    assert f"from 8 up to {least:g} m/s" in one["verdict"]
     refused(f"{typed} --need '17 m/s'", "need", "16 m/s")
     refused(f"{typed} --need '10 km/h'", "need")
 
@@ -267,8 +262,8 @@ def test_a_needed_speed_decides_the_exit_code() -> None:
     printed = run(f"{typed} --format csv --out out.csv").stdout
     assert Path("out.csv").read_text() == printed
     listing = pd.read_csv("out.csv")
-    assert [*listing["car"]] == ["b", "a", "new"]
-    assert [*listing["up_to"][:2]] == up_to
+    assert [*listing["car"]] == ["new", "b"]
+    assert listing["up_to"][1] == least
     assert {*listing["rough"]} == {"no"}
     refused(f"{typed} --out fleet.csv", "fleet.csv is the list itself")
     refused(f"{typed} --quick --out rough.csv", "quick", "rough")
@@ -291,7 +286,7 @@ def test_between_two_speeds_of_the_grid_a_failure_counts() -> None:
 
 OF_SETS = """
 scenario.parameters.grip = 1.0
-scenario.over.speed = { lower = 8, upper = 30, original = 10 }
+scenario.over.speed = { lower = 8, upper = 22, original = 10 }
 """
 
 
@@ -309,9 +304,9 @@ def test_each_parameter_set_has_its_speed(monkeypatch: pytest.MonkeyPatch) -> No
 
     monkeypatch.setattr(models, "other_sets", other_sets)
     study = STUDY.replace("metrics =", OF_SETS + "metrics =")
-    speeds = np.arange(8.0, 31.0)
+    speeds = np.arange(8.0, 23.0, 2.0)
     cars = {"weak": {"decel": 6.0}, "late": {"delay": 1.25}}
-    answer = asked(study, cars=cars)
+    answer = asked(study, cars=cars, step=2.0)
     rows = answer.tables["cars"].set_index("car")
     sets = answer.tables["sets"].set_index(["car", "fit"])["up_to"]
     for name, values in cars.items():
@@ -328,9 +323,6 @@ def test_each_parameter_set_has_its_speed(monkeypatch: pytest.MonkeyPatch) -> No
         for grip in grips
     ]
     assert {*rows["new_car_up_to"]} == {min(new)}
-    alone = asked(study, cars=cars, fits=0)
-    assert alone.numbers["fits"] == 1
-    assert alone.tables["cars"].set_index("car")["up_to"]["weak"] == sets["weak", 0]
 
 
 LISTED = """
