@@ -289,7 +289,7 @@ def test_a_promise_that_is_kept_already_writes_no_file(
     assert not out.exists()
 
 
-@pytest.mark.parametrize("name", ["wear", "rain"])
+@pytest.mark.parametrize("name", [pytest.param("wear", marks=SLOW), "rain"])
 def test_cases_leave_what_vehicles_leave_unless_nobody_saves_them(name: str) -> None:
     """Full braking has no parameters of the driving system, of which `rain` fits one."""
     unsafe = Unsafe(keep=0.3)
