@@ -282,6 +282,14 @@ class Evaluator:
             self._pool.spare = spare(simulations, 0)
         self._pool.checked = 0
 
+    def bound(self, settings: float) -> None:
+        """Let the simulations that follow suffice for at most so many settings. The bar of progress
+        never shows more.
+        """
+        account = self.account
+        account.most = account.spent + int(settings * self._each)
+        self.phases.bound(int(settings * len(self.system.points)))
+
     def scaled(self, number: float) -> int:
         """A usual number of simulations or rounds, times the effort of the question."""
         return int(number * self.account.effort)

@@ -41,7 +41,9 @@ BATCH = 512
 """Number of vehicles in the batch that measures how long a vehicle of a list takes."""
 LEAST_SETTINGS = 3
 """Fewest settings with which a question that samples settings gives an answer."""
-QUICK_EFFORTS = 1 / 40, 1 / 8
+QUICK_SHARE = 1 / 8
+"""Largest number of simulations of a quick answer, as a share of the usual number."""
+QUICK_EFFORTS = 1 / 40, QUICK_SHARE
 """Least and largest effort of a quick answer. (The effort is the amount of search, as a share of
 the usual amount.) Usually a question proposes up to 40 boxes of joint limits: the least effort
 suffices for one box.
@@ -79,6 +81,8 @@ class Account:
         The least number of simulations for an answer.
     effort
         The amount of search, as a share of the usual amount.
+    most
+        The largest number of simulations of a quick answer; infinite for other answers.
     measure
         The metric that the question's criterion bounds; "" without such a metric.
     undefined
@@ -104,6 +108,7 @@ class Account:
     spent: int = 0
     minimum: int = 0
     effort: float = 1.0
+    most: float = float("inf")
     measure: str = ""
     undefined: int = 0
     judged: int = 0
@@ -123,8 +128,8 @@ class Account:
     def left(self) -> float:
         """The number of simulations that may still be done; infinite without a limit."""
         if self.limit is None:
-            return float("inf")
-        return self.limit - self.spent
+            return self.most - self.spent
+        return min(self.limit, self.most) - self.spent
 
     @property
     def undefined_in_words(self) -> str:

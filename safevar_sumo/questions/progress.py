@@ -63,6 +63,10 @@ class Phases:
             name: points * number for name, number in settings.items() if number
         }
 
+    def bound(self, simulations: int) -> None:
+        """Show no larger total than that of so many further simulations."""
+        self._most = self._done + simulations
+
     def begin_part(self, part: str, simulations: int) -> None:
         """Begin a part of `simulations` simulations, which may be a phase or belong to a phase."""
         if not self._is_stage:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import safevar_sumo as sv
 from tests.in_process import json_of, refused, run, write
 
 SHARES = """
@@ -152,3 +153,61 @@ def test_collisions_are_named_where_no_vehicle_meets_the_criterion(
     with_criterion = run(f"{name} {rest} --unsafe 'safety_degree < -40'", expect=None)
     assert told in " ".join(with_criterion.stdout.split())
     assert told not in " ".join(run(f"{name} {rest}", expect=None).stdout.split())
+
+
+LINE = """
+class Line:
+    UNITS = {"a": "mm", "b": "mm", "c": "mm"}
+    version = "1"
+
+    def simulate(self, setting):
+        degree = 4 - max(setting["a"] - 5, 0) - 0.5 * max(setting["b"] - 5, 0)
+        return {"outcome": "stopped" if degree > 0 else "collision", "safety_degree": degree}
+"""
+LINE_STUDY = """
+name = "line"
+title = "Three values"
+scenario.model = "line:Line"
+metrics.ttc_threshold = 1.5
+search = { algorithms = ["rs"], population = 20, evaluations = 40, runs = 1, seed = 1 }
+[vehicle.characteristics]
+a = { unit = "mm", original = 5, lower = 4.9, upper = 10 }
+b = { unit = "mm", original = 5, lower = 0, upper = 10 }
+c = { unit = "mm", original = 5, lower = 0, upper = 10 }
+"""
+
+
+@pytest.mark.parametrize("flags", ["--quick", "--quick --unsafe collision", ""])
+def test_limits_end_only_where_a_failure_lies_beyond_them(
+    flags: str, in_tmp: Path
+) -> None:
+    """Smaller values of `a` and `b` are no worse, and `c` does nothing: these ends have no limit.
+    A quick answer simulates at most an eighth of the usual 15,000 + 80,000.
+    """
+    write("line.py", LINE)
+    write("line.toml", LINE_STUDY)
+    answer = json_of(f"tolerance line.toml {flags}")
+    rows = {row["characteristic"]: row for row in answer["tables"]["limits"]["rows"]}
+    assert (rows["a"]["together_low"], rows["b"]["together_low"]) == (4.9, 0)
+    assert (rows["c"]["together_low"], rows["c"]["together_high"]) == (0, 10)
+    a = rows["a"]["together_high"]
+    b = rows["b"]["together_high"]
+    keep = 0 if "collision" in flags else 0.3
+    assert a - 5 + 0.5 * (b - 5) <= 4 - keep
+    assert a < 10
+    assert "C may have any value of its domain" in answer["verdict"] or b == 10
+
+
+def test_a_quick_answer_never_needs_more_than_its_bar_announced(in_tmp: Path) -> None:
+    write("line.py", LINE)
+    write("line.toml", LINE_STUDY)
+    totals = list[tuple[int, int]]()
+    sv.tolerance(
+        "line.toml",
+        quick=True,
+        jobs=1,
+        progress=lambda _, done, total: totals.append((done, total)),
+    )
+    announced = totals[0][1]
+    assert announced <= (3 * 5_000 + 80_000) / 8
+    assert max(max(pair) for pair in totals) == announced

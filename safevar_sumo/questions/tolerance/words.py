@@ -43,6 +43,11 @@ within the domain.
 """
 KEEP = answer("Keep {limits}.")
 JOINT = answer("The {number} joint limits in the table hold at the same time.")
+ANY_VALUE = (
+    answer("{names} may have any value of its domain (its range of values)."),
+    answer("{names} may have any value of their domains (their ranges of values)."),
+)
+"""The sentence about one characteristic, and the sentence about several."""
 UNLIMITED = answer(
     "No joint limit is needed: each characteristic may have every value of its domain (its range"
     " of values), all at the same time."
