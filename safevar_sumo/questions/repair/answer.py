@@ -160,8 +160,9 @@ def _tested(models: Models, survivors: Survivors, proof: JsonObject) -> Sentence
             fits=survivors.fits,
             number=number,
         )
-    if not models.exclusions:
-        yield single_set_in_words(models.own.evaluator.study, number)
+    evaluator = models.own.evaluator
+    if not models.exclusions and evaluator.account.effort >= 1:
+        yield single_set_in_words(evaluator.study, number)
     if survivors.broken:
         yield words.BROKEN(sets=fit_names(survivors.broken))
     if models.exclusions and number > 1:
