@@ -32,6 +32,7 @@ from safevar_sumo.questions.tables import (
     terminal_tables,
 )
 from safevar_sumo.questions.words import number_of
+from safevar_sumo.records import csv_text
 from safevar_sumo.terminal import print_text
 
 if TYPE_CHECKING:
@@ -186,7 +187,7 @@ def render(
         if table or frame is None:
             frame = answer.table(table)
         cells = frame.map(csv_cell).rename(columns=csv_cell)
-        return cells.to_csv(index=False, lineterminator="\n")
+        return csv_text(cells)
     if table is not None:
         answer = answer.only(table)
     if form == "json":

@@ -33,6 +33,7 @@ from safevar_sumo.records.evaluations import (
     ROUNDING as ROUNDING,
     Evaluations as Evaluations,
     ResultColumns as ResultColumns,
+    csv_text as csv_text,
     differences as differences,
 )
 from safevar_sumo.records.runs import (

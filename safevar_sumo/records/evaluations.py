@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,9 @@ from safevar_sumo.records.driving import (
 )
 from safevar_sumo.records.runs import Outcome
 from safevar_sumo.study import SAFETY_DEGREE
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 COLUMNS = ("settings", "outcome", "collision_speed", "f_diff", "f_num_diff")
 """The arrays that all evaluations have. Each array has a row for each setting."""
@@ -267,3 +270,11 @@ def differences(
         if not is_same.all():
             row = int(np.argmin(is_same))
             yield row, f"{name} is {values[row]} instead of {expected_values[row]}"
+
+
+def csv_text(frame: pd.DataFrame) -> str:
+    """The rows of a frame as CSV, with all digits of each number, whatever user code has set for
+    the printing of numbers.
+    """
+    with np.printoptions(legacy=False):
+        return frame.to_csv(index=False, lineterminator="\n")

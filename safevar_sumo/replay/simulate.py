@@ -23,7 +23,7 @@ from safevar_sumo.questions.subject import (
     study_in,
     study_or_case,
 )
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.records import FloatArray, JsonObject, csv_text
 from safevar_sumo.replay import animation
 from safevar_sumo.replay.comparison import (
     comparison_of,
@@ -181,7 +181,7 @@ def _write_trace(path: Path, system: System, simulation: Simulation) -> None:
     if simulation.pair.runs.lacking("speed").any():
         system.require("a trace", "simulate --trace")
     with whole_file(path, "trace") as file:
-        simulation.trace.to_csv(file, index=False, lineterminator="\n")
+        file.write_text(csv_text(simulation.trace), encoding="utf-8", newline="\n")
 
 
 def _where_met(system: System, setting: FloatArray) -> System:

@@ -36,7 +36,7 @@ from safevar_sumo.questions.options import SIMULATIONS, flag_of
 from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import number_of
-from safevar_sumo.records import JsonObject, Outcome
+from safevar_sumo.records import JsonObject, Outcome, csv_text
 from safevar_sumo.report.budget import REPLAYS
 from safevar_sumo.report.pack import (
     DESCRIPTION,
@@ -445,7 +445,7 @@ def json_bytes(value: Any) -> bytes:
 
 
 def csv_of(frame: pd.DataFrame) -> bytes:
-    return frame.to_csv(index=False, lineterminator="\n").encode()
+    return csv_text(frame).encode()
 
 
 def count_outcomes(case: Case) -> dict[str, int]:

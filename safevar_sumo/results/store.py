@@ -18,7 +18,7 @@ import numpy as np
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, PUBLISHED_SCORING, Scoring
 from safevar_sumo.output import read_file
-from safevar_sumo.records import Evaluations, JsonObject, finite_or_none
+from safevar_sumo.records import Evaluations, JsonObject, csv_text, finite_or_none
 from safevar_sumo.results.identity import (
     FORMAT,
     IDENTITY,
@@ -129,8 +129,7 @@ class ResultsDirectory:
         by its algorithm and number.
         """
         frame = solutions_frame(self._study.domains, solutions.items())
-        text = frame.to_csv(index=False, lineterminator="\n")
-        write_whole(self.path / SOLUTIONS, text)
+        write_whole(self.path / SOLUTIONS, csv_text(frame))
 
     def extent_remarks(self, names: Collection[str]) -> list[str]:
         """Remarks on earlier results in the directory: their runs had another number of
@@ -331,7 +330,7 @@ def write_imported(
         "versions": {"safevar_sumo": version("safevar_sumo")},
         "original": dict(original),
     }
-    write_whole(path / SOLUTIONS, frame.to_csv(index=False, lineterminator="\n"))
+    write_whole(path / SOLUTIONS, csv_text(frame))
     write_manifest(path, manifest)
 
 

@@ -9,10 +9,13 @@ import sys
 from pathlib import Path
 
 import matplotlib
+import numpy as np
+import pandas as pd
 import pytest
 
 from safevar_sumo import draw_comparison, simulate
 from safevar_sumo.questions.figures import new_figure, own_style, save
+from safevar_sumo.records import csv_text
 from safevar_sumo.replay.comparison import comparison_of
 from safevar_sumo.sumo.engine import _numbers_with_points
 
@@ -60,3 +63,13 @@ def test_sumo_reads_numbers_with_points_and_the_locale_stays_the_users() -> None
         assert simulate("smoke").outcome == "stopped"
     finally:
         locale.setlocale(locale.LC_NUMERIC, before)
+
+
+def test_numbers_have_all_their_digits_in_csv_however_user_code_prints_numbers() -> (
+    None
+):
+    frame = pd.DataFrame({"a": [0.1 + 0.2, 1 / 3], "b": ["x", "y"]})
+    expected = "a,b\n0.30000000000000004,x\n0.3333333333333333,y\n"
+    assert csv_text(frame) == expected
+    with np.printoptions(legacy="1.13", precision=1):
+        assert csv_text(frame) == expected
