@@ -207,6 +207,10 @@ class Answer:
     draw: Callable[[Answer], Figure] | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.verdict, str):
+            raise InputError("verdict", repr(self.verdict), "a text")
+        if not isinstance(self.numbers, Mapping):
+            raise InputError("numbers", repr(self.numbers), "a mapping of names")
         if not isinstance(self.tables, Frames):
             object.__setattr__(self, "tables", Frames(self.tables))
 

@@ -212,6 +212,7 @@ class Question:
         if UP_TO in options:
             cut = None
             values[UP_TO] = up_to
+        self._check_names(further_sources, values)
         if source is None:
             raise InputError(f"{self.name}()", "source = None", SUBJECTS)
         how: JsonObject = {"jobs": jobs, "simulations": simulations, "cluster": cluster}
@@ -223,7 +224,6 @@ class Question:
         check_kind("pool", pool, POOL)
         check_kind("progress", progress, PROGRESS)
         how["pool"] = pool
-        self._check_names(further_sources, values)
         values = {name: options[name].check(value) for name, value in values.items()}
 
         def subject_of(source: StudyLike | Results) -> Subject:

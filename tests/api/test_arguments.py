@@ -65,7 +65,13 @@ def test_a_frame_in_place_of_an_answer_or_of_its_table_is_refused() -> None:
         text = {"question": "mine", "study": evaluator.study, "verdict": "Done."}
         return sv.Answer(**text, numbers={}, tables={"masses": frame})
 
+    @sv.question
+    def of_number(subject: Any, evaluator: Any) -> sv.Answer:
+        text: Any = {"question": "mine", "study": evaluator.study, "verdict": 3}
+        return sv.Answer(**text, numbers={}, tables={})
+
     for function, told in (
+        (of_number, "(?s)verdict: 3.*expected: a text"),
         (plain, "returns DataFrame\nexpected: an Answer"),
         (of_table, "(?s)'masses' is a DataFrame.*expected: what tabulate"),
     ):
