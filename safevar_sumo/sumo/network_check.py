@@ -74,6 +74,11 @@ SETTING_ATTRIBUTES = (
 """Attributes of the type of the vehicle under test that the simulation replaces by values of a
 setting.
 """
+TYPE_KEYS = re.compile(
+    rf"(carFollowModel|laneChangeModel|junctionModel)\..*|{DRIVER_ATTRIBUTES.pattern}"
+    rf"|{'|'.join(SETTING_ATTRIBUTES)}|vehicleMass|minGap|length|width|height|vClass|guiShape"
+)
+"""Keys of a `param` that mean an attribute of a type."""
 ACTING_ATTRIBUTES = (
     *(
         "carFollowModel",
@@ -271,6 +276,7 @@ def _check_files(network: NetworkFiles) -> None:
             file, f"{problem}, has {'a stop' if has_stop else 'no stop'}", LEGAL_VUT
         )
     _check_lanes(file, routes, parse_xml(built_network(network)))
+    _refuse_params(file, traffic)
     _refuse_random_types(file, traffic)
     _warnings_file(network)
 
@@ -302,6 +308,22 @@ def _check_lanes(
         )
         if climb > MAX_SLOPE * float(lane.get("length", 0)) or friction != 1:
             raise InputError(file, f"vehicle {VUT!r} {problem}", LEGAL_ROAD)
+
+
+def _refuse_params(file: Path, traffic: ElementTree.Element) -> None:
+    """Refuse a `param` that means an attribute of a type. SUMO ignores most of these params and
+    prefers others to the attribute, and the checks read attributes alone.
+    """
+    for owner in traffic.iter():
+        for param in owner.findall("param"):
+            key = param.get("key", "")
+            if TYPE_KEYS.fullmatch(key):
+                name = key.rpartition(".")[2]
+                raise InputError(
+                    file,
+                    f"{owner.tag} {owner.get('id')!r}: param {key} = {param.get('value')!r}",
+                    f"the attribute {name} of a vType, in place of this param",
+                )
 
 
 def _refuse_random_types(file: Path, traffic: ElementTree.Element) -> None:
