@@ -119,45 +119,24 @@ def checked(function: PublicFunction) -> PublicFunction:
     """Decorator of a public function: an InputError names an argument that the function does not
     have, that is missing, or whose value is of another kind than the annotated type.
     """
-    parameters = inspect.signature(function).parameters
+    signature = inspect.signature(function)
+    parameters = signature.parameters
     takes_any_name = any(
         parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()
     )
-    positional = [
-        parameter.name
-        for parameter in parameters.values()
-        if parameter.kind is parameter.POSITIONAL_OR_KEYWORD
-    ]
-    takes_any_number = any(
-        parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters.values()
-    )
-    title = f"{function.__name__}()"
 
     @wraps(function)
     def call(*values: Any, **named: Any) -> Any:
         for name in named:
             if name not in parameters and not takes_any_name:
                 raise unknown_argument(function.__name__, name, parameters)
-        if len(values) > len(positional) and not takes_any_number:
-            takes = ", ".join(positional) or "no value"
-            raise InputError(
-                title,
-                f"{len(values)} values have no name",
-                f"at most {len(positional)} values without a name: {takes}",
-            )
-        given = {**dict(zip(positional, values, strict=False)), **named}
-        for name, parameter in parameters.items():
-            if name in given:
-                check_kind(name, given[name], str(parameter.annotation))
-            elif parameter.default is parameter.empty and parameter.kind not in (
-                parameter.VAR_POSITIONAL,
-                parameter.VAR_KEYWORD,
-            ):
-                raise InputError(
-                    title,
-                    f"the argument {name!r} is missing",
-                    f"{function.__name__}({', '.join(parameters)})",
-                )
+        try:
+            given = signature.bind(*values, **named).arguments
+        except TypeError as error:
+            title = f"{function.__name__}()"
+            raise InputError(title, str(error), ", ".join(parameters)) from None
+        for name, value in given.items():
+            check_kind(name, value, str(parameters[name].annotation))
         return function(*values, **named)
 
     return cast("PublicFunction", call)
