@@ -30,11 +30,10 @@ from safevar_sumo.results import identity_digest
 from safevar_sumo.study import Study, user_code_names, without_skipping
 from safevar_sumo.sumo.kept import KEPT
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import region_of
 
 if TYPE_CHECKING:
-    from safevar_sumo.check.findings import Finding
+    from safevar_sumo.check.trials import Finding
 
 
 SAME_ELSEWHERE = "the same, to the bit; or repeats = N in [scenario]"
@@ -116,37 +115,30 @@ def random_settings(study: Study) -> FloatArray:
 
 
 def find_in_new_process(study: Study) -> list[Finding]:
-    """Find a result of a simulator of the user's own that is wrong, or that differs, in a new
-    process, for the original vehicle or both ends of the domains. Nothing is compared if the study
-    states `repeats`.
+    """Find a result of a simulator of the user's own that differs in a new process, for the
+    original vehicle or both ends of the domains. Nothing is compared if the study states `repeats`.
     """
     study = without_skipping(study)
-    system = assemble(study)
+    system = system_of(study)
     if system.mover.is_exact or system.repeats > 1:
         return []
-    # This import is slow, and rarely needed.
-    from safevar_sumo.check.findings import Finding, pieces_of_code
-
     members = system.characteristics
     settings = system.region.repaired(
         np.stack([members.original, members.lower, members.upper])
     )
     # The new process simulates first, because a simulator may end the present process.
-    try:
-        with open_pool(1) as pool:
-            (repeated,) = carry_out(
-                evaluate_settings, [(Task(study=study), settings)], pool
-            )
-    except UserCodeError as error:
-        expected = error.legal or "no exception"
-        finding = Finding("contract", error.problem, error.place, "", expected)
-        return [finding.in_code(study, pieces_of_code(study))]
+    with open_pool(1) as pool:
+        (repeated,) = carry_out(
+            evaluate_settings, [(Task(study=study), settings)], pool
+        )
     evaluations = drive_and_score(replace(system, points=system.points[::-1]), settings)
     for row, difference in differences(evaluations.results, repeated.results):
+        # This import is slow, and rarely needed.
+        from safevar_sumo.check.trials import Finding
+
         words = f"{difference} in a new process"
         command = reproduction_command(study, settings[row])
-        finding = Finding("repetition", words, "", command, SAME_ELSEWHERE)
-        return [finding.in_code(study, pieces_of_code(study))]
+        return [Finding("repetition", words, study.source, command, SAME_ELSEWHERE)]
     return []
 
 

@@ -6,26 +6,78 @@ contract. No module below `sumo` or `search` imports this package.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 
 from safevar_sumo.ads import ADS
-from safevar_sumo.check.findings import Code, Finding, Findings, pieces_of_code
-from safevar_sumo.check.oversights import find_oversights
-from safevar_sumo.check.trials import try_algorithm, try_simulations
+from safevar_sumo.check.trials import (
+    Finding,
+    Findings,
+    inspect_sample,
+    try_algorithm,
+    try_simulations,
+)
 from safevar_sumo.errors import UserCodeError, about
+from safevar_sumo.plugins import Lookup
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.shipped import PROGRAM_COMMAND
-from safevar_sumo.study import WHOLE, Study, keys_with, without_skipping
+from safevar_sumo.study import WHOLE, Study, keys_with, user_code, without_skipping
 from safevar_sumo.study.encounters import Parameters
 from safevar_sumo.sumo.empty_road import Reason, find_problems, sentence_on
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.sumo.traci_controller import substitute_traci
 
 STUDY_OF_AN_ADS = "smoke"
 """The study in which `check` lets a driving system drive that the user gives by its name."""
+CHECKS: Mapping[str, str] = {
+    "contract": (
+        "return what the base class documents, leave arguments as they are, state what a metric"
+        " reads in its needs, and guard divisions and roots where the domain ends"
+    ),
+    "repetition": (
+        "draw nothing at random (an algorithm: from `rng` alone), read no clock, and keep nothing"
+        " in a class or a module"
+    ),
+    "order": (
+        "compute element i of a result from element i of the arguments alone, whatever its place"
+    ),
+    "alone": (
+        "compute element i of a result from element i of the arguments alone: no mean, sum or"
+        " maximum over the vehicles; keep what a vehicle remembers in its memory or its own"
+        " instance, not in a class or a module"
+    ),
+    "reaction": (
+        "command enough throttle while nobody is in sight, where `gap` is infinite; check that the"
+        " code reads the quantity that it should react to, with the right sign and unit"
+    ),
+    "meeting": (
+        "choose values of the scenario's parameters at which the vehicle meets the others before"
+        " they have left, and check the signs of places and speeds: the others come into its way"
+    ),
+    "undefined": (
+        "let runs have what the metric reads, its `needs`, or return a number where the metric is"
+        " defined; else leave out its name"
+    ),
+    "unread": (
+        "read each value of the setting by its name, spelled as in `UNITS`, or leave out the"
+        " characteristic"
+    ),
+    "standing": (
+        "find out with `simulate` why a changed vehicle never moves: read each value of the setting"
+        " in its unit, compare numbers by `<` instead of `==`, and start with any of them"
+    ),
+    "original": (
+        "find out with `simulate` why the original vehicle fails: check signs and units of what the"
+        " code reads and commands; changes of a vehicle that is unsafe as it is explain nothing"
+    ),
+}
+"""The checks by name, with advice after a failure. Failures of the first four checks also prevent a
+study from starting.
+"""
 
 
 def study_to_check(name: str) -> Study:
@@ -53,31 +105,27 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
     findings = list(find_defects(study, **how))
     if findings:
         return findings
-    try:
-        with about(study.source), np.errstate(all="ignore"):
-            for code, oversight in find_oversights(study):
-                findings += _first_defect(study, code, oversight)
-    except UserCodeError as error:
-        findings.append(_finding_of(error, study, pieces_of_code(study)))
-    return findings or _find_in_original(study)
-
-
-def _find_in_original(study: Study) -> list[Finding]:
-    """Find that the original vehicle does not get to its encounter, or is unsafe there."""
     system = assemble(study)
+    shown = list(_first_defect(study, dict(user_code(study)), inspect_sample(study)))
+    if shown:
+        return shown
     problems = find_problems(system)
-    driver = [Code("ads.model", study.ads.model)]
-    if not study.ads.model:
-        driver = [Code("scenario.model", study.scenario.model)]
+    where = _definition(study, "ads.model", study.ads.model)
     if problems:
         words = sentence_on(problems, len(system.points))
-        expected = "a drive to the encounter, without braking for nobody"
-        check = "reaction"
         if next(iter(problems.values())).reason is Reason.LATE:
-            driver = [Code("scenario.model", study.scenario.model)]
-            expected = "an encounter while the others are there"
-            check = "meeting"
-        return [Finding(check, words, "", "", expected).in_code(study, driver)]
+            where = _definition(study, "scenario.model", study.scenario.model)
+            return [
+                Finding(
+                    "meeting",
+                    words,
+                    where,
+                    "",
+                    "an encounter while the others are there",
+                )
+            ]
+        expected = "a drive to the encounter, without braking for nobody"
+        return [Finding("reaction", words, where, "", expected)]
 
     unsafe = system.with_contact(system.criterion)
     original = drive_and_score(system, system.characteristics.original_settings)
@@ -85,8 +133,9 @@ def _find_in_original(study: Study) -> list[Finding]:
         return []
     words = f"the original vehicle itself {unsafe.breach_in_words(original)}"
     point = system.points[original.points[0]].name
-    finding = Finding("original", words, "", point, "an original vehicle that is safe")
-    return [finding.in_code(study, driver)]
+    return [
+        Finding("original", words, where, point, "an original vehicle that is safe")
+    ]
 
 
 def refuse_defects(study: Study, limit: int | None = None) -> None:
@@ -104,7 +153,7 @@ def refuse_defects(study: Study, limit: int | None = None) -> None:
         raise UserCodeError(
             study.source,
             f"{finding}; to reproduce it: {command}",
-            f"{finding.expected}; {finding.advice}",
+            f"{finding.expected}; {CHECKS[finding.check]}",
             finding.where,
         )
 
@@ -113,32 +162,43 @@ def find_defects(study: Study, **how: Any) -> Findings:
     """Find the first defect of all simulated user code, and the first defect of each user's
     algorithm. For `how` see `try_simulations`.
     """
-    code = pieces_of_code(study)
-    simulated = [piece for piece in code if piece.key != "search.algorithms"]
+    names = user_code(study)
+    simulated = {key: name for key, name in names if key != "search.algorithms"}
     yield from _first_defect(study, simulated, try_simulations(study, **how))
-    for piece in code:
-        if piece.key == "search.algorithms" and how.get("limit") is None:
-            yield from _first_defect(study, [piece], try_algorithm(study, piece.name))
+    for key, name in names:
+        if key == "search.algorithms" and how.get("limit") is None:
+            yield from _first_defect(study, {key: name}, try_algorithm(study, name))
 
 
-def _first_defect(study: Study, code: Sequence[Code], findings: Findings) -> Findings:
-    """Yield the first of the findings with its place in the user code, or the error that the user
-    code raises.
+def _first_defect(
+    study: Study, names: Mapping[str, str], findings: Findings
+) -> Findings:
+    """Yield the first of the findings with the place of the user code, or the error that the user
+    code raises. `names` has the names of the user code by their keys.
     """
+    places = [_definition(study, key, name) for key, name in names.items()]
+    where = " or ".join(places) or study.source
     try:
         with about(study.source), np.errstate(all="ignore"):
             finding = next(findings, None)
         if finding is not None:
-            yield finding.in_code(study, code)
+            yield finding._replace(where=where)
     except UserCodeError as error:
-        yield _finding_of(error, study, code)
+        yield Finding(
+            "contract",
+            error.problem,
+            error.place or where,
+            "",
+            error.legal or "no exception",
+        )
 
 
-def _finding_of(error: UserCodeError, study: Study, code: Sequence[Code]) -> Finding:
-    """The finding that tells of an error of user code. If the error names one piece of the code,
-    the finding is in this piece.
-    """
-    named = [piece for piece in code if piece.name in error.problem]
-    expected = error.legal or "no exception"
-    finding = Finding("contract", error.problem, error.place, "", expected)
-    return finding.in_code(study, named or code)
+def _definition(study: Study, key: str, name: str) -> str:
+    """The file and line at which user code is defined. Without a known line: its key and name."""
+    if ":" not in name:
+        return f"{key} = {name!r}"
+    with substitute_traci() if study.ads.kind == "traci" else nullcontext():
+        code = Lookup.of(study).find({}, name, key).code
+    # A name with a colon always is a name of user code.
+    assert code is not None
+    return code.definition() or code.name

@@ -39,8 +39,7 @@ from safevar_sumo.terminal import open_progress
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
 
 if TYPE_CHECKING:
-    from safevar_sumo.check.findings import Finding
-    from safevar_sumo.check.trials import Extent
+    from safevar_sumo.check.trials import Extent, Finding
 
 NO_STUDY: Any = None
 LISTED = shipped_columns("list")
@@ -278,7 +277,7 @@ def check(
     # These modules load SUMO, which takes long: import them only if something is checked.
     from safevar_sumo.campaign import check_algorithms
     from safevar_sumo.campaign.user_checks import find_in_new_process
-    from safevar_sumo.check import check_study, study_to_check
+    from safevar_sumo.check import CHECKS, check_study, study_to_check
     from safevar_sumo.sumo.system import assemble
 
     study = study_to_check(name)
@@ -294,12 +293,9 @@ def check(
             )
 
     # The check in a new process comes first, because the user's simulator may end its process.
-    findings = in_new_process = find_in_new_process(study)
-    if not any(item.check == "contract" for item in in_new_process):
-        with open_progress(True) as progress:
-            findings = check_study(
-                study, vehicles=vehicles, progress=progress, tell=tell
-            )
+    in_new_process = find_in_new_process(study)
+    with open_progress(True) as progress:
+        findings = check_study(study, vehicles=vehicles, progress=progress, tell=tell)
     if not findings:
         # Raise the errors with which the command `study` would refuse the study.
         check_algorithms(study, assemble(study))
@@ -309,13 +305,14 @@ def check(
     rows = []
     blocks = []
     for item in findings:
-        rows.append(item._asdict())
+        advice = CHECKS[item.check]
+        rows.append({**item._asdict(), "advice": advice})
         text = f"{item.finding}, with {item.input}" if item.input else item.finding
         blocks += [
             ("where", item.where),
             ("found", text),
             ("expected", item.expected),
-            ("what to do", item.advice),
+            ("what to do", advice),
         ]
     return Answer(
         question="check",

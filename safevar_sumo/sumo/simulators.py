@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from uuid import uuid4
 from weakref import WeakKeyDictionary
 
@@ -138,43 +138,24 @@ class _Setting(dict[str, float]):
         return super().items()
 
 
-class WatchedRun(NamedTuple):
-    """A run of a user's simulator, with what the simulator did to its setting.
-
-    Attributes
-    ----------
-    values, values_after
-        The values of the setting before and after the run, by name.
-    unread
-        The characteristics whose values the simulator did not read.
-    result
-        What the simulator returned.
+def unread_characteristics(system: System, settings: FloatArray) -> set[str]:
+    """The characteristics of the vehicle that a user's simulator reads in none of N settings, shape
+    (N, n). The result is empty for systems without such a simulator.
     """
-
-    values: NamedValues
-    values_after: NamedValues
-    unread: set[str]
-    result: StatedRun
-
-
-def watched_runs(system: System, settings: FloatArray) -> Iterator[WatchedRun]:
-    """Simulate N settings, shape (N, n), in a user's simulator at the system's first point."""
+    if system.mover.is_exact:
+        return set()
     names = system.characteristics.vehicle.names
+    unread = {*names}
     for vehicle, values in zip(*system.split(settings), strict=True):
         searched = dict(
             zip(system.characteristics.scenario.names, values.tolist(), strict=True)
         )
         scenario: Any = encounter(system.points[0], searched).scenario
-        named = dict(zip(names, vehicle.tolist(), strict=True))
-        setting = _Setting(named)
+        setting = _Setting(dict(zip(names, vehicle.tolist(), strict=True)))
         with system.user_code():
-            result = KEPT.at(scenario).simulate(setting)
-        unread = setting.unread
-        # A copy of the setting would count as a reading of all its values.
-        after = {
-            name: dict.__getitem__(setting, name) for name in dict.__iter__(setting)
-        }
-        yield WatchedRun(named, after, unread, result)
+            KEPT.at(scenario).simulate(setting)
+        unread &= setting.unread
+    return unread
 
 
 def simulations_of_setting(system: System) -> int:
@@ -252,13 +233,11 @@ def _check_step(simulator: Simulator, time: FloatArray, point: str) -> None:
     step = round(float(time[1] - time[0]), 6)
     earlier_step = _steps.setdefault(kind, {}).setdefault(point, step)
     if step != earlier_step:
-        code = UserCode(f"scenario.model = {kind.__name__}", kind)
-        shorter, longer = sorted((step, earlier_step))
-        raise code.wrong(
-            "simulate",
-            f"time steps of {shorter:g} and {longer:g} s",
-            "one time step in all runs",
+        steps = f"{min(step, earlier_step):g} and {max(step, earlier_step):g} s"
+        code = UserCode(
+            f"scenario.model = {kind.__name__}: runs have time steps of {steps}", kind
         )
+        raise code.wrong("simulate", f"{step:g} s", "one time step in all runs")
 
 
 def _check_names(scenario: Simulator, result: StatedRun, system: System) -> None:
