@@ -17,7 +17,6 @@ from typing import Any, NoReturn, cast
 
 import click
 
-from safevar_sumo.cli.log import WARNINGS
 from safevar_sumo.errors import (
     INTERRUPT_EXIT_CODE,
     INTERRUPTS,
@@ -240,13 +239,12 @@ def run_command_line() -> None:
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """Print a warning as one line, and log it. A hint is printed as a note."""
+    """Print a warning as one line. A hint is printed as a note."""
     text = printable(str(message))
     if isinstance(message, Hint):
         click.echo(f"note: {text}", err=True)
         return
     click.echo(f"warning: {text}", err=True)
-    WARNINGS.warning(text)
 
 
 def _error_in_two_lines(error: click.ClickException) -> str:
