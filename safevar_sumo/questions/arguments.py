@@ -54,17 +54,8 @@ def _is_mapping_or_none(value: object) -> bool:
     return value is None or isinstance(value, Mapping) or hasattr(value, "keys")
 
 
-def _object_of(name: str) -> Callable[[object], bool]:
-    """The function that says whether a value is an object of the class with this name."""
-
-    def accepts(value: object) -> bool:
-        return name in [kind.__name__ for kind in type(value).__mro__]
-
-    return accepts
-
-
 def _is_pool_or_none(value: object) -> bool:
-    return value is None or _object_of("Pool")(value)
+    return value is None or hasattr(value, "workers")
 
 
 FLAG = "bool"
@@ -89,14 +80,6 @@ KINDS = {
     "str | Path | None": Kind(_is_path_or_none, "a text or a path, or None"),
     "Mapping[str, float] | None": Kind(
         _is_mapping_or_none, "values by name, such as {'mass': 2500}, or None"
-    ),
-    "Comparison": Kind(
-        _object_of("Comparison"),
-        "a Comparison, which sv.comparison_of(simulation) returns",
-    ),
-    "Simulation": Kind(
-        _object_of("Simulation"),
-        "a Simulation, which sv.simulate(study, changes) returns",
     ),
 }
 """The legal values of arguments, by the annotated type. A function itself checks arguments with
