@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -72,11 +72,8 @@ def run(
     keys = all_runs(loaded_study)
     if only is not None:
         legal = "(algorithm of the study, run from 0 to less than `search.runs`)"
-        if isinstance(only, str) or not isinstance(only, Iterable):
-            raise InputError("only", repr(only), f"a list of {legal}")
         for key in only:
-            is_pair = isinstance(key, Sequence) and len(key) == 2
-            if not is_pair or isinstance(key[1], bool) or tuple(key) not in keys:
+            if tuple(key) not in keys:
                 raise InputError("only", repr(key), legal)
         keys = [RunKey(*key) for key in only]
 

@@ -7,12 +7,11 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from numbers import Real
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from safevar_sumo.errors import InputError, check_name
+from safevar_sumo.errors import InputError
 from safevar_sumo.metrics.base import F_SAFE
 from safevar_sumo.metrics.bound import COMPARISONS, MetricBound
 from safevar_sumo.metrics.legal import IMPACT_EXCESS, IMPACT_SPEED
@@ -44,8 +43,6 @@ CRITERIA = (
     ' number, such as "drac > 6"'
 )
 COLLISION = str(Outcome.COLLISION)
-LIMITS_OF_CRITERION = ("below", "keep", "contact", "degree")
-"""The arguments of a criterion that are numbers."""
 DEGREE_SHARE = 0.5
 """The default limit if nothing collides, as a share of the original's safety degree."""
 LIMIT_DIGITS = 6
@@ -103,14 +100,6 @@ class Unsafe:
 
     def __new__(cls, below: float | None = None, **fields: Any) -> Self:
         """Create an object of the class for this kind of criterion."""
-        for name in fields:
-            check_name(
-                "Unsafe()", f"there is no argument {name!r}", name, cls.__match_args__
-            )
-        for name in LIMITS_OF_CRITERION:
-            value = below if name == "below" else fields.get(name)
-            if isinstance(value, bool) or not isinstance(value, Real | None):
-                raise InputError(f"Unsafe({name}=...)", repr(value), "a number")
         kind: type = cls
         if bound := fields.get("bound"):
             kind = METRIC_KINDS.get(bound.measure, UnsafeMetric)

@@ -156,7 +156,9 @@ class Modules:
         sys.modules.update(self._hidden)
         path = ImportPath.here()
         known = {*self._outer_path.folders, *path.added}
-        start = path.folders.index(path.added[0]) if path.added[0] in sys.path else 0
+        start = 0
+        if path.added and path.added[0] in sys.path:
+            start = path.folders.index(path.added[0])
         further = [entry for entry in dict.fromkeys(sys.path) if entry not in known]
         self._path_before = [entry for entry in further if entry in sys.path[:start]]
         self._path_after = [entry for entry in further if entry not in sys.path[:start]]

@@ -5,7 +5,7 @@ annotates says which values an argument may have.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import wraps
 from os import PathLike
 from typing import Any, NamedTuple, TypeVar, cast
@@ -49,11 +49,6 @@ def _is_path_or_none(value: object) -> bool:
     return value is None or _is_path(value)
 
 
-def _is_mapping_or_none(value: object) -> bool:
-    # A Series of pandas has names, too.
-    return value is None or isinstance(value, Mapping) or hasattr(value, "keys")
-
-
 def _is_pool_or_none(value: object) -> bool:
     return value is None or hasattr(value, "workers")
 
@@ -78,9 +73,6 @@ KINDS = {
     "Path | None": Kind(_is_path_or_none, "a text or a path, or None"),
     "str | None": Kind(_is_path_or_none, "a text, or None"),
     "str | Path | None": Kind(_is_path_or_none, "a text or a path, or None"),
-    "Mapping[str, float] | None": Kind(
-        _is_mapping_or_none, "values by name, such as {'mass': 2500}, or None"
-    ),
 }
 """The legal values of arguments, by the annotated type. A function itself checks arguments with
 other types.

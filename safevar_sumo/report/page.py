@@ -34,7 +34,6 @@ from safevar_sumo.questions.options import (
     Jobs,
     PointName,
     Simulations,
-    options_of,
 )
 from safevar_sumo.questions.subject import Results, case_at, changes_since, with_own_set
 from safevar_sumo.records import JsonObject
@@ -155,13 +154,7 @@ def report(
     """
     if not results:
         raise InputError("report()", "no results", "results, or their directories")
-    values: JsonObject = {"ask": ask, "unsafe": unsafe, "point": point, "jobs": jobs}
-    values |= {"cluster": cluster, "simulations": simulations}
-    for option in options_of(report):
-        if option.name in values:
-            values[option.name] = option.check(values[option.name])
-    ask = values["ask"]
-    criterion: Unsafe | None = values["unsafe"]
+    criterion = None if unsafe is None else Unsafe.parse(unsafe)
     out = Path(check_text("out", out))
     check_writable(out, "out", (".html", ".htm"))
 

@@ -156,8 +156,7 @@ OTHERS = {
     "an allowed impact": (
         "autoware_july",
         IMPACTS,
-        "The tests of B allow an impact of 20 km/h, those of A none (CCRs). The worst test case of"
-        " a vehicle is chosen by `impact_excess >` in B, and by the safety degree in A.",
+        "The tests of B allow an impact of 20 km/h, those of A none (CCRs).",
     ),
     "another criterion": (
         "sun",

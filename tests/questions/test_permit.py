@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import re
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from msgspec.structs import replace
-from numpy.random import default_rng
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.drives import Encounters
-from safevar_sumo.questions.model_spread import studies_of_sets
 from safevar_sumo.questions.permit import permit
 from safevar_sumo.questions.permit.rows import verdict_of
 from safevar_sumo.questions.permit.speed_search import Cars
-from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, numbers_of, write
+from tests.in_process import SLOW, write
 
 SHORT = """
 extends = "wear"
@@ -40,76 +32,12 @@ parameters = { test = "CPNCO" }
 payloadCentre = 1.4
 sensorRange = { value = 80, source = "assumption" }
 """
-PLACES = np.linspace(25, 75, 21)  # impact locations [%]
 
 
 @pytest.fixture
 def short(in_tmp: Path) -> Study:
     write("short.toml", SHORT)
     return load_study("short.toml")
-
-
-def are_unsafe(
-    study: Study,
-    fit: int,
-    cars: FloatArray,
-    values: FloatArray,
-    places: FloatArray,
-    keep: float,
-) -> BoolArray:
-    """Second computation: which cars are unsafe at each speed, shape (cars, speeds), at any of the
-    impact locations `places` in any test alone, whether or not the original is safe there.
-    """
-    found = np.zeros((len(cars), len(values)), dtype=bool)
-    own = studies_of_sets(study)[fit]
-    assert own.matrix is not None
-    for test in own.matrix.tests:
-        system = assemble(replace(own, matrix=replace(own.matrix, tests=[test])))
-        rows = [[*car, *at] for car in cars for at in product(values, places)]
-        runs = drive_and_score(system, np.array(rows), with_originals=False)
-        fails = runs.collided | (runs.f_safe < (keep if fit == 0 else 0.0))
-        found |= fails.reshape(len(cars), len(values), -1).any(axis=2)
-    return found
-
-
-@SLOW
-def test_no_encounter_is_unsafe_up_to_a_speed_and_one_is_just_above_it() -> None:
-    study = load_study("wear", encounters="ranges")
-    members = assemble(study).characteristics.vehicle
-    rng = default_rng(5)
-    lower = members.lower + [item.error for item in members]
-    settings = np.vstack(
-        [members.original, lower + rng.random((3, 7)) * (members.upper - lower)]
-    )
-    frame = pd.DataFrame(settings, columns=[*members.names])
-    frame.insert(0, "car", ["new", "a", "b", "c"])
-    answer = permit("wear", cars=frame, fits=6)
-    sets = answer.tables["sets"].set_index(["car", "fit"])
-    up_to = sets["up_to"].unstack()  # noqa: PD010 - of a series
-    assert up_to.loc["new", 0] <= 50
-    assert up_to.loc["new", 5] <= 44, "new cars hit somebody at 45 km/h with this set"
-    speeds = np.arange(10.0, 60.5, 0.5)
-    for fit in range(6):
-        fails = are_unsafe(study, fit, settings, speeds, PLACES, keep=0.1)
-        for car, name in enumerate(frame["car"]):
-            reached = up_to.loc[name, fit]
-            assert np.isnan(reached) or not fails[car, speeds <= reached].any(), (
-                name,
-                fit,
-            )
-            # The encounter that is named for what lies above fails as printed.
-            (speed,) = re.findall(r"speed (\S+) km/h", sets.encounter[name, fit])
-            assert float(speed) <= (10.0 if np.isnan(reached) else reached + 1), (
-                name,
-                fit,
-            )
-            command = sets.simulate[name, fit]
-            assert numbers_of(command)["f_safe"] < (0.1 if fit == 0 else 0), command
-    rows = answer.table().set_index("car")
-    assert rows["up_to"].equals(up_to.min(axis=1, skipna=False)[rows.index])
-    assert (rows["new_car_up_to"] == up_to.loc["new"].min()).all()
-    assert (answer.numbers["fits"], answer.numbers["margin"]) == (6, 0.1)
-    assert not answer.numbers["rough"]
 
 
 @SLOW

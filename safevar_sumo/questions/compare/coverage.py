@@ -18,7 +18,6 @@ from safevar_sumo.questions.compare.words import (
     CRITERIA,
     LACKS,
     LEAVES_OUT,
-    WORST_CASES,
 )
 from safevar_sumo.questions.counterexamples import OF_ENCOUNTER
 from safevar_sumo.questions.evaluator import Evaluator
@@ -146,11 +145,10 @@ def missing_in_words(a: Evaluator, b: Evaluator, titles: Titles) -> Sentences:
                 speed=f"{speed:g} km/h",
                 least=f"{least:g} km/h" if least else "none",
             )
-    for template, words_of in ((CRITERIA, _criterion), (WORST_CASES, _aggregate)):
-        in_a = words_of(a.study)
-        in_b = words_of(b.study)
-        if in_a != in_b:
-            yield template(in_a=in_a, in_b=in_b, **titles)
+    in_a = _criterion(a.study)
+    in_b = _criterion(b.study)
+    if in_a != in_b:
+        yield CRITERIA(in_a=in_a, in_b=in_b, **titles)
 
 
 def _few(phrases: list[str]) -> str:
@@ -164,13 +162,6 @@ def _few(phrases: list[str]) -> str:
 def _criterion(study: Study) -> str:
     """The criterion by which a study calls a vehicle unsafe."""
     return study.unsafe.criterion or "collision"
-
-
-def _aggregate(study: Study) -> str:
-    """What says which test case gives the result of a vehicle, in words."""
-    if study.deciding is None:
-        return "the safety degree"
-    return f"`{study.deciding}`"
 
 
 def _missing_cases(side: Coverage, reference: Coverage) -> Iterator[str]:

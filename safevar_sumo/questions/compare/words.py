@@ -33,9 +33,6 @@ ALLOWS = answer(
 CRITERIA = answer(
     "The study {b} calls a vehicle unsafe by the criterion `{in_b}`, and {a} by `{in_a}`."
 )
-WORST_CASES = answer(
-    "The worst test case of a vehicle is chosen by {in_b} in {b}, and by {in_a} in {a}."
-)
 NEW_COLLISION = answer(
     "The original vehicle of {b} collides at {speed:.2f} m/s{place}. The original vehicle of {a}"
     " does not collide in the same test case."

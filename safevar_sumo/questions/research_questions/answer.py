@@ -120,10 +120,7 @@ def tables(
     table
         Print only this table of the answer. The line "More:" of an answer names the tables.
     """
-    values = {"alpha": alpha, "causes": causes, "jobs": jobs}
-    for option in options_of(tables):
-        if option.name in values:
-            option.check(values[option.name])
+    {option.name: option for option in options_of(tables)}["alpha"].check(alpha)
     if table:
         check_name(
             "table",
