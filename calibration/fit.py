@@ -424,7 +424,7 @@ def print_result(fit: Fit, log: Path) -> None:
         print(
             f"[model_error]\n{SAFETY_DEGREE} = {round(error, ERROR_DECIMALS)}\n[spread]"
         )
-        for key, values in study.spread.items():
+        for key, values in with_sets.spread.items():
             print(f'"{key}" = {values}')
 
 

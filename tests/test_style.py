@@ -5,6 +5,7 @@ public name stands for one thing in the whole package.
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
 import tomllib
@@ -14,6 +15,7 @@ from collections.abc import Iterator
 from tests.in_process import SLOW
 from tests.manual import ROOT
 from tests.size import elements_in, sizes, sources_of
+from tests.support.needs import NOTHING_MISSING
 
 LIMITS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
 DOUBLE = {
@@ -71,8 +73,14 @@ def test_a_public_name_is_defined_once() -> None:
 
 @SLOW
 def test_tests_are_collected_without_the_extras() -> None:
+    environment = {**os.environ}
+    environment.pop(NOTHING_MISSING, None)
     subprocess.run(
-        [sys.executable, "-c", COLLECTION], cwd=ROOT, check=True, capture_output=True
+        [sys.executable, "-c", COLLECTION],
+        cwd=ROOT,
+        env=environment,
+        check=True,
+        capture_output=True,
     )
 
 

@@ -19,6 +19,8 @@ MOST_SPEED = 100.0
 """Largest speed of a body [m/s]; a faster change of its place is a jump."""
 UNIT_TOLERANCE = 1e-6
 """Largest difference of a direction's length from 1 [-]."""
+LANE = 4.0
+"""Width of a wide lane [m]."""
 APART = 1.0
 """Smallest distance of a body from the place where its speed takes it that can be an error [m]. The
 distance is an error if it is more than this, and more than a third of the body's way.
@@ -120,18 +122,18 @@ def check_motion(track: Track, times: FloatArray, step: float) -> None:
             f"at most {MOST_SPEED:g} m/s between two samples",
         )
 
-    # Across the road, a third of the whole way may differ, because a body may face along the road
-    # while it changes lane.
+    # A body may face along the road while it changes lane: across the road, a lane's width and a
+    # third of the whole way may differ.
     along = _way_and_driven(track, track.x, speed * track.along, times)
     across = _way_and_driven(track, track.y, speed * track.left, times)
     longer_along = np.maximum(*np.abs(along))
     longer_way = np.hypot(longer_along, np.maximum(*np.abs(across)))
-    for (way, driven), axis, longer in (
-        (along, "x", longer_along),
-        (across, "y", longer_way),
+    for (way, driven), axis, longer, least in (
+        (along, "x", longer_along, APART),
+        (across, "y", longer_way, LANE),
     ):
         refuse(
-            np.abs(way - driven) > np.maximum(APART, longer / 3),
+            np.abs(way - driven) > np.maximum(least, longer / 3),
             way - driven,
             f"is {{:.3g}} m in {axis} from where its speed takes it",
             f"a place whose {axis} changes by v{axis}, the speed in {axis}, times the time",

@@ -49,13 +49,17 @@ def started(typed: str, batch: int | None = None, **options: object) -> Process:
             text=True,
             start_new_session=True,
             # Only this test's own thread starts processes.
-            preexec_fn=None  # noqa: PLW1509
-            if os.name == "nt"
-            else lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+            preexec_fn=None if os.name == "nt" else _heed_signals,  # noqa: PLW1509
             **options,
         )
     )
     return running[-1]
+
+
+def _heed_signals() -> None:
+    """Let this process end by Ctrl-C, and when its terminal is lost."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def until(condition: Callable[[], bool], process: Process | None = None) -> None:
