@@ -5,7 +5,7 @@ what the verdict claims of them.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -16,7 +16,6 @@ from hypothesis import given, strategies as st
 from msgspec.structs import replace as replace_in
 
 import safevar_sumo as sv
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign.evaluation import Task, evaluate_settings
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.causes import Cause
@@ -24,15 +23,10 @@ from safevar_sumo.questions.evaluator import FRESH_RUNS, Evaluator
 from safevar_sumo.questions.explain.combinations import enumerate_causes, staircase
 from safevar_sumo.questions.explain.smallest import Smallest
 from safevar_sumo.questions.explain.tell import smallest_sentences
-from safevar_sumo.questions.model_spread import studies_of_sets
-from safevar_sumo.questions.over_sets import VEHICLES
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.sentence import Verdict
-from safevar_sumo.questions.variation import VariationModel
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
-from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, json_of, rows_of
 from tests.questions.conftest import (
     ORIGINAL,
@@ -40,6 +34,7 @@ from tests.questions.conftest import (
     Region,
     made_up_evaluator,
     made_up_study,
+    nowhere,
 )
 
 COLLISION = Unsafe()
@@ -126,14 +121,20 @@ def test_with_few_settings_single_changes_are_simulated_at_every_share() -> None
     ]
 
 
-def smallest_of(
-    n: int, region: Region, most: int | None = None
+def answer_of(
+    evaluator: Evaluator, sampled: Sequence[dict[str, float]] = ()
 ) -> tuple[Smallest, str]:
-    """The answer about a region, with at most so many simulations, and its sentences."""
-    evaluator = made_up_evaluator(n, region)
-    evaluator.account.limit = most
-    smallest = Smallest.of(evaluator, COLLISION, 0)
+    """The answer, which may know causes of sampled vehicles, and its sentences."""
+    causes = [Cause(changes, "collision", -1.0, {}) for changes in sampled]
+    smallest = Smallest.of(evaluator, COLLISION, 0, causes)
     return smallest, Verdict(smallest_sentences(smallest, evaluator, COLLISION))
+
+
+def smallest_of(
+    n: int, region: Region, *sampled: dict[str, float]
+) -> tuple[Smallest, str]:
+    """The answer about a region of n characteristics."""
+    return answer_of(made_up_evaluator(n, region), sampled)
 
 
 def way(settings: FloatArray) -> FloatArray:
@@ -206,7 +207,10 @@ def test_a_cause_before_the_ends_is_not_at_the_end_where_few_simulations_are_all
             (np.minimum(first, second) > 0.3) & (first < 0.95)
         )
 
-    assert smallest_of(2, region, 200)[0].table["begins_at"].tolist() == [0.35, 0.7]
+    evaluator = made_up_evaluator(2, region)
+    evaluator.account.limit = 200
+    smallest, _ = answer_of(evaluator)
+    assert smallest.table["begins_at"].tolist() == [0.35, 0.7]
 
 
 def test_combinations_that_contain_a_cause_and_cures_are_counted() -> None:
@@ -216,17 +220,15 @@ def test_combinations_that_contain_a_cause_and_cures_are_counted() -> None:
         return (way(settings)[:, 0] > 0.5) & (way(settings)[:, 1] < 0.5)
 
     smallest, verdict = smallest_of(4, region)
-    counts = [0, 0, 0, 0]
-    for sides in product(SIDES, repeat=4):
-        size = sum(side != ORIGINAL for side in sides)
-        has_cause = sides[0] == 10 and size > 1
-        is_unsafe = bool(region(np.array([sides]))[0])
-        flags = has_cause, size and not has_cause, is_unsafe and not has_cause
-        for place, counted in enumerate((*flags, has_cause and not is_unsafe)):
-            counts[place] += bool(counted)
-    names = ("containing", "tried", "causes", "cures")
-    assert [smallest.numbers[name] for name in names] == counts
-    assert smallest.numbers["containing_tried"] == counts[0]
+    sides = np.array([*product(SIDES, repeat=4)])
+    size = np.count_nonzero(sides != ORIGINAL, axis=1)
+    contains = (sides[:, 0] == 10) & (size > 1)
+    is_unsafe = region(sides)
+    numbers = smallest.numbers
+    assert numbers["containing"] == numbers["containing_tried"] == contains.sum()
+    assert numbers["tried"] == ((size > 0) & ~contains).sum()
+    assert numbers["causes"] == (is_unsafe & ~contains).sum()
+    assert numbers["cures"] == (contains & ~is_unsafe).sum()
     assert (
         "The counts of combinations leave out 26 combinations with a smaller cause"
         in verdict
@@ -254,17 +256,6 @@ def test_the_answer_leads_with_the_smallest_changes() -> None:
     assert "All causes" not in answer["verdict"]
     first, *_, last = rows_of(answer, "staircase")
     assert (first["share"], first["fewest"], last["fewest"]) == (1.0, 2, None)
-
-    # The vehicles of `risk` with both parameter sets.
-    study = load_study("rain")
-    drawn = VariationModel(study).draw(
-        VEHICLES, np.random.default_rng(study.search.seed)
-    )
-    shares = [
-        drive_and_score(assemble(one), drawn).collided.mean()
-        for one in studies_of_sets(study)[:2]
-    ]
-    assert numbers["by_set"] == shares
     assert "over the 2 parameter sets" in answer["verdict"].replace("each of", "over")
 
 
@@ -303,12 +294,13 @@ class Noisy(Plant):
         self,
         study: Study,
         probability: Callable[[FloatArray], FloatArray],
-        bad_luck: float = 0.0,
+        bad_luck: float,
+        seed: int,
     ):
-        super().__init__(study, lambda rows: rows[:, 0] < 0)
+        super().__init__(study, nowhere)
         self._probability = probability
         self._bad_luck = bad_luck
-        self._random = np.random.default_rng(5)
+        self._random = np.random.default_rng(seed)
 
     def compute(self, function: Callable[..., Any], task: Task, *arguments: Any) -> Any:
         if function is not evaluate_settings:
@@ -335,15 +327,13 @@ REPEATS = 4
 
 
 def noisy_answer(
-    probability: Callable[[FloatArray], FloatArray], bad_luck: float = 0.0
+    probability: Callable[[FloatArray], FloatArray], bad_luck: float, seed: int = 5
 ) -> tuple[Smallest, str]:
     """The answer about two characteristics, of vehicles that run four times."""
     study = made_up_study(2)
     scenario = replace_in(study.scenario, repeats=REPEATS)
     study = replace_in(study, scenario=scenario)
-    evaluator = Evaluator(study, Noisy(study, probability, bad_luck))
-    smallest = Smallest.of(evaluator, COLLISION, 0)
-    return smallest, Verdict(smallest_sentences(smallest, evaluator, COLLISION))
+    return answer_of(Evaluator(study, Noisy(study, probability, bad_luck, seed)))
 
 
 def test_a_cause_that_no_fresh_run_confirms_is_none() -> None:
@@ -379,13 +369,10 @@ def test_of_many_noisy_searches_the_interval_holds_the_truth() -> None:
     """The intervals hold the true share, 25 %, although the search chooses its unluckiest runs."""
     held = []
     for seed in range(20):
-        study = made_up_study(2)
-        scenario = replace_in(study.scenario, repeats=REPEATS)
-        study = replace_in(study, scenario=scenario)
-        pool = Noisy(study, lambda rows: np.where(way(rows)[:, 0] > 0.5, 0.25, 0.0))
-        pool._random = np.random.default_rng(seed)
-        smallest = Smallest.of(Evaluator(study, pool), COLLISION, 0)
-        row = smallest.table.to_dict("records")[0]
+        smallest, _ = noisy_answer(
+            lambda rows: np.where(way(rows)[:, 0] > 0.5, 0.25, 0.0), 0.0, seed
+        )
+        row = smallest.table.iloc[0]
         low, high = clopper_pearson(row["failing_runs"], row["runs"])
         held.append(low <= 0.25 <= high)
     assert np.mean(held) >= 0.85
@@ -406,14 +393,6 @@ def test_what_is_left_of_few_simulations_explains_a_sampled_failure() -> None:
     )
 
 
-def leading_of(region: Region, sampled: list[dict[str, float]]) -> tuple[Smallest, str]:
-    """The answer about a region of three characteristics with causes of sampled vehicles."""
-    evaluator = made_up_evaluator(3, region)
-    causes = [Cause(changes, "collision", -1.0, {}) for changes in sampled]
-    smallest = Smallest.of(evaluator, COLLISION, 0, causes)
-    return smallest, Verdict(smallest_sentences(smallest, evaluator, COLLISION))
-
-
 def test_an_island_that_only_sampled_vehicles_hit_leads() -> None:
     """One change at 43.2 to 43.8 % of the way, and two changes at the ends."""
 
@@ -422,7 +401,7 @@ def test_an_island_that_only_sampled_vehicles_hit_leads() -> None:
         is_island = np.abs(share[:, 2] - 0.435) < 0.003
         return is_island | (share[:, :2].min(axis=1) > 0.95)
 
-    smallest, verdict = leading_of(region, [{"c": 7.176}, {"c": 7.172}])
+    smallest, verdict = smallest_of(3, region, {"c": 7.176}, {"c": 7.172})
     first, second = smallest.table.to_dict("records")
     assert (first["size"], second["size"]) == (1, 2)
     assert 7.16 < first["boundary"]["c"] < 7.19
@@ -442,7 +421,7 @@ def test_a_sampled_vehicle_shows_that_a_known_cause_begins_nearer() -> None:
         share = way(settings)[:, 0]
         return (np.abs(share - 0.205) < 0.003) | (share > 0.9)
 
-    smallest, _ = leading_of(region, [{"a": 6.025}])
+    smallest, _ = smallest_of(3, region, {"a": 6.025})
     (row,) = smallest.table.to_dict("records")
     assert row["causes"] == {"a": 10.0}
     assert region(np.array([[row["boundary"]["a"], ORIGINAL, ORIGINAL]]))[0]
@@ -458,7 +437,7 @@ def test_sampled_changes_at_different_shares_are_told_without_a_share() -> None:
         is_first = (share[:, 0] > 0.15) & (share[:, 0] < 0.25)
         return is_first & (share[:, 1] > 0.6) & (share[:, 1] < 0.68)
 
-    smallest, verdict = leading_of(region, [{"a": 6.0, "b": 8.3}])
+    smallest, verdict = smallest_of(3, region, {"a": 6.0, "b": 8.3})
     (row,) = smallest.table.to_dict("records")
     assert np.isnan(row["begins_at"])
     boundary = row["boundary"]
@@ -478,7 +457,7 @@ def test_causes_with_fewer_changes_come_first_and_then_the_more_robust() -> None
         pair = (share[:, 2] > 0.5) & (share[:, 0] < -0.5)
         return (share[:, 0] > 0.999) | (share[:, 1] > 0.5) | pair
 
-    smallest, _ = leading_of(region, [])
+    smallest, _ = smallest_of(3, region)
     table = smallest.table
     assert [list(changes) for changes in table["causes"]] == [["b"], ["a"], ["a", "c"]]
     assert table["robust_share"][0] > table["robust_share"][1]
