@@ -96,9 +96,7 @@ def rewrite(file: Path, *changes: tuple[str, str]) -> None:
     file.write_text(text)
 
 
-def searched(
-    study: Study, out: Path, warn: Callable[[str], None] = lambda message: None
-) -> Path:
+def searched(study: Study, out: Path) -> Path:
     """Search a study in this process; returns its results directory, `out`."""
     run_campaign(
         study,
@@ -107,7 +105,6 @@ def searched(
         out,
         InlinePool(),
         show_no_progress,
-        warn,
     )
     return out
 

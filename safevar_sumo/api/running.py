@@ -93,7 +93,6 @@ def run(
             directory,
             workers,
             show,
-            warn,
             engine,
             retry_failed=retry_failed,
         )

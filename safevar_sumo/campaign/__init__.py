@@ -16,10 +16,7 @@ settings in the batch. Questions ask the same pool for single batches.
   or a task and a batch.
 """
 
-from safevar_sumo.campaign.campaign import (
-    Campaign as Campaign,
-    run_campaign as run_campaign,
-)
+from safevar_sumo.campaign.campaign import run_campaign as run_campaign
 from safevar_sumo.campaign.runs import (
     RunKey as RunKey,
     all_runs as all_runs,

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.random import default_rng
@@ -30,8 +29,8 @@ from safevar_sumo.campaign.runs import (
 )
 from safevar_sumo.campaign.share import Share, carry_share
 from safevar_sumo.campaign.user_checks import check_code, repeat_elsewhere
-from safevar_sumo.errors import InputError, SimulationError, one_of
-from safevar_sumo.metrics import Scoring, Unsafe
+from safevar_sumo.errors import InputError, SimulationError, one_of, warn
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.records import Evaluations, JsonObject
 from safevar_sumo.results import (
     MANIFEST,
@@ -63,17 +62,6 @@ ENGINES = RECORDED, SUMO
 """The engines that a command may name."""
 
 
-class Campaign(NamedTuple):
-    """Results of runs of a study. `no_verdict` is the reason why the results say nothing about the
-    ADS; "" if they do.
-    """
-
-    original: Evaluations
-    runs: list[RunResult]
-    scoring: Scoring
-    no_verdict: str
-
-
 def run_campaign(  # noqa: PLR0913 - options of the command `study`
     study: Study,
     system: System,
@@ -81,12 +69,11 @@ def run_campaign(  # noqa: PLR0913 - options of the command `study`
     directory: Path,
     pool: Pool,
     progress: Progress,
-    warn: Callable[[str], None],
     engine: str = RECORDED,
     *,
     retry_failed: bool = False,
     batch_size: int | None = None,
-) -> Campaign:
+) -> None:
     """Carry out runs of a study, or resume unfinished runs. If the runs are all runs of the study,
     write its solutions.
 
@@ -164,7 +151,6 @@ def run_campaign(  # noqa: PLR0913 - options of the command `study`
         sample = choose_sample(study, original, runs)
         for remark in repeat_in_sumo(task, sample, pool, parts.begin()):
             warn(remark)
-    return Campaign(original, runs, system.measuring.scoring, no_verdict)
 
 
 def _remarks_on_discarded(study: Study, runs: Sequence[RunResult]) -> Iterator[str]:

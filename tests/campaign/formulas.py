@@ -14,7 +14,6 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import (
-    Campaign,
     RunKey,
     all_runs,
     evaluation,
@@ -96,20 +95,18 @@ def carried_out(
     keys: Sequence[RunKey] | None = None,
     batch: int | None = None,
     progress: Progress = show_no_progress,
-) -> Campaign:
+) -> None:
     """Carry out a study whose results are not verified in SUMO."""
     pool = pool or FormulaPool()
-    warnings = list[str]()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "evaluate_batch", pool.evaluate)
-        return run_campaign(
+        run_campaign(
             study,
             assemble(study),
             all_runs(study) if keys is None else keys,
             path,
             pool,
             progress,
-            warnings.append,
             engine="sumo",
             batch_size=batch,
         )

@@ -159,12 +159,12 @@ def test_a_study_counts_what_an_own_algorithm_returns_and_is_no_solution(
     )
     (folder / "own.toml").write_text(own)
     study = load_study("own.toml")
-    warnings: list[str] = []
-    searched(study, folder / "own", warn=warnings.append)
+    with pytest.warns(UserWarning, match="TakesAll") as warned:
+        searched(study, folder / "own")
     case = load_cases([folder / "own"])[0]
     infeasible = (~case.evaluations["feasible"]).sum()
     assert 0 < infeasible < 80 == len(case.solutions) + infeasible
-    (warning,) = (one for one in warnings if "TakesAll" in one)
+    (warning,) = (text for text in map(str, warned) if "TakesAll" in text)
     assert f"{infeasible} settings that TakesAll returned are no solutions" in warning
 
 
