@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from itertools import combinations
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy
 from hypothesis import given, strategies as st
 
 from safevar_sumo.api.simulation import load_study
@@ -21,6 +19,7 @@ from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.questions.cause_limits import BoundaryState, Limits, find_cause_limits
 from safevar_sumo.questions.causes import (
+    Causes,
     are_causes,
     causes_of_runs,
     count_distinct_causes,
@@ -34,13 +33,14 @@ from safevar_sumo.questions.explain.tables import (
     CAUSE_COLUMNS,
     printed_limits,
 )
+from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.tables import cell_text
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.results import handles_of, solutions_frame
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.conftest import FITS
-from tests.in_process import InlinePool, json_of, numbers_of, rows_of
+from tests.in_process import SLOW, InlinePool, json_of, numbers_of, rows_of
 from tests.questions.conftest import (
     ORIGINAL,
     Plant,
@@ -54,41 +54,32 @@ from tests.questions.conftest import (
     two_islands,
 )
 
-SLOW = pytest.mark.slow
-
 RESOLUTION = 1 / 16_384
 """Accuracy of a boundary that `find_boundary_shares` promises, as a share of the line."""
 
 
 @SLOW
 def test_the_rows_are_those_of_the_solutions(case: Case, explained: Answer) -> None:
-    answer = json.loads(explained.render("json"))
-    output = [str(handle) for handle in handles_of(case.solutions)]
-    for row in rows_of(answer, "solutions"):
-        solution = case.solutions.iloc[output.index(row["solution"])]
-        assert (row["outcome"], row["safety_degree"]) == (
-            solution["outcome"],
-            solution["safety_degree"],
+    answer = explained.to_dict()
+    handles = map(str, handles_of(case.solutions))
+    solutions = dict(zip(handles, case.solutions.to_dict("records"), strict=True))
+    rows = {row["solution"]: row for row in rows_of(answer, "solutions")}
+    for handle, row in rows.items():
+        assert row["outcome"] == solutions[handle]["outcome"]
+        assert row["safety_degree"] == solutions[handle]["safety_degree"]
+    causes = rows_of(answer, "causes")
+    assert {cause["solution"] for cause in causes} == rows.keys()
+    for cause in causes:
+        changes = cause["changes"]
+        assert changes.items() <= solutions[cause["solution"]].items()
+        assert (
+            cause["boundary"].keys()
+            == cause["single_boundary"].keys()
+            == changes.keys()
         )
-        causes = [
-            one
-            for one in rows_of(answer, "causes")
-            if one["solution"] == row["solution"]
-        ]
-        assert causes
-        for cause in causes:
-            assert (
-                cause["changes"].items()
-                <= solution[list(case.characteristics.names)].to_dict().items()
-            )
-            assert (
-                cause["boundary"].keys()
-                == cause["single_boundary"].keys()
-                == cause["changes"].keys()
-            )
-            assert cause["size"] == len(cause["changes"])
-            assert 0 <= cause["holds"] <= cause["fits"] == FITS
-            assert cause["avoided_by"] == row["avoided_by"]
+        assert cause["size"] == len(changes)
+        assert 0 <= cause["holds"] <= cause["fits"] == FITS
+        assert cause["avoided_by"] == rows[cause["solution"]]["avoided_by"]
 
 
 @SLOW
@@ -284,23 +275,23 @@ def test_the_minimal_causes_of_a_run_are_those_of_its_unsafe_solutions_each_once
     assert counts[1][0] == ["rs", 0, 3, 3, 2], "a up, b down"
 
 
-def limits(evaluator: Evaluator, *setting: float) -> Limits:
-    """The limits of the only cause of a setting."""
+def causes_and_limits(
+    evaluator: Evaluator, *setting: float
+) -> tuple[Causes, list[Limits]]:
+    """The causes of a setting, and their limits."""
     (causes,) = find_minimal_causes(evaluator, np.array([setting]), COLLISION)
-    (result,) = find_cause_limits(evaluator, causes, COLLISION)
-    return result
+    return causes, find_cause_limits(evaluator, causes, COLLISION)
 
 
 def printed_of(n: int, region: Region, *setting: float) -> Any:
     """The limits of the only cause of a setting, as they are printed."""
     model = made_up_model(n, region)
-    (causes,) = find_minimal_causes(model.evaluator, np.array([setting]), COLLISION)
-    limits = find_cause_limits(model.evaluator, causes, COLLISION)
-    return printed_limits(model, causes, limits)[0]
+    return printed_limits(model, *causes_and_limits(model.evaluator, *setting))[0]
 
 
 def test_a_boundary_is_the_first_unsafe_place_and_no_island_is_skipped() -> None:
-    result = limits(made_up_evaluator(3, two_islands), 9.5, 1.0, 8.0)
+    evaluator = made_up_evaluator(3, two_islands)
+    _, (result,) = causes_and_limits(evaluator, 9.5, 1.0, 8.0)
     assert result.fraction == pytest.approx(1.5 / 4.5, abs=2 * RESOLUTION)
     assert result.boundary["a"] > 6.5 >= result.boundary["a"] - 2 * RESOLUTION * 4.5
     assert result.single_boundary == result.boundary
@@ -342,7 +333,7 @@ def test_a_boundary_of_a_single_change_is_unsafe_when_typed_with_the_others() ->
 
 def test_nothing_is_shrunk_into_what_the_filter_takes_for_no_change() -> None:
     evaluator = made_up_evaluator(1, lambda settings: settings[:, 0] > ORIGINAL)
-    result = limits(evaluator, 9.0)
+    _, (result,) = causes_and_limits(evaluator, 9.0)
     threshold = evaluator.characteristics.threshold[0]
     boundary = result.boundary["a"]
     assert boundary == pytest.approx(ORIGINAL + threshold, rel=1e-3)
@@ -360,7 +351,7 @@ def test_a_boundary_that_ends_where_nothing_can_be_simulated_says_so() -> None:
             failing=lambda rows: (rows[:, 0] > 6) & (rows[:, 0] <= 7),
         ),
     )
-    result = limits(evaluator, 9.0)
+    _, (result,) = causes_and_limits(evaluator, 9.0)
     assert (result.boundary["a"], result.end) == (
         pytest.approx(7, abs=1e-3),
         BoundaryState.NOT_SIMULATED,
@@ -371,10 +362,8 @@ def test_needed_and_changed_over_failures() -> None:
     evaluator = made_up_evaluator(
         3, lambda settings: box(settings) | (settings[:, 2] > 9)
     )
-    settings, members = (
-        np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]]),
-        evaluator.characteristics,
-    )
+    settings = np.array([[9.0, 1.0, 5.0], [9.0, 1.0, 8.0], [9.0, 1.0, 9.5]])
+    members = evaluator.characteristics
     causes = find_minimal_causes(evaluator, settings, COLLISION)
     frame, of_four = (
         count_needed(members, members.changed(settings), causes, number).set_index(
@@ -389,14 +378,8 @@ def test_needed_and_changed_over_failures() -> None:
     assert frame["needed_low"].equals(frame["needed"]), (
         "of all failures the shares are exact"
     )
-    sampled = of_four.loc["a"]
-    ends = [
-        scipy.stats.beta.ppf(q, *shape)
-        for q, shape in ((0.025, (2, 2)), (0.975, (3, 1)))
-    ]
-    assert sampled[["needed_low", "needed_high"]].tolist() == pytest.approx(ends), (
-        "2 of a sample of 3"
-    )
+    ends = of_four.loc["a", ["needed_low", "needed_high"]]
+    assert ends.tolist() == pytest.approx(clopper_pearson(2, 3)), "2 of a sample of 3"
     assert count_distinct_causes(members, causes)[
         ["cause", "failures"]
     ].to_numpy().tolist() == [
@@ -409,25 +392,17 @@ def test_a_cause_is_one_with_some_fitted_models() -> None:
     """Own: a up and b down together are unsafe. Second: a up alone. Third: nothing. Fourth: as the
     own, only wider.
     """
-    wider = made_up_evaluator(3, lambda one: (one[:, 0] > 7) & (one[:, 1] < 5))
-    models = [
-        *(
-            made_up_evaluator(3, region)
-            for region in (box, lambda one: one[:, 0] > 8, nowhere)
-        ),
-        wider,
+    regions: list[Region] = [
+        box,
+        lambda one: one[:, 0] > 8,
+        nowhere,
+        lambda one: (one[:, 0] > 7) & (one[:, 1] < 5),
     ]
-    settings = np.array(
-        [[9.0, 1.0, 5.0], [7.5, 1.0, 8.0], [9.0, 8.0, 5.0], [5.0, 5.0, 5.0]]
-    )
-    rows = COLLISION.of(models[0].evaluate(settings, "settings"))
-    causes = [
-        cause
-        for of_one in find_minimal_causes(models[0], settings[rows], COLLISION)
-        for cause in of_one
-    ]
+    models = [made_up_evaluator(3, region) for region in regions]
+    settings = np.array([[9.0, 1.0, 5.0], [7.5, 1.0, 8.0]])
+    causes = [cause for (cause,) in find_minimal_causes(models[0], settings, COLLISION)]
     holding = [are_causes(model, causes, COLLISION).tolist() for model in models]
-    assert holding == [[holds] * len(causes) for holds in (True, False, False, True)]
+    assert holding == [[holds] * 2 for holds in (True, False, False, True)]
 
 
 def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() -> None:
