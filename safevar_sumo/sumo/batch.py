@@ -30,7 +30,7 @@ from safevar_sumo.sumo.engine import (
 )
 from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.network import copied_network, networks_for
-from safevar_sumo.sumo.perception import Observer, SceneObserver
+from safevar_sumo.sumo.perception import Observer, SceneObserver, of_vehicles
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.sumo.simulators import joined, simulate_each
@@ -207,9 +207,7 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
 
 def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:
     """Speeds at the start of n vehicles at each of K points, shape (K * n,) [m/s]."""
-    return np.concatenate(
-        [np.zeros(n) + point.scenario.start_speed for point in points]
-    )
+    return of_vehicles([point.scenario.start_speed for point in points], n)
 
 
 def open_points_world(

@@ -42,9 +42,9 @@ class VehicleStates(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A vehicle or a person as a rectangle, or M such bodies in columns [m, m/s]. `along` is the
-    direction that the body faces, a unit vector; `speed` is the speed in this direction, `drift`
-    the speed to the left of this direction.
+    """M vehicles or persons as rectangles, in columns [m, m/s]: `middle` and `along` have the shape
+    (M, 2). `along` is the direction that a body faces, a unit vector; `speed` is the speed in this
+    direction, `drift` the speed to the left of this direction. A number holds for all M bodies.
     """
 
     middle: FloatArray
@@ -61,28 +61,18 @@ class Body(NamedTuple):
         along: FloatArray,
         length: Quantity,
         width: Quantity,
-        speed: FloatArray | float,
+        speed: FloatArray,
     ) -> Body:
-        """The body whose middle of the front is at `front`, or M such bodies."""
+        """M bodies, the middles of whose fronts are at `front`, shape (M, 2)."""
         middle = front - along * (np.asarray(length)[..., None] / 2)
-        return cls(middle, along, length, width, speed, np.zeros_like(speed))
+        return cls(middle, along, length, width, speed)
 
     @property
     def velocity(self) -> FloatArray:
         """Velocities of M bodies in columns, shape (M, 2) [m/s]."""
         along, across = _axes_of(self)
-        drift = np.asarray(self.drift)[..., None]
+        drift = self.drift[..., None]
         return np.asarray(along * self.speed[:, None] + across * drift)
-
-    @classmethod
-    def columns(cls, bodies: Sequence[Body]) -> Body:
-        """Join M bodies into columns: `middle` and `along` have the shape (M, 2), the other columns
-        have the shape (M,).
-        """
-        columns = []
-        for field in range(len(cls._fields)):
-            columns.append(np.array([body[field] for body in bodies]))
-        return cls._make(columns)
 
 
 class BodyPairs(NamedTuple):
@@ -251,8 +241,6 @@ class FirstContacts:
 
         # Only the front counts, because SUMO reports no other contacts.
         around = world.bodies_around(np.flatnonzero(enters).tolist())
-        if not len(around.vehicles):
-            return
         depth = find_overlaps(around.body, around.obstacle)
         touches = find_touches(around.body, around.obstacle)
         is_missed = (depth > TOUCH_OVERLAP) & (touches.side == FRONT)

@@ -21,6 +21,7 @@ from safevar_sumo.records import (
     Command,
     FloatArray,
     IntArray,
+    Nominal,
     Observation,
     Outcome,
     Quantity,
@@ -30,12 +31,14 @@ from safevar_sumo.records import (
     nans,
 )
 from safevar_sumo.scenarios import VUT, Point, Scene
+from safevar_sumo.scenarios.roads import Frame
 from safevar_sumo.sumo.bodies import FirstContacts, VehicleStates, VehicleWorld
 from safevar_sumo.sumo.driving_robot import DrivingRobot
 from safevar_sumo.sumo.perception import (
     Observer,
     Perception,
     SceneObserver,
+    of_vehicles,
     per_vehicle,
 )
 from safevar_sumo.sumo.system import System
@@ -46,7 +49,7 @@ from safevar_sumo.vehicles.base import Prepared
 
 Listener = Callable[[Observation], None]
 """A function that is called at every sample, with the observation that the ADS gets."""
-OF_ALL_RUNS = ("step", "vehicle_length", "vehicle_width", "time", "position")
+OF_ALL_RUNS = ("step", "vehicle_length", "vehicle_width", "time")
 """Fields of a trace for which a log keeps no column of its own."""
 TRUTHS = ("active", "visible")
 """Columns of a log that are true or false."""
@@ -73,15 +76,22 @@ def drive(
 
     prepared, ads, motion = enter(system, settings, world)
     state = vehicle.at_start(prepared, motion.speeds)
-    length = float(world.vehicle_length(VUT))
-    nominal = system.nominal._replace(length=length, width=float(world.vehicle_width))
+    nominal = system.nominal._replace(
+        length=float(world.vehicle_length(VUT)), width=float(world.vehicle_width)
+    )
     memory = ads.start(n, nominal, step)
     perception = Perception([point.weather for point in points], step, group_size)
     robot = DrivingRobot(points, vehicle, prepared, state, step)
-    is_tested, may_go_on, last_sample = _limits_of_runs(points, group_size, step)
-    contacts = FirstContacts(n, is_tested)
+    # Contacts with the vehicle's front alone count in tests; some runs go on at their end while the
+    # vehicle closes in on a body.
+    is_tested = [point.scenario.is_hit_in_front for point in points]
+    may_go_on = np.repeat([point.scenario.goes_on for point in points], group_size)
+    last_sample = of_vehicles(
+        [np.round(last_sample_of(point, step)) for point in points], group_size
+    ).astype(int)
+    contacts = FirstContacts(n, np.repeat(is_tested, group_size))
     outcomes = _Outcomes(n)
-    log = _Log(world, _most_samples(last_sample, may_go_on, step))
+    log = _Log(world.frame, n, _most_samples(last_sample, may_go_on, step))
     with check_open_runs(outcomes.is_checked):
         for sample in range(log.capacity):
             time = sample * step
@@ -127,8 +137,7 @@ def drive(
             state = vehicle.advance(prepared, state, command)
             _check_finite(state.speed, settings, system.characteristics)
             motion = world.step(state.speed, outcomes.is_open)
-    trace = log.trace()
-    allowed_impacts = [point.allowed_impact_speed for point in points]
+    trace = log.trace(step, nominal)
     return SimulationRuns(
         trace=trace,
         encounter=observer.encounter(trace),
@@ -138,42 +147,10 @@ def drive(
         test_speed_error=robot.error,
         warning_ttc=outcomes.warning_ttc,
         centre_to_centre=points[0].scenario.centre_to_centre,
-        allowed_impact_speed=np.asarray(per_vehicle(allowed_impacts, group_size)),
+        allowed_impact_speed=of_vehicles(
+            [point.allowed_impact_speed for point in points], group_size
+        ),
     )
-
-
-class _RunLimits(NamedTuple):
-    """What the scenarios of N runs say of their contacts and of their end; each has shape (N,).
-
-    Attributes
-    ----------
-    is_tested
-        Whether only contacts with the front of the vehicle count.
-    may_go_on
-        Whether a run goes on at its end while the vehicle closes in on a body.
-    last_sample
-        The number of the last sample.
-    """
-
-    is_tested: BoolArray
-    may_go_on: BoolArray
-    last_sample: IntArray
-
-
-def _limits_of_runs(
-    points: Sequence[Point], group_size: int, step: float
-) -> _RunLimits:
-    """The limits of the runs at K points, of which each has a group of `group_size` runs."""
-    n = group_size * len(points)
-    is_tested = np.zeros(n, bool)
-    may_go_on = np.zeros(n, bool)
-    last_sample = np.zeros(n, int)
-    for k, point in enumerate(points):
-        group = slice(k * group_size, (k + 1) * group_size)
-        is_tested[group] = point.scenario.is_hit_in_front
-        may_go_on[group] = point.scenario.goes_on
-        last_sample[group] = np.round(last_sample_of(point, step))
-    return _RunLimits(is_tested, may_go_on, last_sample)
 
 
 def _most_samples(last_sample: IntArray, may_go_on: BoolArray, step: float) -> int:
@@ -296,51 +273,44 @@ def _sensors_in_weather(system: System, prepared: Prepared, n: int) -> Sensors:
 
 
 class _Log:
-    """A log of up to `capacity` samples of N runs. A quantity has the shape (capacity, N); the
-    positions of the vehicles, in the world's coordinates, have the shape (capacity, N, 2) [m].
+    """A log of up to `capacity` samples of N runs. A quantity has the shape (capacity, N). `frame`
+    has the coordinates of the lane, along which positions are logged.
     """
 
-    def __init__(self, world: VehicleWorld, capacity: int) -> None:
+    def __init__(self, frame: Frame, n: int, capacity: int) -> None:
         self.capacity = capacity
+        self._frame = frame
         self._samples = 0
-        self._step = world.step_length
-        self._length = world.vehicle_length(VUT)
-        self._width = world.vehicle_width
-        self._frame = world.frame
-        self._positions = np.zeros((capacity, world.n, 2))
-
         self._columns = {}
         for field in fields(Trace):
             if field.name not in OF_ALL_RUNS:
                 # A truth takes one byte, a float eight.
                 kind = bool if field.name in TRUTHS else float
-                self._columns[field.name] = np.zeros((capacity, world.n), dtype=kind)
+                self._columns[field.name] = np.zeros((capacity, n), dtype=kind)
 
     def write(
         self,
-        position: FloatArray,
+        fronts: FloatArray,
         scene: Scene,
         command: Command,
         **quantities: FloatArray | BoolArray,
     ) -> None:
         """Write the next sample."""
-        self._positions[self._samples] = position
         values = {**scene._asdict(), **command._asdict(), **quantities}
+        values["position"] = self._frame.along(fronts)
         for name, column in self._columns.items():
             column[self._samples] = values[name]
         self._samples += 1
 
-    def trace(self) -> Trace:
-        """The trace of all samples that were written; positions are those along the lane [m]."""
+    def trace(self, step: float, nominal: Nominal) -> Trace:
+        """The trace of all samples that were written, which are `step` seconds apart."""
         samples = self._samples
         columns = {name: values[:samples] for name, values in self._columns.items()}
-        along = self._frame.along(self._positions[:samples].reshape(-1, 2))
         return Trace(
-            step=self._step,
-            vehicle_length=self._length,
-            vehicle_width=self._width,
-            time=np.round(np.arange(samples) * self._step, TIME_DECIMALS),
-            position=along.reshape(samples, -1),
+            step=step,
+            vehicle_length=nominal.length,
+            vehicle_width=nominal.width,
+            time=np.round(np.arange(samples) * step, TIME_DECIMALS),
             **columns,
         )
 

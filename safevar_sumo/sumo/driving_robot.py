@@ -11,6 +11,7 @@ import numpy as np
 from safevar_sumo.records import BoolArray, Command, clip_to_share
 from safevar_sumo.scenarios import Point
 from safevar_sumo.scenarios.tracks import KMH
+from safevar_sumo.sumo.perception import of_vehicles
 from safevar_sumo.vehicles import Vehicle, VehicleState
 from safevar_sumo.vehicles.base import Prepared, State
 
@@ -59,13 +60,9 @@ class DrivingRobot:
         step: float,
     ) -> None:
         n = len(state.speed)
-        size = n // len(points)
-        speeds = []
-        for point in points:
-            # A scenario that is no test has the speed None, which becomes NaN.
-            speed = np.asarray(point.scenario.test_speed, float)
-            speeds.append(np.broadcast_to(speed, size))
-        self._test_speed = np.concatenate(speeds)
+        # A scenario that is no test has no speed.
+        test_speeds = [point.scenario.test_speed for point in points]
+        self._test_speed = of_vehicles(test_speeds, n // len(points))
         self.has_test_speed = ~np.isnan(self._test_speed)
         """Whether the scenario of each vehicle has a `test_speed`, shape (N,)."""
         self._is_driving = self.has_test_speed.copy()

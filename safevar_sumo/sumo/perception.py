@@ -123,3 +123,10 @@ def per_vehicle(values: Sequence[Quantity], size: int) -> Quantity:
     if len(values) == 1 or all(value == values[0] for value in values):
         return values[0]
     return np.repeat(values, size)
+
+
+def of_vehicles(values: Sequence[Quantity], size: int) -> FloatArray:
+    """The values of K points for the `size` vehicles of each point, joined, shape (K * size,). A
+    value of a point is a number, an array of shape (size,), or None, which becomes NaN.
+    """
+    return np.concatenate([np.full(size, value, float) for value in values])

@@ -285,8 +285,10 @@ class RecordedWorld:
     def _vehicle_body(self, moment: _Moment, vehicles: IntArray) -> Body:
         scene = self._scene
         along = np.tile(scene.along, (len(vehicles), 1))
-        length = np.full(len(vehicles), scene.length)
-        width = np.full(len(vehicles), scene.width)
         return Body.behind(
-            moment.fronts[vehicles], along, length, width, moment.speeds[vehicles]
+            moment.fronts[vehicles],
+            along,
+            scene.length,
+            scene.width,
+            moment.speeds[vehicles],
         )

@@ -327,8 +327,8 @@ class Traffic:
         return Body.behind(
             np.stack([front, np.zeros_like(front)], axis=1),
             np.tile([1.0, 0.0], (len(front), 1)),
-            np.full(len(front), self.length),
-            np.full(len(front), self.width),
+            self.length,
+            self.width,
             speed,
         )
 

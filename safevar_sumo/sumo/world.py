@@ -212,34 +212,24 @@ class SumoWorld:
 
     def _pairs(self, pairs: Sequence[tuple[int, str]]) -> BodyPairs:
         """Pairs of the bodies of a vehicle under test, by its copy, and of an actor, by its id."""
-        ids = self.ids(VUT)
-        copies = []
-        vehicles = []
-        obstacles = []
-        for copy, id_ in pairs:
-            copies.append(copy)
-            vehicles.append(self._body_of(ids[copy]))
-            obstacles.append(self._body_of(id_))
-        return BodyPairs(
-            np.array(copies), Body.columns(vehicles), Body.columns(obstacles)
-        )
+        copies = [copy for copy, _ in pairs]
+        vehicles = self._bodies([self.ids(VUT)[copy] for copy in copies])
+        obstacles = self._bodies([id_ for _, id_ in pairs])
+        return BodyPairs(np.array(copies), vehicles, obstacles)
 
-    def _body_of(self, id_: str) -> Body:
-        domain = self._domain_of(id_)
-        front = np.array(domain.getPosition(id_))
-        along = direction_of(domain.getAngle(id_))
-        return Body.behind(
-            front,
-            along,
-            domain.getLength(id_),
-            domain.getWidth(id_),
-            domain.getSpeed(id_),
-        )
-
-    def _domain_of(self, id_: str) -> Api:
-        if id_ in self.api.person.getIDList():
-            return self.api.person
-        return self.api.vehicle
+    def _bodies(self, ids: Sequence[str]) -> Body:
+        """The bodies of actors, by their ids, in columns."""
+        persons = self.api.person.getIDList()
+        rows = []
+        for id_ in ids:
+            domain = self.api.person if id_ in persons else self.api.vehicle
+            place = domain.getPosition(id_)
+            along = direction_of(domain.getAngle(id_))
+            size = domain.getLength(id_), domain.getWidth(id_)
+            rows.append((*place, *along, *size, domain.getSpeed(id_)))
+        front, along, rest = np.split(np.reshape(rows, (-1, 7)), (2, 4), axis=1)
+        length, width, speed = rest.T
+        return Body.behind(front, along, length, width, speed)
 
     def speeds(self) -> FloatArray:
         """Speeds of the vehicles under test in this step [m/s]."""
@@ -278,22 +268,22 @@ class SumoWorld:
         """Write the motion of all actors on the road into `tracks`, which has a film of `length`
         samples for each name, at one of these samples.
         """
-        for id_, (place, angle) in self.actor_poses().items():
-            copy, name = copy_and_name(id_)
-            domain = self._domain_of(id_)
-            if name not in tracks:
-                motion = nans((length, self.n, 5))
-                tracks[name] = Film(
-                    motion,
-                    domain is self.api.person,
-                    domain.getLength(id_),
-                    domain.getWidth(id_),
+        for domain in (self.api.vehicle, self.api.person):
+            for id_ in domain.getIDList():
+                copy, name = copy_and_name(id_)
+                if name not in tracks:
+                    motion = nans((length, self.n, 5))
+                    tracks[name] = Film(
+                        motion,
+                        domain is self.api.person,
+                        domain.getLength(id_),
+                        domain.getWidth(id_),
+                    )
+                tracks[name].motion[sample, copy] = (
+                    *domain.getPosition(id_),
+                    *direction_of(domain.getAngle(id_)),
+                    domain.getSpeed(id_),
                 )
-            tracks[name].motion[sample, copy] = (
-                *place,
-                *direction_of(angle),
-                domain.getSpeed(id_),
-            )
 
     def vehicle_length(self, actor: str) -> float:
         return float(self.api.vehicle.getLength(self.ids(actor)[0]))

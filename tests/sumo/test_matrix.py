@@ -220,9 +220,9 @@ def test_bodies_touch_at_the_side_where_the_overlap_began_last(
     speed: float,
     contact: tuple[str, float, float | None],
 ) -> None:
-    own = Body(np.zeros(2), EAST, 4.0, 2.0, 10.0)
-    other = Body(np.array(middle), np.array(along), 0.6, 0.4, speed)
-    touches = find_touches(Body.columns([own]), Body.columns([other]))
+    own = Body(np.zeros((1, 2)), EAST[np.newaxis], 4.0, 2.0, np.array([10.0]))
+    other = Body(np.array([middle]), np.array([along]), 0.6, 0.4, np.array([speed]))
+    touches = find_touches(own, other)
     assert touches.side == contact[0]
     assert touches.age == pytest.approx(contact[1])
     if contact[2] is not None:
