@@ -24,8 +24,10 @@ from safevar_sumo.questions.tolerance import asked, boxes, words
 from safevar_sumo.questions.tolerance.asked import (
     asked_of,
     effort_of,
+    effort_of_few,
     usual_alone,
 )
+from safevar_sumo.questions.tolerance.boxes import Attack
 from safevar_sumo.questions.tolerance.found import worst_of
 from safevar_sumo.questions.tolerance.search import find_limits
 from safevar_sumo.questions.words import bound_in_words
@@ -288,8 +290,8 @@ def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> N
 
 
 def test_the_worst_clearance_is_what_is_left_beside_the_margin_of_its_set() -> None:
-    least = {0: 0.2, 2: 0.4, 3: np.inf}
-    assert worst_of(Unsafe(keep=0.3), least) == 0.4
+    attacks = {0: Attack(least=0.2), 2: Attack(least=0.4), 3: Attack(least=np.inf)}
+    assert worst_of(Unsafe(keep=0.3), attacks) == 0.4
 
 
 def test_few_simulations_claim_nothing_of_a_set_that_they_do_not_reach() -> None:
@@ -303,20 +305,20 @@ def test_few_simulations_claim_nothing_of_a_set_that_they_do_not_reach() -> None
 
 
 def test_few_simulations_are_shared_between_limits_alone_and_the_box() -> None:
-    evaluator = made_up_evaluator(4, nowhere)
-    effort = effort_of(evaluator, 3000, 4)
+    effort = effort_of_few(3000, 4)
     assert (effort.values, effort.alone, effort.cases) == (8, 0, 300)
     on_lines = effort.encounters * (effort.values + sum(effort.box.parts))
     assert 300 < 8 * on_lines <= 0.15 * 3000
     assert (effort.corners, effort.confirmations, effort.share) == (1, 2, 1)
     assert effort.box.retreat == pytest.approx(0.5 + 200 / 3000)
-    assert effort_of(evaluator, 200, 4).values == 3
+    assert effort_of_few(200, 4).values == 3
+    evaluator = made_up_evaluator(4, nowhere)
     assert usual_alone(evaluator) == 4 * usual_alone(evaluator, 1) == 4 * 5000
     # In ranges, a vehicle drives at all 6 points in 16 critical encounters, for 960 s. So the
     # effort is 25 / 960. Fewer than 8 values show no limit.
     evaluator = Evaluator(with_ranges(load_study("r152")), InlinePool())
     evaluator.limit(None, 1, quick=True)
-    quick = effort_of(evaluator, np.inf, 1)
+    quick = effort_of(evaluator)
     assert (quick.values, quick.cases, quick.box.explored) == (8, 130, 0)
     assert (quick.cases_of_set, usual_alone(evaluator, 1)) == (26, 130)
 
