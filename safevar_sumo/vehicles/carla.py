@@ -44,20 +44,6 @@ if TYPE_CHECKING:
 
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
-# Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) in r/min and N m. The
-# curve is stretched over max_rpm of the vehicle.
-TORQUE_IDLE = 400.0  # N m
-TORQUE_PEAK = 500.0  # N m
-TORQUE_END = 400.0  # N m
-# Engine speeds of peak and end over the maximum engine speed. The falling line extends to 1.
-PEAK_SPEED = 1890 / 5800
-END_SPEED = 5730 / 5800
-TORQUE_RISE = (TORQUE_PEAK - TORQUE_IDLE) / PEAK_SPEED
-TORQUE_FALL = (TORQUE_PEAK - TORQUE_END) / (END_SPEED - PEAK_SPEED)
-# Neutral first; blueprint of the LincolnMkz2017.
-GEAR_RATIOS = 0.0, 2.85, 2.02, 1.35, 1.0
-FINAL_RATIO = 4.0
-OVERALL_RATIOS = tuple(ratio * FINAL_RATIO for ratio in GEAR_RATIOS)
 WHEELS = 4
 WHEEL_MASS = 20.0  # kg each; PxVehicleWheelData.mMass
 AIR_DENSITY = 1.2  # kg/m^3
@@ -182,7 +168,7 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         substep = step / substeps
         tyre_step = substep / TYRE_STEPS
 
-        constants = Car(
+        car = Car(
             radius=radius,
             wheel_inertia=WHEELS * 0.5 * WHEEL_MASS * radius * radius / tyre_step,
             wheel_damping=WHEELS * c["dampRate"],
@@ -198,21 +184,18 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             air_drag=0.5 * AIR_DENSITY * FRONTAL_AREA * c["dragCoeff"],
             speed_by_force=tyre_step / c["mass"],
             speed_by_slope=np.zeros_like(radius) + slope.back * tyre_step,
-            standstill=np.zeros_like(radius),
+            standstill=HOLD_SPEED,
         )
 
-        # The speed at which a slope moves the wheels counts as standstill. `car` shares the memory
-        # of `rows`, so that it gets this speed, too.
-        rows = np.array(constants)
-        car = Car(*rows)
+        # The speed at which a slope moves the wheels counts as standstill, too.
         pull = c["mass"] * slope.back
         creep_speed, _ = self._rim_at(car, np.abs(pull), np.zeros_like(radius))
-        rows[Car._fields.index("standstill")] = HOLD_SPEED + creep_speed
+        car = car._replace(standstill=HOLD_SPEED + creep_speed)
         return _Prepared(
             substeps=substeps,
             law=self._law(substep, tyre_step),
             car=car,
-            rows=rows,
+            rows=np.array(car),
             mass=c["mass"],
             shift_time=c["gearSwitchTime"],
             pull=pull,
@@ -232,12 +215,6 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             brake_fall=self.brake_fall * substep,
             engine_inertia=ENGINE_INERTIA / tyre_step,
             engine_torque=float(self.engine_torque),
-            torque_idle=TORQUE_IDLE,
-            torque_rise=TORQUE_RISE,
-            torque_peak=TORQUE_PEAK,
-            torque_fall=TORQUE_FALL,
-            peak_share=PEAK_SPEED,
-            ratios=OVERALL_RATIOS,
             shift_up=float(self.shift_up),
             shift_down=float(self.shift_down),
             shift_latency=float(self.shift_latency),
@@ -245,6 +222,8 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         )
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
+        from safevar_sumo.vehicles.carla_step import OVERALL_RATIOS, TORQUE_PEAK
+
         car = prepared.car
         mass = prepared.mass
         drive = self.engine_torque * TORQUE_PEAK * OVERALL_RATIOS[1] / car.radius
@@ -269,7 +248,11 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         The gearbox has shifted up to the gear for this speed. If the engine is so slow in this gear
         that the gearbox would shift down, its last shift has just ended, so that it must wait.
         """
-        from safevar_sumo.vehicles.carla_step import CarlaState, full_torque
+        from safevar_sumo.vehicles.carla_step import (
+            OVERALL_RATIOS,
+            CarlaState,
+            full_torque,
+        )
 
         p = prepared.car
         rim, force = self._rim_at(p, prepared.pull, speed)

@@ -3,7 +3,7 @@ side by side.
 
 No operation is fused or reordered: a vehicle gets the same bits as with Python's own floats,
 whichever unit of the processor computes it. Numba's cache notices changes of this file only: so
-this file defines the records, and constants are arguments.
+this file defines the records and the constants of the equations, and other numbers are arguments.
 """
 
 from __future__ import annotations
@@ -26,6 +26,20 @@ FIRST_GEAR = 1.0
 """The lowest forward gear."""
 TOP_GEAR = 4.0
 """The highest forward gear."""
+# Torque curve of CARLA's default car: (0, 400), (1890, 500), (5730, 400) in r/min and N m. The
+# curve is stretched over max_rpm of the vehicle.
+TORQUE_IDLE = 400.0  # N m
+TORQUE_PEAK = 500.0  # N m
+TORQUE_END = 400.0  # N m
+# Engine speeds of peak and end over the maximum engine speed. The falling line extends to 1.
+PEAK_SPEED = 1890 / 5800
+END_SPEED = 5730 / 5800
+TORQUE_RISE = (TORQUE_PEAK - TORQUE_IDLE) / PEAK_SPEED
+TORQUE_FALL = (TORQUE_PEAK - TORQUE_END) / (END_SPEED - PEAK_SPEED)
+# Neutral first; blueprint of the LincolnMkz2017.
+GEAR_RATIOS = 0.0, 2.85, 2.02, 1.35, 1.0
+FINAL_RATIO = 4.0
+OVERALL_RATIOS = tuple(ratio * FINAL_RATIO for ratio in GEAR_RATIOS)
 
 
 class Car(NamedTuple):
@@ -56,12 +70,9 @@ class Car(NamedTuple):
 
 
 class Law(NamedTuple):
-    """Constants that all vehicles share: of pedals, engine, gearbox and tyres, in SI units.
+    """Parameters that all vehicles share: of pedals, engine, gearbox and tyres, in SI units.
 
-    `throttle_rise` to `brake_fall` are the largest changes of a pedal in a substep [-]. The torque
-    at full throttle is the lower of two lines over the engine's speed as a share of its highest
-    speed: the first line rises from `torque_idle`, and the second line falls through `torque_peak`
-    at `peak_share` [N m].
+    `throttle_rise` to `brake_fall` are the largest changes of a pedal in a substep [-].
     """
 
     substep: float
@@ -71,12 +82,6 @@ class Law(NamedTuple):
     brake_fall: float
     engine_inertia: float
     engine_torque: float
-    torque_idle: float
-    torque_rise: float
-    torque_peak: float
-    torque_fall: float
-    peak_share: float
-    ratios: tuple[float, ...]
     shift_up: float
     shift_down: float
     shift_latency: float
@@ -102,27 +107,13 @@ class CarlaState(NamedTuple):
     brake: FloatOrArray
 
 
-class Gearbox(NamedTuple):
-    """The gears of a `CarlaState` after a substep."""
-
-    gear: FloatOrArray
-    target_gear: FloatOrArray
-    since_shift: FloatOrArray
-
-
-class Speeds(NamedTuple):
-    """The speeds of a `CarlaState` after a substep."""
-
-    speed: FloatOrArray
-    wheel_speed: FloatOrArray
-    engine_speed: FloatOrArray
-
-
 def full_torque(car: Car, law: Law, engine_speed: FloatOrArray) -> FloatOrArray:
-    """Engine torque at full throttle [N m]: linear between the points of the curve."""
+    """Engine torque at full throttle [N m]: the lower of two lines over the engine's speed as a
+    share of its highest speed.
+    """
     speed_share = engine_speed / car.engine_limit
-    rising_line = law.torque_idle + law.torque_rise * speed_share
-    falling_line = law.torque_peak - law.torque_fall * (speed_share - law.peak_share)
+    rising_line = TORQUE_IDLE + TORQUE_RISE * speed_share
+    falling_line = TORQUE_PEAK - TORQUE_FALL * (speed_share - PEAK_SPEED)
     return law.engine_torque * np.minimum(rising_line, falling_line)
 
 
@@ -140,9 +131,9 @@ def pedal_position(
 
 
 @equation
-def ratio_of(law: Law, gear: FloatOrArray) -> FloatOrArray:
+def ratio_of(gear: FloatOrArray) -> FloatOrArray:
     """Overall ratio of a gear; 0 in neutral."""
-    neutral, first_ratio, second_ratio, third_ratio, fourth_ratio = law.ratios
+    neutral, first_ratio, second_ratio, third_ratio, fourth_ratio = OVERALL_RATIOS
     low = first_ratio if gear == 1.0 else second_ratio
     high = third_ratio if gear == 3.0 else fourth_ratio
     engaged = low if gear < 3.0 else high
@@ -150,8 +141,12 @@ def ratio_of(law: Law, gear: FloatOrArray) -> FloatOrArray:
 
 
 @equation
-def shift(car: Car, law: Law, s: CarlaState, throttle: FloatOrArray) -> Gearbox:
-    """The gears after a substep of the automatic gearbox; during a shift the gear is neutral."""
+def shift(
+    car: Car, law: Law, s: CarlaState, throttle: FloatOrArray
+) -> tuple[FloatOrArray, FloatOrArray, FloatOrArray]:
+    """Gear, target gear and time since a shift began, after a substep of the automatic gearbox;
+    during a shift the gear is neutral.
+    """
     speed_share = s.engine_speed / car.engine_limit
     is_ready = s.since_shift >= law.shift_latency
     sets_off = (s.gear <= NEUTRAL) & (s.gear == s.target_gear) & (throttle > 0.0)
@@ -165,7 +160,7 @@ def shift(car: Car, law: Law, s: CarlaState, throttle: FloatOrArray) -> Gearbox:
     target = s.target_gear + (1.0 if up else 0.0) - (1.0 if down else 0.0)
     since_shift = 0.0 if up | down else s.since_shift + law.substep
     gear = target if (target == s.gear) | (since_shift >= car.shift_end) else NEUTRAL
-    return Gearbox(gear, target, since_shift)
+    return gear, target, since_shift
 
 
 @equation
@@ -196,8 +191,9 @@ def roll(
     gear: FloatOrArray,
     throttle: FloatOrArray,
     brake: FloatOrArray,
-) -> Speeds:
-    """Engine, clutch, wheels, tyres and body over one substep.
+) -> tuple[FloatOrArray, FloatOrArray, FloatOrArray]:
+    """Engine, clutch, wheels, tyres and body over one substep: the speeds of vehicle, wheels and
+    engine after it.
 
     I_e dw_e/dt = throttle T(w_e) - c_e w_e - k_c (w_e - G w_w)
     I_w dw_w/dt = G k_c (w_e - G w_w) - d w_w - T_brake - r F
@@ -207,7 +203,7 @@ def roll(
     damping rates, D is the air drag. The tyre force F is explicit. It may end the slip within a
     step but never reverse it, so the slip cannot oscillate.
     """
-    ratio = ratio_of(law, gear)
+    ratio = ratio_of(gear)
     clutch = car.clutch if gear > NEUTRAL else 0.0
     damping = car.damping_engaged if gear > NEUTRAL else car.damping_neutral
     clutch_by_ratio = ratio * clutch
@@ -252,7 +248,7 @@ def roll(
             free_engine_speed + engine_by_rim * rim, car.engine_limit
         )
         speed = np.maximum(speed + car.speed_by_force * force - speed_loss, 0.0)
-    return Speeds(speed, rim / car.radius, engine_speed)
+    return speed, rim / car.radius, engine_speed
 
 
 @equation
@@ -268,11 +264,10 @@ def move(
         throttle_command, s.throttle, law.throttle_fall, law.throttle_rise
     )
     brake = pedal_position(brake_command, s.brake, law.brake_fall, law.brake_rise)
-    gearbox = shift(car, law, s, throttle)
-    speeds = roll(car, law, s, gearbox.gear, throttle, brake)
+    gear, target_gear, since_shift = shift(car, law, s, throttle)
+    speed, wheel_speed, engine_speed = roll(car, law, s, gear, throttle, brake)
     return CarlaState(
-        speeds.speed, speeds.wheel_speed, speeds.engine_speed,
-        gearbox.gear, gearbox.target_gear, gearbox.since_shift, throttle, brake,
+        speed, wheel_speed, engine_speed, gear, target_gear, since_shift, throttle, brake
     )  # fmt: skip
 
 

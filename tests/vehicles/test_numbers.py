@@ -13,11 +13,10 @@ from safevar_sumo.records import GRAVITY, Command
 from safevar_sumo.vehicles.carla import (
     AIR_DENSITY,
     ENGINE_INERTIA,
-    FINAL_RATIO,
     FRONTAL_AREA,
-    GEAR_RATIOS,
     RPM,
 )
+from safevar_sumo.vehicles.carla_step import FINAL_RATIO, GEAR_RATIOS
 from safevar_sumo.vehicles.lgsvl import _tyre_stiffness
 from tests.made_up import seen
 from tests.vehicles.runs import (
