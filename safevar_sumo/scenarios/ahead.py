@@ -7,7 +7,7 @@ or brakes (CCRb); a motorcyclist stands (CMRs) or brakes (CMRb).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -63,10 +63,6 @@ VEHICLE_SPEED = searched(10.0, 130.0, "km/h", "speed of the vehicle at the start
 """Marks the vehicle's speed as a parameter that a study may search."""
 
 
-SpeedOfTime = Callable[[Quantity], Quantity]
-"""A function that returns the speed of a target [m/s] at a time [s]."""
-
-
 class TargetAhead(ProtocolTest, frozen=True, kw_only=True):
     """Base of a scenario with a target ahead in the vehicle's lane; for its parameters see
     `ProtocolTest`.
@@ -91,9 +87,8 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True):
         """Gap to the target at the start [m]."""
         raise NotImplementedError
 
-    @property
-    def target_speed_at(self) -> SpeedOfTime:
-        """The target's speed [m/s] as a function of the time [s]."""
+    def target_speed_at(self, time: Quantity) -> Quantity:
+        """The target's speed [m/s] at a time [s]."""
         raise NotImplementedError
 
     @property
@@ -182,10 +177,9 @@ class Along(TargetAhead, frozen=True, kw_only=True):
             self.time_to_impact
         )
 
-    @property
-    def target_speed_at(self) -> SpeedOfTime:
-        """The target's speed [m/s] as a function of the time [s]."""
-        return self._profile.speed_at
+    def target_speed_at(self, time: Quantity) -> Quantity:
+        """The target's speed [m/s] at a time [s]."""
+        return self._profile.speed_at(time)
 
     @property
     def _profile(self) -> TargetProfile:
@@ -318,17 +312,15 @@ class CarToCar(TargetAhead, frozen=True, kw_only=True):
         defaults = {PreCrash.LEAD_STOPPED: 0.0, PreCrash.LEAD_SLOWER: slower_speed}
         return defaults.get(self.pre_crash, self.speed) * KMH
 
-    @property
-    def target_speed_at(self) -> SpeedOfTime:
-        """The target's speed [m/s] as a function of the time [s]."""
+    def target_speed_at(self, time: Quantity) -> Quantity:
+        """The target's speed [m/s] at a time [s]."""
         first_speed = self._target_speed
-        brakes_at = self.brakes_at
-        deceleration = self.target_deceleration
         if not self._target_brakes:
-            return lambda time: first_speed
+            return first_speed
         last_speed = np.minimum(first_speed, self.final_speed * KMH)
-        return lambda time: np.maximum(
-            first_speed - deceleration * np.maximum(time - brakes_at, 0.0), last_speed
+        braking_time = np.maximum(time - self.brakes_at, 0.0)
+        return np.maximum(
+            first_speed - self.target_deceleration * braking_time, last_speed
         )
 
     # `np.where` also computes the cases that it does not choose, and these may divide by 0.

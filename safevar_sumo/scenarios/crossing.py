@@ -33,7 +33,6 @@ from safevar_sumo.scenarios.tracks import (
     KMH,
     PERSONS,
     SCREEN,
-    BodySize,
     Speed,
     Track,
 )
@@ -86,7 +85,7 @@ class _Start(NamedTuple):
     direction
         The direction in which the target moves.
     extent
-        Size of the target's body along the lane and across it [m].
+        Extent of the target's body along the lane [m].
     impact_left
         Distance of the impact to the left of the lane's middle [m].
     distance_to_impact
@@ -99,7 +98,7 @@ class _Start(NamedTuple):
 
     side: float
     direction: Direction
-    extent: BodySize
+    extent: float
     impact_left: Quantity
     distance_to_impact: Quantity
     time_to_impact: Quantity
@@ -303,7 +302,7 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True):
         speed = np.where(way < end, start.profile.speed_at(times), 0.0)
         # The place of the target's middle at the impact: the nearest side of its body is then at
         # the vehicle's front.
-        impact = self.start_speed * start.time_to_impact + start.extent.length / 2
+        impact = self.start_speed * start.time_to_impact + start.extent / 2
         x = impact + start.direction.along * path
         y = start.impact_left + start.direction.left * path
         crossing = Track(

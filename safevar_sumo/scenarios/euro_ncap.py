@@ -11,13 +11,14 @@ from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Quantity
 from safevar_sumo.scenarios.base import PreCrash
 from safevar_sumo.scenarios.tracks import BodySize, LaneTest
 from safevar_sumo.shipped import shipped_table
+from safevar_sumo.study import Table
 
 Metres = Annotated[float, Meta(ge=0, le=100)]
 Seconds = Annotated[float, Meta(gt=0, le=60)]
@@ -48,14 +49,9 @@ class Direction(NamedTuple):
             self.left * cosine + self.along * sine,
         )
 
-    def extent(self, body: BodySize) -> BodySize:
-        """The size of a body that faces in this direction, along the lane and across it [m]."""
-        cosine = abs(self.along)
-        sine = abs(self.left)
-        return BodySize(
-            body.length * cosine + body.width * sine,
-            body.length * sine + body.width * cosine,
-        )
+    def extent(self, body: BodySize) -> float:
+        """The extent along the lane of a body that faces in this direction [m]."""
+        return body.length * abs(self.along) + body.width * abs(self.left)
 
 
 SAME_DIRECTION = Direction(1.0, 0.0)
@@ -63,7 +59,7 @@ FROM_RIGHT = Direction(0.0, 1.0)
 FROM_LEFT = Direction(0.0, -1.0)
 
 
-class TestRow(Struct, frozen=True, forbid_unknown_fields=True):
+class TestRow(Table, frozen=True):
     """A row of the protocol's table.
 
     Attributes
