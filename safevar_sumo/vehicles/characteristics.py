@@ -13,16 +13,16 @@ from itertools import compress
 from numbers import Real
 from typing import Any
 
-import msgspec
 import numpy as np
+from msgspec.structs import asdict, force_setattr
 
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.records import BoolArray, FloatArray, NamedValues, Quantity
 from safevar_sumo.study import (
     PHASE,
     PHASE_DECIMALS,
+    CharacteristicTable,
     Interval,
-    Precision,
     Study,
     plain_values,
     unit_text,
@@ -38,37 +38,21 @@ the filter keeps changes that are larger than this share of the domain's width (
 """
 
 
-@dataclass(frozen=True, kw_only=True)
-class Characteristic:
+class Characteristic(CharacteristicTable, frozen=True, kw_only=True):
     """One characteristic of the vehicle under test, or a searched parameter of the scenario
-    (`is_scenario`). All values are in `unit`.
+    (`is_scenario`), with the fields of its table in the study. All values are in `unit`.
 
-    These texts may be empty: `meaning` describes the quantity; `counterpart` names the part of a
-    real vehicle that determines it; `measurement` says how a workshop measures it (if `workshop` is
-    false, who else measures it); `remedy` says what to do with a vehicle beyond a limit.
-    `precision` says how exactly the quantity is measured (None: not stated). `short_name` is the
-    name in sentences: by default the meaning up to the first comma or bracket, such as `engine
-    drag`, or `name` if the study gives no meaning.
+    `short_name` is the name in sentences: by default the meaning up to the first comma or bracket,
+    such as `engine drag`, or `name` if the study gives no meaning.
     """
 
     name: str
-    unit: str
-    original: float
-    lower: float
-    upper: float
-    meaning: str = ""
-    short_name: str = ""
-    counterpart: str = ""
-    workshop: bool = True
-    measurement: str = ""
-    precision: Precision | None = None
-    remedy: str = ""
     is_scenario: bool = False
 
     def __post_init__(self) -> None:
         if not self.short_name:
             beginning = re.split(r"[,;(]", self.meaning)[0].strip()
-            object.__setattr__(self, "short_name", beginning or self.name)
+            force_setattr(self, "short_name", beginning or self.name)
 
     @property
     def words(self) -> str:
@@ -206,7 +190,6 @@ class Characteristic:
         # The option `switch` would allow this value: the message says so.
         elif is_number and self.is_legal(value, beyond=True):
             problem += " is outside its domain"
-            hint = ""
             if switch:
                 hint = f", or any with {switch}"
         raise InputError("", problem, f"{expected}{self.suffix}{otherwise}{hint}")
@@ -243,7 +226,7 @@ class CharacteristicSet:
                 Characteristic(
                     name=name,
                     is_scenario=name in study.ranges,
-                    **msgspec.structs.asdict(row),
+                    **asdict(row),
                 )
                 for name, row in study.domains.items()
             )

@@ -13,7 +13,13 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from msgspec import Meta, Struct
 
-from safevar_sumo.records import Command, FloatArray, FloatOrArray, Observation
+from safevar_sumo.records import (
+    Command,
+    FloatArray,
+    FloatOrArray,
+    Observation,
+    clip_to_share,
+)
 from safevar_sumo.study import Proportion
 from safevar_sumo.vehicles.base import (
     LEVEL,
@@ -281,10 +287,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             _torque_share(engine_rpm / p.largest_rpm) * gearing * p.motor_torque
         )
         needed_torque = p.damping * wheel_speed + p.radius * force
-        throttle = np.minimum(
-            np.maximum(needed_torque, 0.0) / np.maximum(full_torque, 1.0), 1.0
-        )
-        brake = np.minimum(np.maximum(-needed_torque, 0.0) / p.brake_torque, 1.0)
+        throttle = clip_to_share(needed_torque / np.maximum(full_torque, 1.0))
+        brake = clip_to_share(-needed_torque / p.brake_torque)
         return self.at_rest(p)._replace(
             speed=speed,
             wheel_speed=wheel_speed,

@@ -142,30 +142,6 @@ DELAYED = (
 """The fields of an observation that sensors report late: all that they report of an obstacle."""
 
 
-def sensed_observation(
-    observation: Observation,
-    past: DelayedSignal | None,
-    latency: FloatArray,
-    reach: FloatArray,
-    step: float,
-) -> tuple[Observation, DelayedSignal]:
-    """The observation as it was one `latency` [s] ago, without obstacles beyond `reach` [m] times
-    the visibility; and the history for the next call. `past` is None in the first call.
-    """
-    sample = np.empty((len(DELAYED), *observation.gap.shape))
-    for row, name in enumerate(DELAYED):
-        sample[row] = getattr(observation, name)
-    past = (
-        DelayedSignal.of(sample, latency, step)
-        if past is None
-        else past.extended(sample)
-    )
-    then = dict(zip(DELAYED, past.delayed(), strict=True))
-    is_detected = then["gap"] <= reach * observation.visibility
-    then["gap"] = np.where(is_detected, then["gap"], np.inf)
-    return observation._replace(**then), past
-
-
 class SensingState(NamedTuple):
     """State of N vehicles: speed [m/s], positions of pedals and gear [-], and acceleration by the
     wheels [m/s^2].
@@ -205,14 +181,17 @@ class SensingVehicle(Vehicle):
         """The observation as it was one latency ago, without an obstacle beyond the sensors' range
         times the visibility; and the state with the observations so far.
         """
-        sensed, past = sensed_observation(
-            observation,
-            state.observations,
-            prepared.latency,
-            prepared.sensor_range,
-            prepared.step,
-        )
-        return sensed, state._replace(observations=past)
+        sample = np.empty((len(DELAYED), *observation.gap.shape))
+        for row, name in enumerate(DELAYED):
+            sample[row] = getattr(observation, name)
+        if state.observations is None:
+            past = DelayedSignal.of(sample, prepared.latency, prepared.step)
+        else:
+            past = state.observations.extended(sample)
+        then = dict(zip(DELAYED, past.delayed(), strict=True))
+        is_detected = then["gap"] <= prepared.sensor_range * observation.visibility
+        then["gap"] = np.where(is_detected, then["gap"], np.inf)
+        return observation._replace(**then), state._replace(observations=past)
 
     def at_rest(self, prepared: Prepared) -> SensingState:
         zeros = np.zeros_like(prepared.mass)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace as vary
 from typing import Any
 
 import numpy as np
@@ -66,8 +65,8 @@ def test_draws_end_where_no_setting_is_feasible() -> None:
 def test_only_the_phase_of_an_encounter_has_its_own_digits() -> None:
     """All others have a quarter of a thousandth of their width, of 10 and of 200."""
     (item, _) = region(0.0, at_most=20.0).characteristics
-    axis = vary(item, is_scenario=True)
-    wide = vary(axis, upper=200.0)
-    assert vary(item, name=PHASE).digits == axis.digits == item.digits
-    assert vary(axis, name=PHASE).digits == vary(wide, name=PHASE).digits == 4
+    axis = replace(item, is_scenario=True)
+    wide = replace(axis, upper=200.0)
+    assert replace(item, name=PHASE).digits == axis.digits == item.digits
+    assert replace(axis, name=PHASE).digits == replace(wide, name=PHASE).digits == 4
     assert wide.digits < axis.digits
