@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, Meta, Struct, UnsetType
+from msgspec import UNSET, Meta, UnsetType
 from msgspec.structs import replace
 
 from safevar_sumo.errors import InputError, UserCodeError, check_name
@@ -21,7 +21,7 @@ from safevar_sumo.records import (
     SimulationRuns,
     nans,
 )
-from safevar_sumo.study import ORIGINAL_DEGREE, MetricsTable
+from safevar_sumo.study import ORIGINAL_DEGREE, MetricsTable, Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,7 +68,7 @@ MeasureName = Annotated[str, Meta(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z")]
 TitleText = Annotated[str, Meta(pattern=r"^[^\x00-\x1f\x7f]{1,200}\Z")]
 
 
-class Measure(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Measure(Table, frozen=True, kw_only=True):
     """A measure is a column of results: a metric of simulation runs, or a measure of change of
     settings. A search may minimise it, or maximise it if larger values are more unsafe.
 
@@ -180,9 +180,7 @@ def checked_measure(code: UserCode) -> Measure:
     return replace(facts, function=function)
 
 
-class Scoring(
-    Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True
-):
+class Scoring(Table, frozen=True, kw_only=True, omit_defaults=True):
     """The metrics of a study, and the objectives of its searches. Results store the scoring beside
     the study.
 
