@@ -173,6 +173,14 @@ def join_phrases(phrases: Iterable[str], conjunction: str = "and") -> str:
     return f"{', '.join(beginning)} {conjunction} {ending}" if beginning else ending
 
 
+def join_few(phrases: Sequence[str], most: int, others: str = "more") -> str:
+    """At most `most` phrases as a list, and the number of all others: `a, b and 3 more`."""
+    surplus = len(phrases) - most
+    if surplus > 0:
+        phrases = [*phrases[:most], f"{surplus} {others}"]
+    return join_phrases(phrases)
+
+
 def count_in_words(count: float, total: int) -> str:
     """A count with its total: `none of the 24`, `1 of the 24`, `all 24`."""
     if count == total > 1:

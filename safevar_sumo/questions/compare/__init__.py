@@ -76,7 +76,12 @@ from safevar_sumo.questions.sentence import Sentence, Sentences, Verdict, answer
 from safevar_sumo.questions.subject import study_in
 from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.tolerance.asked import usual_alone
-from safevar_sumo.questions.words import UNSAFE_MEANS, counted_in_words, join_phrases
+from safevar_sumo.questions.words import (
+    UNSAFE_MEANS,
+    counted_in_words,
+    join_few,
+    join_phrases,
+)
 from safevar_sumo.records import JsonObject, differences as differing_rows
 from safevar_sumo.study import limits_of
 
@@ -168,7 +173,7 @@ def compare(
     )
     valid = pairs.take(pairs.are_valid)
     settings = _settings_frame(common, valid, criteria)
-    tested = _test(settings, valid)
+    tested = _test(settings)
     counts = counts_of(settings.drop_duplicates(list(evaluator.characteristics.names)))
     names = (study.name, second.study.name)
     if names[0] == names[1]:
@@ -328,14 +333,14 @@ class _PairedTest(NamedTuple):
     groups: str
 
 
-def _test(settings: pd.DataFrame, runs: Pairs) -> _PairedTest:
+def _test(settings: pd.DataFrame) -> _PairedTest:
     """Test the difference of the safety degree between A and B in pairs.
 
     A pair has the mean safety degrees in A and in B over the same settings. These are the solutions
     of a run or, if there are fewer runs than the test needs, the sampled settings on a line.
     """
-    a, b = (run.f_safe for run in runs.runs)
-    frame = settings.assign(a=a, b=b).dropna(subset=SIDES)
+    degrees = {"a": settings["a_degree"], "b": settings["b_degree"]}
+    frame = settings.assign(**degrees).dropna(subset=SIDES)
     pairs = frame[frame["source"] == SAMPLE].groupby(LINE)[SIDES].mean()
     names = [f"line {int(line)}" for line in pairs.index]
     groups = "sampled on one line through the domain"
@@ -432,10 +437,9 @@ def _remarks_on_code(
         for name in code_of_a.keys() | code_of_b.keys()
         if code_of_a.get(name) != code_of_b.get(name)
     )
-    if len(files) > MAX_REASONS:
-        files[MAX_REASONS:] = [f"{len(files) - MAX_REASONS} more files"]
     if files:
-        yield words.EQUAL_RESULTS(files=join_phrases(files), **titles)
+        named = join_few(files, MAX_REASONS, "more files")
+        yield words.EQUAL_RESULTS(files=named, **titles)
 
 
 def _basis(

@@ -9,8 +9,8 @@ of a study whose tests are listed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import product
+from collections.abc import Iterator, Mapping
+from itertools import permutations, product
 from typing import Any, NamedTuple
 
 from safevar_sumo.questions.compare.words import (
@@ -24,10 +24,10 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.pairs import Titles
 from safevar_sumo.questions.part import points_of_tests
 from safevar_sumo.questions.sentence import Sentences
-from safevar_sumo.questions.words import join_phrases, number_of
+from safevar_sumo.questions.words import join_few, number_of
 from safevar_sumo.records import KMH_PER_MS
 from safevar_sumo.scenarios import Point
-from safevar_sumo.study import Study, Weather, unit_text
+from safevar_sumo.study import MatrixTest, Study, Weather, unit_text
 from safevar_sumo.study.characteristics import Domain, Interval
 
 MAX_PARTS_NAMED = 4
@@ -50,28 +50,22 @@ class TestCase(NamedTuple):
     weather: Weather
 
 
-def cases_of(
-    study: Study, points: Sequence[Point]
-) -> Iterator[tuple[str, Point, TestCase]]:
-    """Yield the test cases at the points of a study, each with the name of its test (without tests:
-    of its scenario) and its point.
-    """
-    scenario = study.scenario
-    for test, points_of_test in points_of_tests(study, points):
+def cases_of(side: Evaluator) -> Iterator[tuple[MatrixTest | None, Point, TestCase]]:
+    """Yield the test cases of a version, each with its test (None without tests) and its point."""
+    scenario = side.study.scenario
+    for test, points_of_test in points_of_tests(side.study, side.system.points):
         model = (test and test.model) or scenario.model
         stated = {**scenario.parameters, **(test.parameters if test else {})}
         for point in points_of_test:
             driven = {
                 key: value for key, value in point.parameters if key not in OF_ENCOUNTER
             }
-            parameters = stated | driven
-            case = TestCase(model, parameters, point.weather)
-            yield (test.name if test else model), point, case
+            yield test, point, TestCase(model, stated | driven, point.weather)
 
 
 class Coverage(NamedTuple):
-    """What a version is tested with: its study, and its listed test cases as `cases_of` gives
-    them.
+    """What a version is tested with: its study, and its listed test cases, each with the name of
+    its test (without tests: of its scenario) and its point.
     """
 
     study: Study
@@ -81,10 +75,8 @@ class Coverage(NamedTuple):
     def of(cls, side: Evaluator) -> Coverage:
         """The coverage of a version. Values that an axis lists count even if its range is used."""
         study = side.study
-        tests = {test.name: test for test in study.tests}
         cases = []
-        for name, point, case in cases_of(study, side.system.points):
-            test = tests.get(name)
+        for test, point, case in cases_of(side):
             axes = study.axes_of(test)
             lists = {
                 axis: axes[axis].at for axis in study.ranges_of(test) if axes[axis].at
@@ -95,7 +87,7 @@ class Coverage(NamedTuple):
                 parameters = {**case.parameters, **listed}
                 cases.append(
                     (
-                        name,
+                        test.name if test else case.model,
                         point._replace(name=", ".join(words)),
                         case._replace(parameters=parameters),
                     )
@@ -128,20 +120,19 @@ def missing_in_words(a: Evaluator, b: Evaluator, titles: Titles) -> Sentences:
     """Yield sentences on what the study of one version asks less of than the other, such as
     `Version b lacks the test CCRs, which a has.` `titles` are the names of the versions.
     """
-    of_a, of_b = Coverage.of(a), Coverage.of(b)
-    for side, reference, own, other in (
-        (of_a, of_b, titles["a"], titles["b"]),
-        (of_b, of_a, titles["b"], titles["a"]),
-    ):
+    sides = (Coverage.of(a), titles["a"]), (Coverage.of(b), titles["b"])
+    for (side, own), (reference, other) in permutations(sides):
         if parts := missing_parts(side, reference):
-            yield LACKS(version=own, other=other, parts=_few(parts))
+            parts_named = join_few(parts, MAX_PARTS_NAMED)
+            yield LACKS(version=own, other=other, parts=parts_named)
         if values := left_out(side, reference):
-            yield LEAVES_OUT(version=own, other=other, values=_few(values))
+            values_named = join_few(values, MAX_PARTS_NAMED)
+            yield LEAVES_OUT(version=own, other=other, values=values_named)
         for (speed, least), tests in allowances(side, reference).items():
             yield ALLOWS(
                 version=own,
                 other=other,
-                tests=_few(tests),
+                tests=join_few(tests, MAX_PARTS_NAMED),
                 speed=f"{speed:g} km/h",
                 least=f"{least:g} km/h" if least else "none",
             )
@@ -149,14 +140,6 @@ def missing_in_words(a: Evaluator, b: Evaluator, titles: Titles) -> Sentences:
     in_b = _criterion(b.study)
     if in_a != in_b:
         yield CRITERIA(in_a=in_a, in_b=in_b, **titles)
-
-
-def _few(phrases: list[str]) -> str:
-    """At most `MAX_PARTS_NAMED` phrases as a list, and the number of all others."""
-    surplus = len(phrases) - MAX_PARTS_NAMED
-    if surplus > 0:
-        phrases = [*phrases[:MAX_PARTS_NAMED], f"{surplus} more"]
-    return join_phrases(phrases)
 
 
 def _criterion(study: Study) -> str:
@@ -185,12 +168,13 @@ def left_out(side: Coverage, reference: Coverage) -> list[str]:
     """The values in ranges of `reference` that are in no range of `side`, as phrases: of
     characteristics and of encounters.
     """
-    phrases = []
-    for name, domain in reference.study.vehicle.characteristics.items():
-        own_domain = side.study.vehicle.characteristics[name]
-        if not _has_changes_of(own_domain, domain):
-            for part in _outside(domain, own_domain):
-                phrases.append(_values_in_words(name, part, domain.unit))
+    own_domains = side.study.vehicle.characteristics
+    domains = {
+        name: domain
+        for name, domain in reference.study.vehicle.characteristics.items()
+        if not _has_changes_of(own_domains[name], domain)
+    }
+    phrases = list(_outside_of(domains, own_domains))
     for test, _, case in reference.cases:
         # A test that `side` lacks altogether is named elsewhere.
         counterpart = side.counterpart(test, case)

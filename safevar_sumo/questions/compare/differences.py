@@ -31,7 +31,7 @@ from safevar_sumo.questions.sentence import Sentence
 from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.tolerance.asked import Asked, asked_of
 from safevar_sumo.questions.tolerance.search import alone_with_own_set
-from safevar_sumo.questions.words import count_in_words, join_phrases
+from safevar_sumo.questions.words import count_in_words, join_few
 from safevar_sumo.records import FloatArray, JsonObject
 from safevar_sumo.scenarios import Point
 from safevar_sumo.sumo.matrix import simulate_all_points
@@ -75,26 +75,29 @@ def summary_of(numbers: JsonObject, pairs: pd.DataFrame, titles: Titles) -> Answ
     those of the answer; `pairs` has the safety degrees of A and B.
     """
     number_in_both = numbers["both"]
-    values: JsonObject = {
-        "safety degree of the original vehicle [m, or -m/s after a collision]": [
+    rows = [
+        (
+            "safety degree of the original vehicle [m, or -m/s after a collision]",
             numbers["a_degree"],
             numbers["b_degree"],
-        ],
-        f"unsafe vehicles of {numbers['settings']} changed vehicles": [
+        ),
+        (
+            f"unsafe vehicles of {numbers['settings']} changed vehicles",
             numbers["only_a_unsafe"] + number_in_both,
             numbers["only_b_unsafe"] + number_in_both,
-        ],
-        "mean safety degree of the changed vehicles": pairs[SIDES].mean(),
-        f"scenes with needless braking, of {numbers['benign_scenes']} benign scenes": [
+        ),
+        ("mean safety degree of the changed vehicles", *pairs[SIDES].mean()),
+        (
+            f"scenes with needless braking, of {numbers['benign_scenes']} benign scenes",
             numbers["a_needless_braking"],
             numbers["b_needless_braking"],
-        ],
-        "characteristics with the narrower limit": [
+        ),
+        (
+            "characteristics with the narrower limit",
             numbers["limits_grown"],
             numbers["limits_shrunk"],
-        ],
-    }
-    rows = [(quantity, *of_sides) for quantity, of_sides in values.items()]
+        ),
+    ]
     columns = SUMMARY_COLUMNS | {
         side: SUMMARY_COLUMNS[side]._replace(head=title)
         for side, title in titles.items()
@@ -206,10 +209,8 @@ def compare_limits(limits: pd.DataFrame, members: CharacteristicSet) -> Differen
     ):
         changed = {*exist["characteristic"][exist["change"] == change]}
         names = [item.short_name for item in members if item.name in changed]
-        if len(names) > MAX_LIMITS_NAMED:
-            names[MAX_LIMITS_NAMED:] = [f"{len(names) - MAX_LIMITS_NAMED} more"]
         for is_better in signs if names else ():
-            values = {"wider": wider, "names": join_phrases(names)}
+            values = {"wider": wider, "names": join_few(names, MAX_LIMITS_NAMED)}
             yield Difference(words.LIMITS, values, is_better)
 
 
@@ -251,8 +252,7 @@ def _new_collisions(evaluators: Evaluators) -> Differences:
     """
     of_a, of_b = map(_collisions_of_original, evaluators)
     cases_of_collisions = [case for case, _, _ in of_a]
-    a = evaluators[0]
-    cases_of_a = [case for _, _, case in cases_of(a.study, a.system.points)]
+    cases_of_a = [case for _, _, case in cases_of(evaluators[0])]
 
     new = [
         (speed, point)
@@ -275,10 +275,9 @@ def _collisions_of_original(side: Evaluator) -> list[tuple[TestCase, Point, floa
     """
     original = side.characteristics.original[np.newaxis]
     results = simulate_all_points(side.system, original)
-    cases = cases_of(side.study, side.system.points)
     return [
         (case, point, float(-result.evaluations.f_safe[0]))
-        for (_, point, case), result in zip(cases, results, strict=True)
+        for (_, point, case), result in zip(cases_of(side), results, strict=True)
         if result.evaluations.collided[0]
     ]
 

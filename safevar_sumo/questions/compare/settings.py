@@ -100,7 +100,8 @@ class CommonDomain(NamedTuple):
     evaluators
         The evaluators of A and B, whose characteristics have the same order.
     shift
-        B's original values minus A's, shape (n,); 0 for parameters of the scenario.
+        B's original values minus A's, shape (n,); 0 for parameters of the scenario. A setting of B
+        with the same changes as a setting of A is larger by this.
     lower, upper
         The ends of both domains within the limits, A's in row 0 and B's in row 1, shape (2, n).
     """
@@ -145,16 +146,8 @@ class CommonDomain(NamedTuple):
         """The lower and the upper ends, shape (n,), of the settings of A that are in A's domain,
         and whose counterparts are in B's domain.
         """
-        lower = np.maximum(self.lower[0], self.as_in_a(self.lower[1]))
-        return lower, np.minimum(self.upper[0], self.as_in_a(self.upper[1]))
-
-    def as_in_b(self, settings: FloatArray) -> FloatArray:
-        """The settings of B with the same changes as settings of A."""
-        return settings + self.shift
-
-    def as_in_a(self, settings: FloatArray) -> FloatArray:
-        """The settings of A with the same changes as settings of B."""
-        return settings - self.shift
+        lower = np.maximum(self.lower[0], self.lower[1] - self.shift)
+        return lower, np.minimum(self.upper[0], self.upper[1] - self.shift)
 
     def holds(self, settings: FloatArray) -> BoolArray:
         """Which of M pairs of settings, shape (2, M, n), lie in the domains of their versions,
@@ -169,7 +162,7 @@ class CommonDomain(NamedTuple):
         """The settings of A and their counterparts in B, shape (2, M, n). A value that rounding
         errors move out of B's domain is put onto the domain's end.
         """
-        in_b = np.clip(self.as_in_b(settings), self.lower[1], self.upper[1])
+        in_b = np.clip(settings + self.shift, self.lower[1], self.upper[1])
         return np.stack([settings, in_b])
 
     def evaluate(self, settings: FloatArray) -> list[Evaluations]:
@@ -239,8 +232,8 @@ def pairs_of(
         if not isinstance(case, Case):
             continue
         solutions = case.solutions[names].to_numpy(float)
-        in_a = solutions if side == "a" else common.as_in_a(solutions)
-        in_b = solutions if side == "b" else common.as_in_b(solutions)
+        in_a = solutions if side == "a" else solutions - common.shift
+        in_b = solutions if side == "b" else solutions + common.shift
         settings = np.stack([in_a, in_b])
         is_inside = common.holds(settings)
         run_columns = [
