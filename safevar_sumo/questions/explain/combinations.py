@@ -184,8 +184,6 @@ def count_cures(
         room -= len(containing)
         if room < 0:
             break
-        if not containing:
-            continue
         settings = _settings(evaluator.characteristics, containing)
         runs = evaluator.evaluate_over_encounters(settings, unsafe, COMBINATIONS)
         cures[size] = int(np.count_nonzero(runs.valid & ~unsafe.of(runs)))
@@ -207,9 +205,8 @@ def staircase(
     least_price = encounters * sum(
         number for size, number in at_ends.simulated.items() if size < at_ends.size
     )
-    for remaining_shares, share in zip(
-        range(len(SHARES) - 2, -1, -1), SHARES[1:], strict=True
-    ):
+    for place, share in enumerate(SHARES[1:], 2):
+        remaining_shares = len(SHARES) - place
         budget = (
             limit - remaining_shares * least_price
             if at_ends.causes
@@ -265,8 +262,6 @@ def _robustness(
     """
     members = evaluator.characteristics
     names = members.names
-    if not chosen:
-        return np.zeros(0), [], 0
     runs = evaluator.evaluate_over_encounters(
         _settings(members, chosen), unsafe, COMBINATIONS
     )

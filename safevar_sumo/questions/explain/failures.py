@@ -202,36 +202,22 @@ def _solutions_of(case: Case, named: Sequence[SolutionId]) -> Candidates:
     )
 
 
-class Chosen(NamedTuple):
-    """The failures that are explained, and their causes.
-
-    Attributes
-    ----------
-    reasons
-        The reasons for which failures are chosen, by row.
-    sample
-        The rows of a sample of all failures.
-    causes
-        The minimal causes of chosen and sampled failures, by row.
-    complete
-        The number of changes up to which all minimal causes were found; None if all were found.
-    """
-
-    reasons: Reasons
-    sample: list[int]
-    causes: dict[int, list[Cause]]
-    complete: int | None
-
-
 def choose_failures(
     population: Population, evaluator: Evaluator, limit: int, top: int
-) -> Chosen:
+) -> tuple[Reasons, list[int], dict[int, list[Cause]], int | None]:
     """Choose at most `top` failures that matter, and a sample of all failures, and find their
     minimal causes. If the user names solutions, these are all chosen, and are the sample.
 
     The failures that matter are a failure for each of `REASONS`, and then, for each minimal cause
     that these failures do not have, the simplest failure with this cause. The sample has all
     failures if their causes take at most about `limit` simulations.
+
+    The results are:
+
+    - the reasons for which failures are chosen, by row,
+    - the rows of the sample,
+    - the minimal causes of chosen and sampled failures, by row,
+    - the number of changes up to which all minimal causes were found; None if all were found.
     """
     # A setting takes a simulation at every point: the limit becomes a number of settings.
     limit //= len(evaluator.system.points)
@@ -252,10 +238,9 @@ def choose_failures(
     causes = dict(zip(analysed, groups, strict=True))
     numbers = runs.f_num_diff[analysed].astype(int).tolist()
     complete = largest_complete(numbers, limit)
-    is_cut = complete < max(numbers, default=0)
-    chosen = Chosen(reasons, sample, causes, complete if is_cut else None)
+    complete_up_to = complete if complete < max(numbers, default=0) else None
     if population.is_named:
-        return chosen
+        return reasons, sample, causes, complete_up_to
 
     members = evaluator.characteristics
     kinds = {row: kinds_of(members, group) for row, group in causes.items()}
@@ -267,7 +252,7 @@ def choose_failures(
                 key=lambda row: (runs.f_num_diff[row], runs.f_diff[row], row),
             )
             reasons[simplest] = DISTINCT_CAUSE
-    return chosen
+    return reasons, sample, causes, complete_up_to
 
 
 def _failures_that_matter(population: Population) -> Reasons:
@@ -282,7 +267,7 @@ def _failures_that_matter(population: Population) -> Reasons:
     return reasons
 
 
-PointComparison = tuple[str, tuple[str, ...]]
+PointComparison = tuple[str, list[str]]
 """A sentence on how the runs of the original vehicle and of a failure end at the failure's worst
 point; and the names of the points of a matrix at which the failure is unsafe, in the study's order.
 """
@@ -311,6 +296,6 @@ def compare_at_points(
         )
         # Without a matrix, the only point has no name.
         failures = compress(system.points, is_unsafe[:, vehicle])
-        names = filter(None, (point.name for point in failures))
-        comparisons.append((sentence.text, tuple(names)))
+        names = [point.name for point in failures if point.name]
+        comparisons.append((sentence.text, names))
     return comparisons

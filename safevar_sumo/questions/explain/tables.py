@@ -95,7 +95,7 @@ def failures_frame(
         "largest_change": failures.f_diff,
         "unsafe_neighbours": robust_shares(evaluator, settings, unsafe).mean(axis=1),
         "ends": sentences,
-        "points": list(map(list, points)),
+        "points": points,
         "avoided_by": drivers,
     }
     return pd.DataFrame(columns)
@@ -205,11 +205,15 @@ def printed_limits(
     single_values = iter(values_as_printed(model, alone, names))
     columns = []
     for values, cause in zip(printed, causes, strict=True):
-        single_boundary = {name: next(single_values)[name] for name in cause.changes}
-        cells = {"single_boundary": single_boundary}
-        cells["encounter"] = {name: values[name] for name in cause.encounter}
-        cells["boundary"] = {name: values[name] for name in cause.changes}
-        columns.append(cells)
+        columns.append(
+            {
+                "single_boundary": {
+                    name: next(single_values)[name] for name in cause.changes
+                },
+                "encounter": {name: values[name] for name in cause.encounter},
+                "boundary": {name: values[name] for name in cause.changes},
+            }
+        )
     return columns
 
 

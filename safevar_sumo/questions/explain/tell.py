@@ -99,11 +99,8 @@ def _leading_of_study(
         yield words.UNSAFE_IN_ENCOUNTER
         return
     share = leading["begins_at"]
-    if pd.notna(leading["runs"]):
-        yield _repeated(members, leading)
-    else:
-        templates = _templates(members, leading["boundary"], share)
-        yield _enough(templates, members, unsafe, leading["boundary"], share)
+    templates = _templates(members, leading["boundary"], share)
+    yield _enough(templates, members, unsafe, leading, share)
     if number_of_others := int((table["size"] == leading["size"]).sum()) - 1:
         yield words.OTHERS(causes=number_of(number_of_others, "further cause"))
 
@@ -122,16 +119,6 @@ def _checked(members: CharacteristicSet, row: Mapping[Any, Any]) -> Sentences:
             checks += " and of other parameter sets"
         changes = values_in_words(members, row["causes"])
         yield words.CHECKED_WITH(checks=checks, changes=changes)
-
-
-def _repeated(members: CharacteristicSet, row: Mapping[Any, Any]) -> Sentence:
-    """Say in how many of its fresh runs the vehicle of a row of the table of causes fails."""
-    fails = np.arange(row["runs"]) < row["failing_runs"]
-    return words.WITH_REPEATS(
-        number=number_of(row["size"], "change"),
-        fails=runs_in_words(fails),
-        changes=values_in_words(members, row["boundary"]),
-    )
 
 
 def _templates(
@@ -154,16 +141,26 @@ def _enough(
     templates: Sequence[Sentence],
     members: CharacteristicSet,
     unsafe: Unsafe,
-    changes: NamedValues,
+    row: Mapping[Any, Any],
     share: float = 1.0,
 ) -> Sentence:
-    """Say that changes are enough for an unsafe vehicle. `templates` has the sentence for one
-    change and the sentence for several.
+    """Say that the changes in a row of the table of causes are enough for an unsafe vehicle or, if
+    runs differ, in how many of its fresh runs the vehicle fails. `templates` has the sentence for
+    one change and the sentence for several.
     """
-    return templates[len(changes) > 1](
+    size = len(row["boundary"])
+    changes = values_in_words(members, row["boundary"])
+    if pd.notna(row["runs"]):
+        fails = np.arange(row["runs"]) < row["failing_runs"]
+        return words.WITH_REPEATS(
+            number=number_of(size, "change"),
+            fails=runs_in_words(fails),
+            changes=changes,
+        )
+    return templates[size > 1](
         unsafe=unsafe.event,
-        number=_count(len(changes)),
-        changes=values_in_words(members, changes),
+        number=_count(size),
+        changes=changes,
         share=percentage(share),
     )
 
@@ -282,11 +279,7 @@ def failure_sentences(
         return
 
     members = evaluator.characteristics
-    boundary = leading["boundary"]
-    if pd.notna(leading["runs"]):
-        yield _repeated(members, leading)
-    else:
-        yield _enough(words.CHANGES, members, unsafe, boundary)
+    yield _enough(words.CHANGES, members, unsafe, leading)
     place = leading.get("encounter", {})
     if values := place_in_words(members, place, are_printed=True):
         yield words.ENCOUNTER(values=values)
@@ -296,7 +289,7 @@ def failure_sentences(
             count=count_in_words(number, analysed),
             have="has" if number <= 1 else "have",
         )
-    yield from _beyond(evaluator, unsafe, boundary, place)
+    yield from _beyond(evaluator, unsafe, leading["boundary"], place)
     yield from _sureness(leading)
 
 
