@@ -26,7 +26,7 @@ from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.search import Problem
 from safevar_sumo.search.genetic import Nsga2
 from safevar_sumo.study import SAFETY_DEGREE
-from safevar_sumo.vehicles import CharacteristicSet
+from safevar_sumo.vehicles import CharacteristicSet, FeasibleRegion
 
 TREES, POPULATION = 300, 50
 Evaluate = Callable[[FloatArray], Evaluations]
@@ -53,7 +53,7 @@ def search(
     """The solutions of several runs of NSGA-II, which request their evaluations together."""
     original = evaluate(characteristics.original[np.newaxis])
     problem = Problem(
-        characteristics=characteristics,
+        region=FeasibleRegion(characteristics, ()),
         original=original,
         evaluations=evaluations,
         population=POPULATION,

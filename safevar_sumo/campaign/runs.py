@@ -156,12 +156,11 @@ def check_algorithms(study: Study, system: System) -> None:
 def problem_of(study: Study, system: System, original: Evaluations) -> Problem:
     """The problem that the searches of a study have to solve."""
     return Problem(
-        characteristics=system.characteristics,
+        region=system.region,
         original=original,
         evaluations=study.search.evaluations,
         population=study.search.population,
         scoring=system.measuring.scoring,
-        region=system.region,
     )
 
 

@@ -375,11 +375,10 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
         member, study.search.parameters.get(label, {}), f"search.{label}"
     )
     problem = Problem(
-        characteristics=system.characteristics,
+        region=system.region,
         original=drive_and_score(system, system.characteristics.original_settings),
         population=min(study.search.population, MAX_POPULATION),
         evaluations=min(study.search.evaluations, MAX_EVALUATIONS),
-        region=system.region,
         scoring=system.measuring.scoring,
     )
 

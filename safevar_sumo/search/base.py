@@ -38,8 +38,9 @@ class Problem:
 
     Attributes
     ----------
-    characteristics
-        The characteristics that the search varies.
+    region
+        The settings that satisfy the study's constraints; without constraints, all settings.
+        Settings must be in this region after the filter.
     original
         The evaluation of the original vehicle.
     evaluations
@@ -48,17 +49,18 @@ class Problem:
         Number of settings in a generation, for algorithms with generations.
     scoring
         The objectives, and the rule which evaluated settings are valid.
-    region
-        The feasible region of a study with constraints; None without constraints. Settings must be
-        in this region after the filter.
     """
 
-    characteristics: CharacteristicSet
+    region: FeasibleRegion
     original: Evaluations
     evaluations: int
     population: int
     scoring: Scoring = PUBLISHED_SCORING
-    region: FeasibleRegion | None = None
+
+    @property
+    def characteristics(self) -> CharacteristicSet:
+        """The characteristics that the search varies."""
+        return self.region.characteristics
 
     def uniform(self, number: int, rng: np.random.Generator) -> FloatArray:
         """Draw unfiltered settings uniformly in the domains, shape (number, n). The settings are
@@ -70,25 +72,18 @@ class Problem:
         def draw(count: int) -> FloatArray:
             return rng.uniform(lower, upper, (count, len(lower)))
 
-        if not self.region:
-            return draw(number)
         return self.region.draw_feasible(draw, number, filtered=True)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
         """Return which settings, shape (k, n), satisfy the study's constraints after the filter,
         shape (k,).
         """
-        filtered = self.characteristics.filter(settings)
-        if not self.region:
-            return np.ones(len(filtered), bool)
-        return self.region.feasible(filtered)
+        return self.region.feasible(self.characteristics.filter(settings))
 
     def repaired(self, settings: FloatArray) -> FloatArray:
         """Move settings towards the original until they are feasible after the filter, shape (k,
         n).
         """
-        if not self.region:
-            return settings
         return self.region.repaired(settings)
 
     def nondominated(self, evaluations: Evaluations) -> Evaluations:
@@ -129,18 +124,17 @@ def _checked_settings(
 ) -> FloatArray:
     """Check an array of settings that a user's search yields, and return it as floats."""
     characteristics = problem.characteristics
-    shape = (
-        f"shape (k, {len(characteristics)}) with k from 1 to the {budget}"
-        " evaluations that are left"
-    )
-    is_matrix = isinstance(output, np.ndarray) and output.ndim == 2
-    if (
-        not is_matrix
-        or output.shape[1] != len(characteristics)
-        or not 1 <= len(output) <= budget
+    n = len(characteristics)
+    if not (
+        isinstance(output, np.ndarray)
+        and output.ndim == 2
+        and output.shape[1] == n
+        and 1 <= len(output) <= budget
     ):
         raise code.wrong(
-            "search", f"settings = {quoted(output)}", f"an array of {shape}"
+            "search",
+            f"settings = {quoted(output)}",
+            f"an array of shape (k, {n}) with k from 1 to the {budget} evaluations that are left",
         )
     for characteristic, values in zip(characteristics, output.T, strict=True):
         code.check_numbers(
@@ -156,14 +150,13 @@ def _checked_settings(
         raise code.wrong(
             "search", "unfiltered settings", "problem.characteristics.filter(settings)"
         )
-    if problem.region:
-        problem.region.check(
-            settings,
-            otherwise=(
-                f", for every setting that {code.name} yields:"
-                " problem.characteristics.filter(problem.repaired(settings))"
-            ),
-        )
+    problem.region.check(
+        settings,
+        otherwise=(
+            f", for every setting that {code.name} yields:"
+            " problem.characteristics.filter(problem.repaired(settings))"
+        ),
+    )
     return settings
 
 

@@ -139,9 +139,8 @@ class Ranges:
         # The characteristics of the vehicle come first, then the parameters of the encounter.
         n_vehicle = len(self._characteristics.vehicle)
         n_changes = rng.integers(1, self.max_changes, endpoint=True)
-        for i in rng.choice(n_vehicle, n_changes, replace=False):
-            setting[i] = self._draw_value(i, rng)
-        for i in range(n_vehicle, len(setting)):
+        changed = rng.choice(n_vehicle, n_changes, replace=False)
+        for i in [*changed, *range(n_vehicle, len(setting))]:
             setting[i] = self._draw_value(i, rng)
         return setting
 

@@ -142,8 +142,7 @@ class Reproduction:
         if probability is None:
             probability = 1 / len(characteristics)
         self._mutation_probability = probability
-        self._lower = characteristics.lower.tolist()
-        self._upper = characteristics.upper.tolist()
+        self._domains = characteristics.lower.tolist(), characteristics.upper.tolist()
 
     @contextmanager
     def _randomness(self) -> Iterator[None]:
@@ -168,7 +167,6 @@ class Reproduction:
         """
         offspring = list[Individual]()
         operators = self._operators
-        domains = (self._lower, self._upper)
         with self._randomness():
             while population and len(offspring) < number:
                 pair = [
@@ -177,13 +175,13 @@ class Reproduction:
                 ]
                 if random.random() <= operators.crossover_probability:
                     tools.cxSimulatedBinaryBounded(
-                        *pair, operators.crossover_index, *domains
+                        *pair, operators.crossover_index, *self._domains
                     )
                 for child in pair:
                     tools.mutPolynomialBounded(
                         child,
                         operators.mutation_index,
-                        *domains,
+                        *self._domains,
                         self._mutation_probability,
                     )
                 offspring += self._feasible_children(pair)

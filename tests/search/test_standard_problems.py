@@ -14,7 +14,7 @@ import pytest
 from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.search import ALGORITHMS, Problem, Search
-from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet, FeasibleRegion
 from tests.in_process import SLOW
 from tests.search.test_algorithms import evaluated, steps_of
 from tests.support.needs import need_library
@@ -107,7 +107,7 @@ def standard_problem(
         )
     )
     return Problem(
-        characteristics=unit,
+        region=FeasibleRegion(unit, ()),
         original=evaluated(unit, unit.original_settings, np.zeros(1)),
         evaluations=evaluations,
         population=population,
