@@ -62,10 +62,11 @@ def within_budgets(case: Case) -> pd.DataFrame:
     rows = rows.assign(evaluation=rows.groupby(["algorithm", "run"]).cumcount())
     rows = valid_evaluations(case, rows)
     largest = case.study.search.evaluations
-    parts = list[pd.DataFrame]()
-    for budget in np.union1d(np.minimum(BUDGETS, largest), largest):
-        part = rows[rows["evaluation"] < budget]
-        parts.append(part.assign(simulations=budget))
+    budgets = np.union1d(np.minimum(BUDGETS, largest), largest)
+    parts: list[pd.DataFrame] = [
+        rows[rows["evaluation"] < budget].assign(simulations=budget)
+        for budget in budgets
+    ]
     return pd.concat(parts)
 
 

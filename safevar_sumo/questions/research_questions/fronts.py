@@ -7,7 +7,7 @@ and follows the growth of the hypervolume.
 from __future__ import annotations
 
 import math
-from itertools import pairwise, product
+from itertools import pairwise
 
 import moocore
 import numpy as np
@@ -115,9 +115,11 @@ def frames_of_runs(
     UnanswerableError if no finished run has rows.
     """
     groups = dict(list(frame.groupby(["algorithm", "run"])))
-    runs = list[RunName]()
-    for algorithm in case.algorithms:
-        runs += product([algorithm], case.runs_of(algorithm))
+    runs = [
+        (algorithm, run)
+        for algorithm in case.algorithms
+        for run in case.runs_of(algorithm)
+    ]
     if not runs:
         # The error of this call says that no run is finished.
         case.require_solutions()
@@ -271,8 +273,13 @@ def compute_convergence(case: Case) -> pd.DataFrame:
             new_points = points[(start <= numbers) & (numbers < end)]
             front = nondominated_points(np.concatenate([front, new_points]))
             volumes.append(hypervolume(front, case.study.search.reference_point))
-        columns = {"evaluations": counts_of_run[1:], "hypervolume": volumes}
-        frames.append(pd.DataFrame({"algorithm": algorithm, "run": run, **columns}))
+        columns = {
+            "algorithm": algorithm,
+            "run": run,
+            "evaluations": counts_of_run[1:],
+            "hypervolume": volumes,
+        }
+        frames.append(pd.DataFrame(columns))
     return pd.concat(frames, ignore_index=True)
 
 
