@@ -102,7 +102,7 @@ class _Command(click.Command):
             if isinstance(option, click.Option)
         }
         # A common option with another meaning in this command is explained like the command's own.
-        meanings = {option.name: option.meaning for option in COMMON_OPTIONS}
+        meanings = {name: option.meaning for name, option in COMMON_OPTIONS.items()}
         lines = []
         for title, names in COMMON_NAMES.items():
             flags = []
@@ -221,9 +221,11 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         for parameter in signature.parameters.values()
         if parameter.kind is not parameter.KEYWORD_ONLY
     ]
-    options = [
-        option for option in options_of(function) if option.name not in LIBRARY_ONLY
-    ]
+    options = {
+        name: option
+        for name, option in options_of(function).items()
+        if name not in LIBRARY_ONLY
+    }
     constants = {}
     if "progress" in signature.parameters:
         constants = {"progress": True}
@@ -236,17 +238,17 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
             subjects += value if parameter.kind is parameter.VAR_POSITIONAL else [value]
         return function(
             *subjects,
-            **{option.name: option.check(values[option.name]) for option in options},
+            **{name: option.check(values[name]) for name, option in options.items()},
             **constants,
         )
 
     def print_text(**values: Any) -> None:
         click.echo(call(**values))
 
-    flags = [_flag(option) for option in options if option.name != "table"]
+    flags = [_flag(option) for name, option in options.items() if name != "table"]
     callback = print_text
     if "Answer" in str(signature.return_annotation):
-        flags += map(_flag, options_of(_give_answer))
+        flags += map(_flag, options_of(_give_answer).values())
         callback = partial(_give_answer, call, contents_of(function))
     return _Command(
         name,

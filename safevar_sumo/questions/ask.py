@@ -141,22 +141,22 @@ class Question:
         # A user passes no evaluator: the signature for users lacks it.
         parameters.pop(1)
         texts = [inspect.cleandoc(compute.__doc__ or "")]
-        for option in COMMON_OPTIONS:
-            if option.name not in names:
-                parameters.append(common_parameters[option.name])
-                texts.append(f"{option.name}\n    {option.meaning}")
+        for name, option in COMMON_OPTIONS.items():
+            if name not in names:
+                parameters.append(common_parameters[name])
+                texts.append(f"{name}\n    {option.meaning}")
         self.__signature__ = inspect.Signature(parameters, return_annotation="Answer")
         self.__doc__ = "\n".join(texts)
 
     @cached_property
-    def options(self) -> list[Option]:
-        """The question's own options; the options that all questions have are left out."""
+    def options(self) -> dict[str, Option]:
+        """The question's own options by name. The options that all questions have are left out."""
         return options_of(self.compute)
 
     @property
     def has_rough_answer(self) -> bool:
         """Whether `--quick` asks for a rough answer."""
-        return any(option.name == QUICK for option in self.options)
+        return QUICK in self.options
 
     def __call__(
         self,
@@ -207,24 +207,29 @@ class Question:
         """
         # A question with an option `up_to` of its own leaves out encounters itself: its subjects
         # keep all encounters.
-        options = {option.name: option for option in self.options}
         cut = up_to
-        if UP_TO in options:
+        if UP_TO in self.options:
             cut = None
             values[UP_TO] = up_to
         self._check_names(further_sources, values)
         if source is None:
             raise InputError(f"{self.name}()", "source = None", SUBJECTS)
-        how: JsonObject = {"jobs": jobs, "simulations": simulations, "cluster": cluster}
-        how["as_it_is_now"] = as_it_is_now
-        common = {"point": point, "ranges": ranges, "up_to": up_to, "fresh": fresh}
-        for option in COMMON_OPTIONS:
-            if option.name in common | how:
-                option.check((common | how)[option.name])
+        how: JsonObject = {
+            "jobs": jobs,
+            "cluster": cluster,
+            "simulations": simulations,
+            "as_it_is_now": as_it_is_now,
+        }
+        where = {"point": point, "ranges": ranges, "up_to": up_to}
+        common = {**where, **how, "fresh": fresh}
+        for name, value in common.items():
+            COMMON_OPTIONS[name].check(value)
         check_kind("pool", pool, POOL)
         check_kind("progress", progress, PROGRESS)
         how["pool"] = pool
-        values = {name: options[name].check(value) for name, value in values.items()}
+        values = {
+            name: self.options[name].check(value) for name, value in values.items()
+        }
 
         def subject_of(source: StudyLike | Results) -> Subject:
             """Load the subject of the question, and cut it to the part that is asked about."""
@@ -237,9 +242,9 @@ class Question:
 
         from safevar_sumo.campaign.cache import keep_simulations
 
-        cuts = {"point": point, "up_to": cut}
         names = [_name(source), *map(_name, further_sources)]
-        command = self.command_line(names, cuts, values, ["--ranges"] * ranges)
+        cuts = {"ranges": ranges, "point": point, "up_to": cut}
+        command = self.command_line(names, cuts, values)
         subjects: list[Any] = [subject_of(source)]
         for further, is_file in zip(further_sources, self.others.values(), strict=True):
             subjects.append(Path(str(further)) if is_file else subject_of(further))
@@ -265,11 +270,9 @@ class Question:
         self, further_sources: Sequence[object], values: JsonObject
     ) -> None:
         """Refuse options that the question does not have, and another number of subjects."""
-        names = [option.name for option in self.options]
         for name in values:
-            if name not in names:
-                common = [option.name for option in COMMON_OPTIONS]
-                known = {"source": None, **dict.fromkeys([*names, *common])}
+            if name not in self.options:
+                known = {"source": None, **self.options, **COMMON_OPTIONS}
                 raise unknown_argument(self.name, name, known)
         if len(further_sources) != len(self.others):
             names = ["source", *self.others]
@@ -352,9 +355,13 @@ class Question:
             beginning[1:] = [ROUGH_OF_FEW(most=account.limit)]
         if self.has_rough_answer:
             numbers["rough"] = bool(beginning[1:] or numbers.get("rough"))
-        sentences = [*beginning, *Verdict.of(result.verdict).sentences, *cites]
-        sentences.append(note(account.undefined_in_words))
-        sentences.append(note(account.collided_in_words))
+        sentences = [
+            *beginning,
+            *Verdict.of(result.verdict).sentences,
+            *cites,
+            note(account.undefined_in_words),
+            note(account.collided_in_words),
+        ]
         numbers["never_moved"] = len(account.standing)
         if account.standing and numbers["driven"]:
             sentences.append(STANDING(count=account.standing_in_words))
@@ -413,7 +420,9 @@ class Question:
         source. If a user states neither a criterion nor a margin, the criterion of the study
         counts. The criterion is None if nobody states one, or if the question uses none.
         """
-        names = [option.name for option in self.options if option.metavar == CRITERION]
+        names = [
+            name for name, option in self.options.items() if option.metavar == CRITERION
+        ]
         if not names:
             return None, values, ()
         (name,) = names
@@ -461,16 +470,15 @@ class Question:
     def command_line(
         self,
         subjects: Sequence[str],
-        part: Mapping[str, str | None],
+        part: Mapping[str, str | bool | None],
         values: JsonObject,
-        flags: Sequence[str] = (),
     ) -> str:
         """The command line that asks this question. It has a flag for each option whose value is
-        not the default.
+        not the default, and for each value of `part` that is stated.
         """
         words = [PROGRAM_COMMAND, self.name, *map(quote, subjects)]
-        for option in self.options:
-            value = values.get(option.name, option.default)
+        for name, option in self.options.items():
+            value = values.get(name, option.default)
             # A command names a file of cars, because a table does not fit into it.
             if option.metavar == CARS_FILE and not isinstance(value, str | Path | None):
                 value = CARS_FILE
@@ -481,15 +489,18 @@ class Question:
                 continue
             for text in value if option.is_repeated else [value]:
                 words += [option.flag, quote(str(text))]
-        words += flags
-        for name, text in part.items():
-            if text:
-                words += [flag_of(name), quote(str(text))]
+        for name, stated in part.items():
+            if stated:
+                words.append(flag_of(name))
+            if isinstance(stated, str):
+                words.append(quote(stated))
         return " ".join(words)
 
 
 COMMON_OPTIONS = options_of(Question.__call__)
-"""Options that every question has."""
+"""Options that every question has, by name."""
+SIMULATIONS = COMMON_OPTIONS["simulations"]
+"""The option that pages and packs of evidence have for their questions, too."""
 
 
 def question(compute: Callable[..., Answer]) -> Question:

@@ -23,9 +23,8 @@ class Range(NamedTuple):
     high: float
     is_open: bool = False
 
-    def __contains__(self, value: object) -> bool:
-        assert isinstance(value, Real)
-        number = float(value)
+    def holds(self, number: float) -> bool:
+        """Whether a number is in the range."""
         if self.is_open:
             return self.low < number < self.high
         return self.low <= number <= self.high
@@ -131,8 +130,7 @@ class Option(NamedTuple):
             return value
         if self.is_repeated:
             return self._texts(value)
-        is_object = self.metavar == CARS_FILE and not isinstance(value, str)
-        if is_object:
+        if self.metavar == CARS_FILE and not isinstance(value, str):
             return value
         if self.metavar == CRITERION:
             return Unsafe.parse(value)
@@ -145,7 +143,7 @@ class Option(NamedTuple):
         is_legal = isinstance(value, number) and not isinstance(value, bool)
         if self.limits:
             words += f" {self.limits}"
-            is_legal = is_legal and value in self.limits
+            is_legal = is_legal and self.limits.holds(value)
         if not is_legal:
             raise InputError(self.name, repr(value), words)
         return value
@@ -170,28 +168,14 @@ class Option(NamedTuple):
         return tuple(texts)
 
 
-SIMULATIONS = Option(
-    "simulations",
-    int,
-    get_args(Simulations)[1],
-    (),
-    None,
-    False,
-    True,
-    None,
-    "the largest number",
-)
-"""The option `simulations`, which pages and packs of evidence have for their questions, too."""
-
-
-def options_of(function: Callable[..., Any]) -> list[Option]:
-    """The options of a function: its keyword-only parameters. The signature has their types and
-    defaults, and the numpydoc docstring has their meanings.
+def options_of(function: Callable[..., Any]) -> dict[str, Option]:
+    """The options of a function by name: its keyword-only parameters. The signature has their types
+    and defaults, and the numpydoc docstring has their meanings.
     """
     pattern = re.compile(r"^(\w+)\n((?:    .*\n?)+)", re.MULTILINE)
     texts = dict(pattern.findall(inspect.cleandoc(function.__doc__ or "")))
     names = globals() | inspect.unwrap(function).__globals__
-    options = []
+    options = {}
     for parameter in inspect.signature(function).parameters.values():
         if parameter.kind is parameter.KEYWORD_ONLY:
             hint = parameter.annotation
@@ -199,7 +183,7 @@ def options_of(function: Callable[..., Any]) -> list[Option]:
             if isinstance(hint, str):
                 hint = eval(hint, names)
             meaning = " ".join(texts.get(parameter.name, "").split())
-            options.append(_option(parameter, hint, meaning))
+            options[parameter.name] = _option(parameter, hint, meaning)
     return options
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from safevar_sumo.errors import InputError
-from safevar_sumo.questions.options import SIMULATIONS
+from safevar_sumo.questions.ask import SIMULATIONS
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System
 

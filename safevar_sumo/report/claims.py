@@ -29,10 +29,10 @@ from safevar_sumo.metrics import PUBLISHED_SCORING, Unsafe
 from safevar_sumo.output import temporary_folder
 from safevar_sumo.plugins import add_import_folders
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import Question
+from safevar_sumo.questions.ask import SIMULATIONS, Question
 from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case, build_case
-from safevar_sumo.questions.options import SIMULATIONS, flag_of
+from safevar_sumo.questions.options import flag_of
 from safevar_sumo.questions.subject import changes_since
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import number_of

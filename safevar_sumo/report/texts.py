@@ -14,9 +14,9 @@ from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
-from safevar_sumo.questions.ask import QUICK, Question, find_question
+from safevar_sumo.questions.ask import QUICK, SIMULATIONS, Question, find_question
 from safevar_sumo.questions.case import Case
-from safevar_sumo.questions.options import CRITERION, SIMULATIONS
+from safevar_sumo.questions.options import CRITERION
 from safevar_sumo.records import JsonObject
 from safevar_sumo.terminal import Progress
 
@@ -43,7 +43,8 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
 
     values = JsonObject()
     waiting = iter(words)
-    options = {option.flag: option for option in (*question.options, SIMULATIONS)}
+    known = (*question.options.values(), SIMULATIONS)
+    options = {option.flag: option for option in known}
     for flag in waiting:
         check_name("ask", f"{name} has no option {flag!r}", flag, options)
         option = options[flag]
@@ -76,7 +77,7 @@ def completed(
     """
     usual: JsonObject = {SIMULATIONS.name: part}
     if unsafe is not None and any(
-        option.metavar == CRITERION for option in question.options
+        option.metavar == CRITERION for option in question.options.values()
     ):
         usual["unsafe"] = unsafe
     if quick and question.has_rough_answer:

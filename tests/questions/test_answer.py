@@ -383,12 +383,11 @@ def test_a_printed_command_asks_the_same() -> None:
     default.
     """
     ask = find_question("tolerance")
-    (fits,) = (option.default for option in ask.options if option.name == "fits")
     values = {
         "unsafe": "collision",
         "characteristics": ("mass", "tireFric"),
         "margin": 0.5,
-        "fits": fits,
+        "fits": ask.options["fits"].default,
     }
     typed = shlex.split(
         ask.command_line(["its results"], {"point": "CPNA, night"}, values)

@@ -120,7 +120,7 @@ def tables(
     table
         Print only this table of the answer. The line "More:" of an answer names the tables.
     """
-    {option.name: option for option in options_of(tables)}["alpha"].check(alpha)
+    options_of(tables)["alpha"].check(alpha)
     if table:
         check_name(
             "table",
