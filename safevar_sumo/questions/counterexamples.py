@@ -305,7 +305,7 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
             event,
             impact,
             place_of(points, point, scenario, values, model.fit),
-            dict(point.parameters),
+            point.parameters,
             breach,
             _command(model, setting, point),
             runs_in_words(model.unsafe.failing_runs(run)[:, 0]),
@@ -321,7 +321,7 @@ def _command(model: Model, setting: FloatArray, point: Point) -> str:
     members = model.evaluator.characteristics
     words = [system.command, members.options(setting)]
     searchable = searchable_in(point.scenario)
-    for name, value in point.parameters:
+    for name, value in point.parameters.items():
         if name in searchable and isinstance(value, int | float):
             words.append(f"--set {name}={value!r}")
     words += [f"--fit {model.fit}"] * (model.fit > 0)
@@ -352,7 +352,7 @@ def place_of(
     fit
         The number of the parameter set.
     """
-    numbers = dict(point.parameters) | values
+    numbers = {**point.parameters, **values}
     test = numbers.pop("test", "")
     # The weather is named only if the points differ in it.
     for name in ("weather", PHASE):

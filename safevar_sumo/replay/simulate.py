@@ -197,7 +197,7 @@ def _where_met(system: System, setting: FloatArray) -> System:
 
 
 def _tests_of(system: System) -> set[str]:
-    return {dict(point.parameters).get("test", "") for point in system.points}
+    return {point.parameters.get("test", "") for point in system.points}
 
 
 def load_target(

@@ -194,8 +194,7 @@ def _scenario(study: ReportedStudy) -> str:
         return f"{scenario} {number}. The simulator of the scenario moves and drives the vehicle."
     if points:
         tests = Counter(
-            f"{dict(point.parameters)['test']}, {point.weather.name}"
-            for point in points
+            f"{point.parameters['test']}, {point.weather.name}" for point in points
         )
         described = "; ".join(
             f"{test}: {number_of(count, 'test case')}" for test, count in tests.items()

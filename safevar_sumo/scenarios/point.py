@@ -36,7 +36,7 @@ class Point(NamedTuple):
     scenario: Scenario
     weather: Weather
     name: str = ""
-    parameters: tuple[tuple[str, Any], ...] = ()
+    parameters: Mapping[str, Any] = {}
     allowed_impact_speed: float = 0.0
     phase: Quantity = 0.0
     ranges: Mapping[str, Domain] | None = None

@@ -180,23 +180,20 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
     """The bodies around N vehicles in their `encounters`, shape (N, k), at every point; None if the
     scenario observes a world itself. Tracks last `longer` seconds more than their scenarios.
     """
-    points = system.points
     if not system.has_tracks:
         return None
-    group = np.repeat(np.arange(len(points)), len(encounters))
-    n_encounters = 1
 
-    # The bodies of an encounter that several vehicles meet are computed only once.
-    if encounters.shape[1]:
-        _, distinct, group = np.unique(
-            encounters, axis=0, return_index=True, return_inverse=True
-        )
-        if len(distinct) == len(encounters):
-            distinct = group = np.arange(len(encounters))
-        points = system.at_encounters(encounters[distinct]).points
-        n_encounters = len(distinct)
-        starts = n_encounters * np.arange(len(points))
-        group = (starts[:, None] + np.ravel(group)).ravel()
+    # The bodies of an encounter that several vehicles meet are computed only once. In a study that
+    # searches none of its parameters, all vehicles meet the same encounter.
+    _, distinct, group = np.unique(
+        encounters, axis=0, return_index=True, return_inverse=True
+    )
+    if len(distinct) == len(encounters):
+        distinct = group = np.arange(len(encounters))
+    points = system.at_encounters(encounters[distinct]).points
+    n_encounters = len(distinct)
+    starts = n_encounters * np.arange(len(points))
+    group = (starts[:, None] + np.ravel(group)).ravel()
     step = system.scenes.step_of(points[0].scenario)
     last_sample = max(float(np.max(last_sample_of(point, step))) for point in points)
     n_samples = round(last_sample + longer / step) + 1

@@ -77,7 +77,7 @@ def point_record(result: PointResult) -> JsonObject:
         values[STOPPING_DISTANCE.name] = evaluations.metrics[STOPPING_DISTANCE.name][0]
     record = {
         "point": result.point.name,
-        **dict(result.point.parameters),
+        **result.point.parameters,
         "outcome": str(evaluations.outcome[0]),
     }
     for name, value in values.items():

@@ -172,7 +172,7 @@ def _points_of(
             scenario=scenario,
             weather=weather,
             name=", ".join(words),
-            parameters=tuple(parameters.items()),
+            parameters=parameters,
             allowed_impact_speed=test.allowed_impact_speed / KMH_PER_MS,
             ranges=ranges,
             constraints=constraints if ranges else (),

@@ -95,7 +95,8 @@ class Moving(NamedTuple):
         # The rear corner of a rotated body may be beside the path: the vehicle then touches the
         # body's first point within the path.
         edge = track.x - half_length
-        is_lengthwise = _rotated(track) & (cosine > sine)
+        is_rotated = np.minimum(cosine, sine) > LEAST_SINE
+        is_lengthwise = is_rotated & (cosine > sine)
         if is_lengthwise.any():
             first_in_path = first_in_strip(track, vehicle_width / 2)
             edge = np.where(is_lengthwise, first_in_path, edge)
@@ -105,9 +106,9 @@ class Moving(NamedTuple):
         is_there: BoolArray = slim((track.length > 0) | (track.width > 0))
         is_beside = np.abs(track.y) >= vehicle_width / 2 + half_width + TIE
         is_in_path = slim(is_there & ~is_beside & (track.kind != SCREEN))
-        is_gone = ~np.maximum.accumulate(is_there[::-1], axis=0)[::-1]
+        is_gone = ~_from_now_on(np.maximum, is_there)
         has_entered = np.maximum.accumulate(is_in_path, axis=0)
-        will_touch = np.maximum.accumulate(is_in_path[::-1], axis=0)[::-1]
+        will_touch = _from_now_on(np.maximum, is_in_path)
 
         # With this sign `lateral` rises while a body crosses, from whichever side it comes.
         sign = np.where((vy > 0).any(axis=0), 1.0, -1.0)
@@ -132,7 +133,7 @@ class Moving(NamedTuple):
             is_cleared=slim((has_entered & ~will_touch) | is_gone),
             is_avoidable=slim(has_entered & is_in_path[-1]),
             level=level,
-            is_rotated=bool(_rotated(track).any()),
+            is_rotated=bool(is_rotated.any()),
             faces_along=bool((cosine == 1).all()),
         )
 
@@ -152,11 +153,7 @@ class Moving(NamedTuple):
         return bool((is_inside_x & is_inside_y).all())
 
 
-def _rotated(track: Track) -> BoolArray:
-    return np.asarray(np.minimum(np.abs(track.along), np.abs(track.left)) > LEAST_SINE)
-
-
-def _from_now_on(ufunc: np.ufunc, column: FloatArray) -> FloatArray:
+def _from_now_on(ufunc: np.ufunc, column: Sampled) -> Sampled:
     """The least or largest value of a column from each sample to the last sample."""
     return ufunc.accumulate(column[::-1], axis=0)[::-1]
 

@@ -205,10 +205,10 @@ class RecordedWorld:
 
         # `early` is before vehicles move, `late` is after; other vehicles are hit only late.
         is_person = self._is_person[actors]
-        is_checked = is_person & self._before.meets_persons[vehicles]
-        early = self._overlaps(self._before, vehicles, actors, is_checked)
-        is_checked = ~is_person | self._now.meets_persons[vehicles]
-        late = self._overlaps(self._now, vehicles, actors, is_checked)
+        early = is_person & self._before.meets_persons[vehicles]
+        early &= self._overlaps(self._before, vehicles, actors)
+        late = ~is_person | self._now.meets_persons[vehicles]
+        late &= self._overlaps(self._now, vehicles, actors)
 
         pairs = np.flatnonzero(early | late)
         colliding, rows = np.unique(vehicles[pairs], return_index=True)
@@ -239,22 +239,16 @@ class RecordedWorld:
         moment: _Moment,
         vehicles: IntArray,
         actors: IntArray,
-        is_checked: BoolArray,
     ) -> BoolArray:
-        """Whether vehicle and actor overlap in each pair of `vehicles` and `actors`; false for
-        pairs that are not `is_checked`. Two parallel vehicles must overlap by more than a
-        millimetre (SUMO, `MSLane::detectCollisionBetween`).
+        """Whether vehicle and actor overlap in each pair of `vehicles` and `actors`. Two parallel
+        vehicles must overlap by more than a millimetre (SUMO, `MSLane::detectCollisionBetween`).
         """
-        overlaps = np.zeros(len(vehicles), bool)
-        pairs = np.flatnonzero(is_checked)
-        if len(pairs):
-            bodies = self._vehicle_body(moment, vehicles[pairs])
-            obstacles = self._actors(vehicles[pairs], actors[pairs])
-            is_parallel = np.abs(obstacles.along @ self._scene.along) >= PARALLEL_COSINE
-            has_tolerance = is_parallel & ~self._is_person[actors[pairs]]
-            tolerance = NUMERICAL_EPS * has_tolerance
-            overlaps[pairs] = find_overlaps(bodies, obstacles) > tolerance
-        return overlaps
+        bodies = self._vehicle_body(moment, vehicles)
+        obstacles = self._actors(vehicles, actors)
+        is_parallel = np.abs(obstacles.along @ self._scene.along) >= PARALLEL_COSINE
+        has_tolerance = is_parallel & ~self._is_person[actors]
+        tolerance = np.where(has_tolerance, NUMERICAL_EPS, 0.0)
+        return np.asarray(find_overlaps(bodies, obstacles) > tolerance)
 
     def bodies(self, vehicles: Sequence[int]) -> BodyPairs:
         struck = np.array([self._struck[vehicle] for vehicle in vehicles])

@@ -205,7 +205,7 @@ class System:
     def at(self, point: Point) -> System:
         """The system reduced to one point."""
         return replace(
-            self, points=(point._replace(name="", parameters=(), constraints=()),)
+            self, points=(point._replace(name="", parameters={}, constraints=()),)
         )
 
 

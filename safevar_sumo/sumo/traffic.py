@@ -94,7 +94,7 @@ class Traffic:
 
     def _place(self, n_samples: int) -> None:
         """Compute the bodies' positions at this number of samples."""
-        times = (np.arange(n_samples) * self.step).astype(float)[:, None]
+        times = np.arange(n_samples, dtype=float)[:, None] * self.step
         vehicle = self._vehicle_body(np.zeros(1), np.zeros(1))
         self.tracks = tracks_of(
             self._points, times, self._n_encounters, self.step, vehicle
@@ -296,11 +296,10 @@ class Traffic:
         rear = front - self.length
         for number in self._encountered:
             body = self._bodies[number]
-            if foremost <= at_sample(body.edge, sample, None).min():
+            edge = self._at_sample(body.edge)
+            if foremost <= edge.min():
                 continue
-            is_level = (front > self._at_sample(body.edge)) & (
-                rear < self._at_sample(body.far_end)
-            )
+            is_level = (front > edge) & (rear < self._at_sample(body.far_end))
             may_touch = is_level & self._at_sample(body.is_in_path)
             vehicles = np.flatnonzero(may_touch & is_open & (self._struck == NOBODY))
             if vehicles.size:
@@ -335,12 +334,9 @@ class Traffic:
     def _body(self, number: int, vehicles: IntArray) -> Body:
         """A body at the current sample, in the encounters of the given vehicles."""
         body = self._bodies[number]
-        group = vehicles
-        if self.group is not None:
-            group = self.group[vehicles]
-        # Scenes are computed only of bodies that are nearest to some vehicle: most are not.
+        # If a column has one value for all vehicles, "clip" takes it for each of them.
         length, width, x, y, cosine, sine, speed, drift = (
-            at_sample(column, self._sample, None).take(group, mode="clip")
+            self._at_sample(column).take(vehicles, mode="clip")
             for column in (*body.track[2:], body.vy)
         )
         if not body.faces_along:
@@ -365,9 +361,7 @@ class Traffic:
                 separation, rate, is_counted = self._approach(
                     number, samples, front, speed
                 )
-                is_nearer = is_counted
-                if len(self._encountered) > 1:
-                    is_nearer = is_counted & (separation < distance[samples])
+                is_nearer = is_counted & (separation < distance[samples])
                 np.copyto(distance[samples], separation, where=is_nearer)
                 np.copyto(closing[samples], rate, where=is_nearer)
                 in_conflict[samples] |= is_counted
@@ -397,7 +391,6 @@ class Traffic:
         separation = dx
         if dy.any():
             separation = np.sqrt(dx * dx + dy * dy)
-        # If a column has one value for all encounters, "clip" takes it for each of them.
         divisor = np.maximum(separation, LEAST_DISTANCE)
         rate = (closing_along - parting_across) / divisor
         if body.is_rotated:

@@ -106,7 +106,7 @@ def verify_in_sumo(system: System, settings: FloatArray, worst: IntArray) -> str
     points = system.points
     of_tests = dict[Any, list[int]]()
     for number, point in enumerate(points):
-        of_tests.setdefault(dict(point.parameters).get("test"), []).append(number)
+        of_tests.setdefault(point.parameters.get("test"), []).append(number)
     digest = zlib.crc32(settings.tobytes())
     candidates = [numbers[digest % len(numbers)] for numbers in of_tests.values()]
     second_points = np.resize(candidates, len(settings))

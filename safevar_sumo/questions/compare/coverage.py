@@ -58,7 +58,9 @@ def cases_of(side: Evaluator) -> Iterator[tuple[MatrixTest | None, Point, TestCa
         stated = {**scenario.parameters, **(test.parameters if test else {})}
         for point in points_of_test:
             driven = {
-                key: value for key, value in point.parameters if key not in OF_ENCOUNTER
+                key: value
+                for key, value in point.parameters.items()
+                if key not in OF_ENCOUNTER
             }
             yield test, point, TestCase(model, stated | driven, point.weather)
 
