@@ -17,9 +17,10 @@ from safevar_sumo.campaign import batches
 from safevar_sumo.campaign.batches import Batches
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.metrics import METRICS, Unsafe
-from safevar_sumo.questions import bench, by_criterion, evaluator, part
+from safevar_sumo.questions import bench, by_criterion, cases, evaluator, part, repair
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
+from safevar_sumo.questions.repair import survivors
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Study
 from safevar_sumo.sumo.system import assemble
@@ -177,6 +178,14 @@ def folder(
     (folder / "tiny.toml").write_text(request.module.STUDY)
     searched(load_study(str(folder / "tiny.toml")), folder / "results")
     return folder
+
+
+@pytest.fixture
+def quick_repairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A repair is searched with few simulations, and proved for 99 % of all vehicles."""
+    monkeypatch.setattr(cases, "USUAL_BUDGET", 300)
+    monkeypatch.setattr(repair, "SOBOL_VEHICLES", 32)
+    monkeypatch.setattr(survivors, "MAX_SHARE_REPAIRED", 0.01)
 
 
 def model_of(study: Study, **unsafe: float) -> Model:

@@ -9,14 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 import pytest
-import scipy
 from msgspec.structs import replace
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.braking import brake_onset
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.explain.failures import PointComparison, compare_at_points
+from safevar_sumo.questions.explain.failures import compare_at_points
 from safevar_sumo.questions.explain.robustness import robust_shares
 from safevar_sumo.questions.explain.tell import avoidance
 from safevar_sumo.questions.preventability import (
@@ -26,11 +25,12 @@ from safevar_sumo.questions.preventability import (
     avoided_by,
     drivers_frame,
 )
+from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import ModelTable, ScenarioTable
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool
 from tests.made_up import made_up_runs, original_of
 from tests.questions.conftest import box, made_up_evaluator
@@ -74,21 +74,15 @@ def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
 
 def collisions(here: Evaluator, *settings: FloatArray) -> Evaluations:
     """The evaluations of settings that collide."""
-    evaluations = here.evaluate(
-        np.concatenate([np.atleast_2d(one) for one in settings]), "collisions"
-    )
+    evaluations = here.evaluate(np.array(settings), "collisions")
     assert evaluations.collided.all()
     return evaluations
 
 
 def avoiders(here: Evaluator, *settings: FloatArray) -> list[str]:
     """The weakest driver who avoids each collision."""
-    return list(
-        map(
-            avoided_by,
-            assess_collisions(here, collisions(here, *settings)).to_dict("records"),
-        )
-    )
+    assessed = assess_collisions(here, collisions(here, *settings))
+    return [avoided_by(row) for row in assessed.to_dict("records")]
 
 
 def verdicts(
@@ -187,13 +181,9 @@ def test_shares_are_those_of_all_collisions_and_a_sample_is_random() -> None:
         sample, assess_sample(here, every.take(np.arange(30)[::-1]), max_sample=15)[0]
     )
     letter = drivers_frame(sample, number).iloc[0]
-    hits = letter["avoided"]
-    expected = (
-        scipy.stats.beta.ppf(0.025, hits, 16 - hits),
-        scipy.stats.beta.ppf(0.975, hits + 1, 15 - hits),
-    )
-    assert (letter["share_low"], letter["share_high"]) == pytest.approx(expected)
-    assert expected[0] < 1 / 3 < expected[1]
+    low, high = clopper_pearson(letter["avoided"], 15)
+    assert (letter["share_low"], letter["share_high"]) == pytest.approx((low, high))
+    assert low < 1 / 3 < high
 
 
 TESTS = [
@@ -207,29 +197,12 @@ TESTS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def system() -> System:
-    return assemble(load_study("euro_ncap_pedestrian", matrix={"tests": TESTS}))
-
-
-@pytest.fixture(scope="module")
-def weak(system: System) -> FloatArray:
-    """Half the brakes."""
-    setting = system.characteristics.original.copy()
-    setting[system.characteristics.names.index("maxBrakeTorque")] /= 2
-    return setting[np.newaxis]
-
-
-@pytest.fixture(scope="module")
-def failure(system: System, weak: FloatArray) -> PointComparison:
-    (one,) = compare_at_points(system, weak, Unsafe())
-    return one
-
-
-def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
-    system: System, weak: FloatArray, failure: PointComparison
-) -> None:
-    endings, unsafe_points = failure
+def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst() -> None:
+    """The failed vehicle has half the brakes."""
+    system = assemble(load_study("euro_ncap_pedestrian", matrix={"tests": TESTS}))
+    weak = vehicle()[np.newaxis]
+    weak[0, NAMES.index("maxBrakeTorque")] /= 2
+    ((endings, unsafe_points),) = compare_at_points(system, weak, COLLISION)
     at = next(
         point
         for point in system.points
@@ -245,56 +218,27 @@ def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst(
     )
 
 
-STEP, OBSTACLE = 0.002, 20.0
-Vehicle = tuple[float, float, float, float]
+STEP, SPEED, OBSTACLE = 0.002, 10.0, 20.0
 
 
-def drive_of(*vehicles: Vehicle) -> SimulationRuns:
-    """Vehicles of (speed, gap at which the brake is commanded, delay, deceleration) towards an
-    obstacle at 20 m.
+def drives_of(commanded: list[float], collision_speed: list[float]) -> SimulationRuns:
+    """Vehicles at 10 m/s towards an obstacle at 20 m. They brake by 6 m/s^2, from 0.2 s after the
+    gap at which this is commanded.
     """
-    time = np.arange(0, 8, STEP)
-    drives = []
-    for v, gap, delay, deceleration in vehicles:
-        begins = (OBSTACLE - gap) / v
-        slows, stands = begins + delay, begins + delay + v / deceleration
-        braking = np.clip(time, slows, stands) - slows
-        place = v * np.minimum(time, stands) - deceleration * braking**2 / 2
-        drives.append(
-            (
-                v - deceleration * braking,
-                place,
-                1.0 * (time >= begins),
-                1.0 * (time >= slows),
-            )
-        )
-    speed, place, brake, pedal = (
-        np.stack(part, axis=1) for part in zip(*drives, strict=True)
-    )
-    hit = place >= OBSTACLE
-    collision_speed = np.where(
-        hit.any(axis=0), speed[np.argmax(hit, axis=0), np.arange(len(vehicles))], np.nan
-    )
-    active = np.cumsum(hit, axis=0) <= 1
-    gap, throttle = OBSTACLE - place, np.zeros_like(speed)
-    columns = {
-        "position": place,
-        "throttle": throttle,
-        "brake": brake,
-        "pedal": pedal,
-        "active": active,
-    }
-    return made_up_runs(STEP, speed, gap, collision_speed, **columns)
-
-
-SAME = (10.0, 15.0, 0.2, 6.0)
+    time = np.arange(0, 8, STEP)[:, np.newaxis]
+    begins = (OBSTACLE - np.array(commanded)) / SPEED
+    braking = np.maximum(time - begins - 0.2, 0)
+    speed = np.maximum(SPEED - 6 * braking, 0)
+    gap = OBSTACLE - (np.cumsum(speed, axis=0) - SPEED) * STEP
+    columns = {"brake": 1.0 * (time >= begins), "active": gap > 0}
+    return made_up_runs(STEP, speed, gap, np.array(collision_speed), **columns)
 
 
 def test_an_overshooting_cruise_control_does_not_brake_for_the_obstacle() -> None:
     """Two overshoot; the throttle ends that, or a brake that fades until the hazard. The last one
     does nothing else before it collides.
     """
-    runs = drive_of(SAME, SAME, SAME, (10.0, -5.0, 0.2, 6.0))
+    runs = drives_of([15.0, 15.0, 15.0, -5.0], [np.nan, np.nan, np.nan, SPEED])
     runs.trace.brake[50:150, 1:3] = 0.5
     runs.trace.throttle[150:200, 1] = 0.1
     runs.trace.brake[150:250, 2:] = 0.01

@@ -12,13 +12,12 @@ import pytest
 from msgspec.structs import replace
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign.evaluation import Task, evaluate_settings
-from safevar_sumo.metrics import METRICS
-from safevar_sumo.questions import cases, repair as question
+from safevar_sumo.campaign.evaluation import evaluate_settings
+from safevar_sumo.questions import repair as question
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.repair import answer as answers, problem, survivors
-from safevar_sumo.records import Evaluations, FloatArray, JsonObject, NamedValues
+from safevar_sumo.questions.repair import answer as answers, problem
+from safevar_sumo.records import FloatArray, JsonObject, NamedValues
 from safevar_sumo.study import CharacteristicTable, FreeParameter, Study
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool
@@ -50,38 +49,26 @@ class Brakes(InlinePool):
     """
 
     def compute(self, function: Any, *arguments: Any) -> Any:
-        return self.evaluate(*arguments) if function is evaluate_settings else ""
-
-    def evaluate(self, task: Task, rows: FloatArray) -> Evaluations:
+        if function is not evaluate_settings:
+            return ""
+        task, rows = arguments
         study = task.study
         values: NamedValues = dict(study.ads.parameters)
         values |= dict(zip(task.selection.parameters, rows[:, 2:].T, strict=True))
         grip = study.vehicle.parameters["wear"] * rows[:, 0]
-        gap = np.full(len(rows), SEEN_FROM)
+        gap: Any = SEEN_FROM
         if study.ads.model != "full_braking":
-            at_gap = np.minimum(values["gap"] + values["more"], SEEN_FROM)
-            gap = np.where(np.asarray(values["always"]) >= 0.5, SEEN_FROM, at_gap)
+            gap = np.minimum(values["gap"] + values["more"], SEEN_FROM)
+            gap = np.where(values["always"] >= 0.5, SEEN_FROM, gap)
         rest = gap - braking_way(grip)
-        collides = rest < 0
         impact = np.minimum(SPEED, np.sqrt(2 * grip * np.abs(rest)))
-        degree = np.where(collides, -impact, rest)
-        return made_up_evaluations(
-            degree,
-            settings=rows,
-            outcome=np.where(collides, "collision", "stopped").astype("U16"),
-            collision_speed=np.where(collides, impact, np.nan),
-            metrics={
-                **dict.fromkeys(METRICS, np.full(len(rows), np.nan)),
-                "safety_degree": degree,
-            },
-        )
+        return made_up_evaluations(np.where(rest < 0, -impact, rest), settings=rows)
 
 
-def planted(**today: float) -> Study:
-    """The study of these vehicles; `today` has the present parameters."""
+def planted(gap: float = 12.0, most: float = 64.0) -> Study:
+    """The study of these vehicles: the present gap, and the largest one to which it may change."""
     smoke = load_study("smoke", scenario={"over": False, "margin": 0.3})
-    row = {"unit": "m/s^2", "original": 8.0, "lower": 3.0, "upper": 9.0}
-    paint = {"unit": "-", "original": 1.0, "lower": 0.5, "upper": 2.0}
+    changeable = {**CHANGEABLE, "gap": replace(CHANGEABLE["gap"], upper=most)}
     return replace(
         smoke,
         name="made-up",
@@ -90,14 +77,16 @@ def planted(**today: float) -> Study:
             smoke.vehicle,
             parameters={"wear": WEAR[0]},
             characteristics={
-                "grip": CharacteristicTable(**row),
-                "paint": CharacteristicTable(**paint),
+                "grip": CharacteristicTable(
+                    unit="m/s^2", original=8.0, lower=3.0, upper=9.0
+                ),
+                "paint": CharacteristicTable(
+                    unit="-", original=1.0, lower=0.5, upper=2.0
+                ),
             },
         ),
-        ads=replace(
-            smoke.ads, parameters={"gap": 12.0, "more": 0.0, "always": 0.0, **today}
-        ),
-        repair=replace(smoke.repair, parameters=CHANGEABLE),
+        ads=replace(smoke.ads, parameters={"gap": gap, "more": 0.0, "always": 0.0}),
+        repair=replace(smoke.repair, parameters=changeable),
     )
 
 
@@ -120,13 +109,10 @@ def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonO
 
 
 @pytest.fixture(autouse=True)
-def _few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_vehicles(quick_repairs: None, monkeypatch: pytest.MonkeyPatch) -> None:
     smoke = assemble(load_study("smoke"))
     monkeypatch.setattr(problem, "assemble", lambda study: smoke)
     monkeypatch.setattr(answers, "price_of", price_of)
-    monkeypatch.setattr(cases, "USUAL_BUDGET", 300)
-    monkeypatch.setattr(survivors, "MAX_SHARE_REPAIRED", SHARE)
-    monkeypatch.setattr(question, "SOBOL_VEHICLES", 32)
 
 
 def repaired(study: Study, **options: Any) -> Answer:
@@ -200,20 +186,16 @@ def test_a_promise_that_is_kept_today_needs_no_repair(above: float) -> None:
 
 
 def test_no_repair_is_found_where_no_value_suffices() -> None:
-    study = planted()
-    bounded = {"gap": replace(CHANGEABLE["gap"], upper=NEEDED - 0.1)}
-    study = replace(study, repair=replace(study.repair, parameters=bounded))
-    answer = repaired(study, promise=GRIP, fits=0)
+    study = planted(most=NEEDED - 0.1)
+    answer = repaired(study, promise=GRIP, change=["gap"], fits=0)
     assert answer.numbers["repairs"] == len(rows_of(answer)) == 0
     assert (answer.numbers["kept_today"], answer.numbers["fits"]) == (False, 0)
 
 
 def test_sets_in_which_no_repair_holds_are_named() -> None:
     """The gap suffices with the own set and with more grip, but not with less grip."""
-    study = planted()
-    bounded = {"gap": replace(CHANGEABLE["gap"], upper=NEEDED_IN_SETS - 0.5)}
-    study = replace(study, repair=replace(study.repair, parameters=bounded))
-    answer = repaired(study, promise=GRIP)
+    study = planted(most=NEEDED_IN_SETS - 0.5)
+    answer = repaired(study, promise=GRIP, change=["gap"])
     (repair,) = rows_of(answer)
     assert NEEDED <= repair["parameters"]["gap"] <= NEEDED + 0.1
     assert (answer.numbers["fits"], answer.numbers["fits_tried"]) == (2, 3)
