@@ -32,55 +32,49 @@ from safevar_sumo.vehicles.base import (
     Vehicle,
 )
 
-# Constants that meet arrays in every step are arrays, too: numpy would convert a float each time,
-# which doubles the time of an operation.
-ZERO = np.array(0.0)
-ONE = np.array(1.0)
-TWO = np.array(2.0)
-HALF = np.array(0.5)
-RPM_PER_RAD_S = np.array(30 / math.pi)  # r/min per rad/s
+RPM_PER_RAD_S = 30 / math.pi  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
 WHEELS = 4
 GEAR_RATIOS = np.array([4.17, 3.14, 2.11, 1.67, 1.28, 1.0, 0.84, 0.67])  # VehicleSMI
-FIRST_GEAR = np.array(1.0)
-LAST_GEAR = np.array(float(len(GEAR_RATIOS)))
-FINAL_RATIO = np.array(2.56)  # VehicleSMI
-SHIFT_DELAY = np.array(0.7)  # s, minimum time between two shifts; VehicleSMI
+FIRST_GEAR = 1.0
+LAST_GEAR = float(len(GEAR_RATIOS))
+FINAL_RATIO = 2.56  # VehicleSMI
+SHIFT_DELAY = 0.7  # s, minimum time between two shifts; VehicleSMI
 # Engine speeds above and below which the gearbox shifts, over maxRpm (assumption).
-SHIFT_UP = np.array(0.33)
-SHIFT_DOWN = np.array(0.13)
+SHIFT_UP = 0.33
+SHIFT_DOWN = 0.13
 # 1/s: the engine speed follows the wheels with a time constant of 1/20 s; VehicleSMI.
 RPM_RATE = 20.0
 # Share of maxMotorTorque that the traction control allows at the start; VehicleSMI.
 TRACTION_START = 1 - 0.675
 # N m/s, rate at which the allowed torque rises and falls; VehicleSMI, at 50 Hz.
 TRACTION_RATE = 6.75 / 0.02
-AIR_DRAG = np.array(1.0)  # N s^2/m^2; VehicleSMI
-DOWNFORCE = np.array(2.0)  # N s^2/m^2; VehicleSMI
+AIR_DRAG = 1.0  # N s^2/m^2; VehicleSMI
+DOWNFORCE = 2.0  # N s^2/m^2; VehicleSMI
 # Forward friction of Unity's WheelCollider over slip: it rises to an extremum at PEAK_SLIP, and
 # falls to an asymptote, SLIDING_FRICTION of the extremum, at SLIDING_SLIP.
-PEAK_SLIP = np.array(0.4)
-SLIDING_SLIP = np.array(0.8)
-SLIDING_FRICTION = np.array(0.5)
-SLIDING_RANGE = np.array(SLIDING_SLIP - PEAK_SLIP)
-FRICTION_LOSS = np.array(1 - SLIDING_FRICTION)
+PEAK_SLIP = 0.4
+SLIDING_SLIP = 0.8
+SLIDING_FRICTION = 0.5
+SLIDING_RANGE = SLIDING_SLIP - PEAK_SLIP
+FRICTION_LOSS = 1 - SLIDING_FRICTION
 FRICTION = 1.0  # at the extremum
 # m/s, smallest speed by which a slip speed is divided (assumption, as in PhysX).
-SLIP_FLOOR = np.array(4.0)
+SLIP_FLOOR = 4.0
 # m/s, smallest rim speed with which the slip limit of the traction control is multiplied.
-LEAST_RIM_SPEED = np.array(1e-3)
+LEAST_RIM_SPEED = 1e-3
 # m/s, below which locked wheels hold the vehicle (assumption).
-HOLD_SPEED = np.array(0.05)
-WHEELBASE = np.array(2.85)  # m
+HOLD_SPEED = 0.05
+WHEELBASE = 2.85  # m
 # Errors at the start that the lane keeping corrects (assumption): without them the steering angle
 # would have no effect.
 LATERAL_ERROR = 0.10  # m
 HEADING_ERROR = 0.01  # rad
-LATERAL_GAIN = np.array(0.02)  # rad/m
-HEADING_GAIN = np.array(0.35)  # rad/rad
+LATERAL_GAIN = 0.02  # rad/m
+HEADING_GAIN = 0.35  # rad/rad
 # Torques over maxMotorTorque (assumption).
-TORQUE_IDLE = np.array(0.4)
-TORQUE_BEND = np.array(2.4)
+TORQUE_IDLE = 0.4
+TORQUE_BEND = 2.4
 SUBSTEPS = 2
 
 
@@ -92,13 +86,13 @@ class _Prepared(NamedTuple):
     vehicle.
     """
 
-    step: FloatArray
-    substep: FloatArray
+    step: float
+    substep: float
     mass: FloatArray
     weight: FloatArray  # load on the road [N]
     body: FloatArray
     slope_deceleration: FloatOrArray  # by the slope, g sin(angle) [m/s^2]
-    standstill: FloatArray
+    standstill: FloatOrArray
     radius: FloatArray
     inertia: FloatArray
     damping: FloatArray
@@ -110,7 +104,7 @@ class _Prepared(NamedTuple):
     rolling_drag: FloatArray
     shift_time: FloatArray
     slip_limit: FloatArray
-    friction: FloatArray
+    friction: FloatOrArray
 
 
 class LgsvlState(NamedTuple):
@@ -195,8 +189,8 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         c = characteristics
         inertia = WHEELS * 0.5 * c["wheelMass"] * c["radius"] * c["radius"]
         prepared = _Prepared(
-            step=np.array(step),
-            substep=np.array(step / SUBSTEPS),
+            step=step,
+            substep=step / SUBSTEPS,
             mass=c["mass"],
             weight=c["mass"] * slope.down,
             body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"],
@@ -213,7 +207,7 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             rolling_drag=c["tireDragCoeff"],
             shift_time=c["shiftTime"],
             slip_limit=c["tractionControlSlipLimit"],
-            friction=np.asarray(FRICTION * road_friction),
+            friction=FRICTION * road_friction,
         )
 
         # On a slope even locked wheels creep, with the slip whose tyre force balances the slope:
@@ -339,10 +333,10 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         share = -(LATERAL_GAIN * s.lateral + HEADING_GAIN * s.heading) / (
             self.steering_design_angle * RADIANS
         )
-        angle = np.minimum(np.maximum(share, -ONE), ONE) * p.steering
+        angle = np.minimum(np.maximum(share, -1.0), 1.0) * p.steering
         curvature = angle / WHEELBASE
         heading = s.heading + s.speed * curvature * p.step
-        lateral = s.lateral + s.speed * p.step * HALF * (s.heading + heading)
+        lateral = s.lateral + s.speed * p.step * 0.5 * (s.heading + heading)
         # The lateral force is m v^2 curvature. Its share `angle` points back; divided by v, it is a
         # drag coefficient.
         return lateral, heading, p.mass * np.abs(curvature * angle) * s.speed
@@ -364,7 +358,7 @@ def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
         gear=gear,
         old_ratio=np.where(shifts, _ratio(p, s), s.old_ratio),
         new_ratio=np.where(shifts, GEAR_RATIOS[gear.astype(np.intp) - 1], s.new_ratio),
-        since_shift=np.where(shifts, ZERO, s.since_shift),
+        since_shift=np.where(shifts, 0.0, s.since_shift),
     )
 
 
@@ -372,7 +366,7 @@ def _ratio(p: _Prepared, s: LgsvlState) -> FloatArray:
     """The current gear ratio [-]; see `_shift`."""
     return np.asarray(
         s.old_ratio
-        + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, ONE)
+        + (s.new_ratio - s.old_ratio) * np.minimum(s.since_shift / p.shift_time, 1.0)
     )
 
 
@@ -422,20 +416,20 @@ def _roll(
         + h * (drive - s.brake * p.brake_torque)
         + pull * p.body * slope_speed / damped_mass
     )
-    wheel_speed = np.maximum(wheel_momentum, ZERO) / (
+    wheel_speed = np.maximum(wheel_momentum, 0.0) / (
         p.inertia + h * p.damping + pull * p.radius - pull * pull / damped_mass
     )
-    speed = np.maximum((p.body * slope_speed + pull * wheel_speed) / damped_mass, ZERO)
+    speed = np.maximum((p.body * slope_speed + pull * wheel_speed) / damped_mass, 0.0)
 
     # A vehicle with locked wheels stands if it is slower than `standstill`.
-    is_held = (wheel_speed <= ZERO) & (speed < p.standstill)
+    is_held = (wheel_speed <= 0.0) & (speed < p.standstill)
     if np.count_nonzero(is_held):
-        speed[is_held] = ZERO
+        speed[is_held] = 0.0
     return s._replace(
         speed=speed,
         wheel_speed=wheel_speed,
         engine_rpm=engine_rpm,
-        traction_torque=np.minimum(np.maximum(traction_torque, ZERO), p.motor_torque),
+        traction_torque=np.minimum(np.maximum(traction_torque, 0.0), p.motor_torque),
     )
 
 
@@ -443,10 +437,10 @@ def _torque_share(rpm_share: FloatArray) -> FloatArray:
     """Engine torque over maxMotorTorque, from the engine speed over maxRpm: a parabola up to
     maxRpm, and 0 from maxRpm on (assumption).
     """
-    torque_share = TORQUE_IDLE + TORQUE_BEND * rpm_share * (ONE - rpm_share)
-    is_overspeed = rpm_share >= ONE
+    torque_share = TORQUE_IDLE + TORQUE_BEND * rpm_share * (1.0 - rpm_share)
+    is_overspeed = rpm_share >= 1.0
     if np.count_nonzero(is_overspeed):
-        torque_share[is_overspeed] = ZERO
+        torque_share[is_overspeed] = 0.0
     return torque_share
 
 
@@ -473,11 +467,11 @@ def _tyre_stiffness(
     """
     denominator = np.maximum(np.maximum(speed, rim), SLIP_FLOOR)
     slip = np.abs(slip_speed) / denominator
-    friction_by_slip = (TWO - slip / PEAK_SLIP) / PEAK_SLIP
+    friction_by_slip = (2.0 - slip / PEAK_SLIP) / PEAK_SLIP
     is_sliding = slip >= PEAK_SLIP
     if np.count_nonzero(is_sliding):
-        sliding_share = np.minimum((slip - PEAK_SLIP) / SLIDING_RANGE, ONE)
-        sliding = (ONE - FRICTION_LOSS * sliding_share) / np.maximum(slip, PEAK_SLIP)
+        sliding_share = np.minimum((slip - PEAK_SLIP) / SLIDING_RANGE, 1.0)
+        sliding = (1.0 - FRICTION_LOSS * sliding_share) / np.maximum(slip, PEAK_SLIP)
         friction_by_slip = np.where(is_sliding, sliding, friction_by_slip)
     load = p.weight + DOWNFORCE * speed * speed
     return np.asarray(p.friction * load * friction_by_slip / denominator)
