@@ -290,11 +290,6 @@ def constraints_in_words(study: Study) -> list[str]:
     return [sentence] if conditions else []
 
 
-def simulation_of(study: Study) -> str:
-    """The command that simulates the original vehicle of a study."""
-    return f"{PROGRAM_COMMAND} simulate {study.words}"
-
-
 def single_set_in_words(study: Study, driven: int) -> Sentence:
     """Say that a single parameter set was driven. The sentence is empty if several were, or if the
     study has a simulator of the user's own, which has no parameter sets.

@@ -65,9 +65,10 @@ from safevar_sumo.questions.preventability import (
 from safevar_sumo.questions.price import LEAST_SETTINGS
 from safevar_sumo.questions.sentence import Verdict
 from safevar_sumo.questions.tables import tabulate
-from safevar_sumo.questions.words import ALREADY_UNSAFE, simulation_of
+from safevar_sumo.questions.words import ALREADY_UNSAFE
 from safevar_sumo.records import JsonObject
 from safevar_sumo.study import Study
+from safevar_sumo.sumo.system import simulate_command
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -227,7 +228,7 @@ def explain(
         numbers=numbers,
         tables=tables,
         failures=tuple(failures),
-        next="" if is_caused else simulation_of(study),
+        next="" if is_caused else simulate_command(study),
         draw=draw_staircase if smallest is not None else draw_needed,
     )
 
