@@ -267,12 +267,14 @@ class Evaluator:
         """Limit the number of simulations of the question, which includes the check of a
         simulator's class. `questions` questions share the time. A quick question searches less.
         """
-        seconds = sum(np.max(point.scenario.duration) for point in self.system.points)
-        if self.study.ranges:
-            seconds *= ENCOUNTERS
         account = self.account
-        account.effort = 1.0
         if quick:
+            durations = [
+                np.max(point.scenario.duration) for point in self.system.points
+            ]
+            seconds = sum(durations)
+            if self.study.ranges:
+                seconds *= ENCOUNTERS
             account.effort = float(np.clip(QUICK_SECONDS / seconds, *QUICK_EFFORTS))
         account.allowance = account.limit = simulations
         account.questions = questions

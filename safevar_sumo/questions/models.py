@@ -123,8 +123,8 @@ class Models(NamedTuple):
     original vehicle itself is unsafe, or keeps less than the margin, are left out (`exclusions`).
     """
 
-    members: tuple[Model, ...]
-    exclusions: tuple[Model, ...]
+    members: Sequence[Model]
+    exclusions: Sequence[Model]
 
     @property
     def own(self) -> Model:
@@ -222,7 +222,7 @@ def models_of(
             unsafe_models.append(model._replace(unsafe=unsafe))
         else:
             members.append(model)
-    return Models(tuple(members), tuple(unsafe_models))
+    return Models(members, unsafe_models)
 
 
 def fit_names(fits: Sequence[int]) -> str:

@@ -29,7 +29,6 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import print_text
-from safevar_sumo.vehicles import CharacteristicSet
 
 LONGEST = 900.0
 """A question that takes at most this time does all its simulations by default [s]. Otherwise the
@@ -282,7 +281,7 @@ def seconds_of_simulation(study: Study, system: System, pool: Pool) -> float | N
     """
     if not system.mover.takes_long:
         return None
-    settings = CharacteristicSet.of(study).original_settings
+    settings = system.characteristics.original_settings
     original, seconds = _timed(Task(study=study), settings, pool)
     if system.repeats == 1 and not original.failed[0]:
         forget_other(study, pool, original)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy
 
-from safevar_sumo.errors import InputError, about
+from safevar_sumo.errors import InputError
 from safevar_sumo.records import FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.study.characteristics import (
@@ -29,8 +29,7 @@ class VariationModel:
     """
 
     def __init__(self, study: Study) -> None:
-        with about(study.source):
-            self.region = region_of(study)
+        self.region = region_of(study)
         self.characteristics = self.region.characteristics
 
         self._source = study.source
