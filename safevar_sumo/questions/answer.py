@@ -224,7 +224,7 @@ class Answer:
                 key: {"unit": column.unit, "meaning": column.meaning}
                 for key, column in table.columns.items()
             }
-            rows = list(map(plain, table.frame.to_dict("records")))
+            rows = plain(table.frame.to_dict("records"))
             tables[name] = {"columns": columns, "rows": rows}
         answer = {
             "question": self.question,

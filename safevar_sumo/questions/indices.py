@@ -196,15 +196,16 @@ def _table(
             values[name] = np.clip(value, 0, 1)
             values[f"{name}{LOW}"] = np.clip(value - half, 0, 1)
             values[f"{name}{HIGH}"] = np.clip(value + half, 0, 1)
-            column = Column(
-                "-", f"share of the variance of {of_what}: {meaning}", ".2f"
-            )
+            head = ""
             if output == "degree":
-                column = column._replace(
-                    head=f"{of_what.removeprefix('the ')}: {index}"
-                )
-            else:
-                column = column._replace(is_detail=True)
+                head = f"{of_what.removeprefix('the ')}: {index}"
+            column = Column(
+                "-",
+                f"share of the variance of {of_what}: {meaning}",
+                ".2f",
+                head=head,
+                is_detail=not head,
+            )
             columns |= with_interval(name, column)
 
     frame = pd.DataFrame({"characteristic": names, **values})
