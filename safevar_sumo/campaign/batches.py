@@ -116,11 +116,38 @@ def evaluate_all(
     the settings is simulated again in SUMO, until `verified` settings of the study are verified.
     Nothing is verified if a `selection` restricts or varies the study.
     """
-    packed_study = msgspec.msgpack.encode(study)
-    if pool.shared is not None:
-        return _evaluate_shared(
+    if pool.shared is None:
+        return _evaluate_unshared(
             study, settings, pool, finish, verified, selection, begin
         )
+    evaluation_of = pool.shared.setdefault(
+        msgspec.msgpack.encode((study, selection)), {}
+    )
+    rows = np.unique(settings, axis=0)
+    new_rows = rows[[row.tobytes() not in evaluation_of for row in rows]]
+    finish(len(rows) - len(new_rows))
+    if len(new_rows):
+        evaluations = _evaluate_unshared(
+            study, new_rows, pool, finish, verified, selection, begin
+        )
+        for number, row in enumerate(new_rows):
+            evaluation_of[row.tobytes()] = evaluations.take([number])
+    return Evaluations.concatenate([evaluation_of[row.tobytes()] for row in settings])
+
+
+def _evaluate_unshared(
+    study: Study,
+    settings: FloatArray,
+    pool: Pool,
+    finish: Callable[[int], None],
+    verified: int,
+    selection: Selection,
+    begin: Callable[[], None],
+) -> Evaluations:
+    """Evaluate settings like `evaluate_all`, but without the results that other questions of the
+    page have.
+    """
+    packed_study = msgspec.msgpack.encode(study)
     opened = opened_by(study, pool)
     system = system_of(study)
     if packed_study not in pool.inputs:
@@ -175,39 +202,6 @@ def _refuse_many_failures(study: Study, evaluations: Evaluations, pool: Pool) ->
     if len(failures):
         problem += f": {failures.reason(0)}"
     raise UserCodeError(study.source, problem, "a simulator that fails less often")
-
-
-def _evaluate_shared(
-    study: Study,
-    settings: FloatArray,
-    pool: Pool,
-    finish: Callable[[int], None],
-    verified: int,
-    selection: Selection,
-    begin: Callable[[], None],
-) -> Evaluations:
-    """Evaluate settings like `evaluate_all`, but take the results that other questions of the page
-    have.
-    """
-    shared = pool.shared
-    pool.shared = None
-    assert shared is not None
-    try:
-        evaluation_of = shared.setdefault(
-            msgspec.msgpack.encode((study, selection)), {}
-        )
-        rows = np.unique(settings, axis=0)
-        new_rows = rows[[row.tobytes() not in evaluation_of for row in rows]]
-        finish(len(rows) - len(new_rows))
-        if len(new_rows):
-            evaluations = evaluate_all(
-                study, new_rows, pool, finish, verified, selection, begin
-            )
-            for number, row in enumerate(new_rows):
-                evaluation_of[row.tobytes()] = evaluations.take([number])
-    finally:
-        pool.shared = shared
-    return Evaluations.concatenate([evaluation_of[row.tobytes()] for row in settings])
 
 
 def forget_other(study: Study, pool: Pool, original: Evaluations) -> None:

@@ -9,7 +9,7 @@ import os
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -178,9 +178,10 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
     """
     if len(rows) > task.batch_size:
         batches = np.array_split(rows, math.ceil(len(rows) / task.batch_size))
-        evaluate = partial(evaluate_settings, task)
         with system_of(task.study).modules.active():
-            return Evaluations.concatenate(list(map(evaluate, batches)))
+            return Evaluations.concatenate(
+                [evaluate_settings(task, batch) for batch in batches]
+            )
     try:
         return evaluate_batch(task, rows)
     except (SimulationError, UserCodeError) as error:
