@@ -24,7 +24,6 @@ from importlib.metadata import distributions
 from io import BytesIO
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import diskcache
 import msgspec
@@ -99,10 +98,9 @@ class Cache:
     ) -> None:
         self._folder = folder
         self._is_read = is_read
-        self._entries: diskcache.Cache | None = None
         self._keys = dict[bytes, bytes]()
         self._is_counted = is_counted
-        self._guarded(self._open, None)
+        self._entries: diskcache.Cache | None = self._guarded(self._open, None)
 
     def key_of(self, study: Study, opened: Sequence[str]) -> bytes:
         """The digest of everything that simulations of a study depend on, except their settings.
@@ -166,11 +164,11 @@ class Cache:
         if self._entries is not None:
             self._guarded(self._entries.close, None)
 
-    def _open(self) -> None:
+    def _open(self) -> diskcache.Cache:
         """Open the folder. Beyond `SIZE_LIMIT`, entries that were read least recently are
         removed.
         """
-        self._entries = diskcache.Cache(
+        return diskcache.Cache(
             str(self._folder),
             disk=_PlainBytes,
             size_limit=SIZE_LIMIT,
@@ -380,23 +378,20 @@ def content_of(evaluations: Evaluations) -> bytes:
 
 
 def evaluations_in(content: bytes | None) -> Evaluations | None:
-    """Read the evaluations in the content of an entry; None if there is no content, or it is
-    damaged.
+    """Read the evaluations in the content of an entry; None if there is no content. The cache has
+    compared the content with its digest: it is as `content_of` has written it.
     """
     if content is None:
         return None
-    try:
-        with np.load(BytesIO(zlib.decompress(content)), allow_pickle=False) as file:
-            arrays = dict(file)
-        metrics = {
-            name.removeprefix(METRIC): values
-            for name, values in arrays.items()
-            if name.startswith(METRIC)
-        }
-        columns = {name: arrays[name] for name in COLUMNS}
-        return Evaluations(**columns, metrics=metrics, worst_points=arrays.get(POINTS))
-    except (ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error):
-        return None
+    with np.load(BytesIO(zlib.decompress(content)), allow_pickle=False) as file:
+        arrays = dict(file)
+    metrics = {
+        name.removeprefix(METRIC): values
+        for name, values in arrays.items()
+        if name.startswith(METRIC)
+    }
+    columns = {name: arrays[name] for name in COLUMNS}
+    return Evaluations(**columns, metrics=metrics, worst_points=arrays.get(POINTS))
 
 
 def _digest(key: bytes, content: bytes) -> bytes:
