@@ -59,19 +59,18 @@ def manifest_of(study: Study, identity: Tables) -> JsonObject:
     }
 
 
-def packages_of(study: Study) -> tuple[str, ...]:
+def packages_of(study: Study) -> list[str]:
     """The packages that a study uses, and on whose versions its results depend. The packages of
     pymoo are left out if pymoo is not installed: questions about results do not need pymoo.
     """
-    has_pymoo = any(name.startswith(PYMOO) for name in study.search.algorithms)
-    has_pymoo = has_pymoo and find_spec("pymoo") is not None
     packages = list(PACKAGES)
     packages += [
         LIBRARIES[key] for key in (study.ads.model, study.ads.kind) if key in LIBRARIES
     ]
-    if has_pymoo:
+    uses_pymoo = any(name.startswith(PYMOO) for name in study.search.algorithms)
+    if uses_pymoo and find_spec("pymoo") is not None:
         packages += PYMOO_PACKAGES
-    return tuple(packages)
+    return packages
 
 
 def evaluation_keys(tables: Tables) -> JsonObject:
@@ -101,12 +100,13 @@ def _without_ranges(tables: Tables) -> JsonObject:
             listed["over"] = over
         return listed
 
-    result = {**tables, "scenario": lists(tables.get("scenario", {}))}
+    result = {**tables, "scenario": lists(tables["scenario"])}
     result["scenario"].pop("margin", None)
     if matrix := tables.get("matrix"):
-        result["matrix"] = dict(matrix)
-        if tests := matrix.get("tests"):
-            result["matrix"]["tests"] = [lists(test) for test in tests]
+        result["matrix"] = {
+            **matrix,
+            "tests": [lists(test) for test in matrix["tests"]],
+        }
     if constraints := result.pop("constraints", None):
         names = tables["vehicle"]["characteristics"].keys()
         constraints = [item for item in constraints if item["sum"].keys() <= names]
