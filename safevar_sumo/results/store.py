@@ -345,16 +345,10 @@ def read_imported(path: Path, characteristics: Collection[str]) -> pd.DataFrame:
     import pandas as pd
 
     file = path / SOLUTIONS
-    numbers = dict.fromkeys([*characteristics, "f_safe", "f_diff", *METRICS], float)
-    columns = [
-        "algorithm",
-        *characteristics,
-        "f_safe",
-        "f_diff",
-        "f_num_diff",
-        *METRICS,
-        "outcome",
-    ]
+    numbers: dict[str, type] = dict.fromkeys(
+        [*characteristics, "f_safe", "f_diff", "f_num_diff", *METRICS], float
+    )
+    numbers["f_num_diff"] = int
     try:
         frame = pd.read_csv(
             BytesIO(read_file(file)),
@@ -362,7 +356,7 @@ def read_imported(path: Path, characteristics: Collection[str]) -> pd.DataFrame:
             na_values=[""],
             float_precision="round_trip",
         )
-        return frame[columns].astype({**numbers, "f_num_diff": int})
+        return frame[["algorithm", *numbers, "outcome"]].astype(numbers)
     except (OSError, KeyError, ValueError) as error:
         raise InputError(
             file,
