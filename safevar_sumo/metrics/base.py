@@ -176,7 +176,7 @@ def checked_measure(code: UserCode) -> Measure:
     legal = FINITE
     if facts.of == "runs":
         legal = Legal(undefined=True)
-    function = code.checked_function(measure.function, facts.name, legal, len)
+    function = code.checked_function(measure.function, facts.name, legal)
     return replace(facts, function=function)
 
 

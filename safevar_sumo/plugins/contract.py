@@ -241,12 +241,12 @@ class UserCode(NamedTuple):
             expected += f", shape {shape}"
         try:
             array = np.asarray(value)
+            if array.dtype.kind not in legal.kinds:
+                raise ValueError
         except ValueError:
             raise self.wrong(
                 method, f"{quantity} = {quoted(value)}", expected
             ) from None
-        if array.dtype.kind not in legal.kinds:
-            raise self.wrong(method, f"{quantity} = {quoted(value)}", expected)
         if (
             shape is not None
             and array.shape != shape
@@ -261,21 +261,17 @@ class UserCode(NamedTuple):
         return array
 
     def checked_function(
-        self,
-        function: Callable[..., UserValue],
-        method: str,
-        legal: Legal,
-        count: Callable[[Any], int],
+        self, function: Callable[..., UserValue], method: str, legal: Legal
     ) -> Callable[..., FloatArray]:
         """Wrap a function of user code: the wrapped function gets read-only arguments, and its
-        result of shape (N,) is checked. `count` returns N for the first argument.
+        result of shape (N,) is checked. N is the length of the first argument.
         """
 
         def checked(*arguments: Any) -> FloatArray:
             with np.errstate():
                 values = function(*map(read_only, arguments))
             return self.check_numbers(
-                method, "values", values, (count(arguments[0]),), legal
+                method, "values", values, (len(arguments[0]),), legal
             ).astype(float)
 
         return checked
