@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import faulthandler
-import importlib
 import os
 import re
 import signal
@@ -13,7 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from pkgutil import resolve_name
+from typing import Any, NoReturn
 
 import click
 
@@ -148,11 +148,8 @@ class LazyCommands(click.Group):
 
 def command_function(command: str) -> Callable[..., Any]:
     """Import and return the function of a command."""
-    module, _, name = COMMANDS[command].partition(":")
-    return cast(
-        "Callable[..., Any]",
-        getattr(importlib.import_module(f"safevar_sumo.{module}"), name),
-    )
+    function: Callable[..., Any] = resolve_name(f"safevar_sumo.{COMMANDS[command]}")
+    return function
 
 
 def first_paragraph(function: str) -> str:
@@ -240,11 +237,8 @@ def run_command_line() -> None:
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     """Print a warning as one line. A hint is printed as a note."""
-    text = printable(str(message))
-    if isinstance(message, Hint):
-        click.echo(f"note: {text}", err=True)
-        return
-    click.echo(f"warning: {text}", err=True)
+    kind = "note" if isinstance(message, Hint) else "warning"
+    click.echo(f"{kind}: {printable(str(message))}", err=True)
 
 
 def _error_in_two_lines(error: click.ClickException) -> str:
