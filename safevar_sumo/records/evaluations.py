@@ -25,8 +25,10 @@ if TYPE_CHECKING:
 
 COLUMNS = ("settings", "outcome", "collision_speed", "f_diff", "f_num_diff")
 """The arrays that all evaluations have. Each array has a row for each setting."""
-OF_SOME = ("worst_points", "stands")
-"""Further arrays, which only some evaluations have."""
+OF_SOME = {"worst_points": "points", "stands": "standing"}
+"""Further arrays, which only some evaluations have, and the properties that all evaluations have
+in place of these arrays.
+"""
 ResultColumns = Mapping[str, npt.NDArray[np.generic]]
 """Results by name, as arrays with an element for each setting."""
 ROUNDING = 1e-9
@@ -245,12 +247,11 @@ class Evaluations:
         metrics = {}
         for name in names:
             metrics[name] = np.concatenate([batch.column(name) for batch in batches])
-        if any(batch.worst_points is not None for batch in batches):
-            columns["worst_points"] = np.concatenate(
-                [batch.points for batch in batches]
-            )
-        if any(batch.stands is not None for batch in batches):
-            columns["stands"] = np.concatenate([batch.standing for batch in batches])
+        for name, complete in OF_SOME.items():
+            if any(getattr(batch, name) is not None for batch in batches):
+                columns[name] = np.concatenate(
+                    [getattr(batch, complete) for batch in batches]
+                )
         return cls(**columns, metrics=metrics, reasons=reasons)
 
 
