@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -238,7 +238,7 @@ def load_target(
             else SolutionId.parse(solution)
         )
     row = subject.solutions.iloc[row_of_handle(subject.solutions, handle)]
-    values = {str(name): value for name, value in row.items()}
+    values: dict[Any, Any] = row.to_dict()
     if choice == "fewest" and (fewest := fewest_changes(subject)):
         values = subject.characteristics.named(fewest.settings[0])
     return Target(study, source, handle, values)

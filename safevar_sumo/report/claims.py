@@ -452,8 +452,8 @@ def count_outcomes(case: Case) -> dict[str, int]:
     """The number of evaluations of all finished runs, by outcome."""
     runs = pd.MultiIndex.from_frame(case.evaluations[["algorithm", "run"]])
     outcomes = case.evaluations["outcome"][runs.isin(case.finished_runs)]
-    counts = outcomes.value_counts(sort=False).sort_index()
-    return dict(zip((str(name) for name in counts.index), counts.tolist(), strict=True))
+    counts: dict[Any, int] = outcomes.value_counts().sort_index().to_dict()
+    return counts
 
 
 def count_solutions(solutions: pd.DataFrame, runs: Sequence[RunName]) -> list[int]:
