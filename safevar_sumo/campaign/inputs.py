@@ -81,7 +81,7 @@ def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
     return dict(sorted(files.items()))
 
 
-def code_of(study: Study, used: Iterable[str] = ()) -> Files:
+def code_of(study: Study, used: Iterable[str]) -> Files:
     """The digests, by name, of the user code and FMUs of a study, and of the files with the names
     `used` that exist.
     """

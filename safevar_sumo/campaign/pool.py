@@ -235,7 +235,7 @@ def open_pool(jobs: int | None = None, cluster: str | None = None) -> Iterator[P
     if jobs is not None and (
         isinstance(jobs, bool)
         or not isinstance(jobs, Integral)
-        or not 1 <= int(jobs) <= MAX_JOBS
+        or not 1 <= jobs <= MAX_JOBS
     ):
         raise InputError("jobs", repr(jobs), f"a whole number from 1 to {MAX_JOBS:,}")
     with ExitStack() as stack:

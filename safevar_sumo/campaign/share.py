@@ -148,7 +148,7 @@ def _refuse_failures(study: Study, runs: Sequence[Run]) -> None:
 def _begin(task: Task, share: Share, key: RunKey) -> Run:
     """Open the journal of a run, and begin the run's search."""
     study = task.study
-    system = system_of(task.study)
+    system = system_of(study)
     path = journal_file(share.directory, str(key))
     head = journal_head(
         identity_digest(share.manifest), str(key), system.characteristics.names

@@ -320,5 +320,5 @@ def instance_of(member: Member, parameters: Parameters, name: str, key: str) -> 
             if user_error_of(error):
                 raise
             raise InputError(
-                "", f"{name} does not take {key} = {dict(parameters)}: {error}"
+                "", f"{name} does not take {key} = {parameters}: {error}"
             ) from None

@@ -70,8 +70,8 @@ class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
     runs: list[tuple[str, int]]
     outcomes: dict[str, Annotated[int, Meta(ge=0, le=MAX_EVALUATIONS)]]
     solutions: list[int]
-    unsafe: str | None = None
-    simulations: dict[str, int] = {}
+    unsafe: str | None
+    simulations: dict[str, int]
 
 
 class PackedPlatform(Struct, frozen=True, forbid_unknown_fields=True):

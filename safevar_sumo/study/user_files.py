@@ -101,4 +101,4 @@ def _scenario_files(study: Study) -> list[str]:
                 texts += axes["file"].at
             for table in (study.scenario, test):
                 texts.append(table.parameters.get("file"))
-    return list(dict.fromkeys(text for text in texts if isinstance(text, str)))
+    return [text for text in texts if isinstance(text, str)]
