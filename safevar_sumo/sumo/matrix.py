@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -126,9 +125,13 @@ def drive_and_score(
     size = max(1, most_at_once(system) // (system.repeats * (1 + takes_pairs)))
     if len(settings) > size:
         batches = np.split(settings, range(size, len(settings), size))
-        score_batch = partial(drive_and_score, system, with_originals=with_originals)
         with system.modules.active():
-            return Evaluations.concatenate(list(map(score_batch, batches)))
+            return Evaluations.concatenate(
+                [
+                    drive_and_score(system, batch, with_originals=with_originals)
+                    for batch in batches
+                ]
+            )
 
     vehicles = settings
     if takes_pairs:

@@ -32,7 +32,6 @@ from safevar_sumo.records import (
     LEAST_CLOSING_SPEED,
     NO_CONTACT,
     QUANTITIES,
-    BoolArray,
     Encounter,
     Evaluations,
     FloatArray,
@@ -79,18 +78,13 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
     only point. The time limit holds for each simulation.
     """
     (point,) = system.points
-    vehicles, encounters = system.split(settings)
-    names = system.characteristics.vehicle.names
-    searched = system.characteristics.scenario.names
+    members = system.characteristics
     results = []
-    for vehicle, values, row in zip(
-        vehicles.tolist(), encounters.tolist(), settings, strict=True
-    ):
-        command = f"{system.command} {system.characteristics.options(row)}"
+    for setting in settings:
+        command = f"{system.command} {members.options(setting)}"
         note_work(f"{REPRODUCED_BY}{command}")
-        scenario: Any = encounter(
-            point, dict(zip(searched, values, strict=True))
-        ).scenario
+        scenario: Any = encounter(point, members.encounter_of(setting)).scenario
+        vehicle = members.vehicle.named(setting[members.of_vehicle])
         with (
             temporary_entries(os.environ, {MARK: this_process.mark}),
             system.user_code(),
@@ -100,7 +94,7 @@ def simulate_each(system: System, settings: FloatArray) -> SimulationRuns:
             with _end_worker():
                 simulator = KEPT.at(scenario)
                 KEPT.simulated += 1
-                result = simulator.simulate(dict(zip(names, vehicle, strict=True)))
+                result = simulator.simulate(vehicle)
             if TIME in result:
                 _check_step(simulator, result[TIME], point.name)
             else:
@@ -144,17 +138,15 @@ def unread_characteristics(system: System, settings: FloatArray) -> set[str]:
     """
     if system.mover.is_exact:
         return set()
-    names = system.characteristics.vehicle.names
-    unread = {*names}
-    for vehicle, values in zip(*system.split(settings), strict=True):
-        searched = dict(
-            zip(system.characteristics.scenario.names, values.tolist(), strict=True)
-        )
-        scenario: Any = encounter(system.points[0], searched).scenario
-        setting = _Setting(dict(zip(names, vehicle.tolist(), strict=True)))
+    members = system.characteristics
+    unread = {*members.vehicle.names}
+    for setting in settings:
+        values = members.encounter_of(setting)
+        scenario: Any = encounter(system.points[0], values).scenario
+        vehicle = _Setting(members.vehicle.named(setting[members.of_vehicle]))
         with system.user_code():
-            KEPT.at(scenario).simulate(setting)
-        unread &= setting.unread
+            KEPT.at(scenario).simulate(vehicle)
+        unread &= vehicle.unread
     return unread
 
 
@@ -254,15 +246,11 @@ def _check_names(scenario: Simulator, result: StatedRun, system: System) -> None
                 f"a result without a trace, with {name!r}",
                 f"names of metrics: {', '.join(sorted(names))}",
             )
-    for objective in system.measuring.scoring.objectives:
-        measure = measures.get(objective.name)
-        if objective.name == UNSAFE_SHARE.name:
-            continue
-        if (
-            measure is not None
-            and measure.of == "runs"
-            and objective.name not in result
-        ):
+    # The share of unsafe runs follows from all runs of a setting.
+    known = {UNSAFE_SHARE.name, *result}
+    scoring = system.measuring.scoring
+    for objective in scoring.objectives:
+        if objective in scoring.metrics and objective.name not in known:
             raise code.wrong(
                 "simulate",
                 f"a result without a trace and without {objective.name}",
@@ -277,12 +265,8 @@ def _runs_of(
     trace.
     """
     # Metrics of a result with a trace follow from the trace; other results state their metrics.
-    traces: list[StatedRun] = []
-    rigs: list[StatedRun] = []
-    for result in results:
-        has_trace = TIME in result
-        traces.append(result if has_trace else {})
-        rigs.append({} if has_trace else result)
+    traces = [result if TIME in result else {} for result in results]
+    rigs = [{} if TIME in result else result for result in results]
     times = next((trace[TIME] for trace in traces if trace), np.zeros(2))
     step = float(times[1] - times[0])
     lengths = np.array([len(trace.get(TIME, ())) for trace in traces])
@@ -301,9 +285,6 @@ def _runs_of(
     def number(name: str, records: Sequence[StatedRun] = results) -> FloatArray:
         """The number that each record states under a name, shape (N,); NaN without it."""
         return np.array([record.get(name, np.nan) for record in records], float)
-
-    def is_missing(name: str) -> BoolArray:
-        return np.array([name not in trace for trace in traces])
 
     outcome = np.array([result[OUTCOME] for result in results], dtype="U16")
     collided = outcome == Outcome.COLLISION
@@ -340,7 +321,10 @@ def _runs_of(
         collision_speed=np.where(collided, impact, np.nan),
         contact=NO_CONTACT._replace(speed=struck),
         allowed_impact_speed=np.array(allowed_impact_speed),
-        lacks={name: is_missing(name) for name in QUANTITIES},
+        lacks={
+            name: np.array([name not in trace for trace in traces])
+            for name in QUANTITIES
+        },
         stated=stated,
     )
 
@@ -366,8 +350,8 @@ def joined(
         return np.where(number, total / np.maximum(number, 1), np.nan)
 
     outcomes = evaluations.outcome.reshape(repeats, n)
-    ranks = map(list(map(str, SEVERITY)).index, evaluations.outcome.tolist())
-    severity = np.reshape(list(ranks), (repeats, n))
+    ranks = [SEVERITY.index(outcome) for outcome in evaluations.outcome.tolist()]
+    severity = np.reshape(ranks, (repeats, n))
     degrees = evaluations.f_safe.reshape(repeats, n)
     worst = np.argmin(np.where(np.isnan(degrees), np.inf, degrees), axis=0)
     metrics = {name: mean(values) for name, values in evaluations.metrics.items()}
@@ -384,8 +368,7 @@ def joined(
             for number, row in enumerate(values.reshape(repeats, n), 1):
                 rounds[f"{name}_{number}"] = row
     return replace(
-        evaluations.take(columns),
+        evaluations.take(worst * n + columns),
         outcome=outcomes[np.argmin(severity, axis=0), columns],
-        collision_speed=evaluations.collision_speed.reshape(repeats, n)[worst, columns],
         metrics={**metrics, **rounds},
     )
