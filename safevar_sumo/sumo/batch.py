@@ -4,8 +4,8 @@ SUMO.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -25,11 +25,10 @@ from safevar_sumo.sumo.engine import (
     Create,
     Start,
     open_in_process,
-    open_varied_world,
     open_world,
 )
 from safevar_sumo.sumo.lane_world import LaneWorld
-from safevar_sumo.sumo.network import copied_network, networks_for
+from safevar_sumo.sumo.network import networks_for, varied_network
 from safevar_sumo.sumo.perception import Observer, SceneObserver, of_vehicles
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
@@ -207,12 +206,13 @@ def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:
     return of_vehicles([point.scenario.start_speed for point in points], n)
 
 
+@contextmanager
 def open_points_world(
     system: System,
     encounters: FloatArray,
     traffic: Traffic | None,
     start: Start = open_in_process,
-) -> AbstractContextManager[SumoWorld]:
+) -> Iterator[SumoWorld]:
     """Start SUMO on a copy of the network of the system's only point for each of N encounters,
     shape (N, k).
     """
@@ -236,6 +236,8 @@ def open_points_world(
             start_speeds=speeds,
             start=start_frame(networks[0], step),
         )
-    if n_searched:
-        return open_varied_world(networks, step, create, start)
-    return open_world(copied_network(networks[0], n), n, step, create, start)
+    with (
+        varied_network(networks, n) as files,
+        open_world(files, n, step, create, start) as world,
+    ):
+        yield world

@@ -106,7 +106,7 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     """
     # The sample after the last active one ended the run.
     trace = runs.trace
-    end = int(np.count_nonzero(trace.active)) + 1
+    end = np.count_nonzero(trace.active) + 1
     columns = np.broadcast_arrays(
         trace.gap,
         trace.speed,

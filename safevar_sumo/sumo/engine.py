@@ -19,10 +19,8 @@ from io import StringIO
 from safevar_sumo.errors import EnvironmentFault, InputError, SimulationError
 from safevar_sumo.sumo.network import (
     CopiedNetwork,
-    NetworkFiles,
     options_in,
     program_of_sumo,
-    varied_network,
 )
 from safevar_sumo.sumo.world import Api, SumoWorld
 
@@ -152,21 +150,6 @@ def open_world(
     """
     with start(sumo_options(files, step)) as api:
         yield create(api, n)
-
-
-@contextmanager
-def open_varied_world(
-    networks: Sequence[NetworkFiles],
-    step: float | None,
-    create: Create,
-    start: Start,
-) -> Iterator[SumoWorld]:
-    """Start SUMO on a copy of one network for each of N traffics; see `open_world`."""
-    with (
-        varied_network(networks) as files,
-        open_world(files, len(networks), step, create, start) as world,
-    ):
-        yield world
 
 
 @contextmanager

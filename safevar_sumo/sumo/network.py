@@ -239,11 +239,15 @@ def copied_network(network: NetworkFiles, n: int) -> CopiedNetwork:
 
 
 @contextmanager
-def varied_network(networks: Sequence[NetworkFiles]) -> Iterator[CopiedNetwork]:
-    """A copy of one network for each of N traffics: `networks` differ only in their traffic. The
-    file with the traffic exists until the context ends. Raises the errors of `copied_network`.
+def varied_network(networks: Sequence[NetworkFiles], n: int) -> Iterator[CopiedNetwork]:
+    """`n` copies of a network. Either `networks` is this network alone, or it has a network for
+    each copy, and they differ only in their traffic; then the file with the traffic exists until
+    the context ends. Raises the errors of `copied_network`.
     """
-    files = copied_network(networks[0], len(networks))
+    files = copied_network(networks[0], n)
+    if len(networks) == 1:
+        yield files
+        return
     traffic_file = networks[0].path(TRAFFIC_FILE)
     with temporary_folder() as folder:
         file = Path(folder, TRAFFIC_FILE)
@@ -251,7 +255,7 @@ def varied_network(networks: Sequence[NetworkFiles]) -> Iterator[CopiedNetwork]:
             _changed(traffic_file, network.traffic_changes) for network in networks
         ]
         with about(traffic_file):
-            write_demand(roots, len(roots), file)
+            write_demand(roots, n, file)
         yield files._replace(traffic=file)
 
 

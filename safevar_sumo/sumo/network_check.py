@@ -80,16 +80,16 @@ TYPE_KEYS = re.compile(
 )
 """Keys of a `param` that mean an attribute of a type."""
 ACTING_ATTRIBUTES = (
-    *(
-        "carFollowModel",
-        "tau",
-        "decel",
-        "emergencyDecel",
-        "minGap",
-        "speedFactor",
-        "desiredMaxSpeed",
-    ),
-    *("actionStepLength", "delta", "stepping"),
+    "carFollowModel",
+    "tau",
+    "decel",
+    "emergencyDecel",
+    "minGap",
+    "speedFactor",
+    "desiredMaxSpeed",
+    "actionStepLength",
+    "delta",
+    "stepping",
 )
 """Attributes that act on SUMO's driver under a controller written for TraCI. `sigma` is none of
 them, because this driver never dawdles.

@@ -229,25 +229,23 @@ def _play(
         way = _way_of(api, vut)
         if way is None:
             return NOT_STRAIGHT
-        lane_of = {
-            copy_and_name(id_)[1]: copy_and_name(vehicle.getLaneID(id_))[1]
-            for id_ in vehicle.getIDList()
-        }
-
         # `_tracks` must come last: it advances the world, and the other values are of the start.
         return Recording(
             step_length=world.step_length,
-            start=float(vehicle.getLanePosition(vut)),
-            speed=float(vehicle.getSpeed(vut)),
+            start=vehicle.getLanePosition(vut),
+            speed=vehicle.getSpeed(vut),
             length=world.vehicle_length(VUT),
-            width=float(vehicle.getWidth(vut)),
+            width=world.vehicle_width,
             way=way,
             along=direction_of(vehicle.getAngle(vut)),
             lanes={
                 copy_and_name(id_)[1]: tuple(api.lane.getShape(id_))
                 for id_ in api.lane.getIDList()
             },
-            first_lanes=lane_of,
+            first_lanes={
+                copy_and_name(id_)[1]: copy_and_name(vehicle.getLaneID(id_))[1]
+                for id_ in vehicle.getIDList()
+            },
             tracks=_tracks(scenario, world),
         )
 
@@ -295,7 +293,7 @@ def _way_of(api: Api, vut: str) -> LaneSequence | None:
         return None
     starts, ends = np.array(shapes, float).transpose(1, 0, 2)
     vector = ends - starts
-    lengths = np.array(list(map(api.lane.getLength, lanes)), dtype=float)
+    lengths = np.array([api.lane.getLength(lane) for lane in lanes])
     shape_length = np.sqrt((vector * vector).sum(axis=1))
     direction = vector / shape_length[:, None]
     largest_turn = np.abs(direction - direction[0]).max()

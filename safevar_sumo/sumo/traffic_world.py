@@ -120,8 +120,6 @@ class TrafficWorld(SumoWorld):
         self._move_vehicle = function_of(api, "vehicle", "moveToXY")
         self._set_previous_speed = function_of(api, "vehicle", "setPreviousSpeed")
         self._routes = [api.vehicle.getRoute(name) for name in self.ids(VUT)]
-        self._edges = [str(route[0]) for route in self._routes]
-        """The edges on which the vehicles under test depart."""
 
     @property
     def frame(self) -> Frame:
@@ -193,13 +191,13 @@ class TrafficWorld(SumoWorld):
             places = (
                 self._of_copies(values) for values in (actor.x, actor.y, actor.angle)
             )
-            placed = zip(actor.ids, self._edges, *places, strict=True)
+            placed = zip(actor.ids, self._routes, *places, strict=True)
             if actor.is_person:
-                for id_, edge, x, y, angle in placed:
-                    self._move_person(id_, edge, x, y, angle, ANY_PLACE)
+                for id_, route, x, y, angle in placed:
+                    self._move_person(id_, route[0], x, y, angle, ANY_PLACE)
             else:
-                for id_, edge, x, y, angle in placed:
-                    self._move_vehicle(id_, edge, ANY_LANE, x, y, angle, ANY_PLACE)
+                for id_, route, x, y, angle in placed:
+                    self._move_vehicle(id_, route[0], ANY_LANE, x, y, angle, ANY_PLACE)
                 for id_, speed in zip(
                     actor.ids, self._of_copies(actor.track.speed), strict=True
                 ):

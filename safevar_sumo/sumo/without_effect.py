@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from safevar_sumo.records import FloatArray
 from safevar_sumo.scenarios import equals_clear
 from safevar_sumo.sumo.network_check import ACTING_ATTRIBUTES, network_remarks
 from safevar_sumo.sumo.simulated_study import noise_remarks
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_controller import TraciController
-from safevar_sumo.vehicles import STEP
-from safevar_sumo.vehicles.base import Prepared
+from safevar_sumo.vehicles import prepared_original
 
 UNKNOWN_TO_DRIVER = (
     "SUMO's driver plans with the deceleration and the smallest gap of the traffic file. This"
@@ -63,7 +61,8 @@ def without_effect(system: System) -> list[str]:
 
 
 def _has_tau(system: System) -> bool:
-    return system.vehicle.sumo_type(_prepared(system)).tau is not None
+    prepared = prepared_original(system.vehicle, system.characteristics.vehicle)
+    return system.vehicle.sumo_type(prepared).tau is not None
 
 
 def _remarks_on_driver(system: System) -> list[str]:
@@ -94,7 +93,9 @@ def _remarks_on_grip(system: System) -> list[str]:
     friction = max(point.weather.road_friction for point in system.points)
     nearly, highest = (
         system.vehicle.sumo_type(
-            _prepared(system, friction, decel=np.array([value]))
+            prepared_original(
+                system.vehicle, members, friction, decel=np.array([value])
+            )
         ).decel[0]
         for value in (NEARLY * upper, upper)
     )
@@ -107,15 +108,6 @@ def _remarks_on_grip(system: System) -> list[str]:
 
 
 def _has_limited_range(system: System) -> bool:
-    sensors = system.vehicle.sensors(_prepared(system))
+    prepared = prepared_original(system.vehicle, system.characteristics.vehicle)
+    sensors = system.vehicle.sensors(prepared)
     return sensors is not None and bool(np.isfinite(sensors.reach).all())
-
-
-def _prepared(system: System, friction: float = 1.0, **changes: FloatArray) -> Prepared:
-    """The model's constants of the original vehicle with `changes` of characteristics. `friction`
-    is the factor of the weather on the tyres' friction.
-    """
-    members = system.characteristics.vehicle
-    return system.vehicle.prepare(
-        members.columns(members.original_settings) | changes, friction, STEP
-    )

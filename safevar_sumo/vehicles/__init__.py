@@ -50,7 +50,7 @@ def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> N
     """The original vehicle as an ADS knows it, on a dry road. The calibration drive is simulated
     when its tables are first used.
     """
-    types = vehicle.sumo_type(_prepared_original(vehicle, characteristics))
+    types = vehicle.sumo_type(prepared_original(vehicle, characteristics))
     mass, accel, decel, max_speed, lag = (float(values[0]) for values in types[:5])
     return Nominal(
         mass=mass,
@@ -62,14 +62,19 @@ def calibration_drive(vehicle: Vehicle, characteristics: CharacteristicSet) -> N
     )
 
 
-def _prepared_original(
-    vehicle: Vehicle, characteristics: CharacteristicSet
+def prepared_original(
+    vehicle: Vehicle,
+    characteristics: CharacteristicSet,
+    friction: float = DRY_ROAD_FRICTION,
+    **changes: FloatArray,
 ) -> Prepared:
-    return vehicle.prepare(
-        {member.name: np.full(1, float(member.original)) for member in characteristics},
-        DRY_ROAD_FRICTION,
-        STEP,
-    )
+    """The model's constants of the original vehicle with `changes` of its characteristics.
+    `friction` is the factor of the weather on the tyres' friction.
+    """
+    values = {
+        member.name: np.full(1, float(member.original)) for member in characteristics
+    }
+    return vehicle.prepare(values | changes, friction, STEP)
 
 
 @lru_cache(maxsize=4)
@@ -79,7 +84,7 @@ def _simulated_tables(
     """Tables from three drives of the original vehicle: it accelerates at full throttle to the
     highest speed of the tables; from there it coasts in one drive, and brakes lightly in another.
     """
-    prepared = _prepared_original(vehicle, characteristics)
+    prepared = prepared_original(vehicle, characteristics)
 
     def drive(
         state: VehicleState, throttle: float, brake: float
