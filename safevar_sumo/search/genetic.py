@@ -64,15 +64,12 @@ class Individual(list[float]):
         if the original vehicle is safe, or if a study searches no encounters.
     standing
         The place of the individual among survivors, as a tuple to compare: less is better.
-    has_failed
-        Whether the setting could not be scored.
     """
 
     fitness: base.Fitness
     evaluation: tuple[Evaluations, int]
     violation: float = 0.0
     standing: tuple[float, ...]
-    has_failed: bool = False
 
 
 class Nsga2(Algorithm, Table, frozen=True, kw_only=True):
@@ -110,10 +107,8 @@ class Nsga2(Algorithm, Table, frozen=True, kw_only=True):
         used = 0
 
         while offspring:
-            used += yield from request_evaluations(offspring, problem)
-            alive = [
-                individual for individual in offspring if not individual.has_failed
-            ]
+            alive = yield from request_evaluations(offspring, problem)
+            used += len(offspring)
             survivors = select_survivors(survivors + alive, problem.population)
             offspring = reproduction.draw_offspring(
                 survivors, min(problem.population, problem.evaluations - used)
@@ -211,27 +206,26 @@ class Reproduction:
 
 def request_evaluations(
     individuals: Sequence[Individual], problem: Problem
-) -> Generator[FloatArray, Evaluations, int]:
-    """Request the evaluations of individuals, and store them in the individuals. Return the number
-    of evaluations.
+) -> Generator[FloatArray, Evaluations, list[Individual]]:
+    """Request the evaluations of individuals, and store them in the individuals. Return the
+    individuals that could be scored.
     """
     evaluated = yield problem.characteristics.filter(np.array(individuals))
     scoring = problem.scoring
     fitness = fitness_class(len(problem.scoring.objectives))
     violations = scoring.violation(evaluated)
-    failed = ~np.where(
+    is_scored = np.where(
         violations > 0, np.isfinite(violations), scoring.valid(evaluated)
     )
-    columns = scoring.values(evaluated).tolist(), violations.tolist(), failed.tolist()
+    columns = scoring.values(evaluated).tolist(), violations.tolist()
 
-    for row, (individual, values, violation, has_failed) in enumerate(
+    for row, (individual, values, violation) in enumerate(
         zip(individuals, *columns, strict=True)
     ):
         individual.evaluation = (evaluated, row)
         individual.violation = violation
-        individual.has_failed = has_failed
         individual.fitness = fitness(tuple(values))
-    return len(individuals)
+    return list(compress(individuals, is_scored))
 
 
 def select_survivors(individuals: list[Individual], number: int) -> list[Individual]:

@@ -317,8 +317,9 @@ def _table(common: CommonDomain, settings: pd.DataFrame) -> AnswerTable:
         item = members[column]
         meaning = f"{item.name} in B, the same change of another original"
         columns[f"b_{item.name}"] = Column(item.unit, meaning, is_shown=False)
-    places = settings["unsafe_in"].map(list(UNSAFE_IN).index)
-    rows = settings.loc[places.sort_values(kind="stable").index, list(columns)]
+    rows = settings.sort_values(
+        "unsafe_in", kind="stable", key=lambda names: names.map(list(UNSAFE_IN).index)
+    )
     return tabulate("The same changed vehicles in both versions", columns, rows)
 
 

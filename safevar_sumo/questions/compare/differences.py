@@ -32,7 +32,7 @@ from safevar_sumo.questions.tables import AnswerTable, shipped_columns
 from safevar_sumo.questions.tolerance.asked import Asked, asked_of
 from safevar_sumo.questions.tolerance.search import alone_with_own_set
 from safevar_sumo.questions.words import count_in_words, join_few
-from safevar_sumo.records import FloatArray, JsonObject
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.scenarios import Point
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.vehicles import CharacteristicSet
@@ -250,14 +250,12 @@ def _new_collisions(evaluators: Evaluators) -> Differences:
     does not. The sentence names the fastest new collision. Test cases that A lacks do not count,
     because they show nothing about a change.
     """
-    of_a, of_b = map(_collisions_of_original, evaluators)
-    cases_of_collisions = [case for case, _, _ in of_a]
-    cases_of_a = [case for _, _, case in cases_of(evaluators[0])]
-
+    of_a, of_b = map(_runs_of_original, evaluators)
+    safe_in_a = [case for case, _, run in of_a if not run.collided[0]]
     new = [
-        (speed, point)
-        for case, point, speed in of_b
-        if case in cases_of_a and case not in cases_of_collisions
+        (float(-run.f_safe[0]), point)
+        for case, point, run in of_b
+        if run.collided[0] and case in safe_in_a
     ]
     if new:
         speed, point = max(new, key=lambda pair: pair[0])
@@ -269,16 +267,15 @@ def _new_collisions(evaluators: Evaluators) -> Differences:
         yield Difference(template, values, is_better=False, weight=COLLISION)
 
 
-def _collisions_of_original(side: Evaluator) -> list[tuple[TestCase, Point, float]]:
-    """The test cases in which a version's original vehicle collides, each with the point of the
-    matrix and the speed of the collision [m/s].
+def _runs_of_original(side: Evaluator) -> list[tuple[TestCase, Point, Evaluations]]:
+    """The test cases of a version, each with its point of the matrix and the evaluation of the
+    version's original vehicle.
     """
     original = side.characteristics.original[np.newaxis]
     results = simulate_all_points(side.system, original)
     return [
-        (case, point, float(-result.evaluations.f_safe[0]))
+        (case, point, result.evaluations)
         for (_, point, case), result in zip(cases_of(side), results, strict=True)
-        if result.evaluations.collided[0]
     ]
 
 

@@ -148,24 +148,24 @@ def _first_safe_share(
     members = evaluator.characteristics
     shares = np.arange(1, STEPS + 1) / STEPS
     shares = shares[shares > begins_at]
-    starts, ends = _lines_to_ends(members, settings_of(members, [cause]))
-    (settings,) = on_lines(starts, ends, shares[np.newaxis])
+    (settings,) = _on_way_to_ends(members, [cause], shares)
     runs = evaluator.evaluate(settings, BOUNDARIES)
     is_safe = runs.valid & ~unsafe.of(runs)
     return float(min(shares[is_safe], default=np.nan))
 
 
-def _lines_to_ends(
-    members: CharacteristicSet, settings: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """The original vehicle in the encounters of M settings, and the vehicle with the changes of
-    each setting at the ends of their domains; both have the shape (M, n).
+def _on_way_to_ends(
+    members: CharacteristicSet, causes: Causes, shares: FloatArray
+) -> FloatArray:
+    """The settings in which the changes of each of K causes are at P shares of the way from the
+    original vehicle to the ends of their domains, shape (K, P, n).
     """
+    settings = settings_of(members, causes)
     starts = members.with_original_vehicle(settings)
     ends = np.select(
         [settings > starts, settings < starts], [members.upper, members.lower], starts
     )
-    return starts, ends
+    return on_lines(starts, ends, shares[np.newaxis])
 
 
 def _smallest(
@@ -205,11 +205,9 @@ def _begin(
     if not number:
         return beginnings, []
 
-    # `settings` lie on lines from the original to the ends of the domain, shape (K, steps, n).
     members = evaluator.characteristics
-    starts, ends = _lines_to_ends(members, settings_of(members, causes[:number]))
     shares = np.arange(1, steps + 1) / steps
-    settings = on_lines(starts, ends, np.tile(shares, (number, 1)))
+    settings = _on_way_to_ends(members, causes[:number], shares)
     runs = evaluator.evaluate(settings.reshape(-1, len(members)), BOUNDARIES)
     is_unsafe = evaluator.confirmed(runs, unsafe).reshape(settings.shape[:2])
     is_safe = runs.valid.reshape(is_unsafe.shape) & ~is_unsafe

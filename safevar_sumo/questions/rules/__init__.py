@@ -255,28 +255,23 @@ def shares(
 def _boxes(
     settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet
 ) -> list[FloatArray]:
-    """The boxes that become rules: the whole domain if all settings are unsafe, and no box if there
-    are fewer than `MIN_SETTINGS` safe or unsafe settings.
-    """
-    if is_unsafe.all() and len(settings):
-        return [np.repeat(UNLIMITED, len(characteristics), axis=1)]
-    if min(is_unsafe.sum(), (~is_unsafe).sum()) >= MIN_SETTINGS:
-        return _find_boxes(settings, is_unsafe, characteristics)
-    return []
-
-
-def _find_boxes(
-    settings: FloatArray, is_unsafe: BoolArray, characteristics: CharacteristicSet
-) -> list[FloatArray]:
     """The boxes that become rules, ordered by the number of unsafe settings in them. A box that
     adds few unsafe settings to the boxes before it is dropped.
+
+    The whole domain is the only box if all settings are unsafe. There is no box if there are fewer
+    than `MIN_SETTINGS` safe or unsafe settings.
     """
+    domain = np.repeat(UNLIMITED, len(characteristics), axis=1)
+    if is_unsafe.all() and len(settings):
+        return [domain]
+    if min(is_unsafe.sum(), (~is_unsafe).sum()) < MIN_SETTINGS:
+        return []
+
     # Take the leaves of the tree in which more than half of the settings are unsafe or, without
     # such a leaf, the densest leaf.
     lower = characteristics.lower
     width = characteristics.upper - characteristics.lower
     tree = _fit_pruned_tree((settings - lower) / width, is_unsafe).tree_
-    domain = np.repeat(UNLIMITED, len(width), axis=1)
     leaves = list(_boxes_of_leaves(tree, 0, domain, lower, width))
     densest, _ = max(leaves, key=lambda leaf: leaf[1])
     dense_boxes = [box for box, density in leaves if density > 0.5] or [densest]
