@@ -16,11 +16,11 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import batches
 from safevar_sumo.campaign.batches import Batches
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
-from safevar_sumo.metrics import METRICS, Unsafe
+from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import bench, by_criterion, cases, evaluator, part, repair
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
-from safevar_sumo.questions.repair import survivors
+from safevar_sumo.questions.repair import problem, survivors
 from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Study
 from safevar_sumo.sumo.system import assemble
@@ -48,21 +48,31 @@ def _batches_of_made_up_studies(monkeypatch: pytest.MonkeyPatch) -> None:
 def _made_up_studies_happen_where_smoke_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """No vehicle has their characteristics; their failures are described as of the study smoke."""
     smoke = assemble(load_study("smoke"))
-    for module in (evaluator, by_criterion, bench, part):
+    places = [
+        (module, "assemble")
+        for module in (evaluator, by_criterion, bench, part, problem)
+    ]
+    places += [(module, "system_of") for module in (evaluator, batches)]
+    for module, name in places:
+        usual = getattr(module, name)
         monkeypatch.setattr(
             module,
-            "assemble",
-            lambda study: smoke if study.name == "made-up" else assemble(study),
-        )
-    system_of = batches.system_of
-    for module in (evaluator, batches):
-        monkeypatch.setattr(
-            module,
-            "system_of",
-            lambda study: smoke if study.name == "made-up" else system_of(study),
+            name,
+            lambda study, usual=usual: (
+                smoke if study.name == "made-up" else usual(study)
+            ),
         )
 
 
+ONE_TEST = {
+    "title": "one test",
+    "matrix": {
+        "tests": [
+            {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [40]}}
+        ]
+    },
+}
+"""What is changed in the study `wear`, so that cars drive at one of its points only."""
 ORIGINAL, LOWER, UPPER = 5.0, 0.0, 10.0
 Region = Callable[[FloatArray], BoolArray]
 
@@ -83,6 +93,18 @@ def made_up_study(n: int) -> Study:
     )
 
 
+def nowhere(settings: FloatArray) -> BoolArray:
+    return np.zeros(len(settings), dtype=bool)
+
+
+def everywhere(settings: FloatArray) -> BoolArray:
+    return np.ones(len(settings), dtype=bool)
+
+
+def two_metres(settings: FloatArray) -> FloatArray:
+    return np.full(len(settings), 2.0)
+
+
 class Plant(InlinePool):
     """A pool in which settings in `region` collide at 1 m/s, settings in `failing` fail, and all
     others have the safety degree `degree`.
@@ -92,37 +114,29 @@ class Plant(InlinePool):
         self,
         study: Study,
         region: Region,
-        degree: Callable[[FloatArray], FloatArray] | None = None,
-        failing: Region | None = None,
+        degree: Callable[[FloatArray], FloatArray] = two_metres,
+        failing: Region = nowhere,
     ):
         super().__init__()
-        self._characteristics, self._region = CharacteristicSet.of(study), region
-        self._degree = degree or (lambda settings: np.full(len(settings), 2.0))
-        self._failing = failing or nowhere
+        self._characteristics = CharacteristicSet.of(study)
+        self._region, self._degree, self._failing = region, degree, failing
         self.seen: set[bytes] = set()
 
     def compute(self, function: Callable[..., Any], task: Task, *arguments: Any) -> Any:
         return self.evaluate(*arguments) if function is evaluate_settings else ""
 
     def evaluate(self, settings: FloatArray) -> Evaluations:
-        collides = np.asarray(self._region(settings), dtype=bool)
         fails = self._failing(settings)
-        collides &= ~fails
-        degree = np.where(
-            fails, np.nan, np.where(collides, -1.0, self._degree(settings))
-        )
+        collides = self._region(settings) & ~fails
+        degree = np.where(collides, -1.0, self._degree(settings))
+        outcome = np.where(collides, "collision", "stopped").astype("U16")
+        degree[fails], outcome[fails] = np.nan, "simulator-error"
         self.seen |= {row.tobytes() for row in settings}
         return made_up_evaluations(
             degree,
             settings=settings,
-            outcome=np.where(
-                fails, "simulator-error", np.where(collides, "collision", "stopped")
-            ).astype("U16"),
+            outcome=outcome,
             collision_speed=np.where(collides, 1.0, np.nan),
-            metrics={
-                **dict.fromkeys(METRICS, np.full(len(settings), np.nan)),
-                "safety_degree": degree,
-            },
             f_diff=self._characteristics.largest_change(settings),
             f_num_diff=self._characteristics.number_changed(settings),
         )
@@ -137,14 +151,6 @@ def made_up_model(n: int, region: Region, fit: int = 0) -> Model:
     return Model(fit, made_up_evaluator(n, region), Unsafe())
 
 
-def nowhere(settings: FloatArray) -> BoolArray:
-    return np.zeros(len(settings), dtype=bool)
-
-
-def everywhere(settings: FloatArray) -> BoolArray:
-    return np.ones(len(settings), dtype=bool)
-
-
 def box(settings: FloatArray) -> BoolArray:
     """a above 7 and b below 3: 9 % of two domains."""
     return (settings[:, 0] > 7) & (settings[:, 1] < 3)
@@ -153,13 +159,6 @@ def box(settings: FloatArray) -> BoolArray:
 def two_islands(settings: FloatArray) -> BoolArray:
     """a from 6.5 to 7, and a above 9: 15 % of its domain."""
     return ((settings[:, 0] > 6.5) & (settings[:, 0] < 7)) | (settings[:, 0] > 9)
-
-
-def diagonal_band(settings: FloatArray) -> BoolArray:
-    """Where a - b is from 6 to 8: (16 - 4) / 2 = 6 of 100, none on an axis through the original."""
-    return (settings[:, 0] - settings[:, 1] >= 6) & (
-        settings[:, 0] - settings[:, 1] <= 8
-    )
 
 
 @pytest.fixture

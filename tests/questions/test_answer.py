@@ -34,7 +34,7 @@ from safevar_sumo.questions.render import MAX_LINES, MAX_ROWS
 from safevar_sumo.questions.sentence import Verdict, answer as said, note
 from safevar_sumo.questions.words import change_texts
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import json_of, refused, rows_of, run
+from tests.in_process import json_of, rows_of, run
 from tests.manual import files_of
 
 COLUMNS = {
@@ -364,11 +364,6 @@ def test_the_question_that_the_manual_adds_from_outside(
     failed = run(f"{command} --fail-if 'unsafe_ends > 0'", expect=3)
     assert "Unsafe at an end of the domain: " in failed.stdout
     assert "failed: unsafe_ends = " in failed.stderr
-    refused(
-        "rules smoke --samples 0",
-        "--samples: 0",
-        "a whole number from 1 to 100,000,000",
-    )
     answer = json_of(command)
     assert answer["question"] == name
     rows = rows_of(answer, "ends")

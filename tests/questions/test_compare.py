@@ -29,15 +29,8 @@ from tests.in_process import (
     searched,
     write,
 )
+from tests.questions.conftest import ONE_TEST
 
-ONE_TEST = {
-    "title": "one test",
-    "matrix": {
-        "tests": [
-            {"name": "CPFA", "parameters": {"test": "CPFA"}, "over": {"speed": [40]}}
-        ]
-    },
-}
 POOL = InlinePool()
 
 

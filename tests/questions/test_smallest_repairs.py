@@ -16,10 +16,9 @@ from safevar_sumo.campaign.evaluation import evaluate_settings
 from safevar_sumo.questions import repair as question
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.evaluator import Evaluator
-from safevar_sumo.questions.repair import answer as answers, problem
+from safevar_sumo.questions.repair import answer as answers
 from safevar_sumo.records import FloatArray, JsonObject, NamedValues
 from safevar_sumo.study import CharacteristicTable, FreeParameter, Study
-from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool
 from tests.made_up import made_up_evaluations
 
@@ -109,9 +108,7 @@ def price_of(study: Study, values: NamedValues, encounters: FloatArray) -> JsonO
 
 
 @pytest.fixture(autouse=True)
-def _no_vehicles(quick_repairs: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    smoke = assemble(load_study("smoke"))
-    monkeypatch.setattr(problem, "assemble", lambda study: smoke)
+def _made_up_price(quick_repairs: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(answers, "price_of", price_of)
 
 
