@@ -214,11 +214,11 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             brake_rise=self.brake_rise * substep,
             brake_fall=self.brake_fall * substep,
             engine_inertia=ENGINE_INERTIA / tyre_step,
-            engine_torque=float(self.engine_torque),
-            shift_up=float(self.shift_up),
-            shift_down=float(self.shift_down),
-            shift_latency=float(self.shift_latency),
-            slip_offset=float(self.slip_offset),
+            engine_torque=self.engine_torque,
+            shift_up=self.shift_up,
+            shift_down=self.shift_down,
+            shift_latency=self.shift_latency,
+            slip_offset=self.slip_offset,
         )
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
@@ -365,7 +365,6 @@ class Carla(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         from safevar_sumo.vehicles.carla_step import CarlaState, advance
 
         states = np.array(state)
-        commands = np.empty((2, states.shape[1]))
-        commands[:] = command.throttle, command.brake
+        commands = np.array(command, float)
         advance(prepared.rows, prepared.law, states, commands, prepared.substeps)
         return CarlaState(*states)

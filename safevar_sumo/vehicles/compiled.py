@@ -30,8 +30,7 @@ class _Refuser(event.Listener):
 
 def equation(function: Function) -> Function:
     """Make a function that Numba compiles into each compiled function that calls it."""
-    part: Any = numba.njit(error_model="numpy", inline="always")(function)
-    return part  # type: ignore[no-any-return]
+    return numba.njit(error_model="numpy", inline="always")(function)  # type: ignore[return-value]
 
 
 def compiled(function: Function) -> Function:
@@ -40,10 +39,9 @@ def compiled(function: Function) -> Function:
     """
     # Numba raises an error for `cache=True` if no folder for its cache can be written.
     try:
-        compiled_function: Any = numba.njit(error_model="numpy", cache=True)(function)
+        return numba.njit(error_model="numpy", cache=True)(function)  # type: ignore[return-value]
     except RuntimeError:
-        compiled_function = numba.njit(error_model="numpy")(function)
-    return compiled_function  # type: ignore[no-any-return]
+        return numba.njit(error_model="numpy")(function)  # type: ignore[return-value]
 
 
 def is_compiled(call: Callable[[], object]) -> bool:
