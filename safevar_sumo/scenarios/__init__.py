@@ -2,7 +2,7 @@
 the weathers.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from math import isclose
 
 import msgspec
@@ -124,7 +124,6 @@ def equals_clear(weather: Weather) -> bool:
     clear = WEATHERS["clear"]
     return (
         weather.name != clear.name
-        and weather.light == clear.light
         and msgspec.structs.replace(weather, name=clear.name) == clear
     )
 
@@ -144,11 +143,10 @@ def distance_in_words(safety_degree: float, contact: float, digits: int = 2) -> 
     return f"{text}{FROM_CENTRES} (gap {gap} m)"
 
 
-def pre_crash_sentence(points: Iterable[Point]) -> str:
+def pre_crash_sentence(points: Sequence[Point]) -> str:
     """A sentence that lists the pre-crash types and the light of points; "" if no scenario has a
     type.
     """
-    points = tuple(points)
     types = dict.fromkeys(
         point.scenario.pre_crash for point in points if point.scenario.pre_crash
     )

@@ -188,8 +188,7 @@ class CutOut(LaneChange, frozen=True, kw_only=True):
 
     gap: Gap = 80.0
     headway: Annotated[
-        float,
-        Meta(gt=0, le=60),
+        Seconds,
         searched(0.5, 4.0, "s", "headway, gap to the leader divided by the speed"),
     ] = 2.0
     time_after: Seconds = 10.0

@@ -164,6 +164,7 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
     """
     import pandas as pd
 
+    key = key_of(file)
     # All values are read as texts, so that errors can quote the file.
     try:
         content = read_file(Path(file))
@@ -174,12 +175,10 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
             skipinitialspace=True,
         )
     except (OSError, ValueError) as error:
-        raise InputError(
-            "", f"{key_of(file)}: cannot be read: {error}", "a CSV file"
-        ) from None
+        raise InputError("", f"{key}: cannot be read: {error}", "a CSV file") from None
     # pandas gives the second column of a name another name.
     first_line = content.lstrip().partition(b"\n")[0]
-    _check_header(file, first_line.decode("utf-8-sig", "replace"))
+    _check_header(key, first_line.decode("utf-8-sig", "replace"))
 
     # The length of a name replaces the name: an empty name then is an illegal number, like others.
     values = table[COLUMNS].assign(name=table["name"].str.len())
@@ -195,7 +194,7 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
             expected = "a name"
         raise InputError(
             "",
-            f"{key_of(file)}: row {row + 1}: {name} = {table[name].iloc[row]!r}",
+            f"{key}: row {row + 1}: {name} = {table[name].iloc[row]!r}",
             expected,
         )
 
@@ -206,32 +205,32 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
         steps = [np.diff(rows["time"]) for rows in bodies.values()]
         longest_step = LONGEST_STEP * np.median(np.concatenate(steps))
     for name, rows in bodies.items():
-        _check_steps(f"{key_of(file)}: {name}", rows["time"].to_numpy(), longest_step)
-        _check_headings(f"{key_of(file)}: {name}", rows)
+        _check_steps(f"{key}: {name}", rows["time"].to_numpy(), longest_step)
+        _check_headings(f"{key}: {name}", rows)
         rows["heading"] = np.unwrap(rows["heading"])
     return bodies
 
 
-def _check_header(file: str, line: str) -> None:
+def _check_header(key: str, line: str) -> None:
     """Refuse the first line of a table if it lacks a column, has a column twice, or has another
-    separator than commas.
+    separator than commas. `key` is the file, for errors.
     """
     header = [name.strip().strip('"') for name in line.split(",")]
     if len(header) == 1 and (separator := re.search("[;\\t|]", line)):
         raise InputError(
             "",
-            f"{key_of(file)}: its columns are separated by {separator[0]!r}",
+            f"{key}: its columns are separated by {separator[0]!r}",
             "commas between columns, and points in numbers",
         )
     for name in COLUMNS:
         if header.count(name) > 1:
             raise InputError(
-                "", f"{key_of(file)}: the column {name!r} is there twice", "each once"
+                "", f"{key}: the column {name!r} is there twice", "each once"
             )
         if name not in header:
             raise InputError(
                 "",
-                f"{key_of(file)}: there is no column {name}",
+                f"{key}: there is no column {name}",
                 f"the columns {', '.join(COLUMNS)}",
             )
 
