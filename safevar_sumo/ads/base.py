@@ -24,6 +24,7 @@ from safevar_sumo.plugins import (
     quoted,
 )
 from safevar_sumo.records import (
+    ZERO,
     BoolArray,
     Command,
     FloatArray,
@@ -272,10 +273,7 @@ class DelayLine(NamedTuple):
     @staticmethod
     def parts(delay: FloatOrArray, step: float) -> tuple[FloatArray, FloatArray]:
         """Split a delay [s], or an array of delays, into whole steps and the fraction of a step."""
-        steps, fraction = np.divmod(
-            np.round(np.asarray(delay) / step, STEP_DECIMALS), 1
-        )
-        return steps, fraction
+        return np.divmod(np.round(delay / step, STEP_DECIMALS), 1)
 
     def delayed(self, values: FloatArray) -> tuple[FloatArray, DelayLine]:
         """Return the values one delay ago (linear between two steps), and the delay line for the
@@ -308,7 +306,7 @@ class Trim(NamedTuple):
     brake: FloatArray
 
 
-NO_TRIM = Trim(np.zeros(()), np.zeros(()))
+NO_TRIM = Trim(ZERO, ZERO)
 """The trim on a level road."""
 
 

@@ -69,15 +69,15 @@ class CarFollowing(Ads, Table, frozen=True, kw_only=True):
         self, observation: Observation, memory: _Following
     ) -> tuple[Command, _Following]:
         nominal, trim = memory
-        initial_trim = trim_at(nominal, observation) if trim is None else trim
+        trim = trim or trim_at(nominal, observation)
         gap = np.where(
             is_in_the_way(observation, self.corridor), observation.gap, LARGEST_GAP
         )
         acceleration = self.acceleration_at(
             gap, observation.speed, observation.obstacle_speed
         )
-        command = self.pedals(acceleration, observation.speed, nominal, initial_trim)
-        return command, (nominal, initial_trim)
+        command = self.pedals(acceleration, observation.speed, nominal, trim)
+        return command, (nominal, trim)
 
     @abstractmethod
     def acceleration_at(

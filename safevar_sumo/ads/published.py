@@ -18,7 +18,7 @@ from safevar_sumo.records import (
     Nominal,
     Observation,
 )
-from safevar_sumo.study import Table
+from safevar_sumo.study import Proportion, Table
 
 WidePositive = Annotated[float, Meta(gt=0, le=1e5)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -118,7 +118,13 @@ class Apollo(Ads, Table, frozen=True, kw_only=True):
         self, observation: Observation, memory: _ApolloMemory
     ) -> tuple[Command, _ApolloMemory]:
         plan = self._plan(observation, memory)
-        command = self._pedals(observation, plan)
+        pedals = self.pedals(
+            plan.commanded_acceleration, observation.speed, memory.nominal
+        )
+        stops = plan.has_begun_to_stop
+        command = Command(
+            np.where(stops, 0.0, pedals.throttle), np.where(stops, pedals.brake, 0.0)
+        )
         if observation.time >= self.first_command - FIRST_COMMAND_ROUNDING:
             return command, plan
         is_waiting = observation.speed == 0
@@ -196,21 +202,8 @@ class Apollo(Ads, Table, frozen=True, kw_only=True):
             creeping_time=creeping_time,
         )
 
-    def _pedals(self, observation: Observation, memory: _ApolloMemory) -> Command:
-        """The pedals for the commanded acceleration, according to the tables of the original
-        vehicle.
-        """
-        pedals = self.pedals(
-            memory.commanded_acceleration, observation.speed, memory.nominal
-        )
-        stops = memory.has_begun_to_stop
-        return Command(
-            np.where(stops, 0.0, pedals.throttle), np.where(stops, pedals.brake, 0.0)
-        )
-
 
 UpTo60 = Annotated[float, Meta(ge=0, le=60)]
-Throttle = Annotated[float, Meta(ge=0, le=1)]
 Delay = Annotated[float, Meta(ge=0, le=5)]
 SPEED_LIMIT = 20 / KMH_PER_MS
 """Speed above which the agent releases the throttle [m/s] (20 km/h in its source code)."""
@@ -291,7 +284,7 @@ class WorldOnRails(Ads, Table, frozen=True, kw_only=True):
     brake_place: float
     brake_gap_before: UpTo60
     brake_gap_past: UpTo60
-    throttle: tuple[Throttle, Throttle, Throttle]
+    throttle: tuple[Proportion, Proportion, Proportion]
     recognition_delay: Delay = 0.0
     hesitation: Delay = 0.0
     release_gap: Annotated[float, Meta(ge=-1, le=60)] = -1.0
