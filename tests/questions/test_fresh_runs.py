@@ -31,9 +31,11 @@ def task_of(scores: FloatArray, *, has_repeats: bool = True) -> Any:
         assert anew
         return SimpleNamespace(score=lambda: scores)
 
-    evaluator = SimpleNamespace(number_of_fresh_runs=lambda settings: RUNS)
+    evaluator = SimpleNamespace(
+        has_repeats=has_repeats, number_of_fresh_runs=lambda settings: RUNS
+    )
     own = SimpleNamespace(evaluator=evaluator)
-    bench = SimpleNamespace(has_repeats=has_repeats, own=own, drive=drive)
+    bench = SimpleNamespace(own=own, drive=drive)
     return SimpleNamespace(bench=bench)
 
 
