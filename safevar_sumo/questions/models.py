@@ -88,7 +88,7 @@ class Model(NamedTuple):
         vehicle is safe by `new_car`, else a failure says nothing about changes of the vehicle. All
         count without `new_car`.
         """
-        if self.new_car is None or not len(settings):
+        if self.new_car is None:
             return np.ones(len(settings), dtype=bool)
         settings = self.characteristics.with_original_vehicle(settings)
         originals = self.evaluate(settings, stage)
