@@ -68,7 +68,6 @@ KINDS = {
         "a Pool, or None for new worker processes",
     ),
     "str": Kind(_is_path, "a text"),
-    "Path": Kind(_is_path, "a text or a path"),
     "str | Path": Kind(_is_path, "a text or a path"),
     "Path | None": Kind(_is_path_or_none, "a text or a path, or None"),
     "str | None": Kind(_is_path_or_none, "a text, or None"),

@@ -7,20 +7,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from msgspec.structs import replace as replace_in
 
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import OPTIONAL_METRICS, Unsafe
+from safevar_sumo.questions.case import Case, Subject
 from safevar_sumo.questions.evaluator import Evaluator, open_evaluator
 from safevar_sumo.study import Study
 from safevar_sumo.study.encounters import DecidingMetric
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case, Subject
 
 SOLUTIONS_STAGE = "solutions by the measure"
 

@@ -120,17 +120,10 @@ class Case:
             The evaluations of `settings` in the other study, in the same order.
         """
         # The first evaluation is that of the original vehicle.
-        columns = {
-            "f_safe": evaluations.f_safe,
-            **evaluations.metrics,
-            "outcome": evaluations.outcome,
-            "collision_speed": evaluations.collision_speed,
-        }
+        returned = evaluations.take(slice(1, None))
         solutions = self.solutions.drop(
             columns=list(self.original.keys() - evaluations.metrics.keys())
-        )
-        for name, values in columns.items():
-            solutions[name] = values[1:]
+        ).assign(f_safe=returned.f_safe, **returned.results)
         original = {}
         for metric in scoring.metrics:
             original[metric.name] = float(evaluations.metrics[metric.name][0])
@@ -336,7 +329,7 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
                 evaluations,
                 finished,
                 has_runs="imported" not in manifest,
-                failures=tuple(failures),
+                failures=failures,
                 **facts,
             )
             cases.append(case)

@@ -230,7 +230,7 @@ def count_needed(
     # If the failures are a sample, the share among all failures is uncertain.
     intervals = np.repeat(counts[:, None] / number, 2, axis=1)
     if len(changed) < failures:
-        intervals = np.array([clopper_pearson(int(count), number) for count in counts])
+        intervals = np.array([clopper_pearson(count, number) for count in counts])
     shares = {
         "characteristic": names,
         "changed": changed.sum(axis=0) / number,
@@ -297,7 +297,7 @@ def causes_of_runs(case: Case, evaluator: Evaluator, limit: int) -> pd.DataFrame
     """
     keys = ["algorithm", "run"]
     order = [F_NUM_DIFF.name, F_DIFF.name]
-    names = list(evaluator.characteristics.names)
+    names = evaluator.characteristics.names
     failures = case.solutions[case.unsafe.rows(case.solutions)].drop_duplicates(
         [*keys, *names]
     )

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.metrics.words import runs_in_words
 from safevar_sumo.questions.box import Box
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.causes import find_minimal_causes
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
@@ -38,9 +39,6 @@ from safevar_sumo.scenarios import (
 from safevar_sumo.study import PHASE, unit_text
 from safevar_sumo.sumo.encounters import encounter
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet
-
-if TYPE_CHECKING:
-    from safevar_sumo.questions.case import Case
 
 FURTHER_DIGITS = (0, 1, 2, 4, 7)
 """Numbers of digits beyond the digits of a limit. They are tried one after another, until the
@@ -318,8 +316,7 @@ def _command(model: Model, setting: FloatArray, point: Point) -> str:
     the command `simulate` can set.
     """
     system = model.evaluator.system
-    members = model.evaluator.characteristics
-    words = [system.command, members.options(setting)]
+    words = [system.command, model.characteristics.options(setting)]
     searchable = searchable_in(point.scenario)
     for name, value in point.parameters.items():
         if name in searchable and isinstance(value, int | float):

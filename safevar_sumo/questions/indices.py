@@ -55,14 +55,14 @@ IndexTable = tuple[AnswerTable, str]
 """The table of the indices, and the name of the measure whose variance is shared out."""
 
 
-def _problem(names: Sequence[str]) -> JsonObject:
-    """The problem as SALib wants it: the quantile of each characteristic varies from 0 to 1. The
-    names are numbers, because SALib reserves some endings of names.
+def _problem(number: int) -> JsonObject:
+    """The problem as SALib wants it: the quantiles of `number` characteristics vary from 0 to 1.
+    Their names are numbers, because SALib reserves some endings of names.
     """
     return {
-        "num_vars": len(names),
-        "names": list(map(str, range(len(names)))),
-        "bounds": [[0.0, 1.0]] * len(names),
+        "num_vars": number,
+        "names": list(map(str, range(number))),
+        "bounds": [[0.0, 1.0]] * number,
     }
 
 
@@ -83,7 +83,7 @@ def design_of(evaluator: Evaluator, model: VariationModel) -> Evaluations:
     from SALib.sample import sobol as design
 
     seed = evaluator.seed % 2**32
-    problem = _problem(evaluator.characteristics.names)
+    problem = _problem(len(evaluator.characteristics))
     points = design.sample(problem, BASE_POINTS, calc_second_order=False, seed=seed)
     return evaluator.evaluate(model.settings(points), SENSITIVITY)
 
@@ -106,7 +106,7 @@ def sobol_indices(
 
     indices_of = partial(
         analysis.analyze,
-        _problem(names),
+        _problem(len(names)),
         calc_second_order=False,
         num_resamples=RESAMPLES,
         conf_level=confidence,
@@ -132,7 +132,7 @@ def given_data_indices(
 
     varies = np.ptp(evaluations.settings, axis=0) > 0
     names = list(compress(evaluator.characteristics.names, varies))
-    problem = _problem(names)
+    problem = _problem(len(names))
     options = {"num_resamples": RESAMPLES, "conf_level": confidence, "method": "sobol"}
 
     def indices_of(output: FloatArray) -> Indices:

@@ -170,7 +170,7 @@ def approach_parameters(system: System) -> JsonObject | None:
         return {}
     if len(system.characteristics.scenario):
         return None
-    end = min(int(np.argmax(speed)), int(np.argmax([*is_braking, True])))
+    end = min(np.argmax(speed), np.argmax([*is_braking, True]))
     return {
         "cruise_speed": float(speed.max()),
         "start_throttle": trace.throttle[:end, 0].tolist(),

@@ -109,7 +109,7 @@ def load(directory: str | Path) -> Results:
     """
     from safevar_sumo.questions.case import load_cases
 
-    return Results(Path(str(directory)), load_cases([directory])[0])
+    return Results(Path(directory), load_cases([directory])[0])
 
 
 def study_or_case(
