@@ -26,8 +26,9 @@ from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.tolerance import asked
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
 from tests.in_process import EVERY_STUDY, InlinePool, inline_worker, searched
+from tests.made_up import system_of
 
 collect_ignore = (
     []
@@ -147,15 +148,10 @@ def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(params=EVERY_STUDY)
 def any_system(request: pytest.FixtureRequest) -> System:
     """The system of each shipped study in turn."""
-    system = assemble(load_study(request.param))
+    system = system_of(request.param)
     return replace(
         system, points=system.points[::30]
     )  # only some points of a long matrix
-
-
-@pytest.fixture
-def sun() -> System:
-    return assemble(load_study("sun"))
 
 
 @pytest.fixture

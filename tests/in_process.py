@@ -1,5 +1,5 @@
 """Campaigns and commands in this process: a pool that computes at once, commands as users type
-them.
+them; and Python in a new process.
 """
 
 from __future__ import annotations
@@ -9,7 +9,9 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -25,6 +27,7 @@ from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.cli.program import run_command_line
 from safevar_sumo.errors import INTERRUPTS
 from safevar_sumo.records import FloatArray
+from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study, study_names
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
@@ -96,6 +99,11 @@ def rewrite(file: Path, *changes: tuple[str, str]) -> None:
     file.write_text(text)
 
 
+def own_network(folder: Path, shipped: str = "pedestrian_crossing") -> Path:
+    """Copy a shipped network to a folder, as a user does; returns the folder."""
+    return Path(shutil.copytree(NETWORKS / shipped, folder))
+
+
 def searched(study: Study, out: Path) -> Path:
     """Search a study in this process; returns its results directory, `out`."""
     run_campaign(
@@ -157,6 +165,19 @@ def run(typed: str, *arguments: str, expect: int | None = 0) -> CommandOutput:
         f"{code}\n{out.getvalue()}\n{err.getvalue()}"
     )
     return CommandOutput(out.getvalue(), err.getvalue())
+
+
+def run_python(*arguments: str, expect: int = 0, **options: Any) -> CommandOutput:
+    """Run Python with these arguments in a new process; its exit code must be `expect`."""
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        **options,
+    )
+    assert done.returncode == expect, done.stderr
+    return CommandOutput(done.stdout, done.stderr)
 
 
 def json_of(typed: str, *arguments: str, expect: int = 0) -> Any:

@@ -1,14 +1,17 @@
-"""Made-up records: what vehicles see, their runs by speeds and gaps, and evaluations by safety
-degrees.
+"""Systems with their settings, and made-up records: what vehicles see, their runs by speeds and
+gaps, and evaluations by safety degrees.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.case import Case, build_case
 from safevar_sumo.records import (
     Encounter,
@@ -18,11 +21,15 @@ from safevar_sumo.records import (
     Outcome,
     SimulationRuns,
     Trace,
+    differences,
 )
+from safevar_sumo.reference.rows import COLUMNS
 from safevar_sumo.results import record, solutions_frame
 from safevar_sumo.study import Study
+from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.vehicles import CharacteristicSet
 
+SUN = CharacteristicSet.of(load_study("sun"))
 LIBRARIES = {"wear_rss": "ad_rss", "wear_idm": "highway_env"}
 MISSING = [study for study, library in LIBRARIES.items() if find_spec(library) is None]
 """Shipped studies whose extra is not installed."""
@@ -110,17 +117,38 @@ def seen(
     )
 
 
+def system_of(study: Any, **changes: Any) -> System:
+    """The system of a study, which is given as to `load_study`."""
+    return assemble(load_study(study, **changes))
+
+
 def original_of(system: Any) -> FloatArray:
     """The original vehicle as the only row of settings."""
     return np.asarray(system.characteristics.original_settings)
 
 
+def uniform(characteristics: CharacteristicSet, number: int, seed: int) -> FloatArray:
+    """Settings at random in the domains."""
+    return np.random.default_rng(seed).uniform(
+        characteristics.lower, characteristics.upper, (number, len(characteristics))
+    )
+
+
+def published_rows(
+    characteristics: CharacteristicSet,
+    settings: FloatArray,
+    metrics: Mapping[str, FloatArray],
+) -> pd.DataFrame:
+    """Settings and their metrics in the published format, which has 0 for what is undefined."""
+    columns = {name: np.nan_to_num(metrics[key]) for key, name in COLUMNS.items()}
+    frame = pd.DataFrame(settings, columns=list(characteristics.names))
+    return frame.assign(**columns)
+
+
 def drawn(system: Any, number: int, seed: int) -> FloatArray:
     """The original vehicle and settings at random, those that a region allows."""
     members = system.characteristics
-    settings = np.random.default_rng(seed).uniform(
-        members.lower, members.upper, (number, len(members))
-    )
+    settings = uniform(members, number, seed)
     settings[0] = members.original
     settings = np.asarray(members.filter(settings))
     return settings[system.region.feasible(settings)]
@@ -139,3 +167,9 @@ def made_up_evaluations(safety: Any, **columns: Any) -> Evaluations:
         "f_num_diff": np.zeros(len(values)),
     }
     return Evaluations(**{**made_up, **columns})
+
+
+def assert_same_results(one: Evaluations, other: Evaluations) -> None:
+    """All results of the same settings are equal, to the bit."""
+    assert one.results.keys() == other.results.keys()
+    assert not [*differences(one.results, other.results)]

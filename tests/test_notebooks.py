@@ -12,14 +12,12 @@ import tempfile
 from pathlib import Path
 
 import nbformat
-import numpy as np
 import pytest
 from PIL import Image
 
 import safevar_sumo as sv
-from safevar_sumo.reference.rows import COLUMNS
-from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import SLOW
+from tests.made_up import SUN, published_rows, uniform
 from tests.support.needs import need_library
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
@@ -86,15 +84,10 @@ def test_the_notebook_of_the_paper_shows_published_solutions_beside_a_study(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With made-up rows in the published format, and a smaller study."""
-    characteristics = CharacteristicSet.of(sv.load_study("sun"))
-    settings = np.random.default_rng(5).uniform(
-        characteristics.lower, characteristics.upper, (60, len(characteristics))
-    )
-    rows = sv.evaluate("sun", settings).rename(columns=COLUMNS)
+    settings = uniform(SUN, 60, 5)
+    rows = published_rows(SUN, settings, sv.evaluate("sun", settings))
     for name in ("nsga2", "rs", "fuzzer"):
-        rows[[*characteristics.names, *COLUMNS.values()]].fillna(0).to_csv(
-            tmp_path / f"sun_{name}.csv", index=False
-        )
+        rows.to_csv(tmp_path / f"sun_{name}.csv", index=False)
     monkeypatch.setenv("SAFEVAR_PUBLISHED", str(tmp_path))
     monkeypatch.setenv("SAFEVAR_RUNS", "2")
     monkeypatch.setenv("SAFEVAR_EVALUATIONS", "200")

@@ -6,13 +6,11 @@ from __future__ import annotations
 
 import ast
 import os
-import subprocess
-import sys
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
 
-from tests.in_process import SLOW
+from tests.in_process import SLOW, run_python
 from tests.manual import ROOT
 from tests.size import elements_in, sizes, sources_of
 from tests.support.needs import NOTHING_MISSING
@@ -75,13 +73,7 @@ def test_a_public_name_is_defined_once() -> None:
 def test_tests_are_collected_without_the_extras() -> None:
     environment = {**os.environ}
     environment.pop(NOTHING_MISSING, None)
-    subprocess.run(
-        [sys.executable, "-c", COLLECTION],
-        cwd=ROOT,
-        env=environment,
-        check=True,
-        capture_output=True,
-    )
+    run_python("-c", COLLECTION, cwd=ROOT, env=environment)
 
 
 def test_the_rules_find_what_breaks_them() -> None:

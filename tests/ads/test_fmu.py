@@ -17,12 +17,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pythonfmu.builder import FmuBuilder
 from pythonfmu3.builder import FmuBuilder as FmuBuilder3
 
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError, UserCodeError
-from safevar_sumo.records import Nominal, Observation
+from safevar_sumo.records import Nominal
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
 from tests.in_process import write
+from tests.made_up import seen, system_of, uniform
 
 SOURCE = '''
 from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
@@ -109,7 +109,7 @@ def small(in_tmp: Path) -> Make:
             'extends = "native"\nname = "small"\n[ads]\nkind = "fmu"\n'
             f'model = "Small.fmu"\n{table}',
         )
-        return assemble(load_study("small.toml"))
+        return system_of("small.toml")
 
     return system
 
@@ -118,18 +118,9 @@ def driven(system: System, gaps: list[float], step: float = 0.1) -> np.ndarray:
     """Commands of two vehicles, the second one 10 m farther, shape (T, 2, 2)."""
     memory = system.ads.start(2, NOMINAL, step)
     commands = []
-    one = np.ones(2)
     for sample, gap in enumerate(gaps):
-        seen = Observation(
-            sample * step,
-            10 * one,
-            gap + np.array([0.0, 10.0]),
-            10 * one,
-            one,
-            one,
-            1.0,
-        )
-        command, memory = system.ads.drive(seen, memory)
+        now = seen(sample * step, 10.0, gap + np.array([0.0, 10.0]))
+        command, memory = system.ads.drive(now, memory)
         commands.append([command.throttle, command.brake])
     return np.array(commands)
 
@@ -173,11 +164,8 @@ class Law(Ads):
 """,
     )
     write("law.toml", 'extends = "native"\nname = "law"\n[ads]\nmodel = "law:Law"')
-    law = assemble(load_study("law.toml"))
-    members = law.characteristics
-    settings = np.random.default_rng(5).uniform(
-        members.lower, members.upper, (12, len(members))
-    )
+    law = system_of("law.toml")
+    settings = uniform(law.characteristics, 12, 5)
     expected = drive_and_score(law, settings)
     results = drive_and_score(fmu, settings)
     assert_array_equal(results.outcome, expected.outcome)

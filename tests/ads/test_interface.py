@@ -15,15 +15,13 @@ from pythonfmu.builder import FmuBuilder
 
 from safevar_sumo.ads import Ads, ScalarAds
 from safevar_sumo.ads.base import Trim
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 from safevar_sumo.scenarios.tracks import BODIES
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import assemble
 from tests.ads.test_ads import BRAKING, COASTING, FULL, KNOWN
 from tests.in_process import write
-from tests.made_up import original_of
+from tests.made_up import original_of, seen, system_of
 
 WISHES = [
     (1.0, (1.0 + COASTING) / (FULL + COASTING), 0.0),
@@ -71,9 +69,7 @@ def test_a_class_may_have_another_method_of_that_name(in_tmp: Path) -> None:
         "    def pedals(self, wish):\n        return 0.0, min(-wish, 1.0)\n\n"
         "    def drive(self, seen):\n        return self.pedals(-0.5)\n",
     )
-    system = assemble(
-        load_study("wear", matrix=None, scenario=STANDING, ads={"model": "own:Own"})
-    )
+    system = system_of("wear", matrix=None, scenario=STANDING, ads={"model": "own:Own"})
     assert drive_and_score(system, original_of(system)).outcome.tolist() == ["stopped"]
 
 
@@ -94,7 +90,7 @@ class Listens(Ads):
 
 
 def listened(scenario: dict[str, Any]) -> Listens:
-    system = assemble(load_study("wear", matrix=None, scenario=scenario))
+    system = system_of("wear", matrix=None, scenario=scenario)
     ads = Listens()
     drive_all(replace(system, ads=ads), original_of(system))
     return ads
@@ -150,9 +146,8 @@ def test_an_fmu_may_be_given_the_same_numbers(in_tmp: Path) -> None:
         'inputs = { obstacle_length = "target", nominal_length = "own", step = "step_size" }\n'
         'outputs = { brake = "pedal" }\n',
     )
-    ads = assemble(load_study("tells.toml")).ads
+    ads = system_of("tells.toml").ads
     memory = ads.start(1, KNOWN._replace(length=5.0), 0.1)
-    one = np.ones(1)
-    seen = Observation(0.0, one, one, one, one, one, 1.0, obstacle_length=4 * one)
-    command, _ = ads.drive(seen, memory)
+    now = seen(0.0, 1.0, np.ones(1))._replace(obstacle_length=np.full(1, 4.0))
+    command, _ = ads.drive(now, memory)
     assert command.brake[0] == pytest.approx(0.04 + 0.005 + 0.1)

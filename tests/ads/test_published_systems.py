@@ -16,10 +16,9 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Observation
 from safevar_sumo.sumo.matrix import simulate_all_points
-from safevar_sumo.sumo.system import assemble
 from tests.ads.test_ads import COASTING, FULL, KNOWN
 from tests.in_process import run
-from tests.made_up import MISSING, original_of
+from tests.made_up import MISSING, original_of, system_of
 
 needs_ad_rss = pytest.mark.skipif(
     "wear_rss" in MISSING, reason="the extra ad-rss is missing"
@@ -121,7 +120,7 @@ def test_the_original_of_their_studies_is_safe_and_a_parameter_acts(
     found = []
     for value in (today, other):
         ads = {"model": load_study(study).ads.model, "parameters": {name: value}}
-        system = assemble(load_study(study, ads=ads))
+        system = system_of(study, ads=ads)
         results = simulate_all_points(system, original_of(system))
         found.append(np.array([result.evaluations.f_safe[0] for result in results]))
     assert (found[0] > 1).all()
@@ -140,7 +139,7 @@ def test_without_its_library_the_extra_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(InputError) as error:
-        assemble(load_study("wear", ads={"model": model, "parameters": {}}))
+        system_of("wear", ads={"model": model, "parameters": {}})
     assert f"needs {extra}" in error.value.problem
     assert error.value.legal == f"in the checkout: pip install '.[{extra}]'"
     assert len(str(error.value).splitlines()) == 2

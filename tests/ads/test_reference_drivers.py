@@ -14,15 +14,13 @@ import pytest
 from safevar_sumo.ads.car_following import Acc, Idm
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.reference_drivers import R157, FullBraking, FuzzySafety, Rss
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import FloatArray, Nominal, PedalTables
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
-from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW
-from tests.made_up import original_of, seen
+from tests.made_up import original_of, seen, system_of
 from tests.scenarios.ideal import point_mass
 
 STEP = 0.05
@@ -375,7 +373,7 @@ def test_in_a_car_the_competent_driver_is_the_rule_and_the_cars_delays() -> None
         "target_deceleration": [5.5, 7.0, 9.0],
     }
     car = {"vut_length": 4.7, "vut_width": 1.85}
-    study = load_study(
+    system = system_of(
         "wear",
         weather="clear",
         scenario={"model": "car_to_car", "parameters": {"test": "CCRb", **car}},
@@ -384,7 +382,6 @@ def test_in_a_car_the_competent_driver_is_the_rule_and_the_cars_delays() -> None
         },
         ads={"model": "competent_driver", "parameters": {}},
     )
-    system = assemble(study)
     for point, (kmh, *rest) in zip(system.points, product(*over.values()), strict=True):
         trace = drive_worst(system.at(point), original_of(system)).trace
         gaps = trace.gap[trace.active]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +17,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.part import at_point
 from safevar_sumo.study import tables_of
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import SLOW, write
+from tests.in_process import SLOW, run_python, write
 
 
 @pytest.fixture(scope="module")
@@ -295,10 +293,7 @@ def test_a_script_needs_no_main_guard(in_tmp: Path) -> None:
         " progress=True)\nprint(len(sv.evaluate('smoke', results.solutions[['mass']], jobs=2)) =="
         " len(results.solutions))\n",
     )
-    done = subprocess.run(
-        [sys.executable, "script.py"], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == ["begun", "True"]
+    assert run_python("script.py").stdout.split() == ["begun", "True"]
 
 
 @SLOW

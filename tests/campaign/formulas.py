@@ -28,11 +28,8 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Progress, show_no_progress
-from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import InlinePool
-from tests.made_up import made_up_evaluations
-
-SUN = CharacteristicSet.of(load_study("sun"))
+from tests.made_up import SUN, made_up_evaluations
 
 
 def evaluated(settings: FloatArray) -> Evaluations:

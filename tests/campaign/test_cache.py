@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import shutil
 import sqlite3
 import subprocess
 import sys
@@ -31,10 +30,9 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.questions.catalogue import list_models
 from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import Evaluations, FloatArray
-from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import SLOW, InlinePool, write
+from tests.in_process import SLOW, InlinePool, own_network, run_python, write
 
 OWN_ADS = """
 from threshold import TTC
@@ -174,7 +172,7 @@ def test_a_distribution_may_lack_a_version(
 def test_what_was_simulated_while_an_input_changed_is_refused_and_not_kept(
     folder: Path, simulated: list[int], in_tmp: Path
 ) -> None:
-    own = Path(shutil.copytree(NETWORKS / "pedestrian_crossing", in_tmp / "own"))
+    own = own_network(in_tmp / "own")
     study = load_study("smoke", scenario={"parameters": {"network": str(own)}})
     settings = some_settings(study, 8)
     traffic = own / "traffic.rou.xml"
@@ -352,13 +350,15 @@ def test_the_oldest_simulations_make_room(
 @SLOW
 def test_two_processes_share_a_cache(folder: Path) -> None:
     """Both ask the same question at once, then one of them asks again: the same bytes."""
-    question = ["risk", "smoke", "--samples", "500", "--json"]
-    command = [sys.executable, "-m", "safevar_sumo", *question]
-    both = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(2)]
+    question = ["-m", "safevar_sumo", "risk", "smoke", "--samples", "500", "--json"]
+    both = [
+        subprocess.Popen([sys.executable, *question], stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
     answers = {process.communicate()[0] for process in both}
-    answers.add(subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout)
+    answers.add(run_python(*question).stdout)
     assert len(answers) == 1
-    assert b"probability" in answers.pop()
+    assert "probability" in answers.pop()
 
 
 def test_evidence_does_not_check_itself(

@@ -29,7 +29,6 @@ from safevar_sumo.results import Journal, journal_file, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study
 from tests.campaign.formulas import (
-    SUN,
     FormulaPool,
     carried_out,
     evaluated,
@@ -37,6 +36,7 @@ from tests.campaign.formulas import (
     with_search,
 )
 from tests.in_process import SLOW, InlinePool, searched
+from tests.made_up import SUN
 
 
 @pytest.fixture

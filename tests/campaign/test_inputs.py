@@ -24,19 +24,18 @@ from safevar_sumo.errors import InputError, SafevarError
 from safevar_sumo.plugins.process import record_opened
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import load_runs, manifest, read_manifest
-from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
 from tests.campaign import formulas
 from tests.campaign.formulas import FormulaPool
-from tests.in_process import SLOW, refused, run
+from tests.in_process import SLOW, own_network, refused, rewrite, run
 
 
 @SLOW
 def test_a_file_that_changes_while_a_study_runs_ends_it_before_a_run_counts_as_finished(
     tmp_path: Path,
 ) -> None:
-    shutil.copytree(NETWORKS / "pedestrian_crossing", tmp_path / "mine")
+    own_network(tmp_path / "mine")
     search = {"algorithms": ["rs"], "evaluations": 20, "runs": 1}
     study = load_study(
         "smoke",
@@ -183,15 +182,9 @@ def test_what_user_code_imports_while_it_runs_counts_and_what_it_opens_is_named(
     assert {"hidden.py", "helper.py"} <= set(read_manifest(Path("out"))["files"])
     assert not {"gap.txt", "log.txt"} & set(read_manifest(Path("out"))["files"])
     run("rules out --samples 20")
-    (there / "it.toml").write_text(
-        (there / "it.toml")
-        .read_text()
-        .replace("[search]", 'files = ["gap.txt"]\n[search]')
-    )
+    rewrite(there / "it.toml", ("[search]", 'files = ["gap.txt"]\n[search]'))
     assert "user code reads scale.json, which" in run(f"{command} other").stderr
-    (there / "it.toml").write_text(
-        (there / "it.toml").read_text().replace('files = ["gap.txt"]\n', "")
-    )
+    rewrite(there / "it.toml", ('files = ["gap.txt"]\n', ""))
     (there / "helper.py").write_text("MORE = 2.0\n")
     refused(f"{command} out", "helper.py has changed since", "another --out")
     refused("rules out --samples 20", "helper.py has changed since")

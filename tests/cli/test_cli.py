@@ -8,8 +8,6 @@ import errno
 import inspect
 import os
 import re
-import subprocess
-import sys
 from io import StringIO
 from pathlib import Path
 
@@ -27,8 +25,8 @@ from safevar_sumo.questions.ask import QUESTIONS
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import open_progress
-from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import SLOW, json_of, refused, rows_of, run, write
+from tests.in_process import SLOW, json_of, refused, rows_of, run, run_python, write
+from tests.made_up import SUN
 
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 
@@ -36,13 +34,7 @@ HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 def loaded(code: str) -> set[str]:
     """Which of the heavy packages a fresh interpreter has loaded after some code."""
     result = f"import sys\n{code}\nprint(*(set(sys.modules) & {HEAVY!r}))"
-    return set(
-        subprocess.run(
-            [sys.executable, "-c", result], capture_output=True, text=True, check=True
-        )
-        .stdout.splitlines()[-1]
-        .split()
-    )
+    return set(run_python("-c", result).stdout.splitlines()[-1].split())
 
 
 def test_the_help_lists_every_command_with_the_first_sentence_of_its_function() -> None:
@@ -109,9 +101,6 @@ def test_one_simulation_loads_sumo_and_no_statistics() -> None:
     assert simulation <= {"libsumo", "traci", "pandas", "scipy"}, (
         "Numba looks up the version of scipy"
     )
-
-
-SUN = CharacteristicSet.of(load_study("sun"))
 
 
 @pytest.mark.parametrize(

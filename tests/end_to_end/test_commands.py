@@ -5,7 +5,6 @@ damage.
 from __future__ import annotations
 
 import json
-import shutil
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -15,9 +14,9 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.results import FILES, load_runs, read_manifest
-from safevar_sumo.shipped import NETWORKS
-from tests.end_to_end.conftest import solutions, study, written
-from tests.in_process import SLOW, json_of, numbers_of, refused, run, write
+from tests.campaign.formulas import solutions
+from tests.end_to_end.conftest import study, written
+from tests.in_process import SLOW, json_of, numbers_of, own_network, refused, run, write
 
 pytestmark = pytest.mark.usefixtures("small")
 
@@ -71,7 +70,7 @@ def test_parts_and_one_run_are_the_same_as_in_the_whole(whole: Path) -> None:
     before = written(Path("out"))
     study("--out out")
     assert written(Path("out")) == before, "nothing was left to simulate"
-    assert solutions("out") == solutions(whole)
+    assert solutions(Path("out")) == solutions(whole)
     sv.run("small.toml", "alone", only=keys[1:2])
     assert [path.name for path in Path("alone/runs").glob("*-*")] == ["nsga2-01.jsonl"]
     expected = (
@@ -139,7 +138,7 @@ def mine(in_tmp: Path) -> None:
     write("my_ads.py", ADS)
     write("my_map.py", "GAP = 9.0\n")
     write("mine.toml", STUDY)
-    shutil.copytree(NETWORKS / "pedestrian_crossing", "my_net")
+    own_network(Path("my_net"))
 
 
 MATRIX = """

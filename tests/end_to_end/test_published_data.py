@@ -9,19 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from safevar_sumo.api.simulation import load_study
-from safevar_sumo.reference.rows import package_filter
+from safevar_sumo.reference.rows import COLUMNS, package_filter
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import assemble
-from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import SLOW, json_of, refused, rows_of, run
-
-COLUMNS = {
-    "safety_degree": "SaftyDegree",
-    "tet": "TET",
-    "tit": "TIT",
-    "ave_dece": "Dece",
-}
+from tests.made_up import SUN, published_rows, system_of, uniform
 
 
 @pytest.fixture(scope="module")
@@ -29,20 +20,14 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Forty settings of the study sun in the published format, with the metrics that this package
     finds; some changes are below the threshold.
     """
-    system = assemble(load_study("sun"))
+    system = system_of("sun")
     characteristics = system.characteristics
-    settings = np.random.default_rng(3).uniform(
-        characteristics.lower, characteristics.upper, (40, 12)
-    )
+    settings = uniform(characteristics, 40, 3)
     settings[::2, :6] = characteristics.original[:6] + 0.001
     result = drive_and_score(system, package_filter(characteristics, settings))
-    columns = {
-        column: np.nan_to_num(result.metrics[name]) for name, column in COLUMNS.items()
-    }
     path = tmp_path_factory.mktemp("data") / "mine.csv"
-    pd.DataFrame(settings, columns=list(characteristics.names)).assign(
-        **columns
-    ).to_csv(path, index=False)
+    rows = published_rows(characteristics, settings, result.metrics)
+    rows.to_csv(path, index=False)
     return path
 
 
@@ -122,14 +107,13 @@ def test_imported_solutions_are_filtered_and_counted_anew(
     output = run("import sun --out imported --rs heavy.csv")
     assert "1 rows with values outside the domains are left out" in output.stderr
     assert "39 solutions" in output.stdout
-    original = CharacteristicSet.of(load_study("sun")).original
-    changed = frame.iloc[:, 1:13].to_numpy() != original
+    changed = frame.iloc[:, 1:13].to_numpy() != SUN.original
     assert np.count_nonzero(~changed[:, :6].any(axis=1)) == 40, (
         "changes below the threshold are put back"
     )
     assert frame["f_num_diff"].tolist() == changed.sum(axis=1).tolist()
     assert np.allclose(
-        frame["f_diff"], np.max(np.abs(frame.iloc[:, 1:13] / original - 1), axis=1)
+        frame["f_diff"], np.max(np.abs(frame.iloc[:, 1:13] / SUN.original - 1), axis=1)
     )
 
 

@@ -15,8 +15,8 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.results import load_runs
 from safevar_sumo.search import ALGORITHMS
-from tests.campaign.formulas import FormulaPool, carried_out
-from tests.end_to_end.conftest import solutions, study
+from tests.campaign.formulas import FormulaPool, carried_out, solutions
+from tests.end_to_end.conftest import study
 from tests.in_process import SLOW, run
 
 QUESTIONS = {
@@ -43,7 +43,7 @@ def test_an_answer_has_the_same_bytes_for_one_worker_process_and_for_two(
 @pytest.mark.usefixtures("small", "worker_processes")
 def test_a_search_has_the_same_bytes_in_two_worker_processes(whole: Path) -> None:
     study("--jobs 2 --out out")
-    assert solutions("out") == solutions(whole)
+    assert solutions(Path("out")) == solutions(whole)
 
 
 OURS = [*ALGORITHMS]

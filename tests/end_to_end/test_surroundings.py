@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import locale
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import matplotlib
@@ -18,6 +16,7 @@ from safevar_sumo.questions.figures import new_figure, own_style, save
 from safevar_sumo.records import csv_text
 from safevar_sumo.replay.comparison import comparison_of
 from safevar_sumo.sumo.engine import _numbers_with_points
+from tests.in_process import run_python
 
 DRAW = """
 from pathlib import Path
@@ -34,7 +33,7 @@ def test_a_matplotlibrc_and_a_backend_change_no_picture(in_tmp: Path) -> None:
     expected = Path("drawn.png").read_bytes()
     Path("matplotlibrc").write_text("text.usetex: True\nfont.size: 40\n")
     environment = {**os.environ, "MPLBACKEND": "nonsense"}
-    subprocess.run([sys.executable, "-c", DRAW], env=environment, check=True)
+    run_python("-c", DRAW, env=environment)
     assert Path("drawn.png").read_bytes() == expected
 
 

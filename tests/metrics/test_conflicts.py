@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import OPTIONAL_METRICS
 from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.scenarios.crossing import Crossing
-from safevar_sumo.sumo.system import assemble
+from tests.made_up import system_of
 from tests.scenarios.ideal import met_at_once
 
-WEAR = assemble(load_study("wear", matrix=None, weather="clear"))
+WEAR = system_of("wear", matrix=None, weather="clear")
 
 
 def measured(runs: SimulationRuns) -> FloatArray:

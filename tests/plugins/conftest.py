@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from safevar_sumo.api.simulation import load_study
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
+from tests.made_up import system_of
 
 Mine = Callable[..., System]
 SCALAR = "from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
@@ -32,6 +32,6 @@ def mine(folder: Path) -> Mine:
     def result(module: str, table: str = ADS) -> System:
         (folder / "mine.py").write_text(module)
         (folder / "mine.toml").write_text(f'extends = "smoke"\nname = "mine"\n{table}')
-        return assemble(load_study(str(folder / "mine.toml")))
+        return system_of(str(folder / "mine.toml"))
 
     return result

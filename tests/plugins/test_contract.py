@@ -14,22 +14,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.plugins.process import defer_interrupts, this_process
-from safevar_sumo.records import differences
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import assemble
 from tests.in_process import run, write
-from tests.made_up import original_of
+from tests.made_up import assert_same_results, original_of, system_of
 from tests.plugins.conftest import ADS, SCALAR, Mine
 
 CONSTANT = SCALAR + "    def drive(self, seen):\n        return {}, 0.0\n"
 
 
 def throttle(study: Path) -> float:
-    system = assemble(load_study(str(study)))
+    system = system_of(str(study))
     drive_and_score(system, original_of(system))
     return float(system.ads.start(1, system.nominal, 0.05)[0].drive(None)[0])
 
@@ -227,5 +224,5 @@ def test_what_user_code_tells_numpy_ends_with_its_call(mine: Mine) -> None:
         system := mine(CONSTANT.format(0.2)), original_of(system)
     )
     found = drive_and_score(mine(strict), original_of(system))
-    assert not [*differences(expected.results, found.results)]
+    assert_same_results(expected, found)
     assert np.geterr() == before

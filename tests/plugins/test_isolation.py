@@ -15,12 +15,12 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.plugins import UserCode
 from safevar_sumo.plugins.contract import checked_class
-from safevar_sumo.records import Command, differences
+from safevar_sumo.records import Command
 from safevar_sumo.results import load_runs
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Vehicle
 from tests.in_process import SLOW, json_of, numbers_of, refused, run, searched, write
+from tests.made_up import assert_same_results, system_of
 from tests.manual import files_of
 from tests.plugins.conftest import Mine
 from tests.scenarios.holding import Pedals
@@ -119,7 +119,7 @@ def test_a_state_that_shows_late_is_an_error_at_the_end(
     assert not [*Path().rglob("*.jsonl")], "nothing is continued"
 
 
-NATIVE = assemble(load_study("native"))
+NATIVE = system_of("native")
 ORIGINAL = NATIVE.characteristics.original
 MASS = NATIVE.characteristics.names.index("mass")
 HEAVY = np.where(np.arange(len(ORIGINAL)) == MASS, 1700.0, ORIGINAL)
@@ -185,7 +185,7 @@ def test_a_vehicle_that_diverges_after_its_own_collision_has_the_result_that_it_
     assert len(drive_worst(system, BOTH).trace.time) > LENGTH, (
         "the other vehicle drives longer"
     )
-    assert not [*differences(together.take([0]).results, alone.results)]
+    assert_same_results(together.take([0]), alone)
     assert alone.collided.all()
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from safevar_sumo.check import trials
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import METRICS, OPTIONAL_METRICS
 from safevar_sumo.questions.repair.price import benign_scenes
+from safevar_sumo.records import Evaluations
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.search import ALGORITHMS
@@ -30,7 +31,7 @@ from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import VEHICLES
 from tests.in_process import SLOW, searched, write
-from tests.made_up import drawn
+from tests.made_up import assert_same_results, drawn, system_of
 from tests.manual import ROOT
 
 BASES = {"pedestrian_crossing": "sun", "lead_vehicle_stopped": "native", "stop": "stop"}
@@ -53,17 +54,13 @@ def copied(model: Any, folder: Path) -> str:
     return f"copy_of_{model.__name__.lower()}:{model.__name__}"
 
 
-def results_of(study: Study) -> Mapping[str, np.ndarray]:
-    system = assemble(study)
-    return drive_and_score(system, drawn(system, 8, 2)).results
+def results_of(study: Study) -> Evaluations:
+    system = system_of(study)
+    return drive_and_score(system, drawn(system, 8, 2))
 
 
 def assert_equal(ours: Study, theirs: Study) -> None:
-    expected = results_of(ours)
-    found = results_of(theirs)
-    assert expected.keys() == found.keys()
-    for name, values in expected.items():
-        assert_array_equal(found[name], values, err_msg=name)
+    assert_same_results(results_of(ours), results_of(theirs))
 
 
 def with_scenario(name: str, model: str, **tables: Any) -> Study:
@@ -241,12 +238,10 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
     write("named.py", "\n".join(lines))
     own = [f"named:{name}" for name in shipped]
     objectives = ["named:tit", "f_safe", "named:own_f_diff"]
-    system = assemble(
-        load_study(
-            "smoke",
-            metrics={"also": [*OPTIONAL_METRICS, *own]},
-            search={"objectives": objectives},
-        )
+    system = system_of(
+        "smoke",
+        metrics={"also": [*OPTIONAL_METRICS, *own]},
+        search={"objectives": objectives},
     )
     found = drive_and_score(system, drawn(system, 8, 2))
     for name in shipped:

@@ -15,8 +15,8 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import assemble
 from tests.in_process import InlinePool, run
+from tests.made_up import system_of
 
 DRIVER = """
 import importlib, pickle, sys, threading
@@ -156,7 +156,7 @@ def test_a_system_that_was_assembled_first_runs_its_own_code_later(
     versions: Versions,
 ) -> None:
     studies = versions("importlib")
-    systems = {name: assemble(sv.load_study(path)) for name, path in studies.items()}
+    systems = {name: system_of(path) for name, path in studies.items()}
     for name in ("old", "new", "old"):
         system = systems[name]
         results = drive_and_score(system, system.characteristics.original_settings)

@@ -21,7 +21,7 @@ from safevar_sumo.sumo import drive_worst
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.made_up import made_up_evaluations, original_of
+from tests.made_up import SUN, made_up_evaluations, original_of, system_of, uniform
 
 
 def reference(safety: list[float], tet: list[float]) -> ReferenceData:
@@ -84,7 +84,6 @@ def test_equal_values_and_too_few_have_no_rank_correlation() -> None:
         )
 
 
-SUN = CharacteristicSet.of(load_study("sun"))
 LGSVL = CharacteristicSet.of(load_study("lgsvl"))
 SUN_COLUMNS = [
     "max_rpm",
@@ -208,12 +207,10 @@ def test_vehicles_come_in_the_order_of_the_published_effects(study: str) -> None
     """Spearman's rho over 150 vehicles with the published linear effects, which know nothing of
     what saturates or comes together.
     """
-    system = assemble(load_study(study))
+    system = system_of(study)
     characteristics = system.characteristics
     width = characteristics.upper - characteristics.lower
-    settings = np.random.default_rng(14).uniform(
-        characteristics.lower, characteristics.upper, (150, len(width))
-    )
+    settings = uniform(characteristics, 150, 14)
     effects = np.array(
         [PUBLISHED_EFFECTS.get(name, 0.0) for name in characteristics.names]
     )
@@ -228,12 +225,11 @@ def test_vehicles_come_in_the_order_of_the_published_effects(study: str) -> None
 
 def test_the_published_filter_undoes_changes_below_their_share_of_the_domain() -> None:
     """The share is rounded to three decimals, and a change of exactly beta stays."""
-    members = CharacteristicSet.of(load_study("sun"))
-    width = members.upper - members.lower
-    sign = np.where(members.original + 0.1 * width > members.upper, -1, 1)
+    width = SUN.upper - SUN.lower
+    sign = np.where(SUN.original + 0.1 * width > SUN.upper, -1, 1)
     for beyond, is_kept in ((-0.002, False), (-0.0004, True), (0.0, True)):
-        share = members.threshold / width + beyond
-        changed = (members.original + sign * share * width)[np.newaxis]
-        kept = package_filter(members, changed)
-        expected = changed if is_kept else members.original_settings
+        share = SUN.threshold / width + beyond
+        changed = (SUN.original + sign * share * width)[np.newaxis]
+        kept = package_filter(SUN, changed)
+        expected = changed if is_kept else SUN.original_settings
         assert kept == pytest.approx(expected, abs=0)

@@ -9,7 +9,6 @@ import random
 import re
 import shutil
 import stat
-import subprocess
 import sys
 import tomllib
 import zipfile
@@ -28,8 +27,18 @@ from safevar_sumo.report import claims
 from safevar_sumo.report.evidence import _files_of_user
 from safevar_sumo.report.pack import DESCRIPTION, _check_entries, digests_of, read_pack
 from safevar_sumo.results import load_runs
-from safevar_sumo.shipped import NETWORKS
-from tests.in_process import SLOW, json_of, refused, rows_of, run, searched, write
+from tests.in_process import (
+    SLOW,
+    json_of,
+    own_network,
+    refused,
+    rewrite,
+    rows_of,
+    run,
+    run_python,
+    searched,
+    write,
+)
 from tests.manual import PROGRAM, files_of
 from tests.questions.test_repair import planted as planted  # noqa: PLC0414 - a fixture
 
@@ -94,7 +103,7 @@ def bare(slippery: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def mine(in_tmp: Path) -> Path:
     """Results of a study with an own network and user code, which reads a file."""
     there = in_tmp / "there"
-    shutil.copytree(NETWORKS / "pedestrian_crossing", there / "roads")
+    own_network(there / "roads")
     for name, text in {**FILES, "mine.py": MINE, "mine.toml": STUDY}.items():
         (there / name).write_text(text)
     run(f"study {there / 'mine.toml'} --out {there / 'results'} --quiet --jobs 1")
@@ -246,10 +255,8 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
         "my_questions.py, my_questions:ends",
         "--run-code",
     )
-    command = [sys.executable, "-m", "safevar_sumo", "verify", "it.zip", "--run-code"]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=True
-    )  # in a process that never had the module
+    # In a process that never had the module.
+    done = run_python("-m", "safevar_sumo", "verify", "it.zip", "--run-code")
     assert done.stdout.startswith(
         "7 of the 8 claims of the pack are confirmed. These parts"
     )
@@ -281,31 +288,6 @@ def test_a_pack_holds_a_list_of_cars_without_their_names(
         lambda text: text.replace("lists/1", "fleet"),
     )
     refused(f"verify {named_elsewhere} --run-code", "1-slippery/fleet.csv is missing")
-
-
-@SLOW
-def test_the_verdict_on_an_altered_pack_begins_with_the_alteration(
-    in_tmp: Path,
-) -> None:
-    """The altered file no longer has the digest that the pack states."""
-    searched(load_study("smoke", search={"evaluations": 16}), in_tmp / "results")
-    run("evidence results --ask 'rules --samples 20' --out it.zip")
-    assert "altered" not in run("verify it.zip").stdout
-    texts = texts_of(Path("it.zip"))
-    (answers,) = [path for path in texts if path.endswith("answers.json")]
-    texts[answers] = texts[answers].replace(b'"samples": 20', b'"samples": 21')
-    written(Path("other.zip"), texts, named=False)
-    assert run("verify other.zip", expect=1).stdout.startswith("This pack was altered:")
-
-
-@SLOW
-def test_equal_contents_give_equal_bytes(
-    bare: Path, slippery: Path, tmp_path: Path
-) -> None:
-    run(
-        f"evidence {slippery} --ask 'rules --samples 20' --out {tmp_path / 'again.zip'}"
-    )
-    assert bare.read_bytes() == (tmp_path / "again.zip").read_bytes()
 
 
 def damaged(content: bytes, damage: dict[str, Any]) -> bytes:
@@ -357,21 +339,23 @@ def test_a_damage_is_refused_or_named(
 
 @SLOW
 def test_what_differs_is_shown_from_both_sides(bare: Path, tmp_path: Path) -> None:
+    """A file whose digest is not the one that the pack states was altered."""
     texts = texts_of(bare)
     page = texts["1-slippery/report.html"] + b"\n"
-    (claim,) = not_same(
-        written(tmp_path / "it.zip", {**texts, "1-slippery/report.html": page})
-    )
+    other = written(tmp_path / "it.zip", {**texts, "1-slippery/report.html": page})
+    (claim,) = not_same(other)
     assert (claim["claim"], claim["packed"], claim["here"]) == (
         "report",
         "'\\n'",
         "nothing",
     )
+    assert "altered" not in run(f"verify {other}", expect=1).stdout
     answers = {"1-slippery/answers.json": texts["1-slippery/answers.json"] + b" "}
-    (claim, *_) = not_same(
-        written(tmp_path / "it.zip", {**texts, **answers}, named=False)
-    )
+    altered = written(tmp_path / "it.zip", {**texts, **answers}, named=False)
+    (claim, *_) = not_same(altered)
     assert '"1-slippery/answers.json": "' in claim["packed"]
+    printed = run(f"verify {altered}", expect=1).stdout
+    assert printed.startswith("This pack was altered:")
 
 
 @pytest.mark.parametrize(
@@ -553,10 +537,9 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
     )
     claims = {claim["claim"]: claim["here"] for claim in not_same("it.zip --run-code")}
     assert error in claims["solutions"]
-    command = [sys.executable, "-m", "safevar_sumo", "verify", "it.zip", "--run-code"]
     # The command has processes of its own as workers.
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    assert (done.returncode, done.stdout[:11]) == (1, "2 of the 8 ")
+    command = "-m", "safevar_sumo", "verify", "it.zip", "--run-code"
+    assert run_python(*command, expect=1).stdout.startswith("2 of the 8 ")
     assert os.getcwd() == str(there)
     assert "mine" not in sys.modules
 
@@ -564,17 +547,14 @@ def test_what_the_pack_lacks_is_not_taken_from_the_folder_of_the_author(
 @SLOW
 @pytest.mark.usefixtures("planted")
 def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
-    study = (
-        Path("planted.toml")
-        .read_text()
-        .replace("gap = 12.0, always", "gap = 30.0, always")
+    file = Path("planted.toml")
+    rewrite(
+        file,
+        ("gap = 12.0, always", "gap = 30.0, always"),
+        ("at_least = 5", "at_least = 7.9"),  # which it keeps already
+        ("step_length = 0.005", "step_length = 0.02"),
     )
-    study = study.replace("at_least = 5", "at_least = 7.9").replace(
-        "step_length = 0.005", "step_length = 0.02"
-    )
-    write(
-        "planted.toml", re.sub(r"(always|colour) = \{ .*\n", "", study)
-    )  # which it keeps already
+    file.write_text(re.sub(r"(always|colour) = \{ .*\n", "", file.read_text()))
     run("study planted.toml --out results --quiet --jobs 1")
     run("evidence results --out it.zip --ask 'repair --quick'")
     assert "answer repair --quick" in verified("it.zip --run-code")

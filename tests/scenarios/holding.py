@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads import Ads
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import (
     Command,
     FloatArray,
@@ -19,10 +18,11 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.scenarios import Scenario
 from safevar_sumo.sumo.matrix import drive_worst
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
+from tests.made_up import system_of
 
-CARLA = assemble(load_study("sun"))
-NATIVE = assemble(load_study("native"))
+CARLA = system_of("sun")
+NATIVE = system_of("native")
 
 
 class Hold(Ads):

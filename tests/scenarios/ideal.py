@@ -4,9 +4,9 @@ rule.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,49 +17,22 @@ from safevar_sumo.sumo.drive import drive
 from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traffic import Traffic
-from safevar_sumo.vehicles import Vehicle, calibration_drive
-from safevar_sumo.vehicles.base import SumoType
+from safevar_sumo.vehicles import calibration_drive
+from tests.sumo.planted import Block, Prepared
 
 STEP = 0.05
 
 
-class Rolling(NamedTuple):
-    speed: Any
-    throttle: Any
-    brake: Any
-    gear: Any
-
-
-class Ideal(Vehicle):
+class Ideal(Block):
     """A vehicle without drag or lag: the pedals are accelerations of up to 3 and 9.9 m/s^2."""
 
-    UNITS: ClassVar[dict[str, str]] = {}
+    UNITS: Mapping[str, str] = {}
 
     def prepare(
         self, characteristics: Any, road_friction: Any, step: float, *_: Any
-    ) -> Any:
-        return step, len(next(iter(characteristics.values())))
-
-    def sumo_type(self, prepared: Any) -> SumoType:
-        return SumoType(
-            *(np.full(prepared[1], value) for value in (1500.0, 3.0, 9.9, 70.0, 1e-3))
-        )
-
-    def at_rest(self, prepared: Any) -> Rolling:
-        return Rolling(*np.zeros((4, prepared[1])))
-
-    def at_speed(self, prepared: Any, speed: Any) -> Rolling:
-        return Rolling(speed, *np.zeros((3, prepared[1])))
-
-    def sense(self, prepared: Any, state: Any, seen: Any) -> Any:
-        return seen, state
-
-    def advance(self, prepared: Any, state: Any, command: Any) -> Rolling:
-        speed = np.maximum(
-            state.speed + (3.0 * command.throttle - 9.9 * command.brake) * prepared[0],
-            0.0,
-        )
-        return Rolling(speed, command.throttle, command.brake, state.gear)
+    ) -> Prepared:
+        n = len(next(iter(characteristics.values())))
+        return Prepared(np.full(n, 9.9), step)
 
 
 def ideal(system: System) -> System:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,39 +13,15 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.records import Outcome, Trace
+from safevar_sumo.records import Trace
 from safevar_sumo.scenarios import Lane
 from safevar_sumo.scenarios.crossing import Crossing
 from safevar_sumo.scenarios.euro_ncap import TargetProfile
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
-from safevar_sumo.scenarios.tracks import VUT_WIDTH
-from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW
-from tests.made_up import made_up_runs
-from tests.scenarios.holding import at_contact, driven
-
-
-@pytest.mark.parametrize(
-    ("test", "location", "speed"),
-    [
-        ("CPFA", 50.0, 10.0),
-        ("CPFA", 0.0, 60.0),
-        ("CPNA", 25.0, 30.0),
-        ("CPNA", 100.0, 10.0),
-        ("CPNCO", 10.0, 60.0),
-    ],
-)
-def test_a_vehicle_that_does_not_brake_hits_the_impact_location_at_the_time_to_impact(
-    test: str, location: float, speed: float
-) -> None:
-    run = driven(Crossing(test=test, speed=speed, impact_location=location))
-    assert run.outcome[0] == Outcome.COLLISION
-    assert run.collision_speed[0] == pytest.approx(speed / 3.6)
-    assert at_contact(run, run.trace.time) == pytest.approx(6.0, abs=1e-6)
-    struck = at_contact(run, run.trace.lateral[:, 0]) / VUT_WIDTH + 0.5
-    assert struck == pytest.approx(location / 100, abs=1e-6)
+from tests.in_process import SLOW, own_network
+from tests.made_up import made_up_runs, system_of
 
 
 @settings(max_examples=40)
@@ -68,7 +43,7 @@ def test_a_target_arrives_in_time_with_any_speed_profile(
         )
 
 
-WORN = assemble(load_study("wear", matrix=None))
+WORN = system_of("wear", matrix=None)
 
 
 TURNS = {"north": (0.0, 1.0), "north-west": (-0.6, 0.8)}
@@ -83,10 +58,10 @@ def moved(folder: Path, network: str, forth: tuple[float, float]) -> str:
         y = float(match[2])
         return f'x="{x * forth[0] - y * forth[1]}" y="{x * forth[1] + y * forth[0]}"'
 
-    shutil.copytree(NETWORKS / network, folder / "mine")
-    nodes = folder / "mine" / "network.nod.xml"
+    mine = own_network(folder / "mine", network)
+    nodes = mine / "network.nod.xml"
     nodes.write_text(re.sub(r'x="([-\d.]+)" y="([-\d.]+)"', place, nodes.read_text()))
-    return str(folder / "mine")
+    return str(mine)
 
 
 @pytest.mark.parametrize("forth", TURNS.values(), ids=TURNS)
@@ -95,7 +70,7 @@ def test_a_turned_road_changes_nothing(
     study: str, forth: tuple[float, float], tmp_path: Path
 ) -> None:
     ours = load_study(study)
-    mine = load_study(
+    mine = system_of(
         study,
         scenario={
             "parameters": {"network": moved(tmp_path, ours.scenario.model, forth)}
@@ -106,7 +81,7 @@ def test_a_turned_road_changes_nothing(
         [system.characteristics.original, system.characteristics.lower]
     )
     here = drive_worst(system, settings)
-    there = drive_worst(assemble(mine), settings)
+    there = drive_worst(mine, settings)
     assert here.outcome.tolist() == there.outcome.tolist()
     for name in ("gap", "lateral", "speed"):
         assert np.allclose(

@@ -12,16 +12,14 @@ import pytest
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.reaction import ANY_BRAKING
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
 from safevar_sumo.sumo.matrix import drive_worst, simulate_all_points
-from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, verify_everywhere, write
-from tests.made_up import original_of
+from tests.made_up import original_of, system_of
 from tests.scenarios.holding import Hold, at_contact, driven
 from tests.scenarios.ideal import STEP, Mass, agreement, ideal, met_at_once, point_mass
 
-WEAR = assemble(load_study("wear", matrix=None))
+WEAR = system_of("wear", matrix=None)
 IDEAL = ideal(WEAR)
 LENGTH, WIDTH = 4.7, 1.85
 BODY: dict[str, Any] = {"vut_length": LENGTH, "vut_width": WIDTH}
@@ -183,7 +181,7 @@ def test_the_original_avoids_all_encounters_and_the_regulations_driver_all_but_t
             too_fast,
         ),
     ):
-        system = assemble(load_study("alks", ads=ads))
+        system = system_of("alks", ads=ads)
         results = simulate_all_points(system, original_of(system))
         degrees = {
             point.name: result.evaluations.f_safe[0]
@@ -229,7 +227,7 @@ def test_whoever_drives_the_actors_are_where_sumo_has_them(
     write("script.py", SCRIPT)
     scenario = {"model": model, "parameters": BODY | parameters}
     driver = {"model": ads, "parameters": {}, "kind": "traci" if ":" in ads else ""}
-    system = assemble(load_study("wear", matrix=None, scenario=scenario, ads=driver))
+    system = system_of("wear", matrix=None, scenario=scenario, ads=driver)
     vehicles = np.stack([system.characteristics.original, system.characteristics.lower])
     run = drive_worst(system, vehicles)
     verify_everywhere(system, vehicles)

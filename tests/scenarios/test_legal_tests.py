@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
-from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, run
-from tests.made_up import original_of
+from tests.made_up import original_of, system_of
 
 KMH = 1 / 3.6
 ALLOWED = {
@@ -58,7 +56,7 @@ def test_a_person_on_the_road_may_stand() -> None:
 
 
 def test_r152_allows_the_impact_of_the_higher_row() -> None:
-    points = assemble(load_study("r152")).points
+    points = system_of("r152").points
     found = {point.scenario.speed: point.allowed_impact_speed / KMH for point in points}
     assert found == pytest.approx({**ALLOWED, 56: 35, 60: 35})
 
@@ -73,7 +71,7 @@ def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_
     """Sensors that reach 15 m: the car hits at 60 km/h, where that is allowed, and stops short
     elsewhere.
     """
-    system = assemble(load_study("r152"))
+    system = system_of("r152")
     setting = original_of(system).copy()
     setting[0, system.characteristics.names.index("sensorRange")] = 15.0
     (hit,) = (

@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.sumo import reason_against_scenes
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import assemble
 from tests.in_process import json_of, rows_of, run, write
-from tests.made_up import drawn
+from tests.made_up import drawn, system_of
 
 MINE = """
 from typing import Annotated
@@ -76,23 +74,19 @@ def test_a_users_class_whose_traffic_sumo_moves_is_searched_in_sumo(
     )
     write("own.py", TRAFFIC + methods)
     search = {"distance": {"unit": "m", "original": 50, "lower": 30, "upper": 60}}
-    system = assemble(
-        load_study(
-            "native",
-            scenario={"model": "own:Mine", "over": search},
-            encounters="ranges",
-        )
+    system = system_of(
+        "native",
+        scenario={"model": "own:Mine", "over": search},
+        encounters="ranges",
     )
     assert "by distance" in reason_against_scenes(system)
     settings = drawn(system, 3, 4)
     found = drive_and_score(system, settings)
     for row, setting in enumerate(settings):
         parameters = {"distance": float(setting[-1])}
-        alone = assemble(
-            load_study(
-                "native",
-                scenario={"model": "lead_vehicle_stopped", "parameters": parameters},
-            )
+        alone = system_of(
+            "native",
+            scenario={"model": "lead_vehicle_stopped", "parameters": parameters},
         )
         assert (
             drive_and_score(alone, setting[:-1][np.newaxis]).outcome[0]

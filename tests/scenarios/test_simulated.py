@@ -7,7 +7,6 @@ from __future__ import annotations
 import os
 import re
 import sqlite3
-import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
@@ -28,7 +27,7 @@ from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.metrics import METRICS, Unsafe
 from safevar_sumo.plugins.process import this_process
 from safevar_sumo.questions.evaluator import open_evaluator
-from safevar_sumo.records import Evaluations, differences
+from safevar_sumo.records import Evaluations
 from safevar_sumo.results import manifest_differences
 from safevar_sumo.sumo import kept, simulators
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
@@ -41,11 +40,13 @@ from tests.in_process import (
     json_of,
     numbers_of,
     refused,
+    rewrite,
     rows_of,
     run,
+    run_python,
     write,
 )
-from tests.made_up import made_up_evaluations
+from tests.made_up import assert_same_results, made_up_evaluations, system_of
 
 MODELS = """
 from dataclasses import dataclass
@@ -150,13 +151,12 @@ def wall(in_tmp: Path) -> Iterator[Path]:
     kept.close_simulator()
 
 
-def system_of(study: Path, **changes: object) -> System:
-    return assemble(sv.load_study(str(study), **changes))
-
-
-def choose(model: str, code: str = "") -> None:
-    """Let the study simulate another class, whose module has the code, if any is given."""
-    write("wall.toml", STUDY.replace("models:Wall", model))
+def choose(model: str, code: str = "", more: str = "", end: str = "") -> None:
+    """Let the study simulate another class, whose module has the code, if any is given. The table
+    of the scenario has `more`, and the file has another end.
+    """
+    study = STUDY.replace('"models:Wall"', f'"{model}"\n{more}')
+    write("wall.toml", f"{study}{end}")
     if code:
         write(f"{model.partition(':')[0]}.py", code)
 
@@ -230,7 +230,7 @@ def test_each_setting_alone_gives_the_bytes_of_a_batch(wall: Path) -> None:
     alone = Evaluations.concatenate(
         [drive_and_score(system, row) for row in np.split(rows, 8)]
     )
-    assert not [*differences(drive_and_score(system, rows).results, alone.results)]
+    assert_same_results(drive_and_score(system, rows), alone)
 
 
 def test_one_simulator_is_kept_its_fields_are_set_and_it_is_closed(wall: Path) -> None:
@@ -538,7 +538,7 @@ def test_a_simulator_that_is_not_deterministic_says_how_often_it_is_repeated(
     """The worst run counts, each is in the journal, and without repeats the study is refused."""
     choose("noisy:Drifts", NOISY)
     assert "repeats = N" in run("check wall.toml", expect=1).stdout
-    wall.write_text(STUDY.replace('"models:Wall"', '"noisy:Drifts"\nrepeats = 4'))
+    choose("noisy:Drifts", more="repeats = 4")
     run("check wall.toml")
     found = drive_and_score(
         system_of(wall), np.array([[8.0, 0.0], [3.0, 0.0], [9.0, 0.5]])
@@ -609,8 +609,7 @@ class Rare(Wall):
 @SLOW
 def test_answers_count_the_share_of_unsafe_runs(wall: Path) -> None:
     """A vehicle that fails in 3 of 20 runs counts 0.15; limits are of the worst run."""
-    write("rare.py", RARE)
-    wall.write_text(STUDY.replace('"models:Wall"', '"rare:Rare"\nrepeats = 20'))
+    choose("rare:Rare", RARE, "repeats = 20")
     system = system_of(wall)
     names = [one.name for one in system.measuring.scoring.objectives]
     assert names == ["unsafe_share", "f_diff", "f_num_diff"]
@@ -661,16 +660,11 @@ def test_noise_of_one_seed_is_a_remark(wall: Path) -> None:
 
 @SLOW
 @pytest.mark.usefixtures("worker_processes")
-@pytest.mark.parametrize("often", [1, 2])
-def test_a_simulator_that_ends_its_process_is_started_again_once(
-    wall: Path, often: int
+def test_a_simulator_that_ends_its_process_twice_is_an_error_with_its_setting(
+    wall: Path,
 ) -> None:
-    """What was simulated before is kept; the error names the setting and the command."""
-    end = f"len(open('ended', 'a+').write('x') and open('ended').read()) <= {often}"
+    end = "len(open('ended', 'a+').write('x') and open('ended').read()) <= 2"
     choose("noisy:Ends", NOISY.replace("END", end))
-    if often == 1:
-        run("study wall.toml --out results")
-        return
     told = (
         "exit code 7",
         "to reproduce it: python -m safevar_sumo simulate wall.toml --set decel=3",
@@ -678,6 +672,8 @@ def test_a_simulator_that_ends_its_process_is_started_again_once(
     refused("study wall.toml --out results", *told)
 
 
+SECONDS = f"1234.{os.getpid()}"
+"""Time that a child process sleeps, as no other test's."""
 FAILS = """
 import os
 import subprocess
@@ -695,24 +691,12 @@ class Fails(Wall):
             subprocess.Popen(["sleep", "SECONDS"], start_new_session=True)
             FAILURE
         return super().simulate(setting)
-"""
+""".replace("SECONDS", SECONDS)
 
 
-SECONDS = f"1234.{os.getpid()}"
-"""Time that a child process sleeps, as no other test's."""
-
-
-def with_failures(
-    wall: Path, failure: str, limit: float = 3.2, failed: str = "skip"
-) -> None:
-    text = (
-        FAILS.replace("SECONDS", SECONDS)
-        .replace("FAILURE", failure)
-        .replace("LIMIT", str(limit))
-    )
-    write("fails.py", text)
-    study = STUDY.replace("models:Wall", "fails:Fails")
-    wall.write_text(f'{study}time_limit = 2.0\nfailed = "{failed}"\n')
+def with_failures(failure: str, limit: str = "3.2", failed: str = "skip") -> None:
+    code = FAILS.replace("FAILURE", failure).replace("LIMIT", limit)
+    choose("fails:Fails", code, end=f'time_limit = 2.0\nfailed = "{failed}"\n')
 
 
 def children() -> int:
@@ -731,7 +715,7 @@ def test_settings_that_fail_may_be_skipped_and_tried_again(
     wall: Path, failure: str
 ) -> None:
     """They are infeasible and counted; `check` names them; children end with their simulator."""
-    with_failures(wall, failure)
+    with_failures(failure)
     options = "study wall.toml --out results --jobs 1"
     printed = run(options).stdout
     number = int(re.search(r"could not simulate (\d+) ", printed)[1])
@@ -809,16 +793,8 @@ def test_threads_and_exit_functions_of_a_simulator_keep_no_command(
     wall: Path, damage: str
 ) -> None:
     choose("leaks:Leaks", LEAKS.replace("DAMAGE", damage))
-    command = [
-        sys.executable,
-        "-m",
-        "safevar_sumo",
-        "study",
-        "wall.toml",
-        "--jobs",
-        "1",
-    ]
-    subprocess.run([*command, "--out", "results"], check=True, timeout=200)
+    command = "study wall.toml --jobs 1 --out results"
+    run_python("-m", "safevar_sumo", *command.split(), timeout=200)
     assert Path("results/solutions.csv").exists()
 
 
@@ -841,15 +817,15 @@ def test_a_simulator_that_takes_its_process_apart_is_named(
 
 @SLOW
 def test_more_than_a_tenth_of_failures_is_an_error(wall: Path) -> None:
-    with_failures(wall, "1 / 0", limit=5)
+    with_failures("1 / 0", limit="5")
     told = ("settings failed, more than 10 %", "division by zero")
     refused("study wall.toml --out results", *told, "--retry-failed")
     printed = run("risk wall.toml --simulations 1000", expect=2).stderr
     assert all(part in printed for part in told)
-    with_failures(wall, "1 / 0", failed="stop")
+    with_failures("1 / 0", failed="stop")
     refused("study wall.toml --out other", "division by zero")
     with pytest.raises(InputError, match="failed = 'skip' without a simulator"):
-        assemble(sv.load_study("rain", search={"failed": "skip"}))
+        system_of("rain", search={"failed": "skip"})
 
 
 @SLOW
@@ -990,9 +966,8 @@ def test_what_an_object_keeps_of_another_point_is_found(wall: Path) -> None:
     text = READS.replace(
         "READ", f"(self.__dict__.setdefault('road', {lazy})).length / 40", 1
     )
-    write("reads.py", text)
-    tests = '\n[[matrix.tests]]\nname = "a"\nover = { gap = [40.0, 60.0] }\n'
-    wall.write_text(STUDY.replace("models:Wall", "reads:Reads") + tests)
+    tests = '[[matrix.tests]]\nname = "a"\nover = { gap = [40.0, 60.0] }\n'
+    choose("reads:Reads", text, end=tests)
     assert "in a new process" in run("check wall.toml", expect=1).stdout
     refused("study wall.toml --out results", "points in another order")
 
@@ -1000,8 +975,7 @@ def test_what_an_object_keeps_of_another_point_is_found(wall: Path) -> None:
 @SLOW
 def test_a_library_of_the_search_counts_if_the_simulator_uses_it(wall: Path) -> None:
     run("study wall.toml --out results")
-    manifest = Path("results/manifest.json")
-    manifest.write_text(manifest.read_text().replace(np.__version__, "1.0"))
+    rewrite(Path("results/manifest.json"), (np.__version__, "1.0"))
     refused("study wall.toml --out results", "version of numpy was '1.0'")
     stored, now = ({"versions": {"numpy": one}, "study": {}} for one in ("1.0", "1.1"))
     for libraries, matters in ([], False), (["numpy"], True):
@@ -1031,8 +1005,7 @@ class Unlucky(Wall):
 def test_failures_that_fresh_runs_do_not_repeat_are_told_by_no_answer(
     wall: Path,
 ) -> None:
-    write("unlucky.py", UNLUCKY)
-    wall.write_text(STUDY.replace('"models:Wall"', '"unlucky:Unlucky"\nrepeats = 4'))
+    choose("unlucky:Unlucky", UNLUCKY, "repeats = 4")
     sampled = sv.explain(str(wall), pool=InlinePool())
     assert sampled.tables["causes"].empty
     assert "enough" not in sampled.verdict
@@ -1043,8 +1016,7 @@ def test_failures_that_fresh_runs_do_not_repeat_are_told_by_no_answer(
 
 
 def test_simulate_compares_the_means_of_repeated_runs(wall: Path) -> None:
-    write("unlucky.py", UNLUCKY.replace("n <= 4", "n < 0"))
-    wall.write_text(STUDY.replace('"models:Wall"', '"unlucky:Unlucky"\nrepeats = 4'))
+    choose("unlucky:Unlucky", UNLUCKY.replace("n <= 4", "n < 0"), "repeats = 4")
     answer = json_of("simulate wall.toml --set delay=0.4")
     changed = [3 - 0.4, 2 - 0.4] * 2
     original = [3.0, 2.0] * 2

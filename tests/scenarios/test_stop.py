@@ -8,25 +8,23 @@ import numpy as np
 import pytest
 
 import safevar_sumo as sv
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray
 from safevar_sumo.replay.simulate import show_simulation
 from safevar_sumo.sumo.matrix import simulate_all_points
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
+from tests.made_up import system_of
 
 
 def stops(weather: Any, *speeds: float, **tables: Any) -> System:
     """The worn car's stops from `speeds` [km/h]."""
-    return assemble(
-        load_study(
-            {
-                "extends": "stop",
-                "name": "some",
-                "weather": weather,
-                "matrix": {"tests": [{"name": "stop", "over": {"speed": [*speeds]}}]},
-                **tables,
-            }
-        )
+    return system_of(
+        {
+            "extends": "stop",
+            "name": "some",
+            "weather": weather,
+            "matrix": {"tests": [{"name": "stop", "over": {"speed": [*speeds]}}]},
+            **tables,
+        }
     )
 
 

@@ -17,7 +17,6 @@ from deap import tools
 from hypothesis import given, strategies as st
 from numpy.random import default_rng
 
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
 from safevar_sumo.plugins import read_only
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
@@ -34,9 +33,8 @@ from safevar_sumo.search.surrogate import _learn
 from safevar_sumo.study import ORIGINAL_DEGREE
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet, FeasibleRegion
 from tests.in_process import SLOW
-from tests.made_up import made_up_evaluations
+from tests.made_up import SUN, made_up_evaluations
 
-SUN = CharacteristicSet.of(load_study("sun"))
 POPULATION = 20
 OURS = [
     pytest.param(name, marks=SLOW if name == "surrogate" else ()) for name in ALGORITHMS

@@ -18,7 +18,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.vehicles import region_of
 from tests.in_process import SLOW, json_of, rows_of, run, write
-from tests.search.test_algorithms import SUN
+from tests.made_up import SUN
 
 BOUND = """
 extends = "smoke"

@@ -9,17 +9,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from safevar_sumo.ads.base import DelayLine
-from safevar_sumo.api.simulation import load_study
-from safevar_sumo.records import FloatArray, Outcome, differences
+from safevar_sumo.records import FloatArray, Outcome
 from safevar_sumo.scenarios.base import Scene
 from safevar_sumo.study import Weather
 from safevar_sumo.sumo.drive import _Outcomes
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.perception import Perception
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.without_effect import without_effect
 from tests.in_process import EVERY_STUDY, SLOW
-from tests.made_up import drawn, original_of
+from tests.made_up import assert_same_results, drawn, original_of, system_of
 
 
 @SLOW
@@ -29,25 +28,21 @@ from tests.made_up import drawn, original_of
 def test_a_result_depends_neither_on_the_batch_nor_on_its_size(
     study: str, seed: int, n: int, data: st.DataObject
 ) -> None:
-    system = assemble(load_study(study))
+    system = system_of(study)
     population = drawn(system, n, seed)
     together = drive_and_score(system, population)
     some = data.draw(
         st.lists(st.integers(0, n - 1), min_size=1, max_size=n, unique=True)
     )
     for rows in (some, [0]):
-        assert not [
-            *differences(
-                together.take(rows).results,
-                drive_and_score(system, population[rows]).results,
-            )
-        ]
+        alone = drive_and_score(system, population[rows])
+        assert_same_results(together.take(rows), alone)
 
 
 @pytest.mark.parametrize("name", EVERY_STUDY)
 def test_the_original_vehicle_does_not_collide(name: str) -> None:
     """At any point of a matrix. The collisions of one study are what docs/autoware.md is about."""
-    system = assemble(load_study(name))
+    system = system_of(name)
     original = drive_and_score(system, original_of(system))
     if name == "autoware_december":
         assert original.outcome[0] == Outcome.COLLISION
@@ -236,7 +231,7 @@ def test_hesitation_delays_braking_but_not_the_release_of_the_brake() -> None:
 def test_a_remark_says_that_a_weather_has_no_effect() -> None:
     sentence = "weather 'carla_hard_rain' has no effect"
     for driver, says in (({"model": "full_braking"}, True), ({}, False)):
-        remarks = without_effect(assemble(load_study("rain", ads=driver)))
+        remarks = without_effect(system_of("rain", ads=driver))
         assert any(sentence in remark for remark in remarks) is says
-    remarks = without_effect(assemble(load_study("sun")))
+    remarks = without_effect(system_of("sun"))
     assert not any("has no effect" in remark for remark in remarks)

@@ -5,7 +5,6 @@ bad as they are fast.
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +12,10 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.errors import InputError
-from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.network_check import network_remarks
-from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, json_of, rewrite, rows_of
+from tests.in_process import SLOW, json_of, own_network, rewrite, rows_of
+from tests.made_up import system_of
 
 CHECKED = {"collision.mingap-factor": "0", "collision.check-junctions": "true"}
 OPTIONS = {
@@ -67,11 +65,6 @@ WIZARD = """<sumoConfiguration>
 WEAK_BRAKES = {"brakeGain": 0.6, "reactionTime": 0.8}
 
 
-def own_network(folder: Path, shipped: str) -> Path:
-    shutil.copytree(NETWORKS / shipped, folder)
-    return folder
-
-
 def set_options(folder: Path, options: dict[str, str]) -> None:
     file = folder / "scenario.sumocfg"
     text = re.sub(r".*(ollision|ballistic|teleport).*\n", "", file.read_text())
@@ -96,7 +89,7 @@ def test_no_option_of_a_users_file_decides_what_a_collision_is(
     options: str, tmp_path: Path
 ) -> None:
     stopped = own_network(tmp_path / "lead_vehicle_stopped", "lead_vehicle_stopped")
-    crossing = own_network(tmp_path / "pedestrian_crossing", "pedestrian_crossing")
+    crossing = own_network(tmp_path / "pedestrian_crossing")
     for network in (stopped, crossing):
         set_options(network, OPTIONS[options])
     unsafe = simulated("native", stopped, WEAK_BRAKES)
@@ -180,7 +173,7 @@ def test_the_corners_of_a_car_are_not_cut_off_by_its_shape(tmp_path: Path) -> No
     """SUMO cuts the corners of a `passenger`, and sees no pedestrian there: of this setting it
     would say "stops".
     """
-    network = own_network(tmp_path / "pedestrian_crossing", "pedestrian_crossing")
+    network = own_network(tmp_path / "pedestrian_crossing")
     settings = {
         "max_rpm": 5906.0,
         "dampRateFullT": 0.145,
@@ -265,7 +258,7 @@ def test_a_hit_on_a_moving_car_is_as_bad_as_it_closes(
 ) -> None:
     """`relative_impact_speed` is that of the moment of contact, within the last step."""
     scenario = {"model": "car_to_car", "parameters": parameters}
-    system = assemble(sv.load_study("sun", scenario=scenario, ads={"model": "aeb"}))
+    system = system_of("sun", scenario=scenario, ads={"model": "aeb"})
     weak = system.characteristics.setting(
         {"maxBrakeTorque": 600.0, "tireFric": 0.5}, beyond=True
     )

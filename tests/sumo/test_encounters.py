@@ -28,7 +28,7 @@ from safevar_sumo.study import Study, free_parameters
 from safevar_sumo.sumo.matrix import drive_and_score, efficient_batch
 from safevar_sumo.sumo.system import System, assemble
 from tests.in_process import SLOW, InlinePool, searched, verify_everywhere
-from tests.made_up import case_of, drawn
+from tests.made_up import assert_same_results, case_of, drawn, system_of
 from tests.sumo.planted import BRAKING, GAP
 
 
@@ -136,13 +136,12 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
         weather = {name: values.pop(name) for name in WEATHER}
         base, scenario, _ = CASES[case]
         parameters = {**scenario.get("parameters", {}), **values}
-        plain = load_study(
+        other = system_of(
             base,
             matrix=None,
             scenario={"model": scenario["model"], "parameters": parameters},
             weather={**msgspec.to_builtins(system.points[0].weather), **weather},
         )
-        other = assemble(plain)
         both = np.stack([setting[of_vehicle], other.characteristics.original])
         alone = drive_and_score(other, both)
         assert alone.outcome[0] == evaluations.outcome[row]
@@ -163,8 +162,7 @@ def test_a_result_depends_neither_on_the_batch_nor_on_the_engine() -> None:
     together = drive_and_score(system, settings)
     for row in (0, 7, 29):
         alone = drive_and_score(system, settings[[row]])
-        for name, values in together.results.items():
-            np.testing.assert_array_equal(alone.results[name], values[[row]])
+        assert_same_results(together.take([row]), alone)
     beside = simulate(study, system.characteristics.named(settings[0]))
     assert beside.original.evaluation.f_safe == pytest.approx(
         together.metrics["original_safety_degree"][:1]
@@ -188,13 +186,11 @@ def test_sumo_repeats_the_corners_of_the_widest_domains(case: str) -> None:
     base, scenario, _ = CASES[case]
     widest = free_parameters(SCENARIOS[scenario["model"]])
     search = {name: domain(one.lower, one.upper) for name, one in widest.items()}
-    system = assemble(
-        load_study(
-            base,
-            matrix=None,
-            scenario={**scenario, "over": search},
-            encounters="ranges",
-        )
+    system = system_of(
+        base,
+        matrix=None,
+        scenario={**scenario, "over": search},
+        encounters="ranges",
     )
     corners = product(
         *((one.lower, one.upper) for one in system.characteristics.scenario)

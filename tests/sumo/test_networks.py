@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.export import converted, open_drive
 from safevar_sumo.shipped import NETWORKS
@@ -26,8 +25,9 @@ from safevar_sumo.sumo.network import (
     program_of_sumo,
 )
 from safevar_sumo.sumo.network_check import check_network
-from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import SLOW, rewrite
+from safevar_sumo.sumo.system import System
+from tests.in_process import SLOW, own_network, rewrite
+from tests.made_up import system_of
 
 FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
 
@@ -36,7 +36,7 @@ FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
 def test_the_recipe_builds_the_network_that_is_kept(
     folder: str, tmp_path: Path
 ) -> None:
-    shutil.copytree(NETWORKS / folder, tmp_path / folder)
+    own_network(tmp_path / folder, folder)
     subprocess.run(
         [program_of_sumo("netconvert", folder), "-c", "network.netccfg"],
         cwd=tmp_path / folder,
@@ -85,8 +85,7 @@ CAR = (
 
 @pytest.fixture
 def mine(tmp_path: Path) -> Path:
-    shutil.copytree(NETWORKS / "pedestrian_crossing", tmp_path / "mine")
-    return tmp_path / "mine"
+    return own_network(tmp_path / "mine")
 
 
 def with_traffic(mine: Path, more: str) -> str:
@@ -151,9 +150,7 @@ def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> Non
 
 
 def on(network: Path) -> System:
-    return assemble(
-        load_study("smoke", scenario={"parameters": {"network": str(network)}})
-    )
+    return system_of("smoke", scenario={"parameters": {"network": str(network)}})
 
 
 def roads(network: Path, n: int = 1) -> ElementTree.Element:
@@ -192,7 +189,7 @@ def test_edge_types_in_a_separate_file_change_the_network(mine: Path) -> None:
 def test_a_built_network_without_sources_gives_the_same_results(mine: Path) -> None:
     settings = np.vstack(
         [
-            original := assemble(load_study("smoke")).characteristics.original_settings,
+            original := system_of("smoke").characteristics.original_settings,
             original * 1.01,
         ]
     )

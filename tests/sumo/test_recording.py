@@ -5,7 +5,6 @@ vehicle must drive to the encounter, or no command gives a verdict on its drivin
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,16 +21,15 @@ from safevar_sumo.records import ROUNDING, FloatArray, Observation, differences
 from safevar_sumo.results import read_manifest
 from safevar_sumo.scenarios import SCENARIOS, Point, weather_of
 from safevar_sumo.scenarios.ahead import CarToCar
-from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import reason_against_scenes, recording, simulate_all_points
 from safevar_sumo.sumo.bodies import distance_covered
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.recording import Scenes
-from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import SLOW, json_of, run, verify_everywhere, write
-from tests.made_up import drawn, original_of
+from safevar_sumo.sumo.system import System
+from tests.in_process import SLOW, json_of, own_network, run, verify_everywhere, write
+from tests.made_up import drawn, original_of, system_of
 from tests.scenarios.holding import Pedals
 
 CLAIM = """
@@ -97,7 +95,7 @@ def test_a_scene_from_the_cache_equals_the_scene_that_sumo_played(
 ) -> None:
     """In an empty cache: SUMO plays the scene, and the next process reads the file."""
     monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path)
-    scenario = assemble(load_study("sun")).points[0].scenario
+    scenario = system_of("sun").points[0].scenario
 
     def scene() -> str:
         return repr(Scenes().of(scenario))
@@ -118,8 +116,7 @@ def test_a_shipped_scenario_on_a_users_network_is_simulated_in_sumo() -> None:
 @pytest.fixture
 def reacting(in_tmp: Path) -> Path:
     """A network whose pedestrian stops before a vehicle, as SUMO's pedestrians do by default."""
-    shutil.copytree(NETWORKS / "pedestrian_crossing", in_tmp / "reacting")
-    options = in_tmp / "reacting" / "scenario.sumocfg"
+    options = own_network(in_tmp / "reacting") / "scenario.sumocfg"
     lines = options.read_text().splitlines()
     options.write_text(
         "\n".join(line for line in lines if "mingap-to-vehicle" not in line)
@@ -155,9 +152,7 @@ def test_a_point_whose_runs_end_before_those_of_another_one_is_repeated_to_its_o
     ]
     ads = {"model": "idm", "parameters": {}}
     car = {"model": "car_to_car", "parameters": {}}
-    system = assemble(
-        load_study("wear", ads=ads, scenario=car, matrix={"tests": tests})
-    )
+    system = system_of("wear", ads=ads, scenario=car, matrix={"tests": tests})
     assert drive_and_score(system, original_of(system)).outcome.tolist() == ["timeout"]
     verify_everywhere(system, original_of(system))
 
@@ -174,7 +169,7 @@ def test_who_reacts_against_the_claim_is_at_another_place_in_sumo(
     monkeypatch.syspath_prepend(reacting)
     write("claims.py", CLAIM)
     scenario = {"model": "claims:Claims", "parameters": {"network": "reacting"}}
-    system = assemble(load_study("native", scenario=scenario))
+    system = system_of("native", scenario=scenario)
     with pytest.raises(
         InputError,
         match=r"at [\d.]+ s is .* in the recorded scene and .* in SUMO, with mass = ",
@@ -194,7 +189,7 @@ BRAKES = f"{FIRST}brakes without an obstacle"
 def reason(
     study: str | Study, pedals: Callable[[Observation], tuple[object, object]]
 ) -> str:
-    return why_no_verdict(replace(assemble(load_study(study)), ads=Pedals(pedals)))
+    return why_no_verdict(replace(system_of(study), ads=Pedals(pedals)))
 
 
 @pytest.mark.parametrize(
@@ -261,7 +256,7 @@ def test_a_traci_controller_sees_nobody(step: str, expected: str, in_tmp: Path) 
         "mine.toml",
         'extends = "native"\nname = "mine"\n[ads]\nkind = "traci"\nmodel = "controller:step"\n',
     )
-    said = why_no_verdict(assemble(load_study("mine.toml")))
+    said = why_no_verdict(system_of("mine.toml"))
     assert expected in said
     assert bool(said) == bool(expected)
 

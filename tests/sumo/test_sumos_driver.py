@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.without_effect import without_effect
-from tests.in_process import SLOW, rewrite
+from tests.in_process import SLOW, own_network, rewrite
+from tests.made_up import system_of
 from tests.sumo.test_traci_controller import changed, system
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
@@ -116,7 +115,7 @@ def with_attributes(folder: Path, attributes: str) -> Path:
     """A copy of the network, in which the type of the vehicle under test has attributes of SUMO's
     driver.
     """
-    shutil.copytree(NET, folder)
+    own_network(folder, NET.name)
     traffic = folder / "traffic.rou.xml"
     old = 'speedDev="0" sigma="0" color="0,0.45,0.7"'
     rewrite(traffic, (old, f'speedDev="0" {attributes}'))
@@ -227,8 +226,8 @@ def braking(run: SimulationRuns) -> np.ndarray:
 
 
 def native(**characteristics: object) -> tuple[System, SimulationRuns]:
-    runs = assemble(
-        load_study("native", vehicle={**NO_DELAYS, "characteristics": characteristics})
+    runs = system_of(
+        "native", vehicle={**NO_DELAYS, "characteristics": characteristics}
     )
     return runs, drive_worst(runs, changed(runs))
 
@@ -255,25 +254,23 @@ def test_krauss_brakes_softer_with_a_longer_tau_and_stops_where_sumos_krauss_doe
 
 def test_tau_drives_idm_and_a_line_says_where_it_or_decel_has_no_effect() -> None:
     def remarks(model: str, **parameters: float) -> list[str]:
-        study = load_study("native", ads={"model": model, "parameters": parameters})
-        *others, on_decel = without_effect(assemble(study))
+        system = system_of("native", ads={"model": model, "parameters": parameters})
+        *others, on_decel = without_effect(system)
         assert f"carry at most {0.9 * 9.81:.2f} m/s^2: a decel above" in on_decel
         return others
 
-    stops = assemble(
-        load_study(
-            {"extends": "native", "name": "stops", "scenario": {"model": "stop"}}
-        )
+    stops = system_of(
+        {"extends": "native", "name": "stops", "scenario": {"model": "stop"}}
     )
     settings = [changed(stops, decel=decel) for decel in (8.82, 8.83, 9.0, 9.5)]
     hardest = drive_and_score(stops, np.concatenate(settings)).metrics[
         "stopping_distance"
     ]
     assert hardest[0] > hardest[1] == hardest[2] == hardest[3]
-    grippy = load_study("native", vehicle={"parameters": {"tyre_friction": 1.0}})
-    assert without_effect(assemble(grippy)) == []
+    grippy = system_of("native", vehicle={"parameters": {"tyre_friction": 1.0}})
+    assert without_effect(grippy) == []
 
-    fast, slow = top_speeds(assemble(load_study("native", ads={"model": "idm"})))
+    fast, slow = top_speeds(system_of("native", ads={"model": "idm"}))
     assert fast > slow + 1
     assert remarks("idm") == remarks("krauss") == []
     assert any("tau has no effect" in remark for remark in remarks("acc"))

@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Command, FloatArray
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import slope_of
+from tests.made_up import system_of, uniform
 
 STEP = 0.05
 STUDY_OF = {"carla": "sun", "lgsvl": "lgsvl", "sumo": "native", "worn": "wear"}
-SYSTEMS = {model: assemble(load_study(study)) for model, study in STUDY_OF.items()}
+SYSTEMS = {model: system_of(study) for model, study in STUDY_OF.items()}
 Pedals = Callable[[float], tuple[Any, Any]]
 
 
@@ -115,10 +114,7 @@ def ends(model: str, name: str) -> FloatArray:
 
 
 def drawn(model: str, n: int, seed: int) -> FloatArray:
-    characteristics = SYSTEMS[model].characteristics
-    return np.random.default_rng(seed).uniform(
-        characteristics.lower, characteristics.upper, (n, len(characteristics))
-    )
+    return uniform(SYSTEMS[model].characteristics, n, seed)
 
 
 def full_throttle(time: float) -> tuple[float, float]:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -20,7 +19,7 @@ from safevar_sumo.campaign.batches import COMPILING, compile_vehicle
 from safevar_sumo.records import Command
 from safevar_sumo.vehicles import carla_step, compiled
 from safevar_sumo.vehicles.carla_step import Car, CarlaState
-from tests.in_process import SLOW, InlinePool
+from tests.in_process import SLOW, InlinePool, run_python
 from tests.vehicles.runs import STEP, SYSTEMS, drawn
 
 CARLA = SYSTEMS["carla"].vehicle
@@ -92,13 +91,7 @@ def loaded(folder: str) -> str:
     errors.
     """
     environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
-    done = subprocess.run(
-        [sys.executable, "-c", LOADING],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = run_python("-c", LOADING, env=environment)
     return done.stdout.strip() + done.stderr
 
 

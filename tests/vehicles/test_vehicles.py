@@ -5,7 +5,6 @@ says, and a steady state of every part that starts in motion.
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,15 +16,13 @@ from numpy.random import default_rng
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Command, FloatArray, JsonObject
-from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.matrix import drive_worst
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import LEVEL, VEHICLES, _accelerations, slope_of
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, WHEEL_MASS, WHEELS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.sensors import DelayedSignal
-from tests.in_process import SLOW, write
-from tests.made_up import original_of, seen
+from tests.in_process import SLOW, own_network, write
+from tests.made_up import original_of, seen, system_of
 from tests.vehicles.runs import (
     STEP,
     STUDY_OF,
@@ -323,19 +320,13 @@ def test_a_vehicle_that_starts_on_a_slope_too_slippery_to_hold_becomes_slower(
 
 
 @SLOW
-@pytest.mark.parametrize("study", ["sun", "lgsvl", "native"])
-def test_the_depart_speed_of_the_traffic_is_honoured(
-    study: str, tmp_path: Path
-) -> None:
-    traffic = tmp_path / "net" / "traffic.rou.xml"
-    shutil.copytree(NETWORKS / load_study(study).scenario.model, traffic.parent)
+def test_the_depart_speed_of_the_traffic_is_honoured(tmp_path: Path) -> None:
+    traffic = own_network(tmp_path / "net") / "traffic.rou.xml"
     head, vut, tail = traffic.read_text().partition('<vehicle id="vut"')
     traffic.write_text(
         head + vut + tail.replace('departSpeed="0"', 'departSpeed="5"', 1)
     )
-    system = assemble(
-        load_study(study, scenario={"parameters": {"network": str(traffic.parent)}})
-    )
+    system = system_of("sun", scenario={"parameters": {"network": str(traffic.parent)}})
     trace = drive_worst(system, original_of(system)).trace
     assert trace.speed[0, 0] == 5
     assert abs(trace.speed[1, 0] - 5) < 0.3, (
@@ -416,7 +407,7 @@ def test_a_thousand_times_too_much_is_another_unit(model: str) -> None:
                 }
             }
         with pytest.raises(InputError, match=rf"vehicle\.\w+\.{name}"):
-            assemble(load_study(study.name, name="another", vehicle=tables))
+            system_of(study.name, name="another", vehicle=tables)
 
 
 def test_an_own_vehicle_may_say_that_everything_is_plausible(in_tmp: Path) -> None:
@@ -427,7 +418,7 @@ def test_an_own_vehicle_may_say_that_everything_is_plausible(in_tmp: Path) -> No
     )
     vehicle = {"model": "own:Own", "parameters": {"kerb_mass": 300}}
     characteristics = msgspec.to_builtins(load_study("wear").vehicle.characteristics)
-    study = load_study(
+    system = system_of(
         "wear", spread={}, vehicle={**vehicle, "characteristics": characteristics}
     )
-    assert assemble(study).vehicle.kerb_mass == 300  # type: ignore[attr-defined]
+    assert system.vehicle.kerb_mass == 300  # type: ignore[attr-defined]

@@ -5,8 +5,6 @@ numbers.
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -27,14 +25,13 @@ from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.tolerance.asked import asked_of
 from safevar_sumo.questions.tolerance.search import alone_with_own_set
-from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray, Observation
+from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet, wet_road
 from safevar_sumo.vehicles.sensing import WornVehicle
 from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_friction
-from tests.in_process import SLOW, InlinePool
-from tests.made_up import drawn
+from tests.in_process import SLOW, InlinePool, run_python
+from tests.made_up import SUN, drawn, seen, system_of
 
 CAR = WornVehicle()
 HEALTHY = {
@@ -48,12 +45,11 @@ HEALTHY = {
 }
 
 
-def prepared(road: float, **changes: float):  # type: ignore[no-untyped-def]
-    return CAR.prepare(
-        {name: np.array([value]) for name, value in {**HEALTHY, **changes}.items()},
-        road,
-        0.05,
-    )
+def prepared(road: float, n: int = 1, **changes: float | list[float]) -> Any:
+    """The constants of n healthy cars with some changes."""
+    values = {**HEALTHY, **changes}
+    columns = {name: np.zeros(n) + value for name, value in values.items()}
+    return CAR.prepare(columns, road, 0.05)
 
 
 @pytest.mark.parametrize("road", [1.0, 0.85, 0.5, 0.2])
@@ -148,9 +144,7 @@ def stopping_distances(
         "weather": weather,
         "matrix": {"tests": tests},
     }
-    system = assemble(
-        load_study({**tables, "vehicle": {"parameters": {"brake_force": 40000.0}}})
-    )
+    system = system_of({**tables, "vehicle": {"parameters": {"brake_force": 40000.0}}})
     settings = np.array([[tread, *[*HEALTHY.values()][1:]] for tread in treads])
     return drive_and_score(system, settings).metrics["stopping_distance"]
 
@@ -312,12 +306,7 @@ def test_the_page_of_trust_says_how_far_limits_move_with_an_assumption(
 
 @SLOW
 def test_the_shipped_constants_are_what_the_script_prints() -> None:
-    printed = subprocess.run(
-        [sys.executable, "calibration/wet_friction.py"],
-        check=True,
-        capture_output=True,
-        text=True,
-    ).stdout
+    printed = run_python("calibration/wet_friction.py").stdout
     constants = (Path(wet_road.__file__).parent / "wet_friction.toml").read_text(
         encoding="utf-8"
     )
@@ -350,24 +339,13 @@ def test_the_shipped_constants_are_what_the_script_prints() -> None:
 def test_tread_counts_where_the_weather_is_wet_and_not_where_friction_is_low(
     weather: object, is_wet: bool
 ) -> None:
-    study = load_study(
-        {
-            "extends": "wear",
-            "name": "one",
-            "weather": weather,
-            "matrix": {
-                "tests": [{"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}]
-            },
-        }
-    )
+    test = {"name": "CPNA", "parameters": {"test": "CPNA", "speed": 40}}
+    system = system_of("wear", weather=weather, matrix={"tests": [test]})
     new, worn = drive_and_score(
-        assemble(study),
+        system,
         np.array([[8, 1, 0.1, 75, 1.4, 80, 0.05], [1.6, 1, 0.1, 75, 1.4, 80, 0.05]]),
     ).metrics["ave_dece"]
     assert (worn < 0.995 * new) == is_wet
-
-
-SUN = CharacteristicSet.of(load_study("sun"))
 
 
 def one(lower: float, original: float, upper: float) -> Characteristic:
@@ -435,37 +413,10 @@ def test_a_change_of_just_the_threshold_is_noise() -> None:
     ]
 
 
-def seen_at(gap: Any, time: float = 0.0) -> Observation:
-    """A pedestrian of 0.5 m in the middle of the lane, seen by one vehicle or several."""
-    zeros = np.zeros(np.size(gap))
-    columns = {
-        "speed": zeros + 10.0,
-        "closing_speed": zeros + 10.0,
-        "lateral": zeros,
-        "lateral_speed": zeros,
-    }
-    return Observation(
-        time=time,
-        gap=zeros + gap,
-        visibility=1.0,
-        obstacle_width=zeros + 0.5,
-        **columns,
-    )
-
-
-def sensors(**values: float | list[float]) -> tuple[WornVehicle, Any, Any]:
-    """Worn cars with perfect sensors but for these values; the model, their constants and their
-    state.
-    """
-    n = max(np.size(value) for value in values.values())
-    table = load_study("wear").vehicle.characteristics
-    original = {name: np.full(n, row.original) for name, row in table.items()}
-    given = {name: np.zeros(n) + value for name, value in values.items()}
-    vehicle = WornVehicle()
-    prepared = vehicle.prepare(
-        {**original, "sensorLatency": np.full(n, 1e-9), **given}, 1.0, 0.05
-    )
-    return vehicle, prepared, vehicle.at_speed(prepared, np.full(n, 10.0))
+def sensors(n: int, **values: float | list[float]) -> tuple[Any, Any]:
+    """The constants and the state of n worn cars whose sensors are perfect but for these values."""
+    cars = prepared(1.0, n, sensorLatency=1e-9, **values)
+    return cars, CAR.at_speed(cars, np.full(n, 10.0))
 
 
 def test_an_angle_of_one_degree_puts_a_pedestrian_outside_a_corridor_beyond_92_metres() -> (
@@ -476,15 +427,12 @@ def test_an_angle_of_one_degree_puts_a_pedestrian_outside_a_corridor_beyond_92_m
     """
     for angle in (-4.0, 1.0, 2.0):
         border = 1.6 / abs(math.tan(math.radians(angle)))
-        vehicle, prepared, state = sensors(
-            sensorAngle=[angle, angle], sensorRange=200.0
-        )
-        seen, _ = vehicle.sense(
-            prepared, state, seen_at(np.array([border - 0.01, border + 0.01]))
-        )
-        assert is_in_the_way(seen, corridor=1.6 - 0.25).tolist() == [True, False]
+        cars, state = sensors(2, sensorAngle=angle, sensorRange=200.0)
+        nearer_and_farther = np.array([border - 0.01, border + 0.01])
+        sensed, _ = CAR.sense(cars, state, seen(0.0, 10.0, nearer_and_farther))
+        assert is_in_the_way(sensed, corridor=1.6).tolist() == [True, False]
     assert 1.6 / math.tan(math.radians(1.0)) == pytest.approx(91.66, abs=0.01)
-    unseen, _ = vehicle.sense(prepared, state, seen_at(np.array([np.inf, np.inf])))
+    unseen, _ = CAR.sense(cars, state, seen(0.0, 10.0, np.full(2, np.inf)))
     assert np.isfinite(unseen.lateral).all()
 
 
@@ -492,14 +440,13 @@ def test_lost_frames_repeat_the_last_one_in_a_pattern_that_all_vehicles_share() 
     shares = [0.0, 0.25, 0.25, 0.5]
     patterns = []
     for seed in (3, 3, 4):
-        vehicle, prepared, state = sensors(sensorDropout=shares)
-        seeded = vehicle.seeded(seed)
+        cars, state = sensors(4, sensorDropout=shares)
+        seeded = CAR.seeded(seed)
         gaps = []
         for k in range(400):
-            seen, state = seeded.sense(
-                prepared, state, seen_at(np.full(4, 1000.0 - k) / 20, k * 0.05)
-            )
-            gaps.append(seen.gap * 20)
+            now = seen(k * 0.05, 10.0, np.full(4, 1000.0 - k) / 20)
+            sensed, state = seeded.sense(cars, state, now)
+            gaps.append(sensed.gap * 20)
         patterns.append(np.diff(np.array(gaps), axis=0) == 0)
     lost = patterns[0]
     assert np.array_equal(lost, patterns[1])
@@ -512,8 +459,8 @@ def test_lost_frames_repeat_the_last_one_in_a_pattern_that_all_vehicles_share() 
 
 def test_a_study_without_them_drives_as_with_none() -> None:
     """`wear` keeps its bytes, and an original of 0 counts with the domain's width in f_diff."""
-    with_them = assemble(load_study("sensing", matrix=None))
-    without = assemble(load_study("wear", matrix=None))
+    with_them = system_of("sensing", matrix=None)
+    without = system_of("wear", matrix=None)
     settings = drawn(without, 6, 2)
     ours = drive_and_score(
         with_them, np.concatenate([settings, np.zeros((6, 2))], axis=1)
