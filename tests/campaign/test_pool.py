@@ -36,18 +36,16 @@ from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ModelTable, Origin, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.campaign.formulas import SUN, evaluated
-from tests.in_process import SLOW, write
+from tests.campaign.formulas import evaluated
+from tests.end_to_end.conftest import workers_of
+from tests.in_process import SLOW
+from tests.made_up import SUN
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 
 
 def processes() -> list[psutil.Process]:
-    return [
-        child
-        for child in psutil.Process().children()
-        if "spawn_main" in " ".join(child.cmdline())
-    ]
+    return workers_of(os.getpid())
 
 
 @pytest.fixture
@@ -102,24 +100,13 @@ def take(task: Task, seconds: float) -> None:
 
 
 @SLOW
-def test_work_of_which_two_workers_die_is_named_with_its_study_and_user_code(
-    pool: Pool, in_tmp: Path
-) -> None:
-    write(
-        "my_ads.py",
-        "from safevar_sumo.ads import ScalarAds\n"
-        "class Mine(ScalarAds):\n"
-        "    def drive(self, seen):\n"
-        "        return 0.1, 0.0\n",
-    )
+def test_work_of_which_two_workers_die_is_named_with_its_study(pool: Pool) -> None:
+    """And with its user code, as a test of studies in processes of their own says."""
     study = load_study("smoke", search={"time_limit": 0.2})
     why = "two workers were lost at the same work, 9: a batch took longer than the time limit"
     with pytest.raises(SafevarError, match=f"study 'smoke': {why}"):
         carry_out(take, [(Task(study=study), 9)], pool)
     assert not processes(), "it would keep a core busy beside its successor"
-    mine = replace(study, ads=ModelTable(model="my_ads:Mine"), spread={})
-    with pytest.raises(UserCodeError, match=r"probably in ads\.model = 'my_ads:Mine'"):
-        carry_out(take, [(Task(study=mine), 9)], pool)
 
 
 def test_an_error_of_the_study_arrives_as_it_is(pool: Pool) -> None:

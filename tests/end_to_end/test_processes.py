@@ -14,16 +14,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 
 from safevar_sumo.campaign import batches
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.results import load_runs, write_whole
+from tests.campaign.formulas import solutions
 from tests.end_to_end.conftest import (
     ended,
+    has_loaded,
     killed,
-    solutions,
     started,
     until,
     workers_of,
@@ -68,15 +68,10 @@ def assert_ends_with_the_results(process: Process, whole: Path) -> None:
 def test_ctrl_c_ends_everything_with_code_130(when: str) -> None:
     process = started("study rain --out out --jobs 1 --engine sumo")
     if when == "loading":
-        until(
-            lambda: any(
-                "numpy" in one.path for one in psutil.Process(process.pid).memory_maps()
-            ),
-            process,
-        )
+        until(lambda: has_loaded(process, "numpy"), process)
     else:
         until_it_writes(process)
-        loaded = " ".join(one.path for one in workers_of(process)[0].memory_maps())
+        loaded = " ".join(one.path for one in workers_of(process.pid)[0].memory_maps())
         assert "libsumo" in loaded
         assert not any(
             name in loaded for name in ("pandas", "pyarrow", "matplotlib")
@@ -108,6 +103,19 @@ def test_a_signal_to_end_ends_everything_as_ctrl_c_does_and_leaves_nothing(
     assert not [*Path("temporary").iterdir()]
 
 
+def one_killed_and_one_at_work(code: str) -> tuple[list[str], Process]:
+    """Start a program twice, which prints a name and then waits for its input, and kill the first;
+    returns both names and the second.
+    """
+    command = [sys.executable, "-c", code]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    both = [subprocess.Popen(command, text=True, **pipes) for _ in range(2)]
+    names = [process.stdout.readline().strip() for process in both if process.stdout]
+    both[0].kill()
+    both[0].wait()
+    return names, both[1]
+
+
 def test_what_a_killed_write_left_is_removed_by_the_next_and_what_is_being_written_stays(
     in_tmp: Path,
 ) -> None:
@@ -116,22 +124,15 @@ def test_what_a_killed_write_left_is_removed_by_the_next_and_what_is_being_writt
         " whole_file(Path('page.html')) as file:\n    file.write_text('half')\n    print(file.name,"
         " flush=True)\n    sys.stdin.read()\n"
     )
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    writers = [
-        subprocess.Popen([sys.executable, "-c", code], text=True, **pipes)
-        for _ in range(2)
-    ]
-    names = [writer.stdout.readline().strip() for writer in writers if writer.stdout]
-    writers[0].kill()
-    writers[0].wait()
+    names, writer = one_killed_and_one_at_work(code)
     before = time.time() - 60
     for name in (*names, ".page.0badcafe.tmp.html"):
         Path(name).touch()
         os.utime(name, (before, before))
     write_whole(Path("page.html"), "whole")
     assert sorted(path.name for path in in_tmp.glob(".page*")) == [names[1]]
-    writers[1].communicate("", timeout=60)
-    assert writers[1].returncode == 0
+    writer.communicate("", timeout=60)
+    assert writer.returncode == 0
     assert Path("page.html").read_text() == "half"
     assert not [*in_tmp.glob(".page*")]
 
@@ -148,21 +149,13 @@ def test_a_temporary_folder_is_removed_once_its_process_was_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    command = [sys.executable, "-c", HOLDING]
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    holders = [
-        subprocess.Popen(command, text=True, env=environment, **pipes) for _ in range(2)
-    ]
-    folders = [
-        Path(holder.stdout.readline().strip()) for holder in holders if holder.stdout
-    ]
-    holders[0].kill()
-    holders[0].wait()
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    names, holder = one_killed_and_one_at_work(HOLDING)
+    folders = [Path(name) for name in names]
     with open_pool(1):
         assert len({*tmp_path.glob("safevar-*")} - {*folders}) == 1
         assert [folder.exists() for folder in folders] == [False, True]
-    holders[1].communicate("", timeout=60)
+    holder.communicate("", timeout=60)
     assert not [*tmp_path.glob("safevar-*")]
 
 
@@ -269,15 +262,17 @@ def test_user_code_that_its_workers_die_of_is_an_error_with_its_line(
     assert "in ads.model = 'my_ads:Deadly'" in errors
 
 
-Start = Callable[..., Process]
+Start = Callable[..., tuple[Process, str]]
 
 
 @pytest.fixture
 def start(small: None) -> Iterator[Start]:
-    """Starts a program of Dask's in a process group of its own; all are ended with the test."""
+    """Starts a program of Dask's in a process group of its own, and waits until its log says
+    something; returns the process and the log. All are ended with the test.
+    """
     running = []
 
-    def begin(program: str, *arguments: str) -> Process:
+    def begin(program: str, said: str, *arguments: str) -> tuple[Process, str]:
         command = [
             sys.executable,
             "-m",
@@ -289,18 +284,19 @@ def start(small: None) -> Iterator[Start]:
             **os.environ,
             "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
         }
-        with open(f"{program}-{len(running)}.log", "w") as log:
-            running.append(
-                subprocess.Popen(
-                    command,
-                    stdout=log,
-                    stderr=log,
-                    text=True,
-                    start_new_session=True,
-                    env=environment,
-                )
+        log = Path(f"{program}-{len(running)}.log")
+        with log.open("w") as file:
+            process = subprocess.Popen(
+                command,
+                stdout=file,
+                stderr=file,
+                text=True,
+                start_new_session=True,
+                env=environment,
             )
-        return running[-1]
+        running.append(process)
+        until(lambda: said in log.read_text(), process)
+        return process, log.read_text()
 
     yield begin
     for process in running:
@@ -310,45 +306,28 @@ def start(small: None) -> Iterator[Start]:
 
 
 @pytest.fixture
-def scheduler(start: Start) -> tuple[Process, str]:
-    """A scheduler and its address."""
-    process = start("scheduler", "--host", "127.0.0.1", "--port", "0")
-    log = Path("scheduler-0.log")
-    until(lambda: "Scheduler at:" in log.read_text(), process)
-    return process, next(
-        line.split()[-1]
-        for line in log.read_text().splitlines()
-        if "Scheduler at:" in line
-    )
+def address(start: Start) -> str:
+    """The address of a scheduler."""
+    said = "Scheduler at:"
+    _, log = start("scheduler", said, "--host", "127.0.0.1", "--port", "0")
+    return log.partition(said)[2].split()[0]
 
 
-def worker(start: Start, address: str, *options: str) -> Process:
-    return start(
-        "worker", address, "--nthreads", "1", "--local-directory", "scratch", *options
-    )
-
-
-def busy(process: Process) -> bool:
-    """Whether a worker has loaded a compiled vehicle, so computes."""
-    return any(
-        "llvmlite" in one.path for one in psutil.Process(process.pid).memory_maps()
-    )
+def worker(start: Start, address: str) -> Process:
+    options = "--nthreads", "1", "--local-directory", "scratch", "--no-nanny"
+    process, _ = start("worker", "Registered to", address, *options)
+    return process
 
 
 @SLOW
 def test_two_workers_of_which_one_is_killed_leave_the_same_bytes(
-    scheduler: tuple[Process, str], start: Start, whole: Path
+    address: str, start: Start, whole: Path
 ) -> None:
-    _, address = scheduler
-    workers = [worker(start, address, "--no-nanny") for _ in range(2)]
-    until(
-        lambda: all(
-            "Registered to" in Path(f"worker-{i}.log").read_text() for i in (1, 2)
-        ),
-        workers[0],
-    )
+    workers = [worker(start, address) for _ in range(2)]
     process = started(f"study small.toml --cluster {address} --out out", batch=1)
-    until(lambda: written(OUT) > 0 and all(busy(one) for one in workers), process)
+    until_it_writes(process)
+    for one in workers:  # each loads the compiled vehicle, and computes
+        until(lambda: has_loaded(one, "llvmlite"), process)  # noqa: B023
     assert process.poll() is None, "too late: the study is over"
     killed(workers[0])
     assert_ends_with_the_results(process, whole)
@@ -375,16 +354,13 @@ class Counted(Wall):
 
 @SLOW
 def test_questions_on_a_cluster_have_the_bytes_of_one_process(
-    scheduler: tuple[Process, str], start: Start
+    address: str, start: Start
 ) -> None:
     """A worker that dies is replaced, with its number; one with another file ends the command."""
     write("models.py", MODELS)
     write("counted.py", COUNTED)
     write("wall.toml", STUDY.replace("models:Wall", "counted:Counted"))
-    _, address = scheduler
-    workers = [worker(start, address, "--no-nanny") for _ in range(2)]
-    logs = [Path(f"worker-{number}.log") for number in (1, 2)]
-    until(lambda: all("Registered to" in log.read_text() for log in logs), workers[0])
+    workers = [worker(start, address) for _ in range(2)]
     for command in (
         "risk rain --samples 300",
         "explain rain --quick",
@@ -414,16 +390,10 @@ def test_questions_on_a_cluster_have_the_bytes_of_one_process(
 
 
 @SLOW
-def test_a_worker_with_another_file_ends_a_question(
-    scheduler: tuple[Process, str], start: Start
-) -> None:
-    _, address = scheduler
+def test_a_worker_with_another_file_ends_a_question(address: str, start: Start) -> None:
     write("models.py", MODELS)
     write("wall.toml", STUDY)
-    until(
-        lambda: "Registered to" in Path("worker-1.log").read_text(),
-        worker(start, address, "--no-nanny"),
-    )
+    worker(start, address)
     wrong = "safevar_sumo.campaign.batches"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(f"{wrong}.package_digest", lambda: "other")
