@@ -17,13 +17,14 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from safevar_sumo.api.simulation import load_study, simulate_with_original
+from safevar_sumo.api.simulation import load_study, simulate
 from safevar_sumo.questions.part import at_point
 from safevar_sumo.records import JsonObject
 from safevar_sumo.replay.comparison import Comparison, comparison_of
 from safevar_sumo.replay.export import Poses
 from safevar_sumo.results import write_imported
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.study import Study
+from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import SLOW, refused, run
 from tests.made_up import made_up_evaluations
 from tests.support.needs import (
@@ -43,11 +44,9 @@ SCENES = {
 HANDLE = "--solution made:0:0"
 
 
-def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]:
-    """Results with one solution: the original, a tenth of each domain away from it."""
-    study = load_study(study_name)
-    system = assemble(study)
-    characteristics = system.characteristics
+def results_of(study: Study, folder: Path) -> tuple[Path, dict[str, float]]:
+    """Results with one solution, and its setting: a tenth of each domain away from the original."""
+    characteristics = CharacteristicSet.of(study)
     middle = (characteristics.lower + characteristics.upper) / 2
     setting = characteristics.original + np.sign(
         middle - characteristics.original
@@ -65,7 +64,7 @@ def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]
         {"safety_degree": 1.0},
         {"made": "made.csv"},
     )
-    return folder / "results", system, setting
+    return folder / "results", characteristics.named(setting)
 
 
 @pytest.fixture(
@@ -78,16 +77,14 @@ def results_of(study_name: str, folder: Path) -> tuple[Path, System, np.ndarray]
 def exported(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Comparison]:
-    study, point = SCENES[request.param]
-    results, system, setting = results_of(study, tmp_path_factory.mktemp(request.param))
+    name, point = SCENES[request.param]
+    study = load_study(name)
+    results, setting = results_of(study, tmp_path_factory.mktemp(request.param))
     out = results.with_name("out")
     chosen = f"--point '{point}'" if point else ""
-    done = run(f"export {results} {HANDLE} {chosen} --to openscenario --out {out}")
-    (results / "printed.txt").write_text(done.stdout)
-    there = assemble(at_point(load_study(study), point)) if point else system
-    return out, comparison_of(
-        simulate_with_original(load_study(study), there, setting, filtered=False)
-    )
+    run(f"export {results} {HANDLE} {chosen} --to openscenario --out {out}")
+    there = at_point(study, point) if point else study
+    return out, comparison_of(simulate(there, setting))
 
 
 @SLOW
@@ -181,14 +178,14 @@ def test_asam_finds_no_fault(exported: tuple[Path, Comparison]) -> None:
         assert "<Issue " not in report.read_text()
 
 
-ForCarla = tuple[Any, JsonObject, np.ndarray]
+ForCarla = tuple[Any, JsonObject, dict[str, float]]
 
 
 @pytest.fixture
 def for_carla(tmp_path: Path) -> ForCarla:
     """The exported script's functions, its record, and the setting."""
     need_library("carla")
-    results, _, setting = results_of("rain", tmp_path)
+    results, setting = results_of(load_study("rain"), tmp_path)
     run(f"export {results} {HANDLE} --to carla --out {tmp_path / 'out'}")
     script = SimpleNamespace(**runpy.run_path(str(tmp_path / "out/run_in_carla.py")))
     return script, json.loads((tmp_path / "out/vehicle.json").read_text()), setting
@@ -218,7 +215,9 @@ def test_carla_gets_all_twelve_values_in_its_units(for_carla: ForCarla) -> None:
         physics.drag_coefficient,
     ]
     for wheel in wheel_values:  # in the order of the paper's table; float32 in CARLA
-        assert np.allclose([*body_values, *wheel], setting, rtol=1e-6, atol=0)
+        assert np.allclose(
+            [*body_values, *wheel], [*setting.values()], rtol=1e-6, atol=0
+        )
     assert 30 < wheel_values[0][2] < 40, "centimetres"
 
 
@@ -226,11 +225,7 @@ def test_carla_gets_pedals_places_and_walker(for_carla: ForCarla) -> None:
     import carla
 
     script, scene, setting = for_carla
-    comparison = comparison_of(
-        simulate_with_original(
-            load_study("rain"), assemble(load_study("rain")), setting, filtered=False
-        )
-    )
+    comparison = comparison_of(simulate("rain", setting))
     control = script.pedals(scene, 3)
     end = comparison.moments[-1].end
     assert control.throttle == pytest.approx(comparison.runs.trace.throttle[3, -1])
@@ -274,7 +269,7 @@ def test_the_script_drives_the_whole_record(for_carla: ForCarla) -> None:
 
 
 def test_what_carla_has_no_counterpart_of_is_refused(tmp_path: Path) -> None:
-    worn, _, _ = results_of("wear", tmp_path)
+    worn, _ = results_of(load_study("wear"), tmp_path)
     out = tmp_path / "out"
     refused(
         f"export {worn} {HANDLE} --to carla --out {out}",

@@ -20,7 +20,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image, ImageSequence
 
-from safevar_sumo.api.simulation import simulate_with_original
+from safevar_sumo.api.simulation import simulate
 from safevar_sumo.questions.case import Case
 from safevar_sumo.replay import animation, gui
 from safevar_sumo.replay.animation import (
@@ -40,20 +40,12 @@ from safevar_sumo.replay.comparison import (
 )
 from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
-from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW
 from tests.support.needs import need_program
 
 
 def test_a_replay_that_differs_from_its_row_is_reported(case: Case) -> None:
-    comparison = comparison_of(
-        simulate_with_original(
-            case.study,
-            assemble(case.study),
-            case.characteristics.original,
-            filtered=False,
-        )
-    )
+    comparison = comparison_of(simulate(case.study))
     result = list_differences(
         comparison.evaluations,
         {"safety_degree": 1.0, "tet": np.nan, "outcome": "collision"},
@@ -67,14 +59,8 @@ def test_a_replay_that_differs_from_its_row_is_reported(case: Case) -> None:
 
 @pytest.fixture(scope="module")
 def comparison(case: Case) -> Comparison:
-    return comparison_of(
-        simulate_with_original(
-            case.study,
-            assemble(case.study),
-            case.solutions[list(case.characteristics.names)].to_numpy()[0],
-            filtered=False,
-        )
-    )
+    settings = case.solutions[list(case.characteristics.names)]
+    return comparison_of(simulate(case.study, settings.iloc[0]))
 
 
 def test_moments_of_a_drive(comparison: Comparison) -> None:

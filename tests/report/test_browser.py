@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from safevar_sumo.api.simulation import simulate_with_original
+from safevar_sumo.api.simulation import simulate
 from safevar_sumo.questions.case import Case
 from safevar_sumo.replay.animation import PLAYER_FOLDER, animate
 from safevar_sumo.replay.comparison import comparison_of
 from safevar_sumo.report.page import TEMPLATE_FOLDER
 from safevar_sumo.study.file import study_names
-from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW
 from tests.report.test_sheet import sheet_of_shipped
 from tests.support.needs import need_library, need_program
@@ -116,15 +115,9 @@ def try_player(browser: Chrome, player: WebElement) -> None:
 def test_an_animation_plays_and_scrubs_as_a_file(
     browser: Chrome, case: Case, tmp_path: Path
 ) -> None:
-    setting = case.solutions[list(case.characteristics.names)].to_numpy()[0]
-    animate(
-        comparison_of(
-            simulate_with_original(
-                case.study, assemble(case.study), setting, filtered=False
-            )
-        ),
-        tmp_path / "it.html",
-    )
+    settings = case.solutions[list(case.characteristics.names)]
+    simulation = simulate(case.study, settings.iloc[0])
+    animate(comparison_of(simulation), tmp_path / "it.html")
     opened(browser, tmp_path / "it.html")
     try_player(browser, browser.find_element(By.CSS_SELECTOR, ".animation"))
     assert [entry["message"] for entry in browser.get_log("browser")] == []
