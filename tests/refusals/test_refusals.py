@@ -8,33 +8,25 @@ Each `[[refused]]` of a table beside this file is one mistake:
   slash;
 - `in` is a file that is there already, `adds` what is added to it, and `old` and `new` a change of
   it; a message about a command that names the file has its name, too;
-- `folder` is what the user has begun with, a name of `FOLDERS`;
+- `folder` is "network" where the user has begun with a copy of a shipped network, `mine`;
 - `base` is what the row has in common with others, a table of the same keys above the rows;
   `[default]` is in common to all.
 """
 
 from __future__ import annotations
 
-import shutil
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from safevar_sumo.shipped import NETWORKS
-from tests.in_process import SLOW, refused
-
-FOLDERS: dict[str, Callable[[Path], object]] = {
-    "network": lambda folder: shutil.copytree(
-        NETWORKS / "pedestrian_crossing", folder / "mine"
-    )
-}
+from tests.in_process import SLOW, own_network, refused
 
 
-def rows(table: str = "*") -> Iterator[Any]:
-    for path in sorted(Path(__file__).parent.glob(f"{table}.toml")):
+def rows() -> Iterator[Any]:
+    for path in sorted(Path(__file__).parent.glob("*.toml")):
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
         for row in tables["refused"]:
             base = tables["base"][row["base"]] if "base" in row else {}
@@ -50,8 +42,8 @@ def rows(table: str = "*") -> Iterator[Any]:
 
 def prepare(folder: Path, row: dict[str, Any]) -> None:
     """Write the files of a row."""
-    if "folder" in row:
-        FOLDERS[row["folder"]](folder)
+    if row.get("folder") == "network":
+        own_network(folder / "mine")
     for name in (name for name in row if "." in name or "/" in name):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)

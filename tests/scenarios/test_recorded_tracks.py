@@ -211,12 +211,10 @@ def test_the_lines_of_the_page_make_a_table_of_a_log_of_esmini(
 HEADER = "time,name,x,y,heading,speed,length,width\n0,ego,0,0,0,11.1,4.6,1.8\n"
 
 
-def rows_of_walker(
-    heading: float, speed: float = 1.5, size: str = "0.5,0.6", way: float = 7.5
-) -> str:
+def rows_of_walker(heading: float, size: str = "0.5,0.6") -> str:
     return HEADER + "".join(
-        f"{time},walker,45,{y},{heading},{speed},{size}\n"
-        for time, y in ((0.0, -5.0), (5.0, way - 5.0))
+        f"{time},walker,45,{y},{heading},1.5,{size}\n"
+        for time, y in ((0.0, -5.0), (5.0, 2.5))
     )
 
 

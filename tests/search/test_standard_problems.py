@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import moocore
@@ -74,16 +73,14 @@ class Unfiltered(CharacteristicSet):
         return settings
 
 
-@dataclass
 class StandardScoring:
     """The objectives of a standard problem in place of a vehicle's."""
 
-    problem: StandardProblem
-    metrics: Any = PUBLISHED_SCORING.metrics
-    objectives: list[None] = field(init=False)
+    metrics = PUBLISHED_SCORING.metrics
 
-    def __post_init__(self) -> None:
-        self.objectives = [None] * len(self.problem.reference)
+    def __init__(self, problem: StandardProblem) -> None:
+        self.problem = problem
+        self.objectives = [None] * len(problem.reference)
 
     def values(self, evaluations: Evaluations) -> FloatArray:
         return self.problem.objectives(evaluations.settings - 1)
