@@ -4,113 +4,43 @@ from __future__ import annotations
 
 import subprocess
 import xml.etree.ElementTree as ET
-from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
+import pandas as pd
 import pytest
 from numpy.random import default_rng
 
 from safevar_sumo.metrics import OPTIONAL_METRICS
-from safevar_sumo.records import Encounter, FloatArray, SimulationRuns
-from safevar_sumo.study import MetricsTable
+from safevar_sumo.records import Encounter
 from safevar_sumo.sumo.network import program_of_sumo
 from tests.in_process import SLOW
 from tests.made_up import made_up_runs
 
-RUNS = 50
+ROADS = 50
+"""Each with a car that drives up to a slower one."""
 STEP = 0.05
 LENGTH = 5.0
-WIDTH = 3.2
-"""Of vehicles and lanes: the device takes lanes for bodies."""
-THRESHOLDS = MetricsTable(ttc_threshold=2.0)
 DEVICE = (
-    ("has.ssm.device", "true"),
-    ("device.ssm.measures", "TTC DRAC"),
-    ("device.ssm.thresholds", "1e4 0"),
+    '<param key="has.ssm.device" value="true"/>'
+    '<param key="device.ssm.measures" value="TTC DRAC"/>'
+    '<param key="device.ssm.thresholds" value="1e4 0"/>'
 )
-Rows = dict[str, dict[float, tuple[float, float, float]]]
+COMMANDS = (
+    "netconvert -n nodes.xml -e edges.xml -o net.xml",
+    f"sumo -n net.xml -r routes.xml --step-length {STEP} --fcd-output places.csv --precision 6"
+    " --device.ssm.file conflicts.xml --device.ssm.range 400 --end 50",
+)
 
 
-def vehicle(
-    name: str, route: str, depart: float, place: float, speed: float, *, ego: bool
-) -> str:
-    """A vehicle that keeps its speed; that under test has the device, and brakes for who is
-    ahead.
-    """
-    params = "".join(
-        f'<param key="{key}" value="{value}"/>' for key, value in DEVICE if ego
-    )
+def vehicle(name: str, road: int, place: float, speed: float, device: str = "") -> str:
+    """A vehicle that keeps its speed until it brakes for who is ahead."""
     return (
-        f'<vType id="t{name}" length="{LENGTH}" width="{WIDTH}" maxSpeed="{speed}" accel="8"'
-        ' decel="9" tau="0.05" minGap="0" sigma="0" speedDev="0" jmIgnoreFoeProb="1"'
-        f' jmIgnoreFoeSpeed="99" jmIgnoreJunctionFoeProb="1"/><vehicle id="{name}" type="t{name}"'
-        f' route="{route}" depart="{depart}" departPos="{place}" departSpeed="{speed}"'
-        f' insertionChecks="none">{params}</vehicle>'
+        f'<vType id="{name}" length="{LENGTH}" maxSpeed="{speed}" accel="8" decel="9" tau="0.05"'
+        f' minGap="0" sigma="0" speedDev="0"/><vehicle id="{name}" type="{name}" route="{road}"'
+        f' depart="0" departPos="{place}" departSpeed="{speed}" insertionChecks="none">{device}'
+        "</vehicle>"
     )
-
-
-def simulate(
-    folder: Path, nodes: str, edges: str, traffic: list[str]
-) -> tuple[Rows, dict[str, ET.Element]]:
-    """SUMO's rows by vehicle and time: x, y, speed; and the conflict that the device of each
-    vehicle reports.
-    """
-    (folder / "n.xml").write_text(f"<nodes>{nodes}</nodes>")
-    (folder / "e.xml").write_text(f"<edges>{edges}</edges>")
-    (folder / "r.xml").write_text(f"<routes>{''.join(traffic)}</routes>")
-    net = (
-        "netconvert",
-        "-n",
-        "n.xml",
-        "-e",
-        "e.xml",
-        "-o",
-        "net.xml",
-        "--no-turnarounds",
-        "--no-internal-links=false",
-    )
-    run = (
-        f"sumo -n net.xml -r r.xml --step-length {STEP} --fcd-output fcd.xml --precision 6"
-        " --collision.action none"
-    )
-    run += (
-        " --device.ssm.file ssm.xml --device.ssm.range 400 --time-to-teleport -1"
-        " --device.ssm.extratime 60"
-    )
-    for name, *words in (net, run.split()):
-        subprocess.run(
-            [program_of_sumo(name, "test"), *words],
-            cwd=folder,
-            check=True,
-            capture_output=True,
-        )
-    rows: Rows = defaultdict(dict)
-    for step in ET.parse(folder / "fcd.xml").getroot():
-        for row in step:
-            values = (
-                float(row.attrib["x"]),
-                float(row.attrib["y"]),
-                float(row.attrib["speed"]),
-            )
-            rows[row.attrib["id"]][float(step.attrib["time"])] = values
-    return rows, {
-        row.attrib["ego"] + row.attrib["foe"]: row
-        for row in ET.parse(folder / "ssm.xml").getroot()
-    }
-
-
-def shared(rows: Rows, one: str, other: str) -> tuple[FloatArray, FloatArray]:
-    """The rows of two vehicles at the times at which both are on the road, shape (T, 3) each."""
-    times = sorted(rows[one].keys() & rows[other].keys())
-    return np.array([rows[one][time] for time in times]), np.array(
-        [rows[other][time] for time in times]
-    )
-
-
-def measured(name: str, run: SimulationRuns) -> float:
-    return float(OPTIONAL_METRICS[name].function(run, THRESHOLDS)[0])
 
 
 @SLOW
@@ -121,23 +51,42 @@ def test_behind_a_slower_car_ttc_and_drac_are_those_of_the_device(
     steps.
     """
     rng = default_rng(1)
-    traffic = list[str]()
-    nodes = edges = ""
-    for i in range(RUNS):
-        nodes += f'<node id="a{i}" x="0" y="{20 * i}"/><node id="b{i}" x="600" y="{20 * i}"/>'
-        edges += f'<edge id="e{i}" from="a{i}" to="b{i}" numLanes="1" speed="50" width="{WIDTH}"/>'
-        traffic.append(f'<route id="r{i}" edges="e{i}"/>')
-        fast, slow, gap = rng.uniform(12, 30), rng.uniform(1, 10), rng.uniform(30, 80)
-        traffic.append(vehicle(f"ego{i}", f"r{i}", 0, 50, fast, ego=True))
-        traffic.append(
-            vehicle(f"foe{i}", f"r{i}", 0, 50 + LENGTH + gap, slow, ego=False)
+    nodes = edges = routes = ""
+    for road in range(ROADS):
+        nodes += f'<node id="a{road}" x="0" y="{20 * road}"/>'
+        nodes += f'<node id="b{road}" x="600" y="{20 * road}"/>'
+        edges += (
+            f'<edge id="{road}" from="a{road}" to="b{road}" numLanes="1" speed="50"/>'
         )
-    rows, conflicts = simulate(tmp_path, nodes, edges, traffic)
-    for i in range(RUNS):
-        ego, foe = shared(rows, f"ego{i}", f"foe{i}")
-        gap, closing = (foe - ego)[:, [0]] - LENGTH, (ego - foe)[:, [2]]
-        run = made_up_runs(STEP, ego[:, [2]], gap)
-        run = replace(run, encounter=Encounter(gap, gap, closing, gap > 0))
-        for name, tag in (("ttc_min", "minTTC"), ("drac", "maxDRAC")):
-            of_device = float(conflicts[f"ego{i}foe{i}"].find(tag).attrib["value"])
-            assert measured(name, run) == pytest.approx(of_device, rel=2e-3)
+        routes += f'<route id="{road}" edges="{road}"/>'
+        fast, slow, gap = rng.uniform((12, 1, 30), (30, 10, 80))
+        routes += vehicle(f"fast{road}", road, 50, fast, DEVICE)
+        routes += vehicle(f"slow{road}", road, 50 + LENGTH + gap, slow)
+    for name, text in (("nodes", nodes), ("edges", edges), ("routes", routes)):
+        (tmp_path / f"{name}.xml").write_text(f"<{name}>{text}</{name}>")
+    for command in COMMANDS:
+        program, *options = command.split()
+        words = [program_of_sumo(program, "test"), *options]
+        subprocess.run(words, cwd=tmp_path, check=True, capture_output=True)
+
+    quantities = ["vehicle_x", "vehicle_speed"]
+    drives = pd.read_csv(tmp_path / "places.csv", sep=";").pivot_table(
+        index="timestep_time", columns="vehicle_id", values=quantities
+    )
+    places, speeds = (drives[name] for name in quantities)
+    cars = [f"fast{road}" for road in range(ROADS)]
+    leaders = [f"slow{road}" for road in range(ROADS)]
+    gap = places[leaders].to_numpy() - places[cars].to_numpy() - LENGTH
+    own = speeds[cars].to_numpy()
+    closing = own - speeds[leaders].to_numpy()
+    runs = made_up_runs(STEP, own, gap)
+    runs = replace(runs, encounter=Encounter(gap, gap, closing, gap > 0))
+    found = ET.parse(tmp_path / "conflicts.xml").getroot()
+    conflicts = {row.attrib["ego"]: row for row in found}
+    for name, tag in (("ttc_min", "minTTC"), ("drac", "maxDRAC")):
+        of_device = [
+            float(conflicts[one].find(tag).attrib["value"])  # type: ignore[union-attr]
+            for one in cars
+        ]
+        measured = OPTIONAL_METRICS[name].function(runs, None)
+        assert measured == pytest.approx(of_device, rel=2e-3)
