@@ -20,14 +20,19 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import COMMANDS, command_function
 from safevar_sumo.plugins import ImportPath
-from safevar_sumo.questions import cases
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.sumo.system import System
-from tests.in_process import EVERY_STUDY, InlinePool, inline_worker, searched
+from tests.in_process import (
+    EVERY_STUDY,
+    InlinePool,
+    allow_few_simulations,
+    inline_worker,
+    searched,
+)
 from tests.made_up import system_of
 
 collect_ignore = (
@@ -137,12 +142,7 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Claims are falsified with the fewest simulations that are enough to print them."""
-    monkeypatch.setattr(cases, "USUAL_BUDGET", cases.LEAST_SIMULATIONS)
-    few = asked.USUAL._replace(
-        cases=cases.LEAST_SIMULATIONS, alone=cases.LEAST_SIMULATIONS
-    )
-    monkeypatch.setattr(asked, "USUAL", few)
+    allow_few_simulations(monkeypatch)
 
 
 @pytest.fixture(params=EVERY_STUDY)

@@ -26,6 +26,8 @@ from safevar_sumo.campaign import all_runs, evaluation, run_campaign
 from safevar_sumo.campaign.pool import Pool
 from safevar_sumo.cli.program import run_command_line
 from safevar_sumo.errors import INTERRUPTS
+from safevar_sumo.questions import cases
+from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.records import FloatArray
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.study import Study, study_names
@@ -123,6 +125,13 @@ def verify_everywhere(system: System, settings: FloatArray) -> None:
         assert not verify_in_sumo(
             system.at(point), settings, np.zeros(len(settings), dtype=int)
         )
+
+
+def allow_few_simulations(patch: pytest.MonkeyPatch) -> None:
+    """Claims are falsified with the fewest simulations that are enough to print them."""
+    least = cases.LEAST_SIMULATIONS
+    patch.setattr(cases, "USUAL_BUDGET", least)
+    patch.setattr(asked, "USUAL", asked.USUAL._replace(cases=least, alone=least))
 
 
 class CommandOutput(NamedTuple):

@@ -34,8 +34,7 @@ import pytest
 from click.testing import CliRunner
 
 from safevar_sumo.cli.program import commands
-from safevar_sumo.questions import cases
-from safevar_sumo.questions.tolerance import asked
+from tests.in_process import allow_few_simulations
 from tests.manual import PROGRAM, ROOT, Block, blocks
 
 PAGES = [
@@ -130,10 +129,7 @@ def run_page(page: str, options_of_tests: bool) -> Iterator[tuple[Block, str]]:
             added = ""
             with pytest.MonkeyPatch.context() as patch:
                 if is_shortened and (options_of_tests or not is_shown):
-                    least = cases.LEAST_SIMULATIONS
-                    patch.setattr(cases, "USUAL_BUDGET", least)
-                    few = asked.USUAL._replace(cases=least, alone=least)
-                    patch.setattr(asked, "USUAL", few)
+                    allow_few_simulations(patch)
                     added = block.comment.removeprefix("in tests").replace(":", "", 1)
                 printed = "".join(
                     _run(line, added, code) for line in block.text.splitlines()

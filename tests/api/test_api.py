@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -262,26 +261,6 @@ def test_a_run_refuses_what_its_command_refuses(
         ):
             with pytest.raises(sv.InputError, match="jobs"):
                 ask("smoke", jobs=options["jobs"])
-
-
-@pytest.mark.parametrize(
-    ("function", "argument", "values"),
-    [
-        (sv.load, "directory", {"directory": 3}),
-        (sv.tables, "directory", 3),
-        (sv.report, "results", 3),
-        (sv.run, "out", {"study": "smoke", "out": 3}),
-        (sv.risk, "point", {"source": "wear", "point": 3}),
-        (sv.tolerance, "up_to", {"source": "smoke", "up_to": 3}),
-    ],
-)
-def test_a_value_of_another_type_is_refused_by_the_name_of_its_argument(
-    function: Callable[..., object], argument: str, values: Any
-) -> None:
-    with pytest.raises(
-        sv.InputError, match=f"^{argument}: 3\nexpected: a text or a path"
-    ):
-        function(**values) if isinstance(values, dict) else function(values)
 
 
 @SLOW

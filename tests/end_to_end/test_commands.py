@@ -124,27 +124,14 @@ extends = "smoke"
 name = "mine"
 [ads]
 model = "my_ads:Careful"
-[scenario.parameters]
-network = "my_net"
-[search]
-algorithms = ["rs"]
-evaluations = 30
-runs = 1
-"""
-
-
-@pytest.fixture
-def mine(in_tmp: Path) -> None:
-    write("my_ads.py", ADS)
-    write("my_map.py", "GAP = 9.0\n")
-    write("mine.toml", STUDY)
-    own_network(Path("my_net"))
-
-
-MATRIX = """
 [scenario]
 files = ["table.txt", "near.txt", "far.txt"]
-[matrix]
+parameters = { network = "my_net" }
+[search]
+algorithms = ["rs"]
+evaluations = 4
+population = 2
+runs = 1
 [[matrix.tests]]
 name = "as it is"
 [[matrix.tests]]
@@ -171,20 +158,18 @@ class Test(PedestrianCrossing, frozen=True):
 
 @SLOW
 def test_code_and_named_files_count_and_every_command_that_simulates_results_refuses_by_name(
-    mine: None, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    Path("mine.toml").write_text(
-        STUDY.replace("evaluations = 30", "evaluations = 4\npopulation = 2") + MATRIX
-    )
-    files = {"my_test.py": TEST, "table.txt": "1", "near.txt": "2", "far.txt": "3"}
+    write("mine.toml", STUDY)
+    own_network(Path("my_net"))
+    files = {"my_ads.py": ADS, "my_map.py": "GAP = 9.0\n", "my_test.py": TEST}
+    files |= {"table.txt": "1", "near.txt": "2", "far.txt": "3"}
     for name, text in files.items():
-        Path(name).write_text(text)
+        write(name, text)
     Path("elsewhere").mkdir()
     monkeypatch.chdir("elsewhere")
     run("study ../mine.toml --out ../out --quiet")
-    assert {*files, "my_ads.py", "my_map.py"} <= set(
-        read_manifest(Path("../out"))["files"]
-    )
+    assert {*files} <= {*read_manifest(Path("../out"))["files"]}
     run("study ../mine.toml --out ../out --runs 2 --quiet")
     listed = [
         path.relative_to("../out").as_posix()

@@ -364,7 +364,6 @@ def test_questions_on_a_cluster_have_the_bytes_of_one_process(
     for command in (
         "risk rain --samples 300",
         "explain rain --quick",
-        "tolerance native --quick",
         "risk wall.toml --simulations 200",
         "rules wall.toml --samples 500",
         "tolerance wall.toml --simulations 300",

@@ -209,33 +209,34 @@ def test_a_search_by_an_algorithm_in_a_users_file_finds_the_same_solutions(
     assert_same_solutions(short("smoke", name), short("smoke", f"named:{name}"), in_tmp)
 
 
+COPIES = """
+from msgspec.structs import replace
+from safevar_sumo.metrics import Measure
+
+known = [one for one in list(globals().values()) if isinstance(one, Measure)]
+globals().update({one.name: replace(one, name="own_" + one.name) for one in known})
+
+
+def largest(settings, characteristics):
+    return characteristics.largest_change(settings)
+
+
+own_f_diff = Measure(
+    name="own_f_diff", title="largest", unit="-", of="settings", function=largest
+)
+"""
+"""Below the import of copied metrics: their copies have other names, as a column has one."""
+
+
 def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> None:
-    """A column has one name, so the copies have others."""
     shipped = {**METRICS, **OPTIONAL_METRICS}
     own_functions = [inspect.unwrap(one.function) for one in shipped.values()]
     functions = {inspect.getfile(one): one for one in own_functions}
-    modules = [
-        copied(function, in_tmp).partition(":")[0] for function in functions.values()
-    ]
-    lines = [
-        "from msgspec.structs import replace",
-        *(f"from {module} import *" for module in modules),
-        "from safevar_sumo.metrics import Measure",
-    ]
-    lines.append(
-        "known = [one for one in list(globals().values()) if isinstance(one, Measure)]"
-    )
-    lines.append(
-        "globals().update({one.name: replace(one, name='own_' + one.name) for one in known})"
-    )
-    lines.append(
-        "def largest(settings, characteristics): return characteristics.largest_change(settings)"
-    )
-    lines.append(
-        "own_f_diff = Measure(name='own_f_diff', title='largest', unit='-', of='settings',"
-        " function=largest)"
-    )
-    write("named.py", "\n".join(lines))
+    imports = ""
+    for function in functions.values():
+        module, _, _ = copied(function, in_tmp).partition(":")
+        imports += f"from {module} import *\n"
+    write("named.py", imports + COPIES)
     own = [f"named:{name}" for name in shipped]
     objectives = ["named:tit", "f_safe", "named:own_f_diff"]
     system = system_of(

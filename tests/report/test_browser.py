@@ -78,6 +78,18 @@ def opened(browser: Chrome, page: Path) -> None:
     )
 
 
+def unfold(browser: Chrome, is_open: str) -> None:
+    """Open or close all that is folded."""
+    browser.execute_script(
+        f"document.querySelectorAll('details').forEach((one) => {{ one.open = {is_open}; }})"
+    )
+
+
+def said_by(browser: Chrome) -> list[str]:
+    """What stands on the console."""
+    return [entry["message"] for entry in browser.get_log("browser")]
+
+
 def requests_of(browser: Chrome) -> list[str]:
     messages = [
         json.loads(entry["message"])["message"]
@@ -120,7 +132,7 @@ def test_an_animation_plays_and_scrubs_as_a_file(
     animate(comparison_of(simulation), tmp_path / "it.html")
     opened(browser, tmp_path / "it.html")
     try_player(browser, browser.find_element(By.CSS_SELECTOR, ".animation"))
-    assert [entry["message"] for entry in browser.get_log("browser")] == []
+    assert said_by(browser) == []
     assert {url for url in requests_of(browser) if not url.startswith("data:")} == {
         (tmp_path / "it.html").as_uri()
     }
@@ -131,11 +143,9 @@ def test_nothing_leaves_the_page_and_nothing_is_wrong_with_it(
     browser: Chrome, report: Path
 ) -> None:
     opened(browser, report)
-    browser.execute_script(
-        "document.querySelectorAll('details').forEach((one) => { one.open = true; })"
-    )
+    unfold(browser, "true")
     time.sleep(0.5)
-    assert [entry["message"] for entry in browser.get_log("browser")] == []
+    assert said_by(browser) == []
     assert {url.partition(":")[0] for url in requests_of(browser)} <= {"file", "data"}
     assert [url for url in requests_of(browser) if url.startswith("file:")] in (
         [],
@@ -148,9 +158,7 @@ def test_nothing_leaves_the_page_and_nothing_is_wrong_with_it(
 @SLOW
 def test_the_keyboard_opens_a_replay_and_plays(browser: Chrome, report: Path) -> None:
     opened(browser, report)
-    browser.execute_script(
-        "document.querySelectorAll('details').forEach((one) => { one.open = false; })"
-    )
+    unfold(browser, "false")
     replay = browser.find_element(By.CSS_SELECTOR, "details.replay")
     replay.find_element(By.TAG_NAME, "summary").send_keys(Keys.ENTER)
     assert replay.get_attribute("open") is not None
@@ -173,9 +181,7 @@ def test_it_fits_the_screen_and_everybody_can_read_it(
             browser.execute_script("return document.documentElement.scrollWidth")
             <= width
         )
-        browser.execute_script(
-            "document.querySelectorAll('details').forEach((one) => { one.open = true; })"
-        )
+        unfold(browser, "true")
         assert (
             browser.execute_script("return document.documentElement.scrollWidth")
             <= width

@@ -40,6 +40,7 @@ from tests.in_process import (
     write,
 )
 from tests.manual import PROGRAM, files_of
+from tests.questions.conftest import quick_repairs as quick_repairs  # noqa: PLC0414
 from tests.questions.test_repair import planted as planted  # noqa: PLC0414 - a fixture
 
 MINE = """

@@ -81,11 +81,6 @@ CASES = {
         {"model": "crossing", "parameters": {"test": "CPNCO"}},
         {"speed": SPEED, "target_speed": domain(4, 7)},
     ),
-    "cyclist": (
-        "wear",
-        {"model": "crossing", "parameters": {"test": "CBNA"}},
-        {"impact_location": PLACE, "target_speed": domain(10, 20)},
-    ),
     "car": (
         "wear",
         {"model": "crossing", "parameters": {"test": "CCCscp", "heading": 10.0}},
