@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -54,58 +54,6 @@ OBSERVATION_HEADS = {
 }
 
 
-def trace_frame(
-    runs: SimulationRuns, observations: Sequence[Observation], row: int
-) -> pd.DataFrame:
-    """The trace of one vehicle's simulation: one row for each step until the simulation ends.
-
-    The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane) hold
-    the obstacle's true position. The columns that begin with "seen" hold what the ADS observed:
-    element `row` of the `observations`. `ttc` is empty while no gap closes or the vehicle stands.
-    `gap` is empty while no obstacle is ahead.
-    """
-    # Loading pandas takes longer than the simulation.
-    import pandas as pd
-
-    trace = runs.trace
-    ttc = np.where(trace.speed > STANDSTILL, runs.time_to_collision, np.inf)
-    columns = {
-        "position [m]": trace.position,
-        "speed [m/s]": trace.speed,
-        "acceleration [m/s^2]": np.diff(trace.speed, axis=0, prepend=trace.speed[:1])
-        / trace.step,
-        "gap [m]": trace.gap,
-        "ttc [s]": ttc,
-        "throttle [-]": trace.throttle,
-        "brake [-]": trace.brake,
-        "gear [-]": trace.gear,
-        "lateral [m]": trace.lateral,
-        "lateral speed [m/s]": trace.lateral_speed,
-    }
-
-    active = trace.active[:, 0]
-    frame = pd.DataFrame({"time [s]": trace.time[active]})
-    for name, column in columns.items():
-        frame[name] = column[active, 0]
-
-    # A simulator of the user's own has the driving system inside, and returns no observations.
-    if not observations:
-        return frame.replace([np.inf, -np.inf], np.nan).dropna(
-            axis="columns", how="all"
-        )
-    times = [
-        round(float(observation.time), TIME_DECIMALS) for observation in observations
-    ]
-    observed = pd.DataFrame({"time [s]": times})
-    for name, head in OBSERVATION_HEADS.items():
-        observed[head] = [
-            float(getattr(observation, name)[row]) for observation in observations
-        ]
-    return frame.merge(observed, how="left", on="time [s]").replace(
-        [np.inf, -np.inf], np.nan
-    )
-
-
 class Pair(NamedTuple):
     """The original vehicle (row 0) and the changed vehicle (row 1), driven together at one point.
     If the setting equals the original, the pair has row 0 only.
@@ -146,7 +94,7 @@ class Simulation:
     pair: Pair
     row: int
     no_verdict: str
-    reset_values: Mapping[str, float] = field(default_factory=dict)
+    reset_values: Mapping[str, float]
 
     @cached_property
     def original(self) -> Simulation:
@@ -223,10 +171,59 @@ class Simulation:
 
     @cached_property
     def trace(self) -> pd.DataFrame:
-        """The trace: one row per step. The names of columns have the units; NaN for a value that
-        does not exist.
+        """The trace: one row for each step until the simulation ends. The names of columns have the
+        units; NaN for a value that does not exist.
+
+        The columns `gap` (along the vehicle's path) and `lateral` (from the middle of its lane)
+        hold the obstacle's true position. The columns that begin with "seen" hold what the ADS
+        observed. `ttc` is empty while no gap closes or the vehicle stands. `gap` is empty while no
+        obstacle is ahead.
         """
-        return trace_frame(self.runs, self.pair.observations, self.row)
+        # Loading pandas takes longer than the simulation.
+        import pandas as pd
+
+        trace = self.runs.trace
+        ttc = np.where(trace.speed > STANDSTILL, self.runs.time_to_collision, np.inf)
+        columns = {
+            "position [m]": trace.position,
+            "speed [m/s]": trace.speed,
+            "acceleration [m/s^2]": np.diff(
+                trace.speed, axis=0, prepend=trace.speed[:1]
+            )
+            / trace.step,
+            "gap [m]": trace.gap,
+            "ttc [s]": ttc,
+            "throttle [-]": trace.throttle,
+            "brake [-]": trace.brake,
+            "gear [-]": trace.gear,
+            "lateral [m]": trace.lateral,
+            "lateral speed [m/s]": trace.lateral_speed,
+        }
+
+        active = trace.active[:, 0]
+        frame = pd.DataFrame({"time [s]": trace.time[active]})
+        for name, column in columns.items():
+            frame[name] = column[active, 0]
+
+        observations = self.pair.observations
+        # A simulator of the user's own has the driving system inside, and returns no observations.
+        if not observations:
+            return frame.replace([np.inf, -np.inf], np.nan).dropna(
+                axis="columns", how="all"
+            )
+        times = [
+            round(float(observation.time), TIME_DECIMALS)
+            for observation in observations
+        ]
+        observed = pd.DataFrame({"time [s]": times})
+        for name, head in OBSERVATION_HEADS.items():
+            observed[head] = [
+                float(getattr(observation, name)[self.row])
+                for observation in observations
+            ]
+        return frame.merge(observed, how="left", on="time [s]").replace(
+            [np.inf, -np.inf], np.nan
+        )
 
     @property
     def gap(self) -> float:
