@@ -35,7 +35,6 @@ from safevar_sumo.questions.subject import study_or_case
 from safevar_sumo.questions.tables import tabulate
 from safevar_sumo.questions.words import count_in_words
 from safevar_sumo.records import JsonObject
-from safevar_sumo.report.budget import divided
 from safevar_sumo.report.claims import (
     ANSWERS,
     CANNOT,
@@ -75,12 +74,15 @@ from safevar_sumo.report.pack import (
     versions_here,
     write_pack,
 )
-from safevar_sumo.report.page import usual_questions, with_speed_part
+from safevar_sumo.report.page import (
+    parts_of_simulations,
+    usual_questions,
+    with_speed_part,
+)
 from safevar_sumo.report.texts import parse_question
 from safevar_sumo.results import MANIFEST, SOLUTIONS, changed_values, read_manifest
 from safevar_sumo.study import Study, data_files, fmus_of, tables_of
 from safevar_sumo.sumo.network import OPTIONS_FILE, options_in
-from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import Parts, Progress, open_progress, show_no_progress
 
@@ -193,15 +195,9 @@ def _pack_study(
     questions, lists = _with_lists(list(dict.fromkeys(ask or usual_questions(judged))))
     folder = f"{number}-{study.name}"
     runs = list(case.finished_runs)
-    parts = {}
-    if simulations is not None:
-        system = assemble(judged.study)
-        spent = (
-            len(case.settings)
-            * (judged.study != case.study)
-            * simulations_of_setting(system)
-        )
-        parts = divided(with_speed_part(questions, case), simulations - spent, system)
+    (parts,) = parts_of_simulations(
+        [case], [judged], None, [with_speed_part(questions, case)], simulations
+    )
     outcomes = count_outcomes(case)
     solutions = count_solutions(case.solutions, runs)
     described = PackedStudy(
@@ -223,7 +219,8 @@ def _pack_study(
     }
     show_part = Parts(progress).begin(study.name)
     with open_pool(**workers) as pool:
-        pool.shared = {} if simulations and assemble(study).mover.takes_long else None
+        if simulations and assemble(study).mover.takes_long:
+            pool.shared = {}
         packed = Packed(
             described, files, study.origin.places, workers["jobs"], show_part, pool
         )

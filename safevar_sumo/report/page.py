@@ -155,7 +155,7 @@ def report(
     if not results:
         raise InputError("report()", "no results", "results, or their directories")
     criterion = None if unsafe is None else Unsafe.parse(unsafe)
-    out = Path(check_text("out", out))
+    out = Path(out)
     check_writable(out, "out", (".html", ".htm"))
 
     paths = [
@@ -183,7 +183,9 @@ def report(
         texts = [*chain(*texts_of), *joint]
         # Joint questions take a part from the first results.
         texts_of[0] += joint
-        budgets = _budgets(at_point, by_criterion, point, texts_of, simulations)
+        budgets = parts_of_simulations(
+            at_point, by_criterion, point, texts_of, simulations or None
+        )
         pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
         numbers = count(1)
         costs = [USUAL_COSTS.get(text.split()[0], LEAST_COST) for text in texts]
@@ -246,7 +248,7 @@ def _cases_asked_about(
     return list(cases)
 
 
-def _budgets(
+def parts_of_simulations(
     at_point: Sequence[Case],
     by_criterion: Sequence[Case],
     point: str | None,
@@ -259,7 +261,7 @@ def _budgets(
     All results have equal parts. Simulations that have already repeated solutions (at a point, or
     by a criterion) are subtracted.
     """
-    if not simulations:
+    if simulations is None:
         return [{}] * len(texts_of)
     budgets = []
     for case, adapted, texts in zip(at_point, by_criterion, texts_of, strict=True):
