@@ -202,7 +202,7 @@ def film_of(
     from matplotlib.animation import FuncAnimation
 
     step = comparison.runs.trace.step
-    end = _last_sample(comparison)
+    end = comparison.last_sample
     stride = max(round(SECONDS_PER_FRAME / step), -(-end // frames), 1)
     fps = 1 / (stride * step)
     samples = [*range(0, end, stride), *[end] * round(1 + pause * fps)]
@@ -272,11 +272,6 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
     return figure, show
 
 
-def _last_sample(comparison: Comparison) -> int:
-    """The last sample of the longer run."""
-    return max(moments.end for moments in comparison.moments)
-
-
 def lay_out(comparison: Comparison) -> tuple[list[DrawnBody], Affine2D]:
     """The actors that ever come near the vehicle under test, and the transformation that turns the
     scene: then this vehicle starts at the origin, and heads to the right.
@@ -290,7 +285,7 @@ def lay_out(comparison: Comparison) -> tuple[list[DrawnBody], Affine2D]:
     rows = enumerate(comparison.moments)
     for (name, track), (row, moments) in product(comparison.tracks.items(), rows):
         # After the end of a run its actors stay in place, because their samples are meaningless.
-        samples = np.minimum(np.arange(_last_sample(comparison) + 1), moments.end)
+        samples = np.minimum(np.arange(comparison.last_sample + 1), moments.end)
         place = track.motion[samples, row, :2]
         distance = np.linalg.norm(place - vut.motion[samples, row, :2], axis=1)
         if np.any(distance < MAX_DISTANCE + track.length):

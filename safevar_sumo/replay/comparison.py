@@ -93,7 +93,7 @@ class Comparison:
     point: Point
     evaluations: Evaluations
     runs: SimulationRuns
-    objectives: tuple[Measure, ...] = ()
+    objectives: tuple[Measure, ...]
 
     @property
     def rows(self) -> range:
@@ -112,6 +112,11 @@ class Comparison:
         ]
 
     @property
+    def last_sample(self) -> int:
+        """The last sample of the longer run."""
+        return max(moments.end for moments in self.moments)
+
+    @property
     def has_position(self) -> bool:
         """Whether the runs have the vehicles' positions: a user's simulator need not state them."""
         return not self.runs.lacking("position").any()
@@ -127,10 +132,10 @@ class Comparison:
         return network_for(self.point.scenario)
 
     @cached_property
-    def road(self) -> tuple[DrawnLane, ...]:
+    def road(self) -> list[DrawnLane]:
         """The lanes of the network; for a user's simulator, a single straight lane."""
         if not self.system.mover.has("roads"):
-            return (lane_below(self.runs.trace),)
+            return [lane_below(self.runs.trace)]
         return read_road(self.network)
 
     @cached_property
@@ -251,7 +256,7 @@ def comparison_of(simulation: Simulation) -> Comparison:
     )
 
 
-def read_road(network: NetworkFiles) -> tuple[DrawnLane, ...]:
+def read_road(network: NetworkFiles) -> list[DrawnLane]:
     """Read the lanes of one copy of a network, as netconvert built it."""
     lanes = []
     for edge in ElementTree.parse(built_network(network)).getroot().iter("edge"):
@@ -268,7 +273,7 @@ def read_road(network: NetworkFiles) -> tuple[DrawnLane, ...]:
             if kind != "area":
                 width = float(lane.get("width", 3.2))
             lanes.append(DrawnLane(kind, np.array(line, float), width))
-    return tuple(lanes)
+    return lanes
 
 
 def list_differences(replayed: Evaluations, recorded: JsonObject) -> list[str]:

@@ -52,7 +52,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
         axes = figure.subplots(2, 2, sharex=True).ravel()
 
     runs = comparison.runs
-    divergence_time = find_divergence(comparison.runs)
+    divergence_time = find_divergence(runs)
     trace = runs.trace
     ttc = runs.time_to_collision
     quantities = {

@@ -62,8 +62,10 @@ def show_in_gui(comparison: Comparison, pictures: Path | None = None) -> None:
     """
     runs = comparison.runs
     samples = count()
-    end = max(moments.end for moments in comparison.moments)
-    pauses = {end, *(moments.nearest for moments in comparison.moments)}
+    pauses = {
+        comparison.last_sample,
+        *(moments.nearest for moments in comparison.moments),
+    }
     start = 0.0
 
     def watch(world: SumoWorld) -> None:

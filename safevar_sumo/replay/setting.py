@@ -108,7 +108,7 @@ def answer_of_setting(
         points = points_in_words(vehicle, failing, len(system.matrix))
         sentences.append(evidence(points))
 
-    rows = [(remark,) for remark in dict.fromkeys(remarks)]
+    rows = [(remark,) for remark in dict.fromkeys(remarks) if remark]
     tables["remarks"] = tabulate("Remarks", REMARKS, rows)
     named = system.characteristics.named(setting)
     places = [
@@ -256,10 +256,9 @@ def _safety_comparison(simulation: Simulation) -> Sentence:
 
 def _remarks_of(system: System) -> list[str]:
     remarks = [remark for point in system.points for remark in point.scenario.remarks()]
-    pre_crash = pre_crash_sentence(system.points)
     return [
         *remarks,
         *without_effect(system),
         *vehicle_remarks(system),
-        *([pre_crash] if pre_crash else []),
+        pre_crash_sentence(system.points),
     ]
