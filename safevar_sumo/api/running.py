@@ -10,7 +10,7 @@ from safevar_sumo.api.simulation import load_and_assemble
 from safevar_sumo.campaign import RunKey, all_runs, check_algorithms, run_campaign
 from safevar_sumo.campaign.campaign import RECORDED
 from safevar_sumo.campaign.pool import Pool, open_pool
-from safevar_sumo.errors import InputError, check_text, warn
+from safevar_sumo.errors import InputError, warn
 from safevar_sumo.questions.arguments import checked
 from safevar_sumo.questions.research_questions.fronts import why_few_evaluations
 from safevar_sumo.questions.subject import Results, load
@@ -79,7 +79,7 @@ def run(
 
     directory = Path("results", loaded_study.name)
     if out is not None:
-        directory = Path(check_text("out", out))
+        directory = Path(out)
     if out == "":
         raise InputError("out", "''", "a directory")
 

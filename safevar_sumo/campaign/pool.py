@@ -169,9 +169,7 @@ class Pool:
 
     def _skipped(self) -> int:
         """The number of settings that are skipped, because too many workers have died of them."""
-        folders = (
-            self.attempts.iterdir() if self.attempts and self.attempts.exists() else ()
-        )
+        folders = self.attempts.glob("*") if self.attempts else ()
         return sum(len(list(folder.iterdir())) > MAX_DEATHS for folder in folders)
 
     def everywhere(

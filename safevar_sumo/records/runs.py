@@ -279,10 +279,11 @@ class SimulationRuns:
         """The sample of a vehicle's impact. Without a collision, the sample of the smallest
         separation in conflict; None if no sample is in conflict.
         """
-        active = self.trace.active[:, vehicle]
         if np.isfinite(self.collision_speed[vehicle]):
             return int(self.trace.last_active[vehicle])
-        in_conflict = active & self.encounter.in_conflict[:, vehicle]
+        in_conflict = (
+            self.trace.active[:, vehicle] & self.encounter.in_conflict[:, vehicle]
+        )
         if not in_conflict.any():
             return None
         return int(

@@ -382,11 +382,6 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
     }
     # Each `pop` takes a column that is no metric: the columns that remain are metrics.
     settings = np.stack([columns.pop(name) for name in characteristics], axis=1)
-    reasons = zip(
-        (setting.tobytes() for setting in settings),
-        line.get(REASON, [None] * len(settings)),
-        strict=True,
-    )
     worst_points = None
     if POINT in line:
         worst_points = np.array(line[POINT], np.intp)
@@ -398,6 +393,10 @@ def _evaluations_of(line: JsonObject, characteristics: Sequence[str]) -> Evaluat
         f_diff=f_diff,
         f_num_diff=f_num_diff,
         metrics=columns,
-        reasons={key: reason for key, reason in reasons if reason},
+        reasons={
+            setting.tobytes(): reason
+            for setting, reason in zip(settings, line.get(REASON, ()), strict=False)
+            if reason
+        },
         worst_points=worst_points,
     )

@@ -84,8 +84,8 @@ def load_runs(directory: str | Path) -> StoredResults:
     # Imported solutions have no journals.
     folder = Path(directory)
     manifest = read_manifest(folder)
-    study = manifest["study"]
-    characteristics = list(convert_table(study, Study).domains)
+    study = convert_table(manifest["study"], Study)
+    characteristics = list(study.domains)
     if "imported" in manifest:
         return StoredResults(
             manifest,
@@ -97,7 +97,7 @@ def load_runs(directory: str | Path) -> StoredResults:
     solutions_of_runs = []
     all_positions = []
     failures = []
-    budget = study["search"]["evaluations"]
+    budget = study.search.evaluations
     for key, path, head in stored_journals(folder, manifest):
         content = read_journal(path, head)
         positions, evaluations = content.requested_within(budget)

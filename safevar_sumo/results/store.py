@@ -39,7 +39,7 @@ from safevar_sumo.results.manifest import (
     write_manifest,
     write_whole,
 )
-from safevar_sumo.study import Study, convert_table, label_of, tables_of
+from safevar_sumo.study import Study, convert_table, tables_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -114,11 +114,10 @@ class ResultsDirectory:
         # Another process may have written results since the directory was opened.
         earlier_manifest = self._earlier_manifest()
         now = record(original)
-        manifest = {**self.manifest, "original": now}
         if self._study.scenario.repeats == 1:
             refuse_other_original(self.path, earlier_manifest.get("original", {}), now)
-        write_manifest(self.path, manifest)
-        extent = search_extent_of(manifest)
+        write_manifest(self.path, {**self.manifest, "original": now})
+        extent = search_extent_of(self.manifest)
         if earlier_manifest and search_extent_of(earlier_manifest) != extent:
             file = self.path / SOLUTIONS
             with disk_errors(file, "removed"):
@@ -136,11 +135,11 @@ class ResultsDirectory:
         evaluations, or they have runs that are not among `names`, the runs of the study now.
         """
         earlier_manifest = self._earlier_manifest()
-        remarks = []
         if not earlier_manifest:
             return []
-        *_, budget = search_extent_of(self.manifest)
-        *_, old_budget = search_extent_of(earlier_manifest)
+        remarks = []
+        budget = self._study.search.evaluations
+        old_budget = earlier_manifest["study"]["search"]["evaluations"]
         if old_budget != budget:
             remarks.append(
                 f"{self.path}: each run had {old_budget} evaluations before and has {budget} now:"
@@ -179,12 +178,10 @@ def stored_journals(
     """Yield the existing journals of a manifest's study: the algorithm and number of the run, the
     journal's file, and the head that the file must have.
     """
-    study = manifest["study"]
-    search = study["search"]
-    characteristics = list(convert_table(study, Study).domains)
+    study = convert_table(manifest["study"], Study)
+    characteristics = list(study.domains)
     digest = identity_digest(manifest)
-    labels = dict.fromkeys(label_of(algorithm) for algorithm in search["algorithms"])
-    for algorithm, run in product(labels, range(search["runs"])):
+    for algorithm, run in product(study.search.labels, range(study.search.runs)):
         name = run_name(algorithm, run)
         path = journal_file(directory, name)
         if path.exists():
@@ -294,8 +291,8 @@ def write_imported(
     path: Path,
     study: Study,
     solutions: Mapping[str, Evaluations],
-    original: Mapping[str, float | None],
-    files: Mapping[str, str],
+    original: dict[str, float | None],
+    files: dict[str, str],
 ) -> None:
     """Write a results directory of imported solutions; it replaces an earlier import.
 
@@ -326,9 +323,9 @@ def write_imported(
     manifest = {
         "format": FORMAT,
         "study": tables_of(study),
-        "imported": {"files": dict(files)},
+        "imported": {"files": files},
         "versions": {"safevar_sumo": version("safevar_sumo")},
-        "original": dict(original),
+        "original": original,
     }
     write_whole(path / SOLUTIONS, csv_text(frame))
     write_manifest(path, manifest)
