@@ -19,7 +19,6 @@ from safevar_sumo.study.encounters import (
     ModelTable as ModelTable,
     ScenarioTable as ScenarioTable,
     Weather as Weather,
-    as_axes as as_axes,
     axis_of as axis_of,
 )
 from safevar_sumo.study.extending import StudyTables as StudyTables
@@ -47,7 +46,6 @@ from safevar_sumo.study.parameters import (
     searched as searched,
 )
 from safevar_sumo.study.schema import (
-    OBJECTIVES as OBJECTIVES,
     ORIGINAL_DEGREE as ORIGINAL_DEGREE,
     PYMOO as PYMOO,
     SAFETY_DEGREE as SAFETY_DEGREE,

@@ -242,14 +242,6 @@ class DecidingMetric(NamedTuple):
     name: str
     largest_is_worst: bool
 
-    @classmethod
-    def of(cls, aggregate: str) -> Self | None:
-        """The metric that an aggregate states; None by `worst`, where the safety degree decides."""
-        if aggregate == WORST:
-            return None
-        name, direction = aggregate.split()
-        return cls(name, direction == ">")
-
     def __str__(self) -> str:
         return f"{self.name} {'>' if self.largest_is_worst else '<'}"
 
@@ -299,7 +291,10 @@ class StudyEncounters(Table, frozen=True, kw_only=True):
     @property
     def deciding(self) -> DecidingMetric | None:
         """The metric that `aggregate` states; None if the safety degree decides."""
-        return DecidingMetric.of(self.matrix.aggregate) if self.matrix else None
+        if self.matrix is None or self.matrix.aggregate == WORST:
+            return None
+        name, direction = self.matrix.aggregate.split()
+        return DecidingMetric(name, direction == ">")
 
     def check_axes(self, characteristics: Mapping[str, Domain]) -> None:
         """Refuse axes that contradict the rest of the study.

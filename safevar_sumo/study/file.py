@@ -13,7 +13,7 @@ import msgspec
 import tomli_w
 from msgspec.structs import replace
 
-from safevar_sumo.errors import InputError, about, did_you_mean, one_of
+from safevar_sumo.errors import InputError, about, did_you_mean, one_of, printable
 from safevar_sumo.output import read_file, whole_file
 from safevar_sumo.shipped import STUDIES, STUDY_SCHEMA
 from safevar_sumo.study.encounters import Parameters
@@ -319,10 +319,7 @@ def write_study(path: Path, study: Study, comment: str) -> None:
     # TOML refuses control characters in comments.
     text = SCHEMA_LINE
     for line in comment.splitlines():
-        legal_line = ""
-        for character in line:
-            legal_line += character if character.isprintable() else "?"
-        text += f"# {legal_line}".rstrip() + "\n"
+        text += f"# {printable(line)}".rstrip() + "\n"
     text += "\n" + tomli_w.dumps(tables_of(study))
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")
