@@ -366,10 +366,7 @@ def find_overlaps(body: Body, obstacle: Body) -> FloatArray:
     """Depths by which M pairs of bodies overlap, shape (M,) [m]: of all directions along and across
     the two bodies, the least overlap. A negative depth means that the bodies do not touch.
     """
-    overlaps = _overlaps_along(body, obstacle)
-    if (overlaps > 0).any():
-        return np.minimum(overlaps, _overlaps_along(obstacle, body))
-    return overlaps
+    return np.minimum(_overlaps_along(body, obstacle), _overlaps_along(obstacle, body))
 
 
 def _overlaps_along(body: Body, obstacle: Body) -> FloatArray:

@@ -113,9 +113,8 @@ class DrivingRobot:
         )
 
         error = np.where(self._is_driving, error, 0.0)
-        self._integral = np.minimum(
-            np.maximum(self._integral - error * self._step, -1 / INTEGRAL_GAIN),
-            1 / INTEGRAL_GAIN,
+        self._integral = np.clip(
+            self._integral - error * self._step, -1 / INTEGRAL_GAIN, 1 / INTEGRAL_GAIN
         )
         pedal = (
             self._start_pedal

@@ -223,8 +223,6 @@ def met_at(point: Point, system: System, settings: FloatArray) -> BoolArray:
     A value beyond the range of the study counts as the end of this range.
     """
     members = system.characteristics.scenario
-    if not len(members):
-        return np.ones(len(settings), bool)
     # `split` returns the vehicles and then the encounters, shape (N, n - k).
     encounters = np.clip(system.split(settings)[1], members.lower, members.upper)
     return np.broadcast_to(point.meets(members.columns(encounters)), len(settings))

@@ -270,9 +270,7 @@ def _simulate_unordered(system: System, settings: FloatArray) -> Iterator[PointR
         # Settings that do not meet a point, which then is alone, get the original encounter of the
         # point, so that row i stays setting i. Their results are replaced below.
         is_met = met_at(points[0], system, settings)
-        vehicles = settings
-        if not is_met.all():
-            vehicles = in_place_of_unmet(points[0], system, settings, is_met)
+        vehicles = in_place_of_unmet(points[0], system, settings, is_met)
         runs = drive_all(replace(system, points=points), vehicles)
         evaluations = score(system, np.tile(settings, (len(points), 1)), runs)
         if not is_met.all():

@@ -417,12 +417,10 @@ def networks_for(scenarios: Sequence[Scenario]) -> list[NetworkFiles]:
 
 def _frozen(changes: XmlChanges) -> Changes:
     """The changes as tuples, which can be hashed; see `Changes`."""
-    items = {
-        path: tuple(attributes.items())
+    return tuple(
+        (path, None if attributes is None else tuple(attributes.items()))
         for path, attributes in changes.items()
-        if attributes is not None
-    }
-    return tuple((path, items.get(path)) for path in changes)
+    )
 
 
 class _BuiltRoads:

@@ -114,9 +114,8 @@ class RecordedWorld:
         """
         self._before = self._now
         distances = distance_covered(self._before.speeds, speeds, self.step_length)
-        if np.count_nonzero(is_open) < self.n:
-            speeds = np.where(is_open, speeds, self._before.speeds)
-            distances = np.where(is_open, distances, 0.0)
+        speeds = np.where(is_open, speeds, self._before.speeds)
+        distances = np.where(is_open, distances, 0.0)
         self._lane_position = self._lane_position + distances
         self.sample += 1
 
@@ -151,11 +150,9 @@ class RecordedWorld:
     def vehicle_positions(self, actor: str) -> FloatArray:
         if actor == VUT:
             return self._now.fronts
-        motion = self._scene.tracks[actor].motion
-        places = motion[self.sample, ..., :2]
-        if motion.ndim == 2:
-            return np.full((self.n, 2), places)
-        return places.repeat(self._size, axis=0)
+        # One place for all scenes, or a place for each.
+        places = np.atleast_2d(self._scene.tracks[actor].motion[self.sample, ..., :2])
+        return places.repeat(self.n // len(places), axis=0)
 
     person_positions = vehicle_positions
 
@@ -210,14 +207,15 @@ class RecordedWorld:
         late = ~is_person | self._now.meets_persons[vehicles]
         late &= self._overlaps(self._now, vehicles, actors)
 
-        pairs = np.flatnonzero(early | late)
-        colliding, rows = np.unique(vehicles[pairs], return_index=True)
-        pairs = pairs[rows]
-        early_speeds = self._before.speeds[colliding]
-        speeds = np.where(early[pairs], early_speeds, self._now.speeds[colliding])
-        numbers = colliding.tolist()
-        self._struck = dict(zip(numbers, actors[pairs].tolist(), strict=True))
-        return dict(zip(numbers, speeds.tolist(), strict=True))
+        speeds = {}
+        for pair in np.flatnonzero(early | late):
+            vehicle = int(vehicles[pair])
+            # Of several actors, the first counts.
+            if vehicle not in speeds:
+                moment = self._before if early[pair] else self._now
+                speeds[vehicle] = float(moment.speeds[vehicle])
+                self._struck[vehicle] = int(actors[pair])
+        return speeds
 
     def _is_near(self) -> BoolArray:
         """Whether each vehicle may have touched each of the A actors since the last step, shape
