@@ -200,6 +200,7 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
                 failure.source,
                 f"{failure.problem}{REPRODUCED_BY}{command}",
                 failure.legal,
+                failure.place,
             ) from None
         reasons = {rows[0].tobytes(): " ".join(str(failure).split())}
         changes = characteristics.change_objectives(setting)

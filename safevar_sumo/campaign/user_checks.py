@@ -115,8 +115,9 @@ def random_settings(study: Study) -> FloatArray:
 
 
 def find_in_new_process(study: Study) -> list[Finding]:
-    """Find a result of a simulator of the user's own that differs in a new process, for the
-    original vehicle or both ends of the domains. Nothing is compared if the study states `repeats`.
+    """Find a result of a simulator of the user's own that is wrong, or that differs, in a new
+    process, for the original vehicle or both ends of the domains. Nothing is compared if the study
+    states `repeats`.
     """
     study = without_skipping(study)
     system = system_of(study)
@@ -126,16 +127,21 @@ def find_in_new_process(study: Study) -> list[Finding]:
     settings = system.region.repaired(
         np.stack([members.original, members.lower, members.upper])
     )
+    # This import is slow, and rarely needed.
+    from safevar_sumo.check.trials import Finding
+
     # The new process simulates first, because a simulator may end the present process.
-    with open_pool(1) as pool:
-        (repeated,) = carry_out(
-            evaluate_settings, [(Task(study=study), settings)], pool
-        )
+    try:
+        with open_pool(1) as pool:
+            (repeated,) = carry_out(
+                evaluate_settings, [(Task(study=study), settings)], pool
+            )
+    except UserCodeError as error:
+        place = error.place or study.source
+        expected = error.legal or "no exception"
+        return [Finding("contract", error.problem, place, "", expected)]
     evaluations = drive_and_score(replace(system, points=system.points[::-1]), settings)
     for row, difference in differences(evaluations.results, repeated.results):
-        # This import is slow, and rarely needed.
-        from safevar_sumo.check.trials import Finding
-
         words = f"{difference} in a new process"
         command = reproduction_command(study, settings[row])
         return [Finding("repetition", words, study.source, command, SAME_ELSEWHERE)]

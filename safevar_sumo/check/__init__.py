@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from safevar_sumo.ads import ADS
+from safevar_sumo.check.oversights import find_oversights
 from safevar_sumo.check.trials import (
     Finding,
     Findings,
-    inspect_sample,
     try_algorithm,
     try_simulations,
 )
@@ -35,8 +35,8 @@ STUDY_OF_AN_ADS = "smoke"
 """The study in which `check` lets a driving system drive that the user gives by its name."""
 CHECKS: Mapping[str, str] = {
     "contract": (
-        "return what the base class documents, leave arguments as they are, state what a metric"
-        " reads in its needs, and guard divisions and roots where the domain ends"
+        "return what the documentation of the method says, leave arguments as they are, and guard"
+        " divisions and roots where the domain ends"
     ),
     "repetition": (
         "draw nothing at random (an algorithm: from `rng` alone), read no clock, and keep nothing"
@@ -62,10 +62,17 @@ CHECKS: Mapping[str, str] = {
         "let runs have what the metric reads, its `needs`, or return a number where the metric is"
         " defined; else leave out its name"
     ),
+    "constant": "compute the metric from the runs or settings that it gets, or leave out its name",
     "unread": (
         "read each value of the setting by its name, spelled as in `UNITS`, or leave out the"
         " characteristic"
     ),
+    "modified": "change a copy, such as `dict(setting)`, and not the setting itself",
+    "shift": "read speed, gap and position at the same moment of each step, and then append them",
+    "step": (
+        "multiply each change of the state by the time step [s], the argument `step` of `prepare`"
+    ),
+    "duplicates": "return each solution once, such as the best ones after `np.unique`",
     "standing": (
         "find out with `simulate` why a changed vehicle never moves: read each value of the setting"
         " in its unit, compare numbers by `<` instead of `==`, and start with any of them"
@@ -78,6 +85,26 @@ CHECKS: Mapping[str, str] = {
 """The checks by name, with advice after a failure. Failures of the first four checks also prevent a
 study from starting.
 """
+OF_SIMULATORS: Mapping[str, str] = {
+    "order": "keep nothing of a run for the next run in a class, a module or an engine",
+    "alone": (
+        "keep nothing of a run for the next run in a class, a module or an engine, and let a metric"
+        " compute number i from run i alone"
+    ),
+    "undefined": (
+        "return what the metric needs, such as `gap` and `obstacle_speed`, or the metric itself"
+        " without a trace; else leave out its name"
+    ),
+}
+"""Other advice for studies with a simulator of the user's own, by the names of checks."""
+
+
+def advice_for(finding: Finding, study: Study) -> str:
+    """What to do about a finding in the user code of a study."""
+    is_simulated = not study.ads.model
+    if is_simulated and finding.check in OF_SIMULATORS:
+        return OF_SIMULATORS[finding.check]
+    return CHECKS[finding.check]
 
 
 def study_to_check(name: str) -> Study:
@@ -105,10 +132,12 @@ def check_study(study: Study, **how: Any) -> list[Finding]:
     findings = list(find_defects(study, **how))
     if findings:
         return findings
+    with np.errstate(all="ignore"):
+        for names, oversights in find_oversights(study):
+            findings += _first_defect(study, names, oversights)
+    if findings:
+        return findings
     system = assemble(study)
-    shown = list(_first_defect(study, dict(user_code(study)), inspect_sample(study)))
-    if shown:
-        return shown
     problems = find_problems(system)
     where = _definition(study, "ads.model", study.ads.model)
     if problems:
@@ -153,7 +182,7 @@ def refuse_defects(study: Study, limit: int | None = None) -> None:
         raise UserCodeError(
             study.source,
             f"{finding}; to reproduce it: {command}",
-            f"{finding.expected}; {CHECKS[finding.check]}",
+            f"{finding.expected}; {advice_for(finding, study)}",
             finding.where,
         )
 

@@ -5,7 +5,7 @@ repeated: results must be the same.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,23 +13,22 @@ import numpy as np
 from numpy.random import default_rng
 
 from safevar_sumo.errors import InputError, UserCodeError
+from safevar_sumo.metrics import Measure
 from safevar_sumo.plugins import Lookup, instance_of
 from safevar_sumo.records import (
     QUANTITIES,
     FloatArray,
     IntArray,
-    Outcome,
     ResultColumns,
     SimulationRuns,
     differences,
 )
-from safevar_sumo.scenarios.simulated import unit_contradiction
 from safevar_sumo.search import ALGORITHMS, Algorithm, Problem
 from safevar_sumo.study import Study, label_of
 from safevar_sumo.sumo import reason_against_scenes
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
-from safevar_sumo.sumo.simulators import simulations_of_setting, unread_characteristics
+from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
 from safevar_sumo.terminal import Progress, show_no_progress
@@ -43,12 +42,6 @@ LEAST_SIMULATED = 3
 """Least number of settings, however slow the code is: the original and two corners of the
 domains.
 """
-MANY_UNUSED = 20
-"""Number of settings in which a metric must be defined at least once, and each characteristic must
-be read.
-"""
-FEW_UNUSED = 5
-"""The same number for simulations that take long: the original and four corners of the domains."""
 TIMED = 5
 """Number of settings whose time is taken."""
 RUNS_OF_ALL = 5
@@ -139,9 +132,9 @@ def try_simulations(
     trial.
     """
     region = region_of(study)
-    settings = _settings(region.characteristics, max(vehicles or 0, SIMULATED))
+    settings = trial_settings(region.characteristics, max(vehicles or 0, SIMULATED))
     settings = region.repaired(region.characteristics.filter(settings))
-    system = _system(study)
+    system = trial_system(study)
     if system.mover.takes_long and limit is not None:
         # Each vehicle takes part in four runs; the first and the last vehicle also drive alone.
         simulations = simulations_of_setting(system)
@@ -154,8 +147,8 @@ def try_simulations(
     own_metrics = [
         name for name in (*study.metrics.also, *study.search.objectives) if ":" in name
     ]
-    if not system.mover.is_exact or own_metrics:
-        yield from try_original(
+    if own_metrics:
+        yield from find_unstated_needs(
             system, drive_all(system.at(system.points[0]), settings[:1])
         )
     number, seconds = (1, 0.0) if limit is not None else _affordable(system, settings)
@@ -180,7 +173,7 @@ def try_simulations(
         return
 
     def load() -> Callable[[_Rows], ResultColumns]:
-        system = _system(study)
+        system = trial_system(study)
         return lambda rows: drive_and_score(system, settings[rows]).results
 
     expected = "the same, to the bit"
@@ -191,7 +184,7 @@ def try_simulations(
     yield from _try(load, region.characteristics, settings, progress, expected)
 
     # Recorded scenes of a user's scenario must give the same results as SUMO.
-    system = _system(study)
+    system = trial_system(study)
     if ":" in study.scenario.model and not reason_against_scenes(system):
         try:
             verify_in_sumo(system, settings, drive_and_score(system, settings).points)
@@ -203,66 +196,38 @@ def try_simulations(
             yield Finding("contract", problem, "", setting, reacts)
 
 
-def try_original(system: System, runs: SimulationRuns) -> Findings:
-    """Find mistakes in the run of the original vehicle: wrong units of a simulator of the user's
-    own, and metrics that read a quantity that their `needs` do not state.
-    """
-    if not system.mover.is_exact and (contradiction := unit_contradiction(runs.trace)):
-        expected = "speeds in m/s, and distances in m"
-        yield Finding("contract", contradiction, "", "the original vehicle", expected)
+def find_unstated_needs(system: System, runs: SimulationRuns) -> Findings:
+    """Find metrics that read a quantity that their `needs` do not state."""
     for measure in system.measuring.measures.values():
         if measure.of == "settings":
             continue
-        with system.user_code():
-            values = measure.of_runs(runs, system.metrics_table)
         for quantity in QUANTITIES:
             if quantity in measure.quantities:
                 continue
             variants = (runs.with_all(quantity, value) for value in TRIED_VALUES)
-            try:
-                with system.user_code():
-                    is_read = not all(
-                        np.array_equal(
-                            values,
-                            measure.of_runs(variant, system.metrics_table),
-                            equal_nan=True,
-                        )
-                        for variant in variants
-                    )
-            except UserCodeError:
-                is_read = True
-            if is_read:
+            if reads_a_difference(measure, system, runs, variants):
                 got = f"the metric {measure.name} reads {quantity}, which its needs do not state"
                 expected = f"needs = {(*measure.quantities, quantity)}"
                 yield Finding("contract", got, "", "the original vehicle", expected)
 
 
-def inspect_sample(study: Study) -> Findings:
-    """Find what a few runs show: changed vehicles that never move, although the original vehicle
-    does; metrics of the study that are undefined in all runs; and characteristics that a simulator
-    of the user's own never reads.
-    """
-    system = _system(study)
-    number = FEW_UNUSED if system.mover.takes_long else MANY_UNUSED
-    settings = system.region.repaired(_settings(system.characteristics, number))
-    sample = f"{len(settings)} vehicles: the original, and others up to the ends of the domains"
-    results = drive_and_score(system, settings).results
-    stands = results["outcome"] == Outcome.NEVER_MOVED
-    changed = (settings != settings[0]).any(axis=1)
-    if changed.any() and stands[changed].all() and not stands[0]:
-        problem = "no changed vehicle moves, although the original vehicle does"
-        yield Finding("standing", problem, "", sample, "changed vehicles that drive")
-    for name in map(label_of, (*study.metrics.also, *study.search.objectives)):
-        if name in results and np.isnan(results[name].astype(float)).all():
-            expected = "a value in some run"
-            yield Finding(
-                "undefined", f"{name} is undefined in all runs", "", sample, expected
-            )
-    if unread := sorted(unread_characteristics(system, settings)):
-        expected = "a simulator that reads each characteristic of its vehicle"
-        yield Finding(
-            "unread", f"simulate never reads {', '.join(unread)}", "", sample, expected
-        )
+def reads_a_difference(
+    measure: Measure,
+    system: System,
+    runs: SimulationRuns,
+    variants: Iterable[SimulationRuns],
+) -> bool:
+    """Whether a metric of runs has another value for one of their variants, or refuses it."""
+    with system.user_code():
+        values = measure.of_runs(runs, system.metrics_table)
+        for variant in variants:
+            try:
+                other_values = measure.of_runs(variant, system.metrics_table)
+            except UserCodeError:
+                return True
+            if not np.array_equal(values, other_values, equal_nan=True):
+                return True
+    return False
 
 
 def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
@@ -286,8 +251,8 @@ def try_algorithm(study: Study, name: str) -> Findings:
     """Let an algorithm search twice with the same seed, the second time after a run with another
     seed. Both searches must request and return the same settings.
     """
-    outputs = _search(study, name, seeds=(1,))
-    repeated = _search(study, name, seeds=(2, 1))
+    outputs = np.concatenate(search_with(study, name, seeds=(1,)))
+    repeated = np.concatenate(search_with(study, name, seeds=(2, 1)))
     expected = "the same in every run with the same random numbers, to the bit"
     if len(outputs) != len(repeated):
         difference = (
@@ -337,7 +302,7 @@ def _try(
             yield Finding(check, f"{difference} {circumstance}", "", vehicle, expected)
 
 
-def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
+def trial_settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
     """The original, four corners of the domains, and random settings, shape (count, n)."""
     lower = characteristics.lower
     upper = characteristics.upper
@@ -354,7 +319,7 @@ def _settings(characteristics: CharacteristicSet, count: int) -> FloatArray:
     )[:count]
 
 
-def _system(study: Study) -> System:
+def trial_system(study: Study) -> System:
     """Assemble the system of a study with only a few points of its matrix. This loads user code
     again.
     """
@@ -363,11 +328,18 @@ def _system(study: Study) -> System:
     return replace(system, points=points)
 
 
-def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
-    """Run an algorithm with one seed after another. Return the settings that the last run requests,
-    and then the settings that it returns, shape (k, n).
+class Searched(NamedTuple):
+    """The settings that a run of an algorithm requests, and those that it returns, both of shape
+    (k, n).
     """
-    system = _system(study)
+
+    requested: FloatArray
+    returned: FloatArray
+
+
+def search_with(study: Study, name: str, seeds: tuple[int, ...]) -> Searched:
+    """Run an algorithm with one seed after another. Return the settings of the last run."""
+    system = trial_system(study)
     lookup = Lookup.of(study)
     label = label_of(name)
     member = lookup.class_of(ALGORITHMS, name, "search.algorithms", Algorithm)
@@ -389,11 +361,11 @@ def _search(study: Study, name: str, seeds: tuple[int, ...]) -> FloatArray:
         # If `search` is no generator, its code already runs in this call.
         with system.user_code():
             search = algorithm.search(problem, default_rng(seed))
-        settings = []
+        requested = []
         try:
-            settings.append(next(search))
+            requested.append(next(search))
             while True:
-                settings.append(search.send(drive_and_score(system, settings[-1])))
+                requested.append(search.send(drive_and_score(system, requested[-1])))
         except StopIteration as end:
-            settings.append(end.value.settings)
-    return np.concatenate(settings)
+            returned = end.value.settings
+    return Searched(np.concatenate(requested), returned)

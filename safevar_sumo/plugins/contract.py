@@ -9,6 +9,7 @@ errors (`np.seterr`): `np.errstate()` restores the handling at the end of each c
 
 from __future__ import annotations
 
+import functools
 import inspect
 import traceback
 import types
@@ -84,7 +85,7 @@ def user_error_of(error: BaseException) -> UserCodeError | None:
         frames.append(traceback.FrameSummary(error.filename, error.lineno, "import"))
     for frame in reversed(frames):
         file = frame.filename
-        if is_user_file(file) or file in this_process.named_files:
+        if _is_named_or_users(file):
             method = frame.name.replace("<module>", "import")
             place = f"{file}:{frame.lineno}"
             reason, legal = _reason_of(error)
@@ -92,6 +93,11 @@ def user_error_of(error: BaseException) -> UserCodeError | None:
                 "", f"user code raised in {method}: {reason} ({place})", legal, place
             )
     return None
+
+
+def _is_named_or_users(file: str) -> bool:
+    """Whether a file is the user's, or that of a module that a study names."""
+    return is_user_file(file) or file in this_process.named_files
 
 
 def _reason_of(error: BaseException) -> tuple[str, str]:
@@ -185,17 +191,21 @@ class UserCode(NamedTuple):
 
     def definition(self, method: str = "") -> str:
         """The file and line at which a method begins, or else the class or function. "" if Python
-        knows no source, as for FMUs and compiled code.
+        knows no source in a file of the user, as for FMUs, compiled code and inherited methods.
         """
         target = getattr(self.target, "function", self.target)
-        function = inspect.unwrap(getattr(target, method, target))
-        try:
-            # Python finds the file of a class by its module, which must be loaded.
-            with self.modules.active():
-                line = inspect.getsourcelines(function)[1]
-                return f"{inspect.getfile(function)}:{line}"
-        except (OSError, TypeError):
-            return ""
+        for candidate in (getattr(target, method, target), target):
+            function = inspect.unwrap(candidate)
+            try:
+                # Python finds the file of a class by its module, which must be loaded.
+                with self.modules.active():
+                    file = inspect.getfile(function)
+                    line = inspect.getsourcelines(function)[1]
+            except (OSError, TypeError):
+                continue
+            if _is_named_or_users(file):
+                return f"{file}:{line}"
+        return ""
 
     def wrong(self, method: str, result: str, expected: str) -> UserCodeError:
         """The error that says that a method returned a wrong result."""
@@ -355,6 +365,8 @@ def checked_class(code: UserCode, base: type) -> type:
         result.
         """
 
+        # Errors name the line of the user's method, which `inspect.unwrap` finds.
+        @functools.wraps(getattr(candidate, name))
         def method(self: Any, *arguments: Any) -> UserValue:
             passed = list(arguments)
             if returned.like is not None:

@@ -20,6 +20,7 @@ from safevar_sumo.records.driving import (
     ZERO,
     BoolArray,
     FloatArray,
+    FloatOrArray,
     IntArray,
     TextArray,
     nans,
@@ -257,9 +258,9 @@ class SimulationRuns:
         lacks = [self.lacks.get(name, no_runs) for name in quantities]
         return np.asarray(np.any([no_runs, *lacks], axis=0))
 
-    def with_all(self, quantity: str, value: float) -> SimulationRuns:
-        """The runs with the same value of a quantity at all samples. The speed of a collision is
-        kept.
+    def with_all(self, quantity: str, value: FloatOrArray) -> SimulationRuns:
+        """The runs with the same value of a quantity at all samples, or with values of shape
+        (T, 1). The speed of a collision is kept.
         """
 
         def changed(record: Trace | Encounter) -> dict[str, Any]:

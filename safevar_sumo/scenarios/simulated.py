@@ -11,8 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from safevar_sumo.plugins import SHARE, Contract, Legal, Returned, UserCode, quoted
-from safevar_sumo.records import FloatArray, NamedValues, Outcome, Trace, significant
+from safevar_sumo.records import FloatArray, NamedValues, Outcome, significant
 from safevar_sumo.scenarios.base import Mover, Scenario
+from safevar_sumo.scenarios.trace_ways import contradiction_of_speeds
 from safevar_sumo.study import SAFETY_DEGREE
 
 OWN_SIMULATOR = Mover(
@@ -65,12 +66,6 @@ SLACK = 0.1
 """Largest rounding error of distances [m] and of speeds [m/s]."""
 CREEPS = 1.0
 """Speed below which a vehicle has stopped [m/s]."""
-FACTOR = 1.5
-"""A ratio between the way from speeds and the way from positions is a mistake in units from this
-number on. Smaller ratios may come from sampling.
-"""
-FIRST_SLACK = 0.05
-"""Difference that the ways of the first step may have in addition [m]."""
 STEP_TOLERANCE = 1e-6
 """Largest difference between two time steps of a trace [s]."""
 
@@ -138,6 +133,12 @@ def _checked_trace(
     if not has_collided and not np.isfinite(columns["separation"]).any():
         raise code.wrong(method, "separation = inf", "a finite number at some time")
 
+    step = float(steps[0])
+    if wrong_speeds := contradiction_of_speeds(columns, step):
+        raise code.wrong(
+            method, f"a trace whose {wrong_speeds.problem}", wrong_speeds.expected
+        )
+
     numbers = NamedValues()
     if has_collided:
         if IMPACT_SPEED not in result:
@@ -148,9 +149,7 @@ def _checked_trace(
             )
         ends = {name: result.get(name, 0.0) for name in OF_COLLISION}
         numbers = _numbers(code, method, ends, OF_COLLISION)
-    if contradiction := _contradiction(
-        str(result[OUTCOME]), columns, numbers, steps[0]
-    ):
+    if contradiction := _contradiction(str(result[OUTCOME]), columns, numbers, step):
         raise code.wrong(
             method,
             contradiction,
@@ -188,42 +187,6 @@ def _contradiction(
         return f"{outcome!r} with a separation of 0"
     if outcome == Outcome.STOPPED and speed[-1] > max(braked, CREEPS):
         return f"{outcome!r} at a speed of {significant(speed[-1], 3)}"
-    return ""
-
-
-def unit_contradiction(trace: Trace) -> str:
-    """The contradiction between speeds and ways in the first run of a trace, in words. Such a
-    contradiction shows wrong units, such as km/h instead of m/s. "" if the ways agree, or if the
-    trace has neither a position nor a gap.
-    """
-    active = trace.active[:, 0]
-    if active.sum() < 2:
-        return ""
-    speed = trace.speed[active, 0]
-    gap = trace.gap[active, 0]
-    position = trace.position[active, 0]
-    obstacle_speed = trace.obstacle_speed[active, 0]
-    # The gap is infinite while no obstacle is in sight: such samples do not count.
-    gap = np.where(np.isfinite(gap), gap, np.nan)
-    double_speeds = speed[1:] + speed[:-1]
-    driven = np.sum(double_speeds) * trace.step / 2
-    ways = {"position": np.ptp(position)}
-    if (obstacle_speed == 0).all() and (np.diff(gap) <= 0).all():
-        ways["gap"] = np.ptp(gap)
-    for name, way in ways.items():
-        is_apart = abs(way - driven) > max(speed.max() * trace.step, 1.0)
-        if is_apart and max(way, driven) > FACTOR * min(way, driven):
-            return f"speed and {name} disagree: {driven:.3g} m and {way:.3g} m of way"
-
-    # If the obstacle moves, the gap does not tell the driven way. The first step still shows a
-    # factor.
-    closing = speed - obstacle_speed
-    for name, rate, column in (("position", speed, position), ("gap", closing, -gap)):
-        way = column[1] - column[0]
-        low, high = np.sort(rate[:2]) * trace.step
-        slack = (FACTOR - 1) * max(abs(low), abs(high)) + FIRST_SLACK
-        if way < low - slack or way > high + slack:
-            return f"speed and {name} disagree in the first step: {high:.3g} m and {way:.3g} m"
     return ""
 
 

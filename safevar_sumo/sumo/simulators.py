@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from uuid import uuid4
 from weakref import WeakKeyDictionary
 
@@ -132,22 +132,37 @@ class _Setting(dict[str, float]):
         return super().items()
 
 
-def unread_characteristics(system: System, settings: FloatArray) -> set[str]:
-    """The characteristics of the vehicle that a user's simulator reads in none of N settings, shape
-    (N, n). The result is empty for systems without such a simulator.
+class WatchedRun(NamedTuple):
+    """A run of a user's simulator, with what the simulator did to its setting.
+
+    Attributes
+    ----------
+    values, values_after
+        The values of the setting before and after the run, by name.
+    unread
+        The characteristics whose values the simulator did not read.
+    result
+        What the simulator returned.
     """
-    if system.mover.is_exact:
-        return set()
+
+    values: NamedValues
+    values_after: NamedValues
+    unread: set[str]
+    result: StatedRun
+
+
+def watched_runs(system: System, settings: FloatArray) -> Iterator[WatchedRun]:
+    """Simulate N settings, shape (N, n), in a user's simulator at the system's first point."""
     members = system.characteristics
-    unread = {*members.vehicle.names}
     for setting in settings:
         values = members.encounter_of(setting)
         scenario: Any = encounter(system.points[0], values).scenario
-        vehicle = _Setting(members.vehicle.named(setting[members.of_vehicle]))
+        named = members.vehicle.named(setting[members.of_vehicle])
+        vehicle = _Setting(named)
         with system.user_code():
-            KEPT.at(scenario).simulate(vehicle)
-        unread &= vehicle.unread
-    return unread
+            result = KEPT.at(scenario).simulate(vehicle)
+        unread = {*vehicle.unread}
+        yield WatchedRun(named, dict(vehicle.items()), unread, result)
 
 
 def simulations_of_setting(system: System) -> int:
@@ -225,11 +240,10 @@ def _check_step(simulator: Simulator, time: FloatArray, point: str) -> None:
     step = round(float(time[1] - time[0]), 6)
     earlier_step = _steps.setdefault(kind, {}).setdefault(point, step)
     if step != earlier_step:
-        steps = f"{min(step, earlier_step):g} and {max(step, earlier_step):g} s"
-        code = UserCode(
-            f"scenario.model = {kind.__name__}: runs have time steps of {steps}", kind
-        )
-        raise code.wrong("simulate", f"{step:g} s", "one time step in all runs")
+        code = UserCode(f"scenario.model = {kind.__name__}", kind)
+        shorter, longer = sorted((step, earlier_step))
+        steps = f"time steps of {shorter:g} and {longer:g} s"
+        raise code.wrong("simulate", steps, "one time step in all runs")
 
 
 def _check_names(scenario: Simulator, result: StatedRun, system: System) -> None:

@@ -254,7 +254,8 @@ def test_metrics_and_objectives_in_a_users_file_are_the_same(in_tmp: Path) -> No
     assert_array_equal(
         values, np.stack([-found.column("tit"), found.f_safe, found.f_diff], axis=1)
     )
-    assert not [*trials.try_original(system, drive_all(system, drawn(system, 8, 2)))]
+    runs = drive_all(system, drawn(system, 8, 2))
+    assert not [*trials.find_unstated_needs(system, runs)]
 
 
 def test_no_module_asks_whether_something_is_a_shipped_class_of_another_one() -> None:

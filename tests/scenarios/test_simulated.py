@@ -398,14 +398,25 @@ def test_workers_have_numbers_which_those_have_that_replace_them(wall: Path) -> 
 
 
 def test_runs_have_one_time_step(wall: Path) -> None:
-    """In one batch or in several, and in `check`, too."""
-    change = "lambda r: {**r, 'time': r['time'] * (1 + (len(r['time']) > 60))}"
+    """In one batch or in several, and in `check`, which names the line of the user's method."""
+    change = (
+        "lambda r: {**r, 'time': r['time'] * (k := 1 + (len(r['time']) > 60)),"
+        " 'speed': r['speed'] / k}"
+    )
     system = wrong_system(wall, change)
     simulators.simulate_each(system, np.array([[9.0, 0.0]]))
     with pytest.raises(InputError, match=r"time steps of 0.05 and 0.1 s"):
         simulators.simulate_each(system, np.array([[4.0, 0.5]]))
     choose("models:Wrong")
-    refused("check wall.toml", "time steps of 0.05 and 0.1 s")
+    (finding,) = rows_of(json_of("check wall.toml", expect=1), "findings")
+    assert "time steps of 0.05 and 0.1 s" in finding["finding"]
+    lines = Path("models.py").read_text().splitlines()
+    file, _, line = finding["where"].rpartition(":")
+    assert file == str(wall.parent / "models.py")
+    assert lines[int(line) - 2 : int(line)] == [
+        "class Wrong(Wall):",
+        "    def simulate(self, setting):",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -424,7 +435,7 @@ def test_runs_have_one_time_step(wall: Path) -> None:
         ("gap=40 + (r['gap'] - 40) / 1.4", ""),
         (
             "gap=r['gap'] / 3.6, obstacle_speed=r['gap'] * 0 + 1",
-            "speed and gap disagree in the first step: 0.7 m and 0.208 m",
+            "speed and gap disagree",
         ),
         ("gap=r['gap'] + r['time'], obstacle_speed=r['gap'] * 0 + 1", ""),
         ("gap=np.where(r['time'] == 0, np.inf, r['gap'])", ""),
