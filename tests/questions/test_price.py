@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -199,6 +200,40 @@ def test_a_number_is_that_of_all_simulations_of_an_edited_class(
             )
         )
         assert run(command, expect=None).stdout == output.stdout
+
+
+SUM = """
+from pathlib import Path
+
+class Sum:
+    UNITS = {f"c{number}": "-" for number in range(300)}
+
+    def simulate(self, setting):
+        with Path("count").open("a") as count:
+            count.write(".")
+        rest = 180 - sum(setting.values())
+        return {"outcome": "stopped" if rest > 0 else "collision", "safety_degree": rest}
+"""
+
+
+@pytest.mark.parametrize("question", [sv.risk, sv.rules])
+def test_a_number_holds_with_300_characteristics(question: Any, in_tmp: Path) -> None:
+    write("sums.py", SUM)
+    domain = '= { unit = "-", original = 0.5, lower = 0, upper = 1 }\n'
+    domains = "".join(f"c{number} {domain}" for number in range(300))
+    head, table, rest = STUDY.partition("[vehicle.characteristics]\n")
+    _, metrics, rest = rest.partition("[metrics]")
+    study = head + table + domains + metrics + rest
+    write("sum.toml", study.replace("models:Wall", "sums:Sum"))
+    most = 0
+
+    def show(phase: str, done: int, total: int) -> None:
+        nonlocal most
+        most = max(most, done, total)
+
+    question("sum.toml", simulations=250, pool=InlinePool(), progress=show)
+    assert 100 <= Path("count").stat().st_size <= 250
+    assert 100 <= most <= 250
 
 
 def test_what_decides_is_said_from_enough_vehicles(rig: str) -> None:
