@@ -124,8 +124,8 @@ def show_no_progress(phase: str, number: int, total: int) -> None:
 class Parts:
     """The progress of parts of a command that follow each other, such as its questions.
 
-    `expected` has a number for each part: the part takes at least as long as this number of
-    simulations.
+    `expected` has a number for each part: the part takes about as long as this number of
+    simulations, and counts as so many. A part without a number, or with 0, counts its own.
     """
 
     def __init__(self, show: Progress, expected: Iterable[int] = ()) -> None:
@@ -145,8 +145,8 @@ class Parts:
 
         def show_part(phase: str, number: int, total: int) -> None:
             # A part may take longer than its simulations, for example to start workers. Its
-            # expected number is spread over its simulations.
-            self._whole = max(total, expected)
+            # expected number is spread over its simulations, so that the announced total stays.
+            self._whole = expected or total
             number = self._whole * number // max(total, 1)
             if name:
                 phase = f"{name}: {phase}"

@@ -189,7 +189,15 @@ def report(
         pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
         numbers = count(1)
         costs = [USUAL_COSTS.get(text.split()[0], LEAST_COST) for text in texts]
-        progress_parts = Parts(show, [*costs, *PAGE_COSTS * len(cases)])
+        if simulations:
+            # The questions have equal parts of the simulations.
+            costs = [LEAST_COST] * len(texts)
+        costs += PAGE_COSTS * len(cases)
+        if simulations:
+            # The bar counts the simulations that the user allows.
+            whole = sum(costs)
+            costs = [simulations * cost // whole for cost in costs]
+        progress_parts = Parts(show, costs)
 
         def next_answer(
             places: slice, text: str, parsed: tuple[Question, JsonObject] | None = None
@@ -370,9 +378,12 @@ def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
     """
     anchor = f"study-{number}"
     show = parts.begin()
-    show("figures", 0, 1)
+    show("figures", 0, 0)
     answers = study.answers
     front, *sections = _sections(anchor, [*answers, tested(study), trust(study)])
+    show = parts.begin()
+    replayed = list(replays(study, show, start=100 * number))
+    show("replays", 1, 1)
     return {
         "name": study.case.name,
         "title": study.case.study.title,
@@ -385,7 +396,7 @@ def _study_parts(number: int, study: ReportedStudy, parts: Parts) -> JsonObject:
         "versions": study.versions,
         "is_for_workshop": study.has_workshop_parts,
         "front": front,
-        "replays": list(replays(study, parts.begin(), start=100 * number)),
+        "replays": replayed,
         "sections": sections,
     }
 

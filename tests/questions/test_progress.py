@@ -110,7 +110,7 @@ def test_a_stage_of_more_settings_than_planned_has_those_of_all_points() -> None
     assert shown[-1] == ("first", 0, 2 * 30)
 
 
-def test_parts_weigh_at_least_what_is_expected_of_them() -> None:
+def test_parts_weigh_what_is_expected_of_them() -> None:
     shown = Shown()
     parts = Parts(lambda *one: shown.append(one), [100, 50])
     first = parts.begin("question 1")
@@ -119,8 +119,8 @@ def test_parts_weigh_at_least_what_is_expected_of_them() -> None:
     parts.begin()("c", 1, 2)
     assert shown == [
         ("question 1: a", 50, 150),
-        ("question 1: b", 100, 250),
-        ("c", 225, 250),
+        ("question 1: b", 50, 150),
+        ("c", 125, 150),
     ]
 
 

@@ -50,5 +50,7 @@ def page(slippery: Path, case: Case) -> str:
         page = page_of(slippery, ask=ASK, progress=lambda *values: shows.append(values))
         assert shows[0][1] == 0
         assert shows[-1][0] == "replays"
-        assert all(done <= total or not total for _, done, total in shows)
+        announced = shows[0][2]
+        assert all(done <= total == announced for _, done, total in shows)
+        assert shows[-1][1] == announced
         return page

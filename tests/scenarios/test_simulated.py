@@ -504,8 +504,18 @@ def test_a_page_with_few_simulations_has_the_replay_with_the_fewest_changes(
     wall: Path,
 ) -> None:
     run("study wall.toml --out results --runs 1")
-    run("report results --simulations 400 --out page.html")
+    shown = list[tuple[int, int]]()
+    sv.report(
+        "results",
+        out="page.html",
+        simulations=400,
+        progress=lambda _, done, total: shown.append((done, total)),
+    )
     assert "Fewest changes: " in Path("page.html").read_text()
+    _, announced = shown[0]
+    assert {total for _, total in shown} == {announced}
+    assert shown[-1] == (announced, announced)
+    assert announced <= 400
 
 
 @SLOW
