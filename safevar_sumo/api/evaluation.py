@@ -156,6 +156,7 @@ def _read_settings(
             array = np.where(np.isnan(values), characteristics.original, values)
             index = settings.index
         else:
+            _check_no_flags(settings)
             array = np.array(settings, float)
             if array.ndim != 2 or array.shape[1] != len(names):
                 expected = (
@@ -180,6 +181,16 @@ def _read_settings(
                 float(array[row, column]), beyond=beyond
             )
     return array, index
+
+
+def _check_no_flags(settings: Any) -> None:
+    """Refuse an array with True or False, which numpy would read as the numbers 1 and 0."""
+    rows = plain_values(settings)
+    if not isinstance(rows, Sequence):
+        return
+    for number, row in enumerate(rows):
+        if isinstance(row, Sequence) and any(isinstance(value, bool) for value in row):
+            raise InputError(f"settings, row {number}", repr(row), "numbers")
 
 
 def _check_numbers(name: str, column: pd.Series) -> None:

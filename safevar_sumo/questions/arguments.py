@@ -5,7 +5,7 @@ annotates says which values an argument may have.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from os import PathLike
 from typing import Any, NamedTuple, TypeVar, cast
@@ -49,8 +49,22 @@ def _is_path_or_none(value: object) -> bool:
     return value is None or _is_path(value)
 
 
+def _is_mapping_or_none(value: object) -> bool:
+    # A Series of pandas has names, too.
+    return value is None or isinstance(value, Mapping) or hasattr(value, "keys")
+
+
+def _object_of(name: str) -> Callable[[object], bool]:
+    """The function that says whether a value is an object of the class with this name."""
+
+    def accepts(value: object) -> bool:
+        return name in [kind.__name__ for kind in type(value).__mro__]
+
+    return accepts
+
+
 def _is_pool_or_none(value: object) -> bool:
-    return value is None or hasattr(value, "workers")
+    return value is None or _object_of("Pool")(value)
 
 
 FLAG = "bool"
@@ -72,6 +86,17 @@ KINDS = {
     "Path | None": Kind(_is_path_or_none, "a text or a path, or None"),
     "str | None": Kind(_is_path_or_none, "a text, or None"),
     "str | Path | None": Kind(_is_path_or_none, "a text or a path, or None"),
+    "Mapping[str, float] | None": Kind(
+        _is_mapping_or_none, "values by name, such as {'mass': 2500}, or None"
+    ),
+    "Comparison": Kind(
+        _object_of("Comparison"),
+        "a Comparison, which sv.comparison_of(simulation) returns",
+    ),
+    "Simulation": Kind(
+        _object_of("Simulation"),
+        "a Simulation, which sv.simulate(study, changes) returns",
+    ),
 }
 """The legal values of arguments, by the annotated type. A function itself checks arguments with
 other types.

@@ -45,6 +45,8 @@ class Phases:
         """Number of simulations that the present part still has to do."""
         self._most = math.inf
         """Largest number of simulations that the question may do."""
+        self._never_grows = False
+        """Whether a total also bounds the totals after it."""
 
     def plan(
         self, settings: NamedValues, points: int = 1, most: float = math.inf
@@ -57,6 +59,13 @@ class Phases:
         self._later = {
             name: points * number for name, number in settings.items() if number
         }
+
+    def plan_most(self, settings: NamedValues, points: int) -> None:
+        """Plan the phases by their largest numbers of settings: no total is larger than an earlier
+        one.
+        """
+        self.plan(settings, points)
+        self._never_grows = True
 
     def bound(self, simulations: int) -> None:
         """Show no larger total than that of so many further simulations."""
@@ -141,4 +150,7 @@ class Phases:
             excess = simulations - self._expected
             remainder = max(remainder, excess, LEAST_SHARE * simulations)
         expected = self._done + remainder + sum(self._later.values())
-        return self._done, round(max(min(expected, self._most), self._done))
+        total = max(min(expected, self._most), self._done)
+        if self._never_grows:
+            self._most = total
+        return self._done, round(total)

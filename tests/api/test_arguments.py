@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -44,10 +45,12 @@ def test_every_function_refuses_an_unknown_argument(name: str) -> None:
 
 
 def test_true_is_no_number_and_none_is_no_text() -> None:
+    is_refused("evaluate", ["smoke", np.ones((1, 12), bool)], "settings, row 0: .*True")
     is_refused("load_study", [{3: 4}], "study: the key 3\nexpected: keys")
     is_refused("load_study", [None], "study: None\nexpected: the name of a study")
     is_refused("risk", ["smoke"], "samples: None\nexpected: a whole", samples=None)
     is_refused("tolerance", ["smoke"], "limits: None\nexpected: a text", limits=None)
+    is_refused("draw_comparison", [None], "comparison: None\nexpected: a Comparison")
 
 
 def test_a_frame_in_place_of_an_answer_or_of_its_table_is_refused() -> None:

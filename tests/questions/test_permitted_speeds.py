@@ -219,6 +219,27 @@ def test_each_car_of_a_list_reaches_the_speed_of_the_formula() -> None:
     assert "fast" in answer.verdict, "a test that was left out"
 
 
+@pytest.mark.parametrize("model", ["Car", "Shaky"])
+def test_the_total_of_the_bar_is_an_upper_bound_from_the_beginning(
+    model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With failures on the grid and between its speeds, repairs, and ends of assumed values."""
+    monkeypatch.setattr("safevar_sumo.questions.cases.LEAST_SIMULATIONS", 100)
+    measured = f"upper = 9, precision = {{ value = {WEAKER}, source = 'test' }}"
+    study = STUDY.replace("cars:Car", f"cars:{model}").replace("upper = 9", measured)
+    shown = list[tuple[int, int]]()
+    answer = asked(
+        study + TESTS,
+        cars=CAR_LIST,
+        step=4.0,
+        progress=lambda phase, done, total: shown.append((done, total)),
+    )
+    done, totals = np.transpose(shown)
+    assert (np.diff(totals) <= 0).all()
+    assert (done[:-1] < totals[:-1]).all()
+    assert answer.tables["cars"]["repair_first"].notna().any()
+
+
 def test_the_assumed_value_that_matters_most_is_that_of_the_formula() -> None:
     """Each assumed value at each end of its domain, with the other values as they are."""
     for measured in ({"delay": 0.75}, {"decel": 7.0, "load": 0.5}):
