@@ -29,6 +29,7 @@ from safevar_sumo.plugins.process import this_process
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.records import Evaluations
 from safevar_sumo.results import manifest_differences
+from safevar_sumo.study import tables_of
 from safevar_sumo.sumo import kept, simulators
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.simulators import joined
@@ -998,7 +999,10 @@ def test_a_library_of_the_search_counts_if_the_simulator_uses_it(wall: Path) -> 
     run("study wall.toml --out results")
     rewrite(Path("results/manifest.json"), (np.__version__, "1.0"))
     refused("study wall.toml --out results", "version of numpy was '1.0'")
-    stored, now = ({"versions": {"numpy": one}, "study": {}} for one in ("1.0", "1.1"))
+    study = tables_of(sv.load_study(str(wall)))
+    stored, now = (
+        {"versions": {"numpy": one}, "study": study} for one in ("1.0", "1.1")
+    )
     for libraries, matters in ([], False), (["numpy"], True):
         (change,) = manifest_differences(stored, {**now, "libraries": libraries})
         assert change[2] is matters
@@ -1027,8 +1031,9 @@ def test_failures_that_fresh_runs_do_not_repeat_are_told_by_no_answer(
     wall: Path,
 ) -> None:
     choose("unlucky:Unlucky", UNLUCKY, "repeats = 4")
-    sampled = sv.explain(str(wall), pool=InlinePool())
+    sampled = sv.explain(str(wall), simulations=2000, pool=InlinePool())
     assert sampled.tables["causes"].empty
+    assert "was safe in all its fresh runs" in sampled.verdict
     assert "enough" not in sampled.verdict
     run("study wall.toml --out results")
     summary = json_of("explain results")
