@@ -15,10 +15,16 @@ import pytest
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.replay.export import converted, open_drive
+from safevar_sumo.scenarios.published import (
+    LATERAL_START,
+    WALKING_SPEED,
+    PedestrianCrossing,
+)
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.network import (
+    _BuiltRoads,
     built_network,
     copied_network,
     open_network,
@@ -55,6 +61,23 @@ def test_the_recipe_builds_the_network_that_is_kept(
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_a_network_has_the_road_that_netconvert_makes_of_it(folder: str) -> None:
     assert converted(open_network(folder)) == open_drive(open_network(folder))
+
+
+def test_constants_of_the_published_crossing_are_those_of_its_files() -> None:
+    """How fast the pedestrian walks, and how far beside the vehicle's lane the walk begins."""
+    person = ElementTree.parse(NETWORKS / "pedestrian_crossing/traffic.rou.xml").find(
+        "person"
+    )
+    assert person is not None
+    walk = person.find("walk")
+    assert walk is not None
+    scenario = PedestrianCrossing(
+        lateral_start=LATERAL_START, walking_speed=WALKING_SPEED
+    )
+    actors = scenario.actors(_BuiltRoads(open_network("pedestrian_crossing")))
+    stated = actors["person[@id='pedestrian']"]["departPos"]
+    assert float(stated) == float(person.attrib["departPos"])
+    assert actors["person[@id='pedestrian']/walk"]["speed"] == walk.attrib["speed"]
 
 
 def test_without_sumos_programs_what_needs_them_says_so(
