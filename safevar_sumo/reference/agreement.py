@@ -28,7 +28,7 @@ from safevar_sumo.questions.figures import (
 from safevar_sumo.questions.research_questions.statistics import rounded_to_rank
 from safevar_sumo.questions.tables import shipped_columns
 from safevar_sumo.questions.words import two_decimals
-from safevar_sumo.records import Evaluations, FloatArray
+from safevar_sumo.records import Evaluations, FloatArray, JsonObject
 from safevar_sumo.reference.rows import ReferenceData, read_reference
 from safevar_sumo.results import evaluation_keys
 from safevar_sumo.scenarios.declared import read_study
@@ -107,7 +107,7 @@ def validate(subject: Subject, evaluator: Evaluator, reference: Path) -> Answer:
         question="validate",
         study=study,
         verdict=verdict,
-        numbers={**numbers},
+        numbers=numbers,
         tables={"agreement": tabulate("Agreement with the reference", COLUMNS, table)},
         draw=partial(
             _draw, f"{study.title}\nagainst {reference.name}", data, evaluations
@@ -141,9 +141,7 @@ def _draw(
     return figure
 
 
-def agreement_counts(
-    reference: ReferenceData, evaluations: Evaluations
-) -> dict[str, int]:
+def agreement_counts(reference: ReferenceData, evaluations: Evaluations) -> JsonObject:
     """The numbers of rows, and of rows that collide here, in the reference, and in both."""
     return {
         "rows": len(evaluations),

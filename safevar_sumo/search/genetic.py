@@ -236,11 +236,8 @@ def select_survivors(individuals: list[Individual], number: int) -> list[Individ
     violations (constrained domination, Deb et al. 2002). Each infeasible individual has a rank of
     its own.
     """
-    feasible: list[Individual] = []
-    infeasible: list[Individual] = []
-    for individual in individuals:
-        group = infeasible if individual.violation else feasible
-        group.append(individual)
+    feasible = [individual for individual in individuals if not individual.violation]
+    infeasible = [individual for individual in individuals if individual.violation]
     infeasible.sort(key=attrgetter("violation"))
     for place, individual in enumerate(infeasible):
         individual.standing = len(individuals) + place, 0.0

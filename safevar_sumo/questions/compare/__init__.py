@@ -44,7 +44,6 @@ from safevar_sumo.questions.compare.differences import (
 from safevar_sumo.questions.compare.settings import (
     BOTH_STAGE,
     LINE,
-    RUN_COLUMNS,
     SAMPLE,
     CommonDomain,
     Evaluators,
@@ -346,7 +345,8 @@ def _test(settings: pd.DataFrame) -> _PairedTest:
     names = [f"line {int(line)}" for line in pairs.index]
     groups = "sampled on one line through the domain"
     if "run" in frame:
-        means = frame.dropna(subset=["run"]).groupby(RUN_COLUMNS)[SIDES].mean()
+        # Sampled settings belong to no run: pandas leaves them out.
+        means = frame.groupby(["source", "algorithm", "run"])[SIDES].mean()
         if len(means) >= fewest_runs("RQ1"):
             pairs = means
             names = [

@@ -32,8 +32,6 @@ studies. If hardly any settings satisfy them, fewer settings are returned.
 """
 SAMPLE = "sample"
 """Value of the column `source` of sampled settings."""
-RUN_COLUMNS = ["source", "algorithm", "run"]
-"""Columns that identify a run."""
 LINE = "line"
 """Name of the column with the number of the line on which a sampled setting lies."""
 ROUNDS = 4
@@ -236,9 +234,7 @@ def pairs_of(
         in_b = solutions if side == "b" else solutions + common.shift
         settings = np.stack([in_a, in_b])
         is_inside = common.holds(settings)
-        run_columns = [
-            name for name in RUN_COLUMNS if name in case.solutions and case.has_runs
-        ]
+        run_columns = ["algorithm", "run"] if case.has_runs else []
         frame = case.solutions[run_columns].assign(
             source=side, solution=list(map(str, handles_of(case.solutions)))
         )

@@ -202,8 +202,6 @@ def _begin(
         # At the ends, nobody knows where a cause begins.
         begins_at = share if share < 1 else np.nan
         beginnings.append(Beginning(cause, begins_at, cause.changes, np.nan))
-    if not number:
-        return beginnings, []
 
     members = evaluator.characteristics
     shares = np.arange(1, steps + 1) / steps

@@ -168,11 +168,8 @@ def smallest_tables(smallest: Smallest | None) -> AnswerTables:
     stairs = pd.DataFrame(rows, columns=list(STAIRCASE_COLUMNS)).astype(
         {"fewest": "Int64"}
     )
-    causes = (
-        smallest.table if smallest else pd.DataFrame(columns=list(SMALLEST_COLUMNS))
-    )
     return {
-        "causes": tabulate(TITLE, SMALLEST_COLUMNS, causes),
+        "causes": tabulate(TITLE, SMALLEST_COLUMNS, smallest.table if smallest else ()),
         "staircase": tabulate(title, STAIRCASE_COLUMNS, stairs),
     }
 

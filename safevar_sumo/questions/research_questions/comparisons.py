@@ -168,9 +168,7 @@ def rq2_common(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
 
 
 def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
-    """`rq2_runs` in short, for a paper: columns algorithm, metric, baseline, effect_size,
-    significant, and a12, the effect size with marks.
-    """
+    """`rq2_runs` in short, for a paper: with a column a12, the effect size with marks."""
     tests = rq2_runs(case, choices)
     texts = []
     facts = tests[["effect_size", "significant", "magnitude"]]
@@ -180,8 +178,7 @@ def effects(case: Case, choices: Choices = DEFAULT) -> pd.DataFrame:
             asterisk = "*" if is_significant else ""
             text = f"{effect:.2f}{asterisk} {MARKS[magnitude]}".strip()
         texts.append(text)
-    columns = ["algorithm", "metric", "baseline", "effect_size", "significant"]
-    return tests[columns].assign(a12=texts)
+    return tests.assign(a12=texts)
 
 
 def compare_over_runs(
