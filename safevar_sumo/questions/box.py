@@ -95,7 +95,7 @@ def proof_size(attempt: int, share: float) -> int:
 
 def _error_of(attempt: int) -> float:
     """The probability with which the test number `attempt` (1, 2, ...) may be wrong."""
-    return float((1 - CONFIDENCE) * 0.5**attempt)
+    return (1 - CONFIDENCE) * 0.5**attempt
 
 
 def prove(

@@ -322,17 +322,18 @@ def load_cases(directories: Iterable[str | Path]) -> list[Case]:
             facts = {name: manifest[name] for name in OF_ALGORITHMS if name in manifest}
             if "scoring" in manifest:
                 facts["scoring"] = msgspec.convert(manifest["scoring"], Scoring)
-            case = build_case(
-                study,
-                manifest["original"],
-                solutions,
-                evaluations,
-                finished,
-                has_runs="imported" not in manifest,
-                failures=failures,
-                **facts,
+            cases.append(
+                build_case(
+                    study,
+                    manifest["original"],
+                    solutions,
+                    evaluations,
+                    finished,
+                    has_runs="imported" not in manifest,
+                    failures=failures,
+                    **facts,
+                )
             )
-            cases.append(case)
         except (TypeError, ValueError, KeyError, ArithmeticError) as error:
             raise InputError(
                 path,

@@ -285,15 +285,15 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
         point = points[runs.points[row]]
         values = members.encounter_of(setting)
         scenario = encounter(point, values).scenario
-        run = runs.take(np.array([row]))
-        collided = bool(runs.collided[row])
+        run = runs.take([row])
+        collided = runs.collided[row]
         if runs.standing[row]:
             event = breach = OUTCOME_VERBS[Outcome.NEVER_MOVED]
         else:
             breach = model.unsafe.breach_in_words(run)
             event = _event_in_words(scenario, model.unsafe, collided)
         impact = ""
-        speed = -KMH_PER_MS * float(runs.f_safe[row])
+        speed = -KMH_PER_MS * runs.f_safe[row]
         if collided and model.unsafe.is_of_impacts:
             event = breach
         elif collided and speed >= LEAST_IMPACT:

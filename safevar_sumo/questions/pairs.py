@@ -47,11 +47,8 @@ def table_of_pairs(
     """
     a, b = runs
     in_a, in_b = (unsafe.of(run) for unsafe, run in zip(criteria, runs, strict=True))
-    where = np.select(
-        [in_a & ~in_b, in_b & ~in_a, in_a & in_b],
-        list(UNSAFE_IN)[:-1],
-        list(UNSAFE_IN)[-1],
-    )
+    *versions, neither = UNSAFE_IN
+    where = np.select([in_a & ~in_b, in_b & ~in_a, in_a & in_b], versions, neither)
     values = (solutions, where, a.outcome, a.f_safe, b.outcome, b.f_safe)
     return pd.DataFrame(dict(zip(SETTING_COLUMNS, values, strict=True)))
 

@@ -425,11 +425,9 @@ def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str
 
     bars = [bar.blocks for bar in table.bars]
     if bars and columns:
-        yield WholeTable(
-            title,
-            [(labels[0].head, False, labels[0].texts), (LEGEND["text"], False, bars)],
+        blocks.insert(
+            0, [labels[0], _ReaderColumn([], LEGEND["text"], "", bars, False)]
         )
-        title = ""
     for block in filter(None, blocks):
         heads_and_texts = [(item.head, item.is_number, item.texts) for item in block]
         yield WholeTable(title, heads_and_texts)
