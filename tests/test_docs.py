@@ -190,6 +190,14 @@ def test_every_file_of_code_that_is_named_exists() -> None:
             ), f"{file}: {name}"
 
 
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "sumo_nets/README.md"])
+def test_every_link_of_a_page_outside_of_the_site_leads_to_a_file(page: str) -> None:
+    """`mkdocs build --strict` follows the links of the site."""
+    links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", (ROOT / page).read_text())
+    for link in links:
+        assert (ROOT / page).parent.joinpath(link).exists(), link
+
+
 def test_the_page_on_results_lists_every_key_that_may_change() -> None:
     page = (ROOT / "docs" / "results.md").read_text()
     (listed,) = re.findall(
