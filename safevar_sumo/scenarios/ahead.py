@@ -92,11 +92,6 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True):
         raise NotImplementedError
 
     @property
-    def offset(self) -> Quantity:
-        """Distance of the target's rear to the right of the lane's middle [m]."""
-        return lateral_offset(self.impact_location, self.vut_width)
-
-    @property
     def direction(self) -> Direction:
         """The direction in which the target faces."""
         return SAME_DIRECTION
@@ -109,7 +104,9 @@ class TargetAhead(ProtocolTest, frozen=True, kw_only=True):
         direction = self.direction
         body = BODIES[target]
         speeds = self.target_speed_at(times)
-        y = direction.left * body.length / 2 - self.offset
+        # The distance of the middle of the target's rear to the right of the lane's middle.
+        offset = lateral_offset(self.impact_location, self.vut_width)
+        y = direction.left * body.length / 2 - offset
         at_gap = Track("target", target, *body, self.gap, y, *direction, speeds)
         first_point = first_in_strip(at_gap._replace(x=0.0), self.vut_width / 2)
         return [at_gap._replace(x=self.gap - first_point + travelled(speeds, times))]

@@ -4,7 +4,7 @@ weather declare ranges, which complete the study.
 
 from __future__ import annotations
 
-import dataclasses
+import inspect
 from collections.abc import Sequence
 from typing import Any
 
@@ -195,15 +195,8 @@ class _Declared:
             SCENARIOS, model, "scenario.model", *SCENARIO_BASES
         )
         with self._lookup.modules.active():
-            default = stated.get(name, _defaults(member.target).get(name))
-        return free_parameters(member.target).get(name), default
-
-
-def _defaults(model: type) -> Parameters:
-    """The default values of a class's fields."""
-    fields: Sequence[Any] = ()
-    if issubclass(model, msgspec.Struct):
-        fields = msgspec.structs.fields(model)
-    if dataclasses.is_dataclass(model):
-        fields = dataclasses.fields(model)
-    return {field.name: field.default for field in fields}
+            fields = inspect.signature(member.target).parameters
+        original = stated.get(name)
+        if name not in stated and name in fields:
+            original = fields[name].default
+        return free_parameters(member.target).get(name), original
