@@ -190,9 +190,7 @@ class PerVehicleAds(Ads):
         self, observation: Observation, memory: list[ScalarAds]
     ) -> tuple[Command, list[ScalarAds]]:
         n = len(memory)
-        values = np.empty((len(observation), n))
-        for row, value in enumerate(observation):
-            values[row] = value
+        values = np.array(np.broadcast_arrays(*observation), float)
         observations = [Observation._make(row) for row in values.T.tolist()]
         pedals = [(0.0, 0.0)] * n
         # The driver of a vehicle whose run has ended is not called: the vehicle may be in a state
@@ -209,20 +207,19 @@ class PerVehicleAds(Ads):
 
     def _checked_pedals(self, command: Any) -> Pedals:
         """Refuse an illegal result of a user's `drive`, and convert a legal result to pedals."""
-        if type(command) is tuple and len(command) == 2:
-            throttle, brake = command
-            # The fast path skips the general check, because this code runs for every vehicle in
-            # every step.
-            if (
-                type(throttle) is type(brake) is float
-                and 0 <= throttle <= 1
-                and 0 <= brake <= 1
-            ):
-                return throttle, brake
         if not isinstance(command, tuple | list) or len(command) != 2:
             raise self._code.wrong(
                 "drive", quoted(command), "(throttle, brake), each in [0, 1]"
             )
+        throttle, brake = command
+        # The fast path skips the general check, because this code runs for every vehicle in every
+        # step.
+        if (
+            type(throttle) is type(brake) is float
+            and 0 <= throttle <= 1
+            and 0 <= brake <= 1
+        ):
+            return throttle, brake
         pedals = zip(Command._fields, command, strict=True)
         throttle, brake = (
             self._code.check_numbers("drive", name, value, (), SHARE)

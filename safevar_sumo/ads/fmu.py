@@ -104,12 +104,7 @@ class Fmu:
             expected = "throttle, brake or both; alternatively acceleration"
             raise InputError("", f"ads.outputs = {sorted(table.outputs)}", expected)
 
-        observed = [
-            name
-            for name in UNITS
-            if name in (*Observation._fields, "detected", "step")
-            or name.startswith(NOMINAL)
-        ]
+        observed = [name for name in UNITS if name not in ("acceleration", "warns")]
         self.inputs = {
             key: self._variable("input", key, name, observed)
             for key, name in table.inputs.items()

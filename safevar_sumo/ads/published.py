@@ -163,21 +163,19 @@ class Apollo(Ads, Table, frozen=True, kw_only=True):
         ) & ~memory.has_begun_to_stop
         has_begun_to_stop = memory.has_begun_to_stop | begins_braking
         last_acceleration = memory.commanded_acceleration
-        largest_change = np.array(self.jerk * memory.step)
-        if np.count_nonzero(begins_braking):
-            # Apollo plans in continuous time. Braking began within the last step, when
-            # `needed_after_lag` passed `comfortable_deceleration`. Only since then, the
-            # acceleration has changed.
-            rise = np.maximum(needed_after_lag - memory.needed_after_lag, LEAST_RISE)
-            share_since_onset = np.minimum(
-                (needed_after_lag - self.comfortable_deceleration) / rise, 1.0
-            )
-            last_acceleration = np.where(
-                begins_braking, np.minimum(last_acceleration, 0.0), last_acceleration
-            )
-            largest_change = largest_change * np.where(
-                begins_braking, share_since_onset, 1.0
-            )
+        # Apollo plans in continuous time. Braking began within the last step, when
+        # `needed_after_lag` passed `comfortable_deceleration`. Only since then, the acceleration
+        # has changed.
+        rise = np.maximum(needed_after_lag - memory.needed_after_lag, LEAST_RISE)
+        share_since_onset = np.minimum(
+            (needed_after_lag - self.comfortable_deceleration) / rise, 1.0
+        )
+        last_acceleration = np.where(
+            begins_braking, np.minimum(last_acceleration, 0.0), last_acceleration
+        )
+        largest_change = (self.jerk * memory.step) * np.where(
+            begins_braking, share_since_onset, 1.0
+        )
 
         taper = np.maximum(speed - self.creep_speed, 0.0) / TAPER_TIME
         braking = np.minimum(
