@@ -71,10 +71,8 @@ def prepared_original(
     """The model's constants of the original vehicle with `changes` of its characteristics.
     `friction` is the factor of the weather on the tyres' friction.
     """
-    values = {
-        member.name: np.full(1, float(member.original)) for member in characteristics
-    }
-    return vehicle.prepare(values | changes, friction, STEP)
+    original = characteristics.columns(characteristics.original_settings)
+    return vehicle.prepare(original | changes, friction, STEP)
 
 
 @lru_cache(maxsize=4)

@@ -422,9 +422,7 @@ def _roll(
     speed = np.maximum((p.body * slope_speed + pull * wheel_speed) / damped_mass, 0.0)
 
     # A vehicle with locked wheels stands if it is slower than `standstill`.
-    is_held = (wheel_speed <= 0.0) & (speed < p.standstill)
-    if np.count_nonzero(is_held):
-        speed[is_held] = 0.0
+    speed[(wheel_speed <= 0.0) & (speed < p.standstill)] = 0.0
     return s._replace(
         speed=speed,
         wheel_speed=wheel_speed,
@@ -438,9 +436,7 @@ def _torque_share(rpm_share: FloatArray) -> FloatArray:
     maxRpm, and 0 from maxRpm on (assumption).
     """
     torque_share = TORQUE_IDLE + TORQUE_BEND * rpm_share * (1.0 - rpm_share)
-    is_overspeed = rpm_share >= 1.0
-    if np.count_nonzero(is_overspeed):
-        torque_share[is_overspeed] = 0.0
+    torque_share[rpm_share >= 1.0] = 0.0
     return torque_share
 
 
