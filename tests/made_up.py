@@ -127,6 +127,11 @@ def original_of(system: Any) -> FloatArray:
     return np.asarray(system.characteristics.original_settings)
 
 
+def changed(system: Any, **values: float) -> FloatArray:
+    """The original vehicle with some values as the only row of settings."""
+    return np.asarray(system.characteristics.setting(values, beyond=True)[np.newaxis])
+
+
 def uniform(characteristics: CharacteristicSet, number: int, seed: int) -> FloatArray:
     """Settings at random in the domains."""
     return np.random.default_rng(seed).uniform(

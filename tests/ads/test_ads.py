@@ -34,7 +34,7 @@ from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import ModelTable, study_names
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW
-from tests.made_up import MISSING, seen
+from tests.made_up import MISSING, changed, seen
 from tests.scenarios.holding import CARLA, Hold, driven
 from tests.scenarios.test_crossing import WORN
 
@@ -171,9 +171,7 @@ def test_a_scalar_ads_drives_every_vehicle_with_an_instance_of_its_own() -> None
 
 
 def worn(scenario: Any, latency: float, ads: Any) -> SimulationRuns:
-    setting = WORN.characteristics.original.copy()
-    setting[WORN.characteristics.names.index("sensorLatency")] = latency
-    return driven(scenario, ads, setting[np.newaxis], WORN)
+    return driven(scenario, ads, changed(WORN, sensorLatency=latency), WORN)
 
 
 @pytest.mark.parametrize("latency", [0.05, 0.25, 0.4])

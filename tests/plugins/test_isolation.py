@@ -20,7 +20,7 @@ from safevar_sumo.results import load_runs
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.vehicles import Vehicle
 from tests.in_process import SLOW, json_of, numbers_of, refused, run, searched, write
-from tests.made_up import assert_same_results, system_of
+from tests.made_up import assert_same_results, changed, original_of, system_of
 from tests.manual import files_of
 from tests.plugins.conftest import Mine
 from tests.scenarios.holding import Pedals
@@ -120,9 +120,9 @@ def test_a_state_that_shows_late_is_an_error_at_the_end(
 
 
 NATIVE = system_of("native")
-ORIGINAL = NATIVE.characteristics.original
-MASS = NATIVE.characteristics.names.index("mass")
-HEAVY = np.where(np.arange(len(ORIGINAL)) == MASS, 1700.0, ORIGINAL)
+MASS = 1700.0
+"""Of the heavy vehicle [kg]."""
+HEAVY = changed(NATIVE, mass=MASS)
 
 
 BRAKES = Pedals(
@@ -134,7 +134,7 @@ BRAKES = Pedals(
 """Full throttle, and hardly any for the light one of two."""
 
 
-LENGTH = len(drive_worst(replace(NATIVE, ads=BRAKES), HEAVY[np.newaxis]).trace.time)
+LENGTH = len(drive_worst(replace(NATIVE, ads=BRAKES), HEAVY).trace.time)
 """Samples until the heavy vehicle collides."""
 
 
@@ -153,7 +153,7 @@ class Diverges(Vehicle):
     )
 
     def prepare(self, characteristics: Any, *arguments: Any) -> Any:
-        self._is_heavy = characteristics["mass"] == HEAVY[MASS]
+        self._is_heavy = characteristics["mass"] == MASS
         self._calls = 0
         return self._inner.prepare(characteristics, *arguments)
 
@@ -170,7 +170,7 @@ class Diverges(Vehicle):
 USERS = checked_class(UserCode("vehicle.model = 'mine:Mine'", Diverges), Vehicle)
 
 
-BOTH = np.stack([HEAVY, ORIGINAL])
+BOTH = np.concatenate([HEAVY, original_of(NATIVE)])
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,14 @@ from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, write
-from tests.made_up import SUN, made_up_evaluations, published_rows, system_of, uniform
+from tests.made_up import (
+    SUN,
+    changed,
+    made_up_evaluations,
+    published_rows,
+    system_of,
+    uniform,
+)
 
 GAP = "ads.parameters.brake_gap"
 OWN = float(load_study("sun").ads.parameters["brake_gap"])
@@ -180,7 +187,7 @@ def test_the_sets_are_simulated_one_by_one() -> None:
         repeatability={"safety_degree": 1e-9},
         model_error={},
     )
-    setting = assemble(study).characteristics.setting({"tireFric": 1.3})[np.newaxis]
+    setting = changed(system_of(study), tireFric=1.3)
     alone = [
         drive_and_score(
             system_of("sun", ads={"parameters": {"brake_gap": gap}}), setting

@@ -369,7 +369,7 @@ def commands_of(page: str) -> list[str]:
     return re.findall(f"<code>{PROGRAM}(.*?)</code>", page)
 
 
-DAY, RAIN = "crossing, clear", "crossing, hard_rain"
+DAY = "crossing, clear"
 
 
 @pytest.fixture(scope="module")

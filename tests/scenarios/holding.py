@@ -22,7 +22,6 @@ from safevar_sumo.sumo.system import System
 from tests.made_up import system_of
 
 CARLA = system_of("sun")
-NATIVE = system_of("native")
 
 
 class Hold(Ads):

@@ -11,7 +11,7 @@ import safevar_sumo as sv
 from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from tests.in_process import SLOW, InlinePool, run
-from tests.made_up import original_of, system_of
+from tests.made_up import changed, system_of
 
 KMH = 1 / 3.6
 ALLOWED = {
@@ -72,8 +72,7 @@ def test_the_worst_point_is_that_of_the_largest_excess_and_an_allowed_impact_is_
     elsewhere.
     """
     system = system_of("r152")
-    setting = original_of(system).copy()
-    setting[0, system.characteristics.names.index("sensorRange")] = 15.0
+    setting = changed(system, sensorRange=15.0)
     (hit,) = (
         one
         for one in simulate_all_points(system, setting)

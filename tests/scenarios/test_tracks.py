@@ -39,10 +39,6 @@ class Cast(TrackScenario):
         return [one(times) for one in self.cast]
 
 
-def standing(x: float) -> Any:
-    return lambda times: Track.of("standing", "car", x, 0.0)
-
-
 def moving(
     name: str, x: float, y: float, vx: float, vy: float, kind: str = "car"
 ) -> Any:

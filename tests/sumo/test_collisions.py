@@ -7,7 +7,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import safevar_sumo as sv
@@ -15,7 +14,7 @@ from safevar_sumo.errors import InputError
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.network_check import network_remarks
 from tests.in_process import SLOW, json_of, own_network, rewrite, rows_of
-from tests.made_up import system_of
+from tests.made_up import changed, system_of
 
 CHECKED = {"collision.mingap-factor": "0", "collision.check-junctions": "true"}
 OPTIONS = {
@@ -259,10 +258,8 @@ def test_a_hit_on_a_moving_car_is_as_bad_as_it_closes(
     """`relative_impact_speed` is that of the moment of contact, within the last step."""
     scenario = {"model": "car_to_car", "parameters": parameters}
     system = system_of("sun", scenario=scenario, ads={"model": "aeb"})
-    weak = system.characteristics.setting(
-        {"maxBrakeTorque": 600.0, "tireFric": 0.5}, beyond=True
-    )
-    ((_, evaluations, runs),) = simulate_all_points(system, weak[np.newaxis])
+    weak = changed(system, maxBrakeTorque=600.0, tireFric=0.5)
+    ((_, evaluations, runs),) = simulate_all_points(system, weak)
     assert evaluations.outcome[0] == "collision"
     assert evaluations.f_safe[0] == pytest.approx(
         other - runs.collision_speed[0], abs=1e-9

@@ -106,9 +106,12 @@ CASES = {
 }
 
 
-def searched_study(case: str) -> Study:
+@SLOW
+@pytest.mark.parametrize("case", CASES)
+def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> None:
+    """Its scene is one that SUMO has played, and its original vehicle drives there."""
     base, scenario, search = CASES[case]
-    return load_study(
+    system = system_of(
         base,
         matrix=None,
         scenario={**scenario, "over": {**search, **WEATHER}},
@@ -116,20 +119,12 @@ def searched_study(case: str) -> Study:
         name=case,
         title=case,
     )
-
-
-@SLOW
-@pytest.mark.parametrize("case", CASES)
-def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> None:
-    """Its scene is one that SUMO has played, and its original vehicle drives there."""
-    system = assemble(searched_study(case))
     settings = drawn(system, 4, 3)
     evaluations = drive_and_score(system, settings)
     of_vehicle = system.characteristics.of_vehicle
     for row, setting in enumerate(settings):
         values = system.characteristics.scenario.named(setting[~of_vehicle])
         weather = {name: values.pop(name) for name in WEATHER}
-        base, scenario, _ = CASES[case]
         parameters = {**scenario.get("parameters", {}), **values}
         other = system_of(
             base,

@@ -26,7 +26,7 @@ from safevar_sumo.sumo.driving_robot import DrivingRobot
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW
-from tests.made_up import assert_same_results, drawn, original_of
+from tests.made_up import assert_same_results, changed, drawn, original_of
 from tests.scenarios.holding import CARLA as SUN, Pedals, driven
 
 BASE = load_study("euro_ncap_pedestrian")
@@ -74,7 +74,6 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
 
 
 WEAK = replace(SUN, vehicle=replace_in(SUN.vehicle, engine_torque=0.5))  # type: ignore[type-var]
-MAX_RPM = SUN.characteristics.names.index("max_rpm")
 EAST = np.array([1.0, 0.0])
 
 
@@ -83,9 +82,7 @@ HOLDS_HALF = Pedals(lambda seen: (0.5, 0))
 
 
 def with_max_rpm(*values: float) -> FloatArray:
-    settings = np.tile(SUN.characteristics.original, (len(values), 1))
-    settings[:, MAX_RPM] = values
-    return settings
+    return np.concatenate([changed(SUN, max_rpm=value) for value in values])
 
 
 @pytest.mark.parametrize(

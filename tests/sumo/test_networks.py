@@ -111,11 +111,6 @@ def mine(tmp_path: Path) -> Path:
     return own_network(tmp_path / "mine")
 
 
-def with_traffic(mine: Path, more: str) -> str:
-    rewrite(mine / "traffic.rou.xml", ("</routes>", f"{CAR}{more}</routes>"))
-    return str(mine)
-
-
 GOOD = {
     "a flow": (
         '<flow id="f" type="car" from="oncoming" to="oncoming_on" begin="0" end="9" period="3"/>'
@@ -151,7 +146,8 @@ GOOD = {
 @SLOW
 @pytest.mark.parametrize("what", sorted(GOOD))
 def test_legal_traffic_moves_equally_in_every_copy(mine: Path, what: str) -> None:
-    network = with_traffic(mine, GOOD[what])
+    rewrite(mine / "traffic.rou.xml", ("</routes>", f"{CAR}{GOOD[what]}</routes>"))
+    network = str(mine)
     check_network(network)
     with open_world(copied_network(open_network(network), 2), 2) as world:
         world.enter(None)

@@ -18,8 +18,8 @@ from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.without_effect import without_effect
 from tests.in_process import SLOW, own_network, rewrite
-from tests.made_up import system_of
-from tests.sumo.test_traci_controller import changed, system
+from tests.made_up import changed, original_of, system_of
+from tests.sumo.test_traci_controller import system
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
 CONTROLLERS = """
@@ -131,7 +131,7 @@ def refuse_difference(
     """The speeds are SUMO's, and so is the place: SUMO ends its last step at once, ours at its
     end.
     """
-    trace = drive_worst(runs, changed(runs)).trace
+    trace = drive_worst(runs, original_of(runs)).trace
     n = np.count_nonzero(trace.active)
     bare = bare_sumo(traffic, step)
     assert n > 70
@@ -191,14 +191,14 @@ def test_between_two_actions_sumos_driver_asks_for_what_he_decided(
         )
         scenario = {"parameters": {"network": str(traffic.parent)}}
         runs = system("idle", CONTROLLERS, vehicle=vehicle, scenario=scenario)
-        run = drive_worst(runs, changed(runs))
+        run = drive_worst(runs, original_of(runs))
         assert run.outcome[0] == Outcome.STOPPED
         assert last_gap(run) == pytest.approx(2.5, abs=0.3), "his minGap"
 
 
 def test_delays_that_sumos_driver_does_not_know_cost_him_his_gap() -> None:
     runs = system("idle", CONTROLLERS)
-    run = drive_worst(runs, changed(runs))
+    run = drive_worst(runs, original_of(runs))
     assert run.outcome[0] == Outcome.STOPPED or run.collision_speed[0] < 3
     assert last_gap(run) < 2  # of the 2.5 m that he wants
     assert any(
@@ -225,13 +225,6 @@ def braking(run: SimulationRuns) -> np.ndarray:
     return deceleration[deceleration > 0.1]
 
 
-def native(**characteristics: object) -> tuple[System, SimulationRuns]:
-    runs = system_of(
-        "native", vehicle={**NO_DELAYS, "characteristics": characteristics}
-    )
-    return runs, drive_worst(runs, changed(runs))
-
-
 def test_krauss_brakes_softer_with_a_longer_tau_and_stops_where_sumos_krauss_does(
     tmp_path: Path,
 ) -> None:
@@ -246,7 +239,10 @@ def test_krauss_brakes_softer_with_a_longer_tau_and_stops_where_sumos_krauss_doe
         (tmp_path / "traffic.rou.xml").write_text(text)
         bare = bare_sumo(tmp_path / "traffic.rou.xml", lambda *_: None)
         bare_hardest.append(-np.diff(bare[:, 0]).min() / 0.1)
-        _, run = native(**NO_DELAY, tau={"original": tau})
+        characteristics = {**NO_DELAY, "tau": {"original": tau}}
+        vehicle = {**NO_DELAYS, "characteristics": characteristics}
+        system = system_of("native", vehicle=vehicle)
+        run = drive_worst(system, original_of(system))
         assert last_gap(run) == pytest.approx(bare[-1, 1], abs=0.1)
         assert braking(run).max() == pytest.approx(bare_hardest[-1], rel=0.2)
     assert np.all(np.diff(bare_hardest) < 0)

@@ -18,7 +18,7 @@ from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.traci_commands import CommandedSpeed
 from tests.in_process import SLOW, write
-from tests.made_up import original_of
+from tests.made_up import changed, original_of
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
 SCRIPT = """
@@ -89,10 +89,6 @@ def system(name: str, script: str = SCRIPT, **tables: object) -> System:
             ads=ModelTable(model=f"my_controller:{name}", kind="traci"),
         )
     )
-
-
-def changed(of: System, **values: float) -> np.ndarray:
-    return of.characteristics.setting(values)[np.newaxis]
 
 
 @SLOW

@@ -51,13 +51,7 @@ def prepare(
     water: float = 0.0,
 ) -> Any:
     """The constants of vehicles with these settings, shape (N, n)."""
-    values = dict(
-        zip(
-            SYSTEMS[model].characteristics.names,
-            np.ascontiguousarray(settings.T),
-            strict=True,
-        )
-    )
+    values = SYSTEMS[model].characteristics.columns(settings)
     return SYSTEMS[model].vehicle.prepare(
         values, road, STEP, slope_of(np.full(len(settings), grade)), water
     )

@@ -20,7 +20,7 @@ from safevar_sumo.records import Command
 from safevar_sumo.vehicles import carla_step, compiled
 from safevar_sumo.vehicles.carla_step import Car, CarlaState
 from tests.in_process import SLOW, InlinePool, run_python
-from tests.vehicles.runs import STEP, SYSTEMS, drawn
+from tests.vehicles.runs import STEP, SYSTEMS, drawn, prepare
 
 CARLA = SYSTEMS["carla"].vehicle
 
@@ -45,9 +45,7 @@ def test_a_step_has_the_bits_of_a_plain_loop_over_one_vehicle(
     """From rest through all gears, with held gears, to a standstill with locked wheels; the first
     and the last of n.
     """
-    names = SYSTEMS["carla"].characteristics.names
-    values = dict(zip(names, np.ascontiguousarray(drawn("carla", n, 3).T), strict=True))
-    p = CARLA.prepare(values, 0.6, STEP)
+    p = prepare("carla", drawn("carla", n, 3), road=0.6)
     rng = np.random.default_rng(5)
     state = CARLA.at_rest(p)
     cars = [Car(*map(float, p.rows[:, i])) for i in (0, n - 1)]

@@ -18,7 +18,7 @@ from safevar_sumo.vehicles.carla import (
 )
 from safevar_sumo.vehicles.carla_step import FINAL_RATIO, GEAR_RATIOS
 from safevar_sumo.vehicles.lgsvl import _tyre_stiffness
-from tests.made_up import seen
+from tests.made_up import changed, seen
 from tests.vehicles.runs import (
     STEP,
     SYSTEMS,
@@ -36,12 +36,7 @@ CARLA = SYSTEMS["carla"].vehicle
 
 def prepared(model: str, **changes: float) -> Any:
     """The constants of one vehicle: the original with some characteristics changed."""
-    characteristics = SYSTEMS[model].characteristics
-    values = {
-        member.name: np.full(1, changes.get(member.name, float(member.original)))
-        for member in characteristics
-    }
-    return SYSTEMS[model].vehicle.prepare(values, 1.0, STEP)
+    return prepare(model, changed(SYSTEMS[model], **changes))
 
 
 def step(model: str, state: Any, throttle: float = 0.0) -> Any:
@@ -73,10 +68,8 @@ def test_carlas_gearbox_shifts_up_at_065_and_down_at_050_and_waits_two_seconds()
 ):
     # The values of sun are fitted.
     vehicle = replace(CARLA, shift_up=0.65, shift_down=0.5, shift_latency=2.0)
-    names = SYSTEMS["carla"].characteristics
-    p = vehicle.prepare(
-        {one.name: np.full(1, float(one.original)) for one in names}, 1.0, 1 / 60
-    )  # one substep
+    values = SYSTEMS["carla"].characteristics.columns(original("carla"))
+    p = vehicle.prepare(values, 1.0, 1 / 60)  # one substep
     limit = 5800 * 2 * np.pi / 60
 
     def target(gear: int, share: float, since: float = 2.0) -> float:
@@ -223,7 +216,7 @@ def test_a_braked_sumo_vehicle_does_not_go_on_speeding_up_during_the_lag() -> No
     brake ends it at once.
     """
     vehicle = SYSTEMS["sumo"].vehicle
-    p = prepared("sumo", actuatorLag=0.5, brakeDelay=0.0)
+    p = prepared("sumo", actuatorLag=0.5, brakeDelay=1e-9)
     state = vehicle.at_rest(p)
     for _ in range(40):
         state = vehicle.advance(p, state, Command(np.ones(1), np.zeros(1)))

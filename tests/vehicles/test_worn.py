@@ -31,7 +31,7 @@ from safevar_sumo.vehicles import Characteristic, CharacteristicSet, wet_road
 from safevar_sumo.vehicles.sensing import WornVehicle
 from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_friction
 from tests.in_process import SLOW, InlinePool, run_python
-from tests.made_up import SUN, drawn, seen, system_of
+from tests.made_up import SUN, changed, drawn, seen, system_of
 
 CAR = WornVehicle()
 HEALTHY = {
@@ -466,8 +466,5 @@ def test_a_study_without_them_drives_as_with_none() -> None:
         with_them, np.concatenate([settings, np.zeros((6, 2))], axis=1)
     )
     assert ours.f_safe.tolist() == drive_and_score(without, settings).f_safe.tolist()
-    angled = with_them.characteristics.original.copy()
-    angled[with_them.characteristics.names.index("sensorAngle")] = 2.5
-    assert with_them.characteristics.largest_change(angled[np.newaxis]).tolist() == [
-        0.25
-    ]
+    angled = changed(with_them, sensorAngle=2.5)
+    assert with_them.characteristics.largest_change(angled).tolist() == [0.25]
