@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from msgspec.structs import replace as replace_in
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
@@ -48,6 +49,7 @@ ROWS = [
     ("c_d", np.nan, np.nan, np.nan, np.nan, {}),
 ]
 TABLES = {"parts": tabulate("Parts & ages", COLUMNS, ROWS)}
+OTHERS = tabulate("Others", {"name": "it"}, [("none",)])
 ANSWER = Answer(
     question="parts",
     study=load_study("smoke"),
@@ -133,13 +135,7 @@ def test_one_screen_has_as_many_rows_as_there_are_lines_for() -> None:
 def test_a_list_of_up_to_50_cars_is_whole(number: int, shown: int) -> None:
     rows = [[f"<{row}>"] for row in range(number)]
     table = tabulate("Cars", {"car": ""}, rows, shown_whole=SHOWN_WHOLE)
-    answer = Answer(
-        question="",
-        study=load_study("smoke"),
-        verdict="",
-        numbers={},
-        tables={"cars": table},
-    )
+    answer = replace(ANSWER, tables={"cars": table})
     text = answer.render("text")
     assert len(re.findall("<[0-9]+>", text)) == shown
     assert ("39 more rows: --details" in text) == (number == 51)
@@ -261,43 +257,33 @@ def test_a_spreadsheet_calculates_no_cell_of_a_csv() -> None:
 
 
 def test_one_table_can_be_asked_for_with_the_remarks_on_it() -> None:
-    other = tabulate("Others", {"name": "it"}, [("none",)])
     rows = [("parts", "one is old"), ("others", "none is"), ("all", "they are made up")]
     remarks = tabulate("Remarks", {"table": "table", "remark": "remark"}, rows)
-    answer = replace(
-        ANSWER, tables={**TABLES, "others": other, "remarks": remarks}
-    ).only("parts")
+    tables = {**TABLES, "others": OTHERS, "remarks": remarks}
+    answer = replace(ANSWER, tables=tables).only("parts")
     assert list(answer.tables) == ["parts", "remarks"]
     assert [*answer.tables["remarks"]["remark"]] == ["one is old", "they are made up"]
-    long = tabulate(
-        "Remarks",
-        {"remark": "remark"},
-        [("All of them are made up. " * 5,)],
-    )
-    assert "made up. \n" in replace(ANSWER, tables={"remarks": long}).render(
-        "text", details=True
-    )
-    assert "Others" not in ANSWER.render("latex", "parts")
-    on_others = remarks.frame[remarks.frame["table"] == "others"]
-    others = replace(
-        answer,
-        tables={**answer.tables.records, "remarks": remarks.with_rows(on_others)},
-    )
     assert r"\noindent{\footnotesize one is old\par}" in answer.render("latex"), (
         "no table, whose label would repeat"
     )
+    on_others = remarks.with_rows(remarks.frame[1:2])
+    others = replace(answer, tables={**TABLES, "others": OTHERS, "remarks": on_others})
     for form in ("text", "html"):
         assert "Remarks" in answer.render(form, details=True)
         without = replace(others, folded=("others",))
         assert "Remarks" not in without.render(form, details=True), "an empty table"
         assert "Remarks" not in others.render(form, "parts")
+    assert "Others" not in ANSWER.render("latex", "parts")
+    sentence = "All of them are made up. " * 5
+    long = tabulate("Remarks", {"remark": "remark"}, [(sentence,)])
+    text = replace(ANSWER, tables={"remarks": long}).render("text", details=True)
+    assert "made up. \n" in text
     with pytest.raises(sv.InputError, match="did you mean 'parts'"):
         ANSWER.only("part")
 
 
 def test_readers_see_folded_tables_only_if_they_ask() -> None:
-    other = tabulate("Others", {"name": "it"}, [("none",)])
-    answer = replace(ANSWER, tables={**TABLES, "others": other}, folded=("others",))
+    answer = replace(ANSWER, tables={**TABLES, "others": OTHERS}, folded=("others",))
     for form in ("text", "latex", "html"):
         assert "Others" not in answer.render(form, details=True)
         assert "Others" in answer.render(form, "others")
@@ -313,15 +299,14 @@ def test_a_label_is_that_of_one_study_question_table_and_command() -> None:
         return found
 
     other = load_study("rain")
-    answers = [
-        {},
-        {"study": other},
-        {"question": "other"},
-        {"command": "one"},
-        {"command": "two"},
+    labels = [
+        label(),
+        label(study=other),
+        label(question="other"),
+        label(command="one"),
+        label(command="two"),
     ]
-    labels = [label(**changes) for changes in answers]
-    assert len({*labels}) == len(answers)
+    assert len({*labels}) == len(labels)
     assert label(command="one") == labels[3], "the same command, the same label"
     assert label(study=other).startswith(f"tab:rain-{ANSWER.question}-parts")
 
@@ -408,7 +393,7 @@ def test_a_change_has_no_share_of_an_original_that_is_0() -> None:
 
 def test_a_change_over_decades_or_next_to_the_original_is_no_other_value() -> None:
     items = CharacteristicSet.of(load_study("sun"))
-    mass = replace(
+    mass = replace_in(
         items.members[items.names.index("mass")], original=1e-9, lower=0, upper=0.1
     )
     texts = (change_texts([mass], {"mass": value}) for value in (3.2e-6, 0.051, 1.1e-9))
@@ -424,6 +409,5 @@ def test_limits_are_rounded_to_the_safe_side() -> None:
     assert one.rounded(2.3178, upwards=True) == 2.32
     assert one.rounded(2.3278, upwards=False) == 2.32
     assert one.rounded(7.999, upwards=True) == 8
-    assert replace(one, original=7.9992).rounded(7.999, upwards=True) == 7.9992, (
-        "not beyond the original"
-    )
+    worn = replace_in(one, original=7.9992)
+    assert worn.rounded(7.999, upwards=True) == 7.9992, "not beyond the original"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -16,12 +17,14 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.bench import Bench, DrivenWorld
 from safevar_sumo.questions.box import Box, prove
+from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.drives import Drives, Judged
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model, Models
 from safevar_sumo.questions.sampling import Stream
 from safevar_sumo.questions.tolerance import asked, boxes, words
 from safevar_sumo.questions.tolerance.asked import (
+    Asked,
     asked_of,
     effort_of,
     effort_of_few,
@@ -33,7 +36,7 @@ from safevar_sumo.questions.tolerance.search import find_limits
 from safevar_sumo.questions.words import bound_in_words
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.scenarios.declared import with_ranges
-from safevar_sumo.study import Limit
+from safevar_sumo.study import Limit, Study
 from safevar_sumo.vehicles import region_of
 from tests.in_process import SLOW, InlinePool, rows_of
 from tests.made_up import case_of
@@ -143,16 +146,12 @@ def test_the_box_holds_no_unsafe_solution_of_a_search() -> None:
     pool = Plant(study, sliver)
     found = pool.evaluate(np.array([[8.5, 8.13, 2.0, 2.2], [5.0, 5.0, 5.0, 5.0]]))
     case = case_of(study, found.take([1]), found)
-    bare, known, two = (
-        tolerance.compute(
-            subject, Evaluator(study, pool), unsafe=unsafe, characteristics=names
-        )
-        for subject, unsafe, names in (
-            (study, Unsafe(), ()),
-            (case, None, ()),
-            (case, None, ("a,b",)),
-        )
-    )
+
+    def asked_about(subject: Study | Case, **options: Any) -> Answer:
+        return tolerance.compute(subject, Evaluator(study, pool), **options)
+
+    bare, known = asked_about(study, unsafe=Unsafe()), asked_about(case)
+    two = asked_about(case, characteristics=("a,b",))
     assert known.numbers["unsafe"] == "collision", (
         "as the solutions do, and as `explain` takes it"
     )
@@ -206,21 +205,24 @@ def share_of_domain(answer: Answer) -> float:
     return float(((limits["together_high"] - limits["together_low"]) / 10).prod())
 
 
+def task_of(
+    *models: Model,
+    varied: Sequence[int] = (0, 1),
+    specified: Mapping[str, Limit] | None = None,
+) -> Asked:
+    """The question about limits of these columns, in these parameter sets."""
+    return asked_of(
+        Models(models, ()), Unsafe(), varied, specified or {}, at_tests=True
+    )
+
+
 def test_sets_that_break_or_cut_limits_are_told() -> None:
     """Of four sets one breaks the specified limit, and one makes another limit narrower."""
-    study = made_up_study(2)
     regions = [pair, lambda rows: rows[:, 0] > 8, lambda rows: rows[:, 1] > 7, nowhere]
-    plants = [Plant(study, region) for region in regions]
-    fits = [
-        Model(number, Evaluator(study, plant), Unsafe())
-        for number, plant in enumerate(plants)
-    ]
+    models = [made_up_model(2, region, fit) for fit, region in enumerate(regions)]
     limits = {"a": Limit(at_most=9.0)}
     own, two, all_sets = (
-        find_limits(
-            asked_of(Models(tuple(some), ()), Unsafe(), [0, 1], limits, at_tests=True)
-        )
-        for some in (fits[:1], fits[:2], fits)
+        find_limits(task_of(*models[:number], specified=limits)) for number in (1, 2, 4)
     )
     assert [*all_sets.broken] == [1]
     assert {*all_sets.attacks} == {0, 2, 3}
@@ -233,7 +235,7 @@ def test_sets_that_break_or_cut_limits_are_told() -> None:
     # All its corners are driven anew.
     ends = np.stack(all_sets.boxes.ends(all_sets.sides))
     corners = {np.array(values).tobytes() for values in product(*ends.T)}
-    assert corners <= plants[0].seen
+    assert corners <= models[0].evaluator._pool.seen
 
 
 class Sliver(Bench[DrivenWorld]):
@@ -250,13 +252,13 @@ class Sliver(Bench[DrivenWorld]):
 
 def test_a_search_begins_where_encounters_only_just_count() -> None:
     """Where vehicles fail there is no slope towards these encounters, and hardly any is drawn."""
-    models = Models((made_up_model(8, nowhere),), ())
-    bench = Sliver(models.own, [DrivenWorld(models.own)])
+    own = made_up_model(8, nowhere)
+    bench = Sliver(own, [DrivenWorld(own)])
     bench.places = 3
     edges = bench.edges(0, 64, np.random.default_rng(1)).place
     assert ((edges[:, 0] > 0.69) & (edges[:, 0] <= 0.7)).all()
     assert len(np.unique(edges[:, 1:], axis=0)) > 4, "lines between several places"
-    task = asked_of(models, Unsafe(), range(8), {}, at_tests=True)
+    task = task_of(own, varied=range(8))
     for lines in (0, 64):
         effort = task.effort._replace(lines=lines)
         question = task._replace(bench=bench, effort=effort)
@@ -267,8 +269,7 @@ def test_a_search_begins_where_encounters_only_just_count() -> None:
 
 def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> None:
     """a above 7 with b below 3: the largest box ends at the one or the other."""
-    models = Models((made_up_model(3, corner),), ())
-    limits = find_limits(asked_of(models, Unsafe(), [0, 1], {}, at_tests=True))
+    limits = find_limits(task_of(made_up_model(3, corner)))
     assert limits.sides is not None
     ends = np.stack(limits.boxes.ends(limits.sides))
     assert ends[:, 2].tolist() == [5, 5], "it does not vary"
@@ -297,8 +298,7 @@ def test_the_worst_clearance_is_what_is_left_beside_the_margin_of_its_set() -> N
 def test_few_simulations_claim_nothing_of_a_set_that_they_do_not_reach() -> None:
     own = made_up_model(8, nowhere)
     own.evaluator.account.limit = 600
-    models = Models((own, own._replace(fit=1)), ())
-    limits = find_limits(asked_of(models, Unsafe(), range(8), {}, at_tests=True))
+    limits = find_limits(task_of(own, own._replace(fit=1), varied=range(8)))
     assert [*limits.attacks] == [0]
     assert limits.sides is None
     assert bytes(64) in own.evaluator._pool.seen, "a corner, with all values 0"
@@ -350,14 +350,7 @@ def test_a_box_stays_within_that_of_a_smaller_unsafe_region() -> None:
         return pair(rows) | (rows[:, 1] > 7) & (rows[:, 2] > 5.5)
 
     asked, wider = (
-        asked_of(
-            Models((made_up_model(3, region),), ()),
-            Unsafe(),
-            range(3),
-            {},
-            at_tests=True,
-        )
-        for region in (both, pair)
+        task_of(made_up_model(3, region), varied=range(3)) for region in (both, pair)
     )
     outer = find_limits(wider)
     alone, inner = find_limits(asked), find_limits(asked, outer)
@@ -423,12 +416,9 @@ def test_the_margin_is_added_to_a_collision_alone() -> None:
     """Safety degrees are 8 - |a - 5|, and 1 m less than 5 m is left from a = 8 on."""
 
     def ends(**options: Any) -> tuple[str, float, Any]:
-        numbers, tables = (
-            answer_of(1, lambda rows: rows[:, 0] > 9, **options).to_dict()[part]
-            for part in ("numbers", "tables")
-        )
-        (row,) = tables["limits"]["rows"]
-        return numbers["unsafe"], numbers["margin"], row["alone_high"]
+        answer = answer_of(1, lambda rows: rows[:, 0] > 9, **options)
+        (high,) = answer.values("limits.alone_high")
+        return answer.numbers["unsafe"], answer.numbers["margin"], high
 
     assert ends() == ("collision", 0.446, 9.0), "the error of the study's model"
     assert ends(unsafe="collision") == ("collision", 0, 9.0), "as it stands"
