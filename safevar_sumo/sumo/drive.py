@@ -338,7 +338,7 @@ class _Outcomes:
         speed: FloatArray,
         over: BoolArray,
         collisions: dict[int, float],
-        is_last: BoolArray | bool,
+        is_last: BoolArray,
     ) -> BoolArray:
         """Process one sample. Returns whether the sample is part of each run, shape (N,)."""
         active = self.is_open & ~over
@@ -354,7 +354,7 @@ class _Outcomes:
         self._has_stopped |= self.is_open & self._has_moved & is_standing
         self._has_moved |= self.is_open & ~is_standing
         self._is_over |= self.is_open & over
-        self.is_open &= ~over & ~np.asarray(is_last)
+        self.is_open &= ~over & ~is_last
         return active
 
     def note_warnings(

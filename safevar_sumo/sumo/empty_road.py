@@ -107,17 +107,19 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     # The sample after the last active one ended the run.
     trace = runs.trace
     end = np.count_nonzero(trace.active) + 1
-    columns = np.broadcast_arrays(
-        trace.gap,
-        trace.speed,
-        trace.brake,
-        trace.position,
-        trace.obstacle_speed,
-        trace.obstacle_width,
+    gap, lateral, speed, position, throttle, brake, obstacle_speed, obstacle_width = (
+        column[:end, 0]
+        for column in (
+            trace.gap,
+            trace.lateral,
+            trace.speed,
+            trace.position,
+            trace.throttle,
+            trace.brake,
+            trace.obstacle_speed,
+            trace.obstacle_width,
+        )
     )
-    gap, speed, brake, position, obstacle_speed, obstacle_width = np.stack(columns)[
-        :, :end, 0
-    ]
 
     # Braking that only holds a speed, as cruise controls do, is no fault.
     is_slower = speed < np.maximum.accumulate(speed) - MIN_SLOWDOWN
@@ -133,7 +135,7 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
         return None
 
     # A vehicle that drives past somebody who stays beside its way has met nobody.
-    beside = np.abs(trace.lateral[:end, 0]) - (trace.vehicle_width + obstacle_width) / 2
+    beside = np.abs(lateral) - (trace.vehicle_width + obstacle_width) / 2
     stays_beside = (beside > 0).all() and beside[-1] >= beside[-2:][0]
     if last_gap <= 0 and stays_beside:
         return EmptyRoadFault(
@@ -148,14 +150,16 @@ def _problem(runs: SimulationRuns, test_speed: float | None) -> EmptyRoadFault |
     if np.isfinite(last_gap):
         distance += f" of {driven + last_gap:.1f}"
     slow_speed = max(speed[0], MIN_SLOWDOWN) - SLOW_APPROACH
-    if runs.outcome[0] == Outcome.PASSED and speed[-1] > slow_speed:
+    if runs.outcome[0] == Outcome.PASSED and last_speed > slow_speed:
         words = f"is late for the encounter: the others have left after {trace.time[end - 1]:.1f} s"
         return EmptyRoadFault(
             Reason.LATE,
-            f"{words}, when it has come {distance} m at {speed[-1]:.1f} m/s",
+            f"{words}, when it has come {distance} m at {last_speed:.1f} m/s",
         )
-    throttle = trace.throttle[:end, 0].max()
-    commanded = f"with at most {throttle:.2g} of the throttle and {brake.max():.2g} of the brake"
+    commanded = (
+        f"with at most {throttle.max():.2g} of the throttle and {brake.max():.2g} of the"
+        " brake"
+    )
     return EmptyRoadFault(
         Reason.STANDS,
         f"never reaches the encounter (it gets {distance} m, {commanded})",

@@ -157,7 +157,7 @@ class SensedTraffic:
         if not leader or not leader[0]:
             return Snapshot(vehicle, actors, None)
         leader_id, gap = leader
-        return Snapshot(vehicle, actors, (copy_and_name(leader_id)[1], float(gap)))
+        return Snapshot(vehicle, actors, (copy_and_name(leader_id)[1], gap))
 
 
 def _limit_to_range(snapshot: Snapshot, reach: float, scale: float) -> Snapshot:
@@ -293,7 +293,7 @@ class TraciView:
             if name in COMMANDS or name in SUBSCRIPTIONS:
                 bound.apply_defaults()
             if name in COMMANDS:
-                return self._command(domain, name, *bound.args)
+                return self._command(name, *bound.args)
             if name == "subscribe":
                 return self._subscribe(domain, *bound.args)
             if name in SUBSCRIPTIONS:
@@ -308,20 +308,20 @@ class TraciView:
                 re.sub(r"'([:!]?)\d+\.", r"'\1", str(error))
             ) from None
 
-    def _command(self, domain: str, name: str, vehicle: str, *values: Value) -> Value:
+    def _command(self, name: str, vehicle: str, *values: Value) -> Value:
         """Note a command for the vehicle under test. SUMO itself only gets commands that change
         attributes of its driver.
         """
         if vehicle != VUT:
             raise refused(
-                domain,
+                "vehicle",
                 name,
                 f"vehID = {vehicle!r} is not the vehicle under test, {VUT!r}",
             )
         speed = float(self._api.vehicle.getSpeed(self._vut))
         self._commands.command(name, self.time, speed, values)
         if name in DRIVER_COMMANDS:
-            self._sumo_value(domain, name, VUT, *values)
+            self._sumo_value("vehicle", name, VUT, *values)
 
     def _query(self, domain: str, name: str, *arguments: Value) -> Value:
         """The value of a function that only reads: what the sensors report of another actor, and
@@ -368,12 +368,7 @@ class TraciView:
         the parts of the network (such as its edges).
         """
         if domain not in SENSED:
-            return tuple(
-                dict.fromkeys(
-                    _original_ids(name)
-                    for name in getattr(self._api, domain).getIDList()
-                )
-            )
+            return tuple(dict.fromkeys(self._sumo_value(domain, "getIDList")))
         ids = [VUT] if domain == "vehicle" else []
         return (*ids, *self._traffic.seen[self._copy].actors[domain])
 

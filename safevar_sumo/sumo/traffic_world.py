@@ -210,9 +210,7 @@ class TrafficWorld(SumoWorld):
 
     def _at_copies(self, column: Sampled) -> Sampled:
         values = at_sample(column, self._sample, self._traffic.group)
-        if len(values) == self.n:
-            return values
-        return np.repeat(values, self.n)
+        return np.broadcast_to(values, self.n)
 
     def _checked(self, motion: VehicleStates) -> VehicleStates:
         """Return the motion on the lane unchanged, after a check. Raises a SimulationError if SUMO

@@ -85,7 +85,7 @@ def judged(
             np.array([speed]),
             np.array([i == over]),
             {} if crash is None else {0: crash},
-            is_last=i == len(speeds) - 1,
+            is_last=np.array([i == len(speeds) - 1]),
         )
         active.append(bool(verdicts[0]))
     assert not outcomes.is_open.any()
