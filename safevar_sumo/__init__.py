@@ -4,10 +4,13 @@
 all public names; each is loaded on first use, so importing the package is fast.
 """
 
+import logging
 from typing import Any
 
 import lazy_loader
 
+# The package logs in silence until a program adds a handler.
+logging.getLogger(__name__).addHandler(logging.NullHandler())
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 

@@ -5,6 +5,7 @@ find out whether simulations of a study say anything about its ADS.
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 import platform
 from collections.abc import Callable, Iterable, Sequence
@@ -52,6 +53,7 @@ last worker, and progress can estimate the time left.
 """
 MAX_REPEATS = 5
 """Largest number of simulations that are repeated as a check, if simulations are limited."""
+LOGGER = logging.getLogger(__name__)
 FEW_SKIPPED = 100
 """The share of skipped settings is computed as if a question had at least this number of settings.
 Otherwise a single failure among the first settings would end the question.
@@ -182,10 +184,25 @@ def _evaluate_unshared(
         if cache and not evaluations.failed.any():
             cache.put(key, content_of(evaluations), len(portion))
         evaluated.append(evaluations)
+        LOGGER.debug("%s: %d settings simulated", study.name, len(portion))
+        _log_failures(study, evaluations)
     evaluations = Evaluations.concatenate(evaluated)
     if study.search.failed == "skip":
         _refuse_many_failures(study, evaluations, pool)
     return evaluations.take(row_of.ravel())
+
+
+def _log_failures(study: Study, evaluations: Evaluations) -> None:
+    """Log how many settings could not be simulated, with the reason of the first."""
+    failures = evaluations.take(evaluations.failed)
+    if len(failures):
+        LOGGER.warning(
+            "%s: %d of %d settings could not be simulated: %s",
+            study.name,
+            len(failures),
+            len(evaluations),
+            failures.reason(0),
+        )
 
 
 def _refuse_many_failures(study: Study, evaluations: Evaluations, pool: Pool) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import math
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -44,6 +46,7 @@ from safevar_sumo.sumo import efficient_batch, reason_against_scenes
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import Parts, Progress
 
+LOGGER = logging.getLogger(__name__)
 BATCHES_PER_SHARE = 2
 """Largest number of batches that the populations of all runs of a share fill."""
 MAX_RUNS = 256
@@ -134,6 +137,14 @@ def run_campaign(  # noqa: PLR0913 - options of the command `study`
     if is_new and not system.mover.is_exact and system.repeats == 1:
         repeat_elsewhere(study, pool)
 
+    LOGGER.info(
+        "%s: search of %d runs with %d workers into %s",
+        study.name,
+        len(keys),
+        pool.workers,
+        directory,
+    )
+    begin = time.monotonic()
     hands = deal(keys, pool.workers, task.batch_size, study.search.population)
     about = directory.absolute(), results.manifest, original, retry_failed
     shares = [(task, Share(dealt, *about)) for dealt in hands]
@@ -141,6 +152,7 @@ def run_campaign(  # noqa: PLR0913 - options of the command `study`
         chain.from_iterable(carry_out(carry_share, shares, pool, show_journals))
     )
 
+    LOGGER.info("%s: searched in %.1f s", study.name, time.monotonic() - begin)
     # Solutions of a part of the runs would look like the solutions of the whole study.
     runs.sort(key=lambda run: run.key)
     for remark in _remarks_on_discarded(study, runs):
@@ -149,8 +161,11 @@ def run_campaign(  # noqa: PLR0913 - options of the command `study`
         results.finish({run.key: run.solutions for run in runs})
     if engine_used == RECORDED and runs:
         sample = choose_sample(study, original, runs)
+        begin = time.monotonic()
         for remark in repeat_in_sumo(task, sample, pool, parts.begin()):
             warn(remark)
+        seconds = time.monotonic() - begin
+        LOGGER.info("%s: sample repeated in SUMO in %.1f s", study.name, seconds)
 
 
 def _remarks_on_discarded(study: Study, runs: Sequence[RunResult]) -> Iterator[str]:

@@ -7,6 +7,7 @@ A job is a plain function with its arguments. Both are sent to the worker. `carr
 
 from __future__ import annotations
 
+import logging
 import os
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -30,6 +31,7 @@ Home = tuple[str, ...]
 """The folders of a study with user code. Whatever user code does to its process, it does to no
 process of another home. () for studies without user code, which any worker carries out.
 """
+LOGGER = logging.getLogger(__name__)
 SECONDS_BETWEEN_LOOKS = 0.5
 """Longest time between two calls of a `Look` [s]."""
 
@@ -160,6 +162,9 @@ class Pool:
             elif cause := self._started[worker].cause_of_death(error):
                 self._started.pop(worker).end()
                 deaths[number] += 1
+                LOGGER.warning(
+                    "worker %d was lost in job %d: %s", worker, number, cause
+                )
                 if deaths[number] > MAX_DEATHS + (MAX_DEATHS + 1) * self._skipped():
                     raise WorkerLostError(number, cause)
                 waiting.appendleft(number)
@@ -208,6 +213,7 @@ class Pool:
             with suppress(BrokenExecutor):
                 return self._started[worker].submit(function, *job)
             self._started.pop(worker).end()
+        LOGGER.debug("worker %d starts", worker)
         self._started[worker] = self._start(worker)
         return self._started[worker].submit(function, *job)
 

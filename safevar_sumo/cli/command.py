@@ -20,6 +20,7 @@ import click
 from click.shell_completion import CompletionItem
 from rich.console import Console
 
+from safevar_sumo.cli.log import LOG_OPTIONS
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics.bound import COMPARISONS
 from safevar_sumo.output import check_writable
@@ -48,8 +49,8 @@ METAVARS = {
 }
 """The names of positional parameters in the help. Other parameters have their own names."""
 COMMON_NAMES = {
-    "Which encounters": ("point", "ranges", "up_to"),
-    "How to simulate": ("jobs", "cluster", "simulations", "as_it_is_now", "fresh"),
+    "What to use": ("point", "ranges", "up_to", "as_it_is_now"),
+    "How to simulate": ("jobs", "cluster", "simulations", "fresh", "verbose", "log"),
     "How to print": ("format", "json", "details", "table", "plot", "fail_if"),
 }
 """Options that many commands have. If such an option has its usual meaning, the help only lists
@@ -252,7 +253,7 @@ def command_of(name: str, function: Callable[..., Any]) -> click.Command:
         callback = partial(_give_answer, call, contents_of(function))
     return _Command(
         name,
-        params=[*map(_argument, positional), *flags, HELP_ALL],
+        params=[*map(_argument, positional), *flags, *LOG_OPTIONS, HELP_ALL],
         callback=callback,
         help=inspect.cleandoc(function.__doc__ or "").partition("\nParameters\n")[0],
     )

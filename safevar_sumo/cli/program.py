@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 
 import click
 
+from safevar_sumo.cli.log import WARNINGS
 from safevar_sumo.errors import (
     INTERRUPT_EXIT_CODE,
     INTERRUPTS,
@@ -236,9 +237,13 @@ def run_command_line() -> None:
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    """Print a warning as one line. A hint is printed as a note."""
-    kind = "note" if isinstance(message, Hint) else "warning"
-    click.echo(f"{kind}: {printable(str(message))}", err=True)
+    """Print a warning as one line, and log it. A hint is printed as a note."""
+    text = printable(str(message))
+    if isinstance(message, Hint):
+        click.echo(f"note: {text}", err=True)
+        return
+    click.echo(f"warning: {text}", err=True)
+    WARNINGS.warning(text)
 
 
 def _error_in_two_lines(error: click.ClickException) -> str:

@@ -589,6 +589,7 @@ class Evaluator:
     def end(self) -> None:
         """Repeat the first simulations of user code: other results than before are an error."""
         repeat_first_batches(self.study, self._pool)
+        self.phases.log_end()
 
     def for_study(self, study: Study, *, verified: int | None = None) -> Evaluator:
         """An evaluator of another study, on the same pool and account. In addition, `verified`

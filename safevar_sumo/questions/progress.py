@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import math
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from safevar_sumo.records import NamedValues
 from safevar_sumo.terminal import Progress
 
+LOGGER = logging.getLogger(__name__)
 OVERRUN = 0.18
 """In a phase with an unknown number of rounds, at least this share of its simulations so far is
 expected to follow, because nobody knows whether a round is the last.
@@ -47,6 +50,8 @@ class Phases:
         """Largest number of simulations that the question may do."""
         self._never_grows = False
         """Whether a total also bounds the totals after it."""
+        self._begun_at = time.monotonic()
+        """The time at which the present phase began [s]."""
 
     def plan(
         self, settings: NamedValues, points: int = 1, most: float = math.inf
@@ -124,6 +129,7 @@ class Phases:
         """Begin a phase, if it comes after the present phase."""
         if name not in self._later and self._name:
             return
+        self.log_end()
         planned = 0.0
         while name in self._later:
             planned = self._later.pop(next(iter(self._later)))
@@ -132,6 +138,14 @@ class Phases:
         self._before = self._done
         self._waiting = 0
         self._expected = planned if settings is None else self._points * settings
+
+    def log_end(self) -> None:
+        """Log that the present phase ends, with its simulations and its time."""
+        seconds = time.monotonic() - self._begun_at
+        if self._name:
+            simulations = self._done - self._before
+            LOGGER.info("%s: %d simulations, %.1f s", self._name, simulations, seconds)
+        self._begun_at = time.monotonic()
 
     def expect(self, settings: float) -> None:
         """Expect that `settings` settings follow in the present phase."""

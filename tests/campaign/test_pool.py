@@ -5,6 +5,7 @@ fail.
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -76,12 +77,13 @@ def test_workers_start_when_they_are_needed_and_end_with_the_block() -> None:
 
 @SLOW
 def test_the_job_of_a_dead_worker_is_carried_out_once_more_and_others_go_on(
-    tmp_path: Path,
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with open_pool(2) as pool:
         jobs = [(tmp_path / str(k), int(k == 1)) for k in range(4)]
         assert pool.map(die, jobs) == ["done"] * 4
         assert [len(path.read_text()) for path, _ in jobs] == [1, 2, 1, 1]
+        assert re.findall(r"was lost in job (\d)", caplog.text) == ["1"]
         with pytest.raises(
             WorkerLostError, match=r"the worker process died \(exit code -9\)"
         ) as lost:

@@ -318,3 +318,34 @@ def test_a_metric_of_the_study_is_a_key_of_its_simulations(in_tmp: Path) -> None
         "failed: drac = "
         in run("simulate mine.toml --fail-if 'drac > 0'", expect=3).stderr
     )
+
+
+def test_a_log_has_command_versions_stages_and_warnings_of_each_call(
+    in_tmp: Path,
+) -> None:
+    Path("log.txt").write_text("of others\n")
+    for seed in (1, 2):
+        run(f"study smoke --runs 1 --seed {seed} --out r{seed} --log log.txt")
+    run("simulate r1 --set tireFric=1 --log log.txt")
+    log = Path("log.txt").read_text()
+    assert log.startswith("of others\n")
+    for seed in (1, 2):
+        assert f"study smoke --runs 1 --seed {seed} --out r{seed} --log log.txt" in log
+    assert log.count(f"with safevar_sumo {sv.__version__}, libsumo 1.28.0") == 3
+    assert len(re.findall(r"smoke: search of \d+ runs with 2 workers into r", log)) == 2
+    assert len(re.findall(r"smoke: searched in [\d.]+ s$", log, re.MULTILINE)) == 2
+    assert len(re.findall(r"ended after [\d.]+ s$", log, re.MULTILINE)) == 3
+    for folder in ("r1", "r2"):
+        assert not [path for path in Path(folder).rglob("*") if "log" in path.name]
+    refused("risk smoke --log no/log.txt", "--log: no/log.txt cannot be written")
+
+
+def test_verbose_shows_stages_and_more_batches_and_silence_is_the_default() -> None:
+    stage = "sampling vehicles: 20 simulations"
+    batch = "smoke: 20 settings simulated"
+    shown = [
+        run(f"risk smoke --samples 20 --simulations 60 {flags}").stderr
+        for flags in ("", "-v", "-vv")
+    ]
+    assert [stage in text for text in shown] == [False, True, True]
+    assert [batch in text for text in shown] == [False, False, True]
