@@ -339,11 +339,15 @@ def simulate(
     SimulationError
         If SUMO fails.
     """
+    if changes is None:
+        changes = {}
     loaded_study, system = load_and_assemble(study)
-    names = () if changes is None else changes.keys()
     with about("changes"):
-        loaded_study, system = with_set_axes(loaded_study, system, names)
-    setting = changed_setting(system, changes, filtered, beyond)
+        loaded_study, system = with_set_axes(loaded_study, system, changes.keys())
+        setting = system.characteristics.setting(changes, beyond=beyond)
+        if not beyond:
+            simulated = system.characteristics.filter(setting) if filtered else setting
+            system.region.check(simulated[None], otherwise=", or any with beyond=True")
     return simulate_with_original(
         loaded_study, where_met(system, setting), setting, filtered=filtered
     )
@@ -369,24 +373,6 @@ def load_study(study: StudyLike, **changes: Any) -> Study:
     loaded_study = read_study(study, **changes)
     create_shipped_models(loaded_study)
     return loaded_study
-
-
-def changed_setting(
-    system: System, changes: Mapping[str, float] | None, filtered: bool, beyond: bool
-) -> FloatArray:
-    """The unfiltered setting with these changes, shape (n,).
-
-    The function raises an InputError if the setting is illegal, or infeasible. If `filtered`, the
-    setting must be feasible after the filter.
-    """
-    with about("changes"):
-        setting = system.characteristics.setting(
-            {} if changes is None else changes, beyond=beyond
-        )
-        if not beyond:
-            simulated = system.characteristics.filter(setting) if filtered else setting
-            system.region.check(simulated[None], otherwise=", or any with beyond=True")
-        return setting
 
 
 def simulate_with_original(

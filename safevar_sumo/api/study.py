@@ -294,10 +294,11 @@ def _breach_of_original(case: Case) -> str:
     """How the original vehicle is unsafe, in words. "" if the original vehicle is safe, or if the
     study searches encounters.
     """
-    system = assemble(case.study)
     if case.characteristics.scenario:
         return ""
-    original = drive_and_score(system, case.characteristics.original_settings)
+    original = drive_and_score(
+        assemble(case.study), case.characteristics.original_settings
+    )
     if not case.unsafe.of(original)[0]:
         return ""
     return case.unsafe.breach_in_words(original)
