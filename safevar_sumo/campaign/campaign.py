@@ -65,7 +65,7 @@ ENGINES = RECORDED, SUMO
 """The engines that a command may name."""
 
 
-def run_campaign(  # noqa: PLR0913 - options of the command `study`
+def run_campaign(
     study: Study,
     system: System,
     keys: Sequence[RunKey],
@@ -75,7 +75,6 @@ def run_campaign(  # noqa: PLR0913 - options of the command `study`
     engine: str = RECORDED,
     *,
     retry_failed: bool = False,
-    batch_size: int | None = None,
 ) -> None:
     """Carry out runs of a study, or resume unfinished runs. If the runs are all runs of the study,
     write its solutions.
@@ -89,9 +88,6 @@ def run_campaign(  # noqa: PLR0913 - options of the command `study`
         simulated again in SUMO at the end.
     retry_failed
         Whether to simulate settings again that failed before.
-    batch_size
-        Largest number of settings in a batch, which may hold settings of several runs; by default
-        the fastest size. The size changes no result.
 
     Raises
     ------
@@ -116,7 +112,8 @@ def run_campaign(  # noqa: PLR0913 - options of the command `study`
     system, engine_used, reason = choose_engine(system, engine)
     results.manifest["engine"] = {"name": engine_used, "reason": reason}
     results.manifest |= _about_algorithms(study)
-    size = batch_size or efficient_batch(system)
+    # A batch may hold settings of several runs. Its size changes no result.
+    size = efficient_batch(system)
     task = Task(study=study, in_sumo=system.in_sumo, batch_size=size)
 
     evaluations = len(keys) * study.search.evaluations

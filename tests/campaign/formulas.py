@@ -16,6 +16,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import (
     RunKey,
     all_runs,
+    campaign,
     evaluation,
     run_campaign,
     user_checks,
@@ -97,6 +98,8 @@ def carried_out(
     pool = pool or FormulaPool()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "evaluate_batch", pool.evaluate)
+        if batch is not None:
+            patch.setattr(campaign, "efficient_batch", lambda system: batch)
         run_campaign(
             study,
             assemble(study),
@@ -105,7 +108,6 @@ def carried_out(
             pool,
             progress,
             engine="sumo",
-            batch_size=batch,
         )
 
 
