@@ -256,7 +256,7 @@ class Evaluations:
 
 
 def differences(
-    expected: ResultColumns, actual: ResultColumns, tolerance: float = 0.0
+    expected: ResultColumns, actual: ResultColumns
 ) -> Iterator[tuple[int, str]]:
     """Yield the first row with a difference for each result that differs, and both values in
     words.
@@ -265,9 +265,7 @@ def differences(
         values = actual[name]
         is_same = values == expected_values
         if values.dtype.kind == "f":
-            is_same |= np.isclose(
-                values, expected_values, rtol=0, atol=tolerance, equal_nan=True
-            )
+            is_same |= np.isnan(values) & np.isnan(expected_values)
         if not is_same.all():
             row = int(np.argmin(is_same))
             yield row, f"{name} is {values[row]} instead of {expected_values[row]}"
