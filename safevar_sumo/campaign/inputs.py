@@ -10,7 +10,7 @@ from pathlib import Path
 
 from safevar_sumo.errors import InputError
 from safevar_sumo.output import file_beside
-from safevar_sumo.plugins import Files, code_files, digests, digests_by_name, files_in
+from safevar_sumo.plugins import Files, code_files, digests, file_by_name, files_in
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import RESULTS, manifest_differences, manifest_of
 from safevar_sumo.study import Study, data_files, fmus_of, user_modules
@@ -89,5 +89,5 @@ def code_of(study: Study, used: Iterable[str]) -> Files:
     fmus = {
         Path(file_beside(name, places or [os.getcwd()])) for _, name in fmus_of(study)
     }
-    files = code_files(user_modules(study), places) | fmus
-    return digests_by_name(used, places) | digests(files, places)
+    opened = {Path(path) for name in used if (path := file_by_name(name, places))}
+    return digests(code_files(user_modules(study), places) | fmus | opened, places)

@@ -20,7 +20,6 @@ from safevar_sumo.plugins.files import (
     Files as Files,
     code_files as code_files,
     digests as digests,
-    digests_by_name as digests_by_name,
     file_by_name as file_by_name,
     files_in as files_in,
     is_of_shipped_network as is_of_shipped_network,

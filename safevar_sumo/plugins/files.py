@@ -124,12 +124,6 @@ def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
     return dict(sorted(files.items()))
 
 
-def digests_by_name(names: Iterable[str], folders: Sequence[str]) -> Files:
-    """The digests of the files with these names. Files that do not exist are left out."""
-    paths = (file_by_name(name, folders) for name in names)
-    return digests(map(Path, filter(None, paths)), folders)
-
-
 def name_of_file(path: Path, folders: Sequence[str]) -> str:
     """The path of a file relative to the first folder that contains the file; the whole path if no
     folder does.
