@@ -84,10 +84,10 @@ def answer_of_setting(
         remarks.append(words.IGNORED.format(small=" and ".join(small)))
 
     original = simulation.original.numbers
-    simulated = simulation.numbers
+    numbers = simulation.numbers
     units = {"outcome": "", **simulation.units}
     results = [
-        (name, unit, original[name], simulated[name]) for name, unit in units.items()
+        (name, unit, original[name], numbers[name]) for name, unit in units.items()
     ]
     tables = {
         "characteristics": _characteristics(simulation),
@@ -122,7 +122,6 @@ def answer_of_setting(
         sentences.append(words.ENCOUNTER(values=join_phrases(places)))
     if phase := named.get(PHASE):
         sentences.append(words.LATER(phase=phase))
-    numbers = simulation.numbers
     if handle is not None:
         numbers = {"solution": str(handle), **numbers}
     return Answer(

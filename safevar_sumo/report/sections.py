@@ -203,12 +203,10 @@ def _scenario(study: ReportedStudy) -> str:
             f"{scenario} {len(points)} test cases, all of which every vehicle drives"
             f" ({described})."
         )
+    sentence = f"{scenario} the weather {weather.name}."
     if equals_clear(weather):
-        return (
-            f"{scenario} the weather {weather.name}. This weather changes neither the road nor the"
-            " sensors."
-        )
-    return f"{scenario} the weather {weather.name}."
+        sentence += " This weather changes neither the road nor the sensors."
+    return sentence
 
 
 def _search(study: ReportedStudy) -> str:

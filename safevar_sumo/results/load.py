@@ -7,7 +7,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from itertools import starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -165,8 +164,10 @@ def handles_of(solutions: pd.DataFrame) -> list[SolutionId]:
 
     runs = solutions.get("run", pd.Series(0, index=solutions.index))
     rows = solutions.groupby([solutions["algorithm"], runs], sort=False).cumcount()
-    columns = (str(algorithm) for algorithm in solutions["algorithm"]), runs, rows
-    return list(starmap(SolutionId, zip(*columns, strict=True)))
+    return [
+        SolutionId(str(algorithm), run, row)
+        for algorithm, run, row in zip(solutions["algorithm"], runs, rows, strict=True)
+    ]
 
 
 def row_of_handle(solutions: pd.DataFrame, handle: SolutionId) -> int:

@@ -93,12 +93,11 @@ def _inherited(base: StudyTables, overrides: Tables) -> dict[str, Any]:
 
 def _different_parts(inherited: Tables, tables: Tables) -> list[str]:
     """The parts of the system, such as `vehicle`, whose model or network the new study changes."""
-    parts = []
-    for key in keys_with(PART_OF_SYSTEM, Study):
-        inherited_part = _model_and_network(inherited.get(key))
-        if _model_and_network(tables.get(key)) != inherited_part:
-            parts.append(key)
-    return parts
+    return [
+        key
+        for key in keys_with(PART_OF_SYSTEM, Study)
+        if _model_and_network(tables.get(key)) != _model_and_network(inherited.get(key))
+    ]
 
 
 def _dropped_keys(base: Tables, tables: Tables) -> list[str]:

@@ -292,16 +292,17 @@ def _with_base(
         )
 
     base_study = _read_file(base_path, (*visited_paths, path))
-    merged_study = with_overrides(base_study, tables, raw.source)
-    origin = Origin(
-        called=raw.origin.called,
+    origin = replace(
+        raw.origin,
         places=tuple(dict.fromkeys((*raw.origin.places, *base_study.origin.places))),
         files=(*raw.origin.files, *base_study.origin.files),
     )
+    merged_study = with_overrides(base_study, tables, raw.source)
+    merged_study = merged_study._replace(origin=origin)
     # Shipped studies omit keys on purpose: remarks on them would only confuse the user.
     if path.parent == STUDIES:
-        return merged_study._replace(origin=origin, remarks=())
-    return merged_study._replace(origin=origin)
+        return merged_study._replace(remarks=())
+    return merged_study
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
