@@ -338,12 +338,7 @@ class Evaluator:
         if selection == EVERYTHING:
             counted = self._without_unsafe_originals(evaluations)
         counted = self._without_standing(counted, selection)
-        self.account.count(evaluations)
-        if measure := self.account.measure:
-            is_safe = evaluations.valid & ~evaluations.collided & ~counted.standing
-            is_undefined = np.isnan(evaluations.column(measure)) & is_safe
-            self.account.undefined += int(np.count_nonzero(is_undefined))
-            self.account.judged += len(evaluations)
+        self.account.count(evaluations, counted.standing)
         return counted
 
     def _compile(self) -> None:
@@ -544,15 +539,14 @@ class Evaluator:
         return Unsafe.default_among(evaluations, original)
 
     def use(self, unsafe: Unsafe) -> None:
-        """Use a criterion in the question. If it bounds a metric, the account counts the settings
-        without a value of this metric. Raises the errors of `checked`.
+        """Use a criterion in the question. The account counts the settings that meet it. Raises the
+        errors of `checked`.
         """
         self.checked(unsafe)
         if not unsafe.is_collision:
             self.account.criterion = unsafe
         if unsafe.bound:
-            self.account.measure = unsafe.bound.measure
-            self.check_measured(unsafe.bound.measure)
+            self.check_measured(unsafe.measure)
 
     def checked(self, unsafe: Unsafe) -> Unsafe:
         """The criterion, with the safety degree at which bodies of the study touch. Raises an

@@ -246,10 +246,8 @@ def _lists_up_to(study: Study, name: str, high: float) -> Study:
             if values_up_to and max(values) > high:
                 values_up_to = sorted({*values_up_to, high})
         if values_up_to:
-            axis = study.axes_of(test)[name]
-            is_plain = axis.range is None
-            listed = values_up_to if is_plain else replace(axis, at=values_up_to)
-            tests.append(replace(test, over={**test.over, name: listed}))
+            axis = replace(study.axes_of(test)[name], at=values_up_to)
+            tests.append(replace(test, over={**test.over, name: axis}))
     low = min(all_values)
     highest = max(all_values)
     if not low <= high <= highest:

@@ -24,7 +24,7 @@ from safevar_sumo.errors import InputError, NobodyMoved
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.questions.words import number_of
-from safevar_sumo.records import Evaluations, FloatArray, significant
+from safevar_sumo.records import BoolArray, Evaluations, FloatArray, significant
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System
@@ -82,16 +82,13 @@ class Account:
         The amount of search, as a share of the usual amount.
     most
         The largest number of simulations of a quick answer; infinite for other answers.
-    measure
-        The metric that the question's criterion bounds; "" without such a metric.
-    undefined
-        Number of settings without a collision for which this metric is undefined.
-    judged
-        Number of all settings that were judged by this metric.
     criterion
         The question's criterion, if a collision alone does not meet it; else None.
     met, collided, evaluated
         Numbers of settings that meet this criterion, that collide, and that were simulated.
+    undefined
+        Number of settings without a collision for which the metric that this criterion bounds is
+        undefined.
     standing
         The vehicles (as bytes) that never moved in an encounter in which the original vehicle
         moves.
@@ -108,13 +105,11 @@ class Account:
     minimum: int = 0
     effort: float = 1.0
     most: float = float("inf")
-    measure: str = ""
-    undefined: int = 0
-    judged: int = 0
     criterion: Unsafe | None = None
     met: int = 0
     collided: int = 0
     evaluated: int = 0
+    undefined: int = 0
     standing: set[bytes] = field(default_factory=set)
     has_moved: bool = False
 
@@ -133,17 +128,27 @@ class Account:
     @property
     def undefined_in_words(self) -> str:
         """A sentence that says how often the metric was undefined; "" if it never was."""
-        if not self.undefined:
+        if not self.undefined or self.criterion is None:
             return ""
-        of_all = f"{self.undefined:,} of {self.judged:,} simulated settings, which count as safe"
-        return f"Remark: {self.measure} is undefined, without a collision, in {of_all}."
+        of_all = f"{self.undefined:,} of {self.evaluated:,} simulated settings, which count as safe"
+        measure = self.criterion.measure
+        return f"Remark: {measure} is undefined, without a collision, in {of_all}."
 
-    def count(self, evaluations: Evaluations) -> None:
-        """Count evaluations that meet the question's criterion, and that collide."""
-        if self.criterion is not None:
-            self.met += int(np.count_nonzero(self.criterion.of(evaluations)))
-            self.collided += int(np.count_nonzero(evaluations.collided))
-            self.evaluated += len(evaluations)
+    def count(self, evaluations: Evaluations, standing: BoolArray) -> None:
+        """Count evaluations that meet the question's criterion, that collide, and in which its
+        metric is undefined, although the vehicle is not among those that are `standing`.
+        """
+        if self.criterion is None:
+            return
+        self.met += int(np.count_nonzero(self.criterion.of(evaluations)))
+        self.collided += int(np.count_nonzero(evaluations.collided))
+        self.evaluated += len(evaluations)
+        if self.criterion.bound:
+            is_safe = evaluations.valid & ~evaluations.collided & ~standing
+            is_undefined = (
+                np.isnan(evaluations.column(self.criterion.measure)) & is_safe
+            )
+            self.undefined += int(np.count_nonzero(is_undefined))
 
     @property
     def collided_in_words(self) -> str:
