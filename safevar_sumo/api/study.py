@@ -395,12 +395,19 @@ def summarise(results: Results) -> Answer:
         )
         outcomes = Counter(simulated["outcome"])
         feasible = simulated[case.scoring.feasible_rows(simulated)]
-        counts = outcomes[Outcome.INVALID_TEST], outcomes[Outcome.SIMULATOR_ERROR]
-        means = solutions[list(metrics)].mean()
-        collisions = int(are_collisions(feasible).sum())
-        ends = (collisions, *counts, feasible["f_safe"].min(), len(solutions))
         rows.append(
-            (name, finished[name], study.search.runs, len(simulated), *ends, *means)
+            (
+                name,
+                finished[name],
+                study.search.runs,
+                len(simulated),
+                int(are_collisions(feasible).sum()),
+                outcomes[Outcome.INVALID_TEST],
+                outcomes[Outcome.SIMULATOR_ERROR],
+                feasible["f_safe"].min(),
+                len(solutions),
+                *solutions[list(metrics)].mean(),
+            )
         )
 
     table = tabulate(study.title, ALGORITHMS | metrics, rows, words=titles_of([case]))

@@ -128,7 +128,7 @@ def run_campaign(
     no_verdict = ask_why_no_verdict(study, pool)
     original = evaluate_original(task, pool)
     undeclared = [name for name in opened if name not in results.manifest["files"]]
-    for remark in _remarks(study, undeclared, no_verdict, original):
+    for remark in _remarks(undeclared, no_verdict, original):
         warn(f"study {study.name!r}: {remark}")
     results.begin(original)
     if is_new and not system.mover.is_exact and system.repeats == 1:
@@ -143,8 +143,11 @@ def run_campaign(
     )
     begin = time.monotonic()
     hands = deal(keys, pool.workers, task.batch_size, study.search.population)
-    about = directory.absolute(), results.manifest, original, retry_failed
-    shares = [(task, Share(dealt, *about)) for dealt in hands]
+    place = directory.absolute()
+    shares = [
+        (task, Share(dealt, place, results.manifest, original, retry_failed))
+        for dealt in hands
+    ]
     runs = list(
         chain.from_iterable(carry_out(carry_share, shares, pool, show_journals))
     )
@@ -179,7 +182,7 @@ def _remarks_on_discarded(study: Study, runs: Sequence[RunResult]) -> Iterator[s
 
 
 def _remarks(
-    study: Study, undeclared: Sequence[str], no_verdict: str, original: Evaluations
+    undeclared: Sequence[str], no_verdict: str, original: Evaluations
 ) -> Iterator[str]:
     """Remarks on what makes results uncertain or useless: files that user code reads and the study
     does not name, a driving system that fails on an empty road, and an original vehicle that

@@ -198,24 +198,21 @@ def _pack_study(
     (parts,) = parts_of_simulations(
         [case], [judged], None, [with_speed_part(questions, case)], simulations
     )
-    outcomes = count_outcomes(case)
-    solutions = count_solutions(case.solutions, runs)
     described = PackedStudy(
         folder,
         questions,
         runs,
-        outcomes,
-        solutions,
+        count_outcomes(case),
+        count_solutions(case.solutions, runs),
         str(unsafe) if unsafe else None,
         parts,
     )
 
-    code = _files_of_user(study, manifest["files"], questions)
     files = {
         MANIFEST: json_bytes(manifest),
         SOLUTIONS: csv_of(case.solutions),
         **lists,
-        **code,
+        **_files_of_user(study, manifest["files"], questions),
     }
     show_part = Parts(progress).begin(study.name)
     with open_pool(**workers) as pool:
