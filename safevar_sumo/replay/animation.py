@@ -289,10 +289,18 @@ def lay_out(comparison: Comparison) -> tuple[list[DrawnBody], Affine2D]:
         place = track.motion[samples, row, :2]
         distance = np.linalg.norm(place - vut.motion[samples, row, :2], axis=1)
         if np.any(distance < MAX_DISTANCE + track.length):
-            kind = name == VUT, track.is_person, track.length, track.width
             x, y = turn.transform(place).T
             bodies.append(
-                DrawnBody(row, *kind, x, y, track.heading[samples, row] - heading)
+                DrawnBody(
+                    row,
+                    name == VUT,
+                    track.is_person,
+                    track.length,
+                    track.width,
+                    x,
+                    y,
+                    track.heading[samples, row] - heading,
+                )
             )
     return bodies, turn
 

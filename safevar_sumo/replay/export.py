@@ -191,7 +191,9 @@ def converted(network: NetworkFiles) -> str:
     """
     netconvert = program_of_sumo("netconvert", f"an export of {network.folder}")
     with temporary_folder() as folder:
-        arguments = (
+        exit_code, errors = run_program(
+            Path(folder),
+            netconvert,
             "-s",
             str(built_network(network)),
             "--opendrive-output",
@@ -199,7 +201,6 @@ def converted(network: NetworkFiles) -> str:
             "-o",
             "net.xml",
         )
-        exit_code, errors = run_program(Path(folder), netconvert, *arguments)
         if exit_code != 0:
             raise EnvironmentFault(
                 f"{network.folder}: netconvert writes no OpenDRIVE: {errors}"

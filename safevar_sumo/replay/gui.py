@@ -107,7 +107,8 @@ def _open_view(options: Sequence[str]) -> Iterator[Api]:
     with temporary_folder() as folder:
         settings_file = Path(folder) / "view.xml"
         settings_file.write_text(VIEW_SETTINGS, encoding="utf-8")
-        view = [
+        options_of_view = [
+            *options,
             "--gui-settings-file",
             str(settings_file),
             "--start",
@@ -115,5 +116,5 @@ def _open_view(options: Sequence[str]) -> Iterator[Api]:
             "--window-size",
             "1200,700",
         ]
-        with open_window([*options, *view]) as api:
+        with open_window(options_of_view) as api:
             yield api
