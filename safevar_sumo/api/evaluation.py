@@ -140,10 +140,8 @@ def _read_settings(
     names = list(characteristics.names)
     if isinstance(settings, Sequence):
         settings = plain_values(settings)
-    if isinstance(settings, Sequence) and all(
-        isinstance(setting, Mapping) for setting in settings
-    ):
-        settings = pd.DataFrame(list(settings), index=range(len(settings)))
+        if all(isinstance(setting, Mapping) for setting in settings):
+            settings = pd.DataFrame(list(settings), index=range(len(settings)))
     try:
         # A table may leave out characteristics. An array has a column for each characteristic.
         if isinstance(settings, pd.DataFrame):

@@ -128,7 +128,7 @@ class Simulation:
     @property
     def outcome(self) -> Outcome:
         """How the simulation ended."""
-        return Outcome(str(self.evaluation.outcome[0]))
+        return Outcome(self.evaluation.outcome[0])
 
     @property
     def collision_speed(self) -> float:
@@ -237,11 +237,10 @@ class Simulation:
         """Outcome, metrics, objectives and gap as plain values; None means undefined. `driven` is
         false if simulations of the study say nothing about its ADS.
         """
-        gap = finite_or_none(self.gap)
         return {
             "driven": not self.no_verdict,
             **record(self.evaluation),
-            "gap": gap,
+            "gap": finite_or_none(self.gap),
         }
 
     @property

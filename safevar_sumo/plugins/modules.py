@@ -157,7 +157,7 @@ class Modules:
         path = ImportPath.here()
         known = {*self._outer_path.folders, *path.added}
         start = 0
-        if path.added and path.added[0] in sys.path:
+        if path.added[0] in sys.path:
             start = path.folders.index(path.added[0])
         further = [entry for entry in dict.fromkeys(sys.path) if entry not in known]
         self._path_before = [entry for entry in further if entry in sys.path[:start]]

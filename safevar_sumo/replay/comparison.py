@@ -181,7 +181,7 @@ class Comparison:
             return collision_in_words(
                 runs.closing_speed[row], runs.collision_speed[row], digits=1
             )
-        ending = OUTCOME_VERBS[Outcome(str(runs.outcome[row]))]
+        ending = OUTCOME_VERBS[runs.outcome[row]]
         if nearest is not None and runs.outcome[row] == Outcome.STOPPED:
             has_gap = self.system.mover.has("roads")
             distance = runs.trace.gap if has_gap else runs.encounter.separation

@@ -40,8 +40,7 @@ OUTCOME = "outcome"
 REASON = "reason"
 POINT = "point"
 SOLUTIONS = "solutions"
-CHECKSUM = "crc32"
-CHECKSUM_MARK = f',"{CHECKSUM}":'.encode()
+CHECKSUM_MARK = b',"crc32":'
 FIXED_COLUMNS = ("collision_speed", "f_diff", "f_num_diff")
 
 
@@ -146,8 +145,8 @@ class Journal:
 
     def append(self, positions: Sequence[int], evaluations: Evaluations) -> None:
         """Add a batch of evaluations, as a table."""
-        line = {
-            POSITION: list(positions),
+        line: JsonObject = {
+            POSITION: positions,
             OUTCOME: evaluations.outcome.tolist(),
             **dict(
                 zip(self._characteristics, evaluations.settings.T.tolist(), strict=True)
@@ -171,7 +170,7 @@ class Journal:
         """Add the result of a finished run: the positions of its solutions, and the budget. Then
         flush the file to the disk.
         """
-        self._add({SOLUTIONS: list(positions), "budget": budget})
+        self._add({SOLUTIONS: positions, "budget": budget})
         with disk_errors(self.path, "written"):
             os.fsync(self._file.fileno())
 

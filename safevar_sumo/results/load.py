@@ -165,7 +165,7 @@ def handles_of(solutions: pd.DataFrame) -> list[SolutionId]:
     runs = solutions.get("run", pd.Series(0, index=solutions.index))
     rows = solutions.groupby([solutions["algorithm"], runs], sort=False).cumcount()
     return [
-        SolutionId(str(algorithm), run, row)
+        SolutionId(algorithm, run, row)
         for algorithm, run, row in zip(solutions["algorithm"], runs, rows, strict=True)
     ]
 

@@ -110,12 +110,8 @@ def write_whole(path: Path, text: str) -> None:
     SafevarError
         If the file cannot be written.
     """
-    with (
-        disk_errors(path, "written"),
-        whole_file(path) as temporary_file,
-        open(temporary_file, "w", encoding="utf-8", newline="") as file,
-    ):
-        file.write(text)
+    with disk_errors(path, "written"), whole_file(path) as file:
+        file.write_text(text, encoding="utf-8", newline="")
 
 
 @contextmanager
