@@ -25,7 +25,7 @@ from safevar_sumo.records import BoolArray, Evaluations, FloatArray
 from safevar_sumo.study import CharacteristicTable, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import InlinePool, searched, write
+from tests.in_process import InlinePool, write
 from tests.made_up import made_up_evaluations
 
 
@@ -161,22 +161,23 @@ def two_islands(settings: FloatArray) -> BoolArray:
     return ((settings[:, 0] > 6.5) & (settings[:, 0] < 7)) | (settings[:, 0] > 9)
 
 
+AHEAD = """
+extends = "wear"
+name = "ahead"
+title = "A pedestrian ahead on a wet road"
+[[matrix.tests]]
+name = "CPLA"
+model = "along"
+parameters = { vut_length = 4.7, vut_width = 1.85 }
+over = { speed = [50, 60] }
+"""
+
+
 @pytest.fixture
-def ahead(request: pytest.FixtureRequest, in_tmp: Path) -> Study:
-    """The study that the test's module has as `AHEAD`."""
-    write("ahead.toml", request.module.AHEAD)
+def ahead(in_tmp: Path) -> Study:
+    """A study of one test at two speeds."""
+    write("ahead.toml", AHEAD)
     return load_study("ahead.toml")
-
-
-@pytest.fixture(scope="module")
-def folder(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    """Where the module's `STUDY` and its results are."""
-    folder = tmp_path_factory.mktemp("tiny")
-    (folder / "tiny.toml").write_text(request.module.STUDY)
-    searched(load_study(str(folder / "tiny.toml")), folder / "results")
-    return folder
 
 
 @pytest.fixture

@@ -19,17 +19,6 @@ from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, json_of, write
 
-AHEAD = """
-extends = "wear"
-name = "ahead"
-title = "A pedestrian ahead on a wet road"
-[[matrix.tests]]
-name = "CPLA"
-model = "along"
-parameters = { vut_length = 4.7, vut_width = 1.85 }
-over = { speed = [50, 60] }
-"""
-
 
 @pytest.mark.parametrize(
     ("over", "between", "said"),
@@ -66,10 +55,10 @@ def test_limits_hold_at_whole_speeds_between_the_tests(ahead: Study) -> None:
     options = "--characteristics treadDepth,sensorLatency --fits 3"
     limits = json_of(f"tolerance ahead.toml {options}")["tables"]["limits"]
     members = assemble(ahead).characteristics
-    ends = np.array([members.original, members.original])
-    for row in limits["rows"]:
-        column = members.names.index(row["characteristic"])
-        ends[:, column] = row["together_low"], row["together_high"]
+    ends = [
+        members.setting({row["characteristic"]: row[end] for row in limits["rows"]})
+        for end in ("together_low", "together_high")
+    ]
     points = default_rng(5).random((300, len(members)))
     points[:100] = np.round(points[:100])
     cars = np.vstack([members.original, ends[0] + points * (ends[1] - ends[0])])

@@ -18,7 +18,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.by_criterion import SOLUTIONS_STAGE, study_by
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import Evaluations, FloatArray
-from tests.in_process import SLOW, InlinePool, json_of, numbers_of, run, searched
+from tests.in_process import SLOW, InlinePool, json_of, numbers_of, run, searched, write
 from tests.made_up import HARDEST_BRAKING
 
 STUDY = """
@@ -36,11 +36,10 @@ runs = 1
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, coarse: None) -> Path:
-    (tmp_path / "hardest_braking.py").write_text(HARDEST_BRAKING)
-    (tmp_path / "tiny.toml").write_text(STUDY)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+def folder(in_tmp: Path, coarse: None) -> Path:
+    write("hardest_braking.py", HARDEST_BRAKING)
+    write("tiny.toml", STUDY)
+    return in_tmp
 
 
 @pytest.mark.parametrize(

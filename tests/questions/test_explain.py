@@ -127,27 +127,18 @@ def test_every_boundary_is_unsafe_as_it_is_printed(
 ) -> None:
     """Also each change alone at its boundary."""
     table = explained.tables.records["causes"]
+
+    def printed(row: dict[Any, Any], name: str) -> dict[str, float]:
+        text = cell_text(row[name], table.columns[name].number_format)
+        found = re.findall(r"(\w+) ([\d.]+)", text)
+        return {name: float(value) for name, value in found}
+
     typed = []
     for row in table.frame.to_dict("records"):
-        boundary, alone = (
-            dict(
-                re.findall(
-                    r"(\w+) ([\d.]+)",
-                    cell_text(row[name], table.columns[name].number_format),
-                )
-            )
-            for name in ("boundary", "single_boundary")
-        )
-        typed += [
-            boundary,
-            *({**row["changes"], name: value} for name, value in alone.items()),
-        ]
-    settings = [
-        case.characteristics.setting(
-            {name: float(value) for name, value in one.items()}
-        )
-        for one in typed
-    ]
+        typed.append(printed(row, "boundary"))
+        alone = printed(row, "single_boundary")
+        typed += [row["changes"] | {name: value} for name, value in alone.items()]
+    settings = [case.characteristics.setting(values) for values in typed]
     assert case.unsafe.of(
         drive_and_score(assemble(case.study), np.array(settings))
     ).all()

@@ -66,6 +66,15 @@ QUESTIONS = {
 }
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the study and its results are."""
+    folder = tmp_path_factory.mktemp("tiny")
+    (folder / "tiny.toml").write_text(STUDY)
+    searched(load_study(str(folder / "tiny.toml")), folder / "results")
+    return folder
+
+
 @pytest.fixture
 def case(folder: Path) -> Case:
     return load_cases([folder / "results"])[0]

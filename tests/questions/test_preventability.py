@@ -31,6 +31,7 @@ from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
 from safevar_sumo.study import ModelTable, ScenarioTable
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
+from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import SLOW, InlinePool
 from tests.made_up import made_up_runs, original_of
 from tests.questions.conftest import box, made_up_evaluator
@@ -52,8 +53,7 @@ def test_robust_is_what_its_neighbours_are_too() -> None:
 
 STUDY = load_study("euro_ncap_pedestrian")
 BLIND = ModelTable(model="aeb", parameters={"reach": 3.0})
-NAMES = list(STUDY.vehicle.characteristics)
-ORIGINAL = np.array([one.original for one in STUDY.vehicle.characteristics.values()])
+MEMBERS = CharacteristicSet.of(STUDY)
 
 
 def evaluator(**parameters: object) -> Evaluator:
@@ -69,7 +69,7 @@ def vehicle(brakes: float = 1.0, max_rpm: float = 1.0) -> FloatArray:
     speed of the engine.
     """
     factors = {"maxBrakeTorque": brakes, "dampRateZeroT_CE": brakes, "max_rpm": max_rpm}
-    return ORIGINAL * [factors.get(name, 1.0) for name in NAMES]
+    return MEMBERS.original * [factors.get(name, 1.0) for name in MEMBERS.names]
 
 
 def collisions(here: Evaluator, *settings: FloatArray) -> Evaluations:
@@ -201,7 +201,7 @@ def test_both_vehicles_are_compared_at_the_point_where_the_failure_is_worst() ->
     """The failed vehicle has half the brakes."""
     system = assemble(load_study("euro_ncap_pedestrian", matrix={"tests": TESTS}))
     weak = vehicle()[np.newaxis]
-    weak[0, NAMES.index("maxBrakeTorque")] /= 2
+    weak[0, MEMBERS.names.index("maxBrakeTorque")] /= 2
     ((endings, unsafe_points),) = compare_at_points(system, weak, COLLISION)
     at = next(
         point

@@ -386,14 +386,12 @@ def test_one_driving_system_drives_vehicles_with_different_parameters(
     together = drive_and_score(
         replace(system, ads=VariedAds(system.ads, names, values)), settings
     )
-    for row, one in enumerate(values):
-        ads = ADS[model](
-            **{**parameters, **dict(zip(names, one.tolist(), strict=True))}
-        )
+    for row, one in enumerate(values.tolist()):
+        own = dict(zip(names, one, strict=True))
+        ads = ADS[model](**{**parameters, **own})
         alone = drive_and_score(replace(system, ads=ads), settings[:1])
-        assert not list(differences(together.take([row]).results, alone.results)), dict(
-            zip(names, one, strict=True)
-        )
+        different = differences(together.take([row]).results, alone.results)
+        assert not list(different), own
 
 
 @SLOW

@@ -4,9 +4,11 @@ between those of others.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from safevar_sumo import tolerance
 from safevar_sumo.api.simulation import load_study
@@ -14,7 +16,7 @@ from safevar_sumo.questions.part import UpperEnd, names_left_out, study_up_to
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW
+from tests.in_process import SLOW, write
 
 AHEAD = """
 extends = "wear"
@@ -33,12 +35,18 @@ over = { speed = [50, 60] }
 """
 
 
+@pytest.fixture
+def slow_and_fast(in_tmp: Path) -> Study:
+    write("ahead.toml", AHEAD)
+    return load_study("ahead.toml")
+
+
 def up_to(study: Study, speed: float) -> Study:
     return study_up_to(study, UpperEnd("speed", speed))
 
 
 def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(
-    ahead: Study,
+    slow_and_fast: Study,
 ) -> None:
     def over(study: Study) -> list[Any]:
         return [study.lists_of(test)["speed"] for test in study.matrix.tests]
@@ -47,8 +55,10 @@ def test_a_matrix_is_cut_at_the_value_itself_where_its_scenario_can_move(
     assert over(up_to(wear, 45)) == [[10, 20, 30, 40]] * 3 + [[10, 20, 30, 40, 45]]
     assert over(up_to(stop, 75)) == [[30, 50]], "a fixed way to stop has its own speeds"
     assert up_to(wear, 60) == wear
-    assert over(up_to(ahead, 40)) == [[30, 40]]
-    left_out = [names_left_out(ahead, up_to(ahead, speed)) for speed in (40, 50)]
+    assert over(up_to(slow_and_fast, 40)) == [[30, 40]]
+    left_out = [
+        names_left_out(slow_and_fast, up_to(slow_and_fast, speed)) for speed in (40, 50)
+    ]
     assert left_out == [["fast"], []]
     placed = study_up_to(wear, UpperEnd("impact_location", 30))
     assert over(placed) == over(wear), "tests without such an axis count unchanged"
@@ -64,12 +74,12 @@ def test_a_searched_original_above_the_value_becomes_it() -> None:
 
 @SLOW
 def test_limits_up_to_a_value_between_two_tests_hold_there_and_lie_between_theirs(
-    ahead: Study,
+    slow_and_fast: Study,
 ) -> None:
     """At a brake torque that is safe at 40 km/h and not at 50, the cut at 45 decides."""
     answers = [
         tolerance(
-            ahead,
+            slow_and_fast,
             up_to=f"speed={value}",
             characteristics=("brakeTorque",),
             quick=True,
@@ -83,8 +93,12 @@ def test_limits_up_to_a_value_between_two_tests_hold_there_and_lie_between_their
     assert "speed=45: fast" in between.verdict
     assert "test slow (scenario along) at 30 to 45 km/h" in between.numbers["scope"]
     assert between.numbers["up_to"] == 45
-    cut = assemble(up_to(ahead, 45))
-    settings = np.tile(cut.characteristics.original, (2, 1))
-    settings[:, cut.characteristics.names.index("brakeTorque")] = least[1], least[0]
+    cut = assemble(up_to(slow_and_fast, 45))
+    settings = np.array(
+        [
+            cut.characteristics.setting({"brakeTorque": value})
+            for value in (least[1], least[0])
+        ]
+    )
     is_kept = drive_and_score(cut, settings).f_safe >= between.numbers["margin"]
     assert is_kept.tolist() == [True, False]
