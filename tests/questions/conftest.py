@@ -18,6 +18,7 @@ from safevar_sumo.campaign.batches import Batches
 from safevar_sumo.campaign.evaluation import Selection, Task, evaluate_settings
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import bench, by_criterion, cases, evaluator, part, repair
+from safevar_sumo.questions.drives import Drives, Encounters, Scope
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.repair import problem, survivors
@@ -186,6 +187,23 @@ def quick_repairs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cases, "USUAL_BUDGET", 300)
     monkeypatch.setattr(repair, "SOBOL_VEHICLES", 32)
     monkeypatch.setattr(survivors, "MAX_SHARE_REPAIRED", 0.01)
+
+
+def scope_of(n: int, *, worlds: int = 1, center: FloatArray | None = None) -> Scope:
+    """n values from 0 to 10, some worlds, a phase and another place."""
+    ends = np.zeros(n), np.full(n, 10.0)
+    return Scope(*ends, range(worlds), np.zeros(1), np.ones(1), center=center)
+
+
+def places(*values: float) -> Encounters:
+    """Encounters at these places."""
+    number = len(values)
+    world = np.zeros(number, dtype=np.intp)
+    return Encounters(world, np.zeros(number), np.array(values)[:, np.newaxis])
+
+
+def drives_of(*vehicles: list[float]) -> Drives:
+    return Drives(np.array(vehicles), places(*[0.0] * len(vehicles)))
 
 
 def model_of(study: Study, **unsafe: float) -> Model:

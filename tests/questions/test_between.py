@@ -37,7 +37,7 @@ from tests.in_process import SLOW, InlinePool, json_of, write
     ],
 )
 def test_a_scope_names_a_range_only_where_it_was_driven(
-    ahead: Study, over: str, between: bool, said: str
+    in_tmp: Path, over: str, between: bool, said: str
 ) -> None:
     text = f'[[matrix.tests]]\nname = "A"\nparameters = {{ test = "CPNA" }}\nover = {{ {over} }}\n'
     if "target" in over:

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, strategies as st
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.campaign.batches import COMPILING
 from safevar_sumo.errors import InputError
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer
@@ -409,27 +408,21 @@ def test_more_failures_than_can_be_afforded_are_sampled_and_always_the_same() ->
     )
 
 
-def test_progress_of_a_stage_counts_all_calls() -> None:
-    """Two calls of 3 and 2 settings, the second by an evaluator of another study; about 4 were
-    expected, and as many follow as there were too many. What belongs to an earlier stage, or to
-    none, counts in the stage under way.
-    """
+def test_progress_of_a_stage_counts_the_settings_of_all_its_evaluators() -> None:
+    """The second one simulates another study."""
     shown = list[tuple[str, int, int]]()
     study = made_up_study(1)
     evaluator = Evaluator(
         study, Plant(study, nowhere), lambda *values: shown.append(values)
     )
-    evaluator.begin({"first": 1, "all calls": 1})
-    another = evaluator.for_study(evaluator.study)
-    with evaluator.phases.stage("all calls", 4):
+    evaluator.begin({"all calls": 5})
+    with evaluator.phases.stage("all calls"):
         evaluator.evaluate(np.array([[1.0], [2.0], [3.0]]), "a call")
+        another = evaluator.for_study(study)
         another.evaluate(np.array([[4.0], [5.0]]), "another")
-    with evaluator.phases.stage("first"):
-        another.evaluate(np.array([[7.0]]), "as many as it takes")
-    shown = [one for one in shown if one[0] != COMPILING]
-    assert {stage for stage, _, _ in shown} == {"all calls"}
-    counts = [*dict.fromkeys((done, total) for _, done, total in shown)]
-    assert counts == [(0, 4), (3, 4), (3, 5), (5, 6), (6, 8)]
+    counts = [done for stage, done, _ in shown if stage == "all calls"]
+    assert [*dict.fromkeys(counts)] == [0, 3, 5]
+    assert shown[-1] == ("all calls", 5, 5)
 
 
 def test_of_an_unsafe_original_no_change_is_a_cause(

@@ -9,19 +9,12 @@ import numpy as np
 import pytest
 
 from safevar_sumo.questions.cases import Counterexamples
-from safevar_sumo.questions.drives import Drives, Encounters, Scope
+from safevar_sumo.questions.drives import Drives, Scope
 from safevar_sumo.questions.tolerance.search import _in_fresh_runs
 from safevar_sumo.records import FloatArray
+from tests.questions.conftest import drives_of, scope_of
 
 RUNS = 20
-NUMBERS = (np.zeros(1), np.ones(1))
-SCOPE = Scope(*NUMBERS, range(1), np.zeros(0), np.zeros(0), phases=False)
-
-
-def drives_of(values: FloatArray) -> Drives:
-    n = len(values)
-    encounters = Encounters(np.zeros(n, dtype=int), np.zeros(n), np.zeros((n, 0)))
-    return Drives(values[:, np.newaxis], encounters)
 
 
 def task_of(scores: FloatArray, *, has_repeats: bool = True) -> Any:
@@ -41,7 +34,7 @@ def task_of(scores: FloatArray, *, has_repeats: bool = True) -> Any:
 
 def search(scope: Scope, start: Drives) -> Counterexamples:
     """A search that simulated nine drives, and found none of them unsafe."""
-    return Counterexamples(drives_of(np.array([0.9, 0.8])), np.array([0.2, 0.3]), 9, 9)
+    return Counterexamples(drives_of([0.9], [0.8]), np.array([0.2, 0.3]), 9, 9)
 
 
 @pytest.mark.parametrize("fresh_score", [-0.1, 0.1])
@@ -49,7 +42,8 @@ def test_a_box_fails_where_a_fresh_run_of_its_worst_vehicles_does(
     fresh_score: float,
 ) -> None:
     repeated = _in_fresh_runs(task_of(np.array([0.5, fresh_score])), search)
-    results = repeated(SCOPE, drives_of(np.zeros(0)))
+    scope = scope_of(1)
+    results = repeated(scope, scope.nothing)
     unsafe = [[0.8]] if fresh_score < 0 else []
     assert results.unsafe.vehicle.tolist() == unsafe
     assert (results.simulated, results.counted) == (9, 9)

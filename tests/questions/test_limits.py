@@ -25,7 +25,6 @@ from safevar_sumo.questions.cases import (
 )
 from safevar_sumo.questions.drives import (
     Drives,
-    Encounters,
     Judge,
     Scope,
     from_matrix,
@@ -43,15 +42,9 @@ from safevar_sumo.questions.tolerance.boxes import (
     widen,
 )
 from safevar_sumo.records import FloatArray
+from tests.questions.conftest import drives_of, places, scope_of
 
 PARTS = 8, 8, 8
-Sides = FloatArray
-
-
-def scope_of(n: int, *, worlds: int = 1, center: FloatArray | None = None) -> Scope:
-    """n values from 0 to 10, some worlds, a phase and another place."""
-    ends = np.zeros(n), np.full(n, 10.0)
-    return Scope(*ends, range(worlds), np.zeros(1), np.ones(1), center=center)
 
 
 def star_of(n: int) -> Scope:
@@ -74,17 +67,6 @@ def boxes_of(
 
 def nothing(n: int) -> Failures:
     return Failures.known(scope_of(n).nothing)
-
-
-def places(*values: float) -> Encounters:
-    """Encounters at these places."""
-    number = len(values)
-    world = np.zeros(number, dtype=np.intp)
-    return Encounters(world, np.zeros(number), np.array(values)[:, np.newaxis])
-
-
-def drives_of(*vehicles: list[float]) -> Drives:
-    return Drives(np.array(vehicles), places(*[0.0] * len(vehicles)))
 
 
 def search_of(judge: Judge, budget: int, seed: int = 0) -> Search:
@@ -123,18 +105,14 @@ def moving(drives: Drives) -> FloatArray:
     return np.asarray(9 - (vehicle - 5).sum(axis=1) - 2 * wave)
 
 
-def share_of(boxes: Boxes, sides: Sides) -> float:
-    return float(np.exp(boxes.log_volume(sides)))
-
-
-def unsafe_in(boxes: Boxes, sides: Sides, judge: Judge) -> int:
+def unsafe_in(boxes: Boxes, sides: FloatArray, judge: Judge) -> int:
     """The unsafe of 20,000 cases of a box, by another draw than that of the search."""
     scope = boxes.scope_of(sides)
     drives = draw(scope, 20_000, default_rng(9))
     return int((judge(drives) < 0).sum())
 
 
-def largest(boxes: Boxes) -> Sides:
+def largest(boxes: Boxes) -> FloatArray:
     start = nothing(len(boxes.original))
     quick, thorough = search_of(boxes.judge, 1024, 0), search_of(boxes.judge, 5000, 1)
     settled = find_largest_box(boxes, start, quick, thorough, default_rng(0))
@@ -145,28 +123,35 @@ def largest(boxes: Boxes) -> Sides:
 
 
 @pytest.mark.parametrize(
-    ("judge", "n", "optimum", "share"),
+    ("judge", "n", "given", "optimum", "share"),
     [
-        (linear, 3, 0.375, 0.97),
-        (moving, 4, ((5 + 7 / 4) / 10) ** 4, 0.95),
-        (tooth, 3, 0.58, 1.0),
-        (unsafe_where(lambda drives: (drives.vehicle > 7).all(axis=1)), 3, 0.7, 0.97),
+        (linear, 3, {}, 0.375, 0.97),
+        (linear, 3, {(1, 2): 2.0}, 0.315, 0.97),
+        (moving, 4, {}, ((5 + 7 / 4) / 10) ** 4, 0.95),
+        (tooth, 3, {}, 0.58, 1.0),
+        (
+            unsafe_where(lambda drives: (drives.vehicle > 7).all(axis=1)),
+            3,
+            {},
+            0.7,
+            0.97,
+        ),
     ],
 )
 def test_the_box_is_nearly_the_largest_and_holds_nothing_unsafe(
-    judge: Judge, n: int, optimum: float, share: float
+    judge: Judge,
+    n: int,
+    given: dict[tuple[int, int], float],
+    optimum: float,
+    share: float,
 ) -> None:
-    boxes = boxes_of(n, judge)
+    """Also where a limit is given."""
+    boxes = boxes_of(n, judge, given)
     sides = largest(boxes)
-    assert share * optimum < share_of(boxes, sides) <= 1.05 * optimum
+    volume = np.exp(boxes.log_volume(sides))
+    assert share * optimum < volume <= 1.05 * optimum
+    assert {side: sides[side] for side in given} == given
     assert not unsafe_in(boxes, sides, judge)
-
-
-def test_the_box_with_a_given_limit_is_nearly_the_largest() -> None:
-    boxes = boxes_of(3, linear, {(1, 2): 2.0})
-    sides = largest(boxes)
-    assert sides[1, 2] == 2
-    assert 0.97 * 0.315 < share_of(boxes, sides) <= 0.315
 
 
 def test_no_box_where_what_is_given_fails() -> None:

@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 
 from safevar_sumo.api.simulation import load_study
-from safevar_sumo.questions.drives import Encounters
 from safevar_sumo.questions.permit import permit
 from safevar_sumo.questions.permit.rows import verdict_of
 from safevar_sumo.questions.permit.speed_search import Cars
 from safevar_sumo.study import Study
 from tests.in_process import SLOW, write
+from tests.questions.conftest import places
 
 SHORT = """
 extends = "wear"
@@ -85,7 +85,5 @@ def test_a_car_passes_a_test_of_a_regulation() -> None:
 def test_all_corners_of_five_measured_values_drive_the_grid() -> None:
     """16 of 32 corners meet each encounter."""
     cars = Cars.measured(np.zeros(5), np.ones(5))
-    places = np.arange(9.0)[:, np.newaxis]
-    encounters = Encounters(np.zeros(9, dtype=np.intp), np.zeros(9), places)
-    met = cars.drives_in(encounters).vehicle
+    met = cars.drives_in(places(*np.arange(9.0))).vehicle
     assert (len(met), len(np.unique(met, axis=0))) == (9 * 16, 32)

@@ -20,7 +20,7 @@ from safevar_sumo.ads.varied import CHANGEABLE, VariedAds
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions import cases, repair as question
 from safevar_sumo.questions.bench import bench_of
-from safevar_sumo.questions.drives import Drives, Encounters
+from safevar_sumo.questions.drives import Drives
 from safevar_sumo.questions.evaluator import open_evaluator
 from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.repair import (
@@ -41,6 +41,7 @@ from safevar_sumo.study import FreeParameter
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, InlinePool, rows_of
+from tests.questions.conftest import places
 
 SPEED, MARGIN, GAP_TODAY = 20.0, 0.3, 12.0
 """Speed [m/s] of the planted system; its gap of today lets even a new sled collide, so that the
@@ -256,8 +257,7 @@ def test_the_smallest_changes_are_those_of_the_closed_form(
     parameters: int, need: float, changed: dict[int, float]
 ) -> None:
     problem: Any = Adding(parameters, need)
-    number = np.zeros(20, dtype=np.intp)
-    encounters = Encounters(number, np.zeros(20), np.zeros((20, 0)))
+    encounters = places(*np.zeros(20))
     easy, hard = np.linspace([0.5, 1], [0, 0.5], 20).T[..., np.newaxis]
     search = smallest.Search(problem, Drives(easy, encounters))
     search.smallest_changes()

@@ -57,20 +57,15 @@ def test_the_interval_holds_the_analytic_volume(region: Region, volume: float) -
     assert numbers["probability"] == numbers["failures"] / 8000
 
 
-@pytest.mark.parametrize("confidence", [0.9, 0.99])
-def test_no_failure_says_how_many_vehicles_would_show_a_rare_one(
-    confidence: float,
-) -> None:
+def test_no_failure_says_how_many_vehicles_would_show_a_rare_one() -> None:
     """And that nothing decides: all vehicles of the plant have one safety degree."""
-    answer = of(nowhere, samples=200, confidence=confidence)
+    answer = of(nowhere, samples=200, confidence=0.9)
     verdict = answer.verdict
     (told,) = re.findall(
         r"at most 0\.01 %, ([\d,]+) sampled vehicles are needed, and all", verdict
     )
     needed = int(told.replace(",", ""))
-    highest = [
-        clopper_pearson(0, number, confidence)[1] for number in (needed - 1, needed)
-    ]
+    highest = [clopper_pearson(0, number, 0.9)[1] for number in (needed - 1, needed)]
     assert highest[1] <= 1e-4 < highest[0]
     assert "the safety degree is the same for all sampled vehicles" in verdict
     assert "shares of the variance" not in answer.render("text"), (

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import safevar_sumo as sv
-from tests.in_process import json_of, refused, run, write
+from tests.in_process import json_of, refused, rows_of, run, write
 
 SHARES = """
 class Shares:
@@ -48,15 +48,14 @@ def write_shares(least: float, most: float) -> None:
 
 @pytest.mark.parametrize(
     "command",
-    ["check", "explain", "tolerance", "tolerance --quick", "risk", "rules"],
+    ["check", "explain", "tolerance", "risk", "rules"],
 )
 def test_constraints_that_hardly_any_vehicle_satisfies_are_refused_alike(
     command: str, in_tmp: Path
 ) -> None:
     write_shares(0.999, 1.001)
-    name, _, flags = command.partition(" ")
     refused(
-        f"{name} shares.toml {flags}",
+        f"{command} shares.toml",
         "fewer than 2 in 1,000 random settings satisfy them",
         "one characteristic less, whose value your class computes from the others",
     )
@@ -67,13 +66,13 @@ def test_no_limit_is_printed_where_hardly_any_vehicle_was_tested(
     flags: str, in_tmp: Path
 ) -> None:
     write_shares(0.9975, 1.0025)
-    printed = run(f"tolerance shares.toml {flags}", expect=3).stdout
-    assert "No joint limits can be given" in printed
-    assert "Keep " not in printed
-    assert "No single characteristic was found" not in printed
     answer = json_of(f"tolerance shares.toml {flags}", expect=3)
+    assert "No joint limits can be given" in answer["verdict"]
+    assert "Keep " not in answer["verdict"]
+    assert "No single characteristic was found" not in answer["verdict"]
     assert answer["numbers"]["box"] is False
-    for row in answer["tables"]["limits"]["rows"]:
+    for row in rows_of(answer, "limits"):
+        assert "Keep " not in row["sentence"]
         for end in ("alone_low", "alone_high", "together_low", "together_high"):
             assert row[end] is None, (row["characteristic"], end)
 
@@ -82,7 +81,7 @@ def test_limits_with_a_wider_constraint_hold_for_every_vehicle_that_satisfies_it
     in_tmp: Path,
 ) -> None:
     write_shares(0.9, 1.1)
-    rows = json_of("tolerance shares.toml --quick")["tables"]["limits"]["rows"]
+    rows = rows_of(json_of("tolerance shares.toml --quick"), "limits")
     low = np.array([row["together_low"] for row in rows])
     high = np.array([row["together_high"] for row in rows])
     vehicles = np.random.default_rng(3).uniform(low, high, (200_000, 3))
@@ -148,7 +147,7 @@ def test_collisions_are_named_where_no_vehicle_meets_the_criterion(
 ) -> None:
     write_wall(12000)
     name, _, flags = command.partition(" ")
-    rest = f"wall.toml {flags} --simulations 2000 --details"
+    rest = f"wall.toml {flags} --simulations 600 --details"
     told = "simulated vehicles collide, although no vehicle is unsafe by the criterion"
     with_criterion = run(f"{name} {rest} --unsafe 'safety_degree < -40'", expect=None)
     assert told in " ".join(with_criterion.stdout.split())
@@ -177,33 +176,27 @@ c = { unit = "mm", original = 5, lower = 0, upper = 10 }
 """
 
 
-def test_limits_end_only_where_a_failure_lies_beyond_them(in_tmp: Path) -> None:
+def test_a_quick_answer_ends_limits_at_failures_and_keeps_to_what_its_bar_announced(
+    in_tmp: Path,
+) -> None:
     """Smaller values of `a` and `b` are no worse, and `c` does nothing: these ends have no limit.
     A quick answer simulates at most an eighth of the usual 15,000 + 80,000.
     """
     write("line.py", LINE)
     write("line.toml", LINE_STUDY)
-    answer = json_of("tolerance line.toml --quick")
-    rows = {row["characteristic"]: row for row in answer["tables"]["limits"]["rows"]}
-    assert (rows["a"]["together_low"], rows["b"]["together_low"]) == (4.9, 0)
-    assert (rows["c"]["together_low"], rows["c"]["together_high"]) == (0, 10)
-    a = rows["a"]["together_high"]
-    b = rows["b"]["together_high"]
-    assert a - 5 + 0.5 * (b - 5) <= 4 - 0.3
-    assert a < 10
-    assert "C may have any value of its domain" in answer["verdict"] or b == 10
-
-
-def test_a_quick_answer_never_needs_more_than_its_bar_announced(in_tmp: Path) -> None:
-    write("line.py", LINE)
-    write("line.toml", LINE_STUDY)
-    totals = list[tuple[int, int]]()
-    sv.tolerance(
+    shown = list[tuple[int, int]]()
+    answer = sv.tolerance(
         "line.toml",
         quick=True,
         jobs=1,
-        progress=lambda _, done, total: totals.append((done, total)),
+        progress=lambda _, done, total: shown.append((done, total)),
     )
-    announced = totals[0][1]
+    limits = answer.tables["limits"].set_index("characteristic")
+    low, high = limits["together_low"], limits["together_high"]
+    assert (low["a"], low["b"], low["c"], high["c"]) == (4.9, 0, 0, 10)
+    assert high["a"] - 5 + 0.5 * (high["b"] - 5) <= 4 - 0.3
+    assert high["a"] < 10
+    assert "C may have any value of its domain" in answer.verdict or high["b"] == 10
+    (_, announced), *_ = shown
     assert announced <= (3 * 5_000 + 80_000) / 8
-    assert max(max(pair) for pair in totals) == announced
+    assert max(max(pair) for pair in shown) == announced
