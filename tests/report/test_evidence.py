@@ -553,7 +553,7 @@ def test_a_repair_is_packed_and_made_again(in_tmp: Path) -> None:
         file,
         ("gap = 12.0, always", "gap = 30.0, always"),
         ("at_least = 5", "at_least = 7.9"),  # which it keeps already
-        ("step_length = 0.005", "step_length = 0.02"),
+        ("step_length = 0.01", "step_length = 0.02"),
     )
     file.write_text(re.sub(r"(always|colour) = \{ .*\n", "", file.read_text()))
     run("study planted.toml --out results --quiet --jobs 1")

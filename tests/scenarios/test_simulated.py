@@ -718,7 +718,7 @@ class Fails(Wall):
 
 def with_failures(failure: str, limit: str = "3.2", failed: str = "skip") -> None:
     code = FAILS.replace("FAILURE", failure).replace("LIMIT", limit)
-    choose("fails:Fails", code, end=f'time_limit = 2.0\nfailed = "{failed}"\n')
+    choose("fails:Fails", code, end=f'time_limit = 1.0\nfailed = "{failed}"\n')
 
 
 def children() -> int:
