@@ -38,7 +38,7 @@ docs-outputs: .venv/installed-test
 	$(RUN) docs/generate.py
 
 pictures: .venv/installed-test
-	$(RUN) docs/pictures.py
+	$(RUN) docs/scripts/pictures.py
 
 benchmark: .venv/installed-test
 	$(RUN) benchmarks/evaluation.py

@@ -1,5 +1,5 @@
-"""Lists of pages that are made from the code: `python docs/generate.py` writes them anew between
-their marks. As a hook of MkDocs, this file draws formulas.
+"""Lists of pages that are made from the code, and blocks that are files of `examples/`: `python
+docs/generate.py` writes them anew. As a hook of MkDocs, this file draws formulas.
 """
 
 from __future__ import annotations
@@ -42,12 +42,19 @@ MARKED = re.compile(
     r"(<!-- generated: (\w+) -->\n).*?(?=<!-- end of what is generated -->)", re.DOTALL
 )
 """A list of a page, with the mark above it."""
+EXAMPLE = re.compile(
+    r"(<!-- file: (\S+) -->\n```[^\n]*\n).*?(?=^```$)", re.DOTALL | re.MULTILINE
+)
+"""A block of a page that has the content of a file, with the mark above it."""
 
 
 def filled(page: str) -> str:
-    """A page with its lists as the code has them now."""
-    return MARKED.sub(
+    """A page with its lists as the code has them now, and with examples as their files are."""
+    with_lists = MARKED.sub(
         lambda match: f"{match[1]}\n{LISTS[match[2]]().strip()}\n\n", page
+    )
+    return EXAMPLE.sub(
+        lambda match: match[1] + (DOCS.parent / match[2]).read_text("utf-8"), with_lists
     )
 
 
@@ -373,5 +380,6 @@ LISTS: dict[str, Callable[[], str]] = {
 }
 
 if __name__ == "__main__":
-    for path in sorted(DOCS.glob("*.md")):
+    # The index is made from README.
+    for path in (DOCS.parent / "README.md", *sorted(DOCS.rglob("*.md"))):
         path.write_text(filled(path.read_text(encoding="utf-8")), encoding="utf-8")

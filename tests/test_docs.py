@@ -76,7 +76,7 @@ def test_every_picture_has_its_command_and_its_page() -> None:
     texts = "".join((ROOT / page).read_text() for page in PAGES)
     assert (
         {path.name for path in (ROOT / "docs" / "pictures").iterdir()}
-        == script_of_docs("pictures").COMMANDS.keys()
+        == script_of_docs("scripts.pictures").COMMANDS.keys()
         == set(re.findall(r"pictures/([\w.]+)\)", texts))
     )
 
@@ -97,7 +97,7 @@ def test_a_picture_is_drawn_anew_as_large_as_it_stands_on_its_page(
     name: str, tmp_path: Path
 ) -> None:
     """That of a page of `report` takes minutes; tests/report/test_browser.py looks at pages."""
-    drawn_anew = script_of_docs("pictures").draw(name, tmp_path)
+    drawn_anew = script_of_docs("scripts.pictures").draw(name, tmp_path)
     with (
         Image.open(drawn_anew) as drawn,
         Image.open(ROOT / "docs" / "pictures" / name) as stored,
@@ -174,7 +174,7 @@ def test_every_name_of_code_that_a_page_mentions_is_in_the_file_that_it_names() 
 def test_every_file_of_code_that_is_named_exists() -> None:
     """In a page, a study or the package; a page may also make the file that it names."""
     code = [*(ROOT / "studies").rglob("*.toml"), *(ROOT / "safevar_sumo").rglob("*.py")]
-    there = [*code, *ROOT.glob("[bcdt]*/**/*.py")]
+    there = [*code, *ROOT.glob("[bcdet]*/**/*.py")]
     for file in [
         "CONTRIBUTING.md",
         *PAGES,
@@ -190,7 +190,14 @@ def test_every_file_of_code_that_is_named_exists() -> None:
             ), f"{file}: {name}"
 
 
-@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "sumo_nets/README.md"])
+@pytest.mark.parametrize(
+    "page",
+    [
+        "CONTRIBUTING.md",
+        "sumo_nets/README.md",
+        *(str(path.relative_to(ROOT)) for path in ROOT.glob("examples/**/*.md")),
+    ],
+)
 def test_every_link_of_a_page_outside_of_the_site_leads_to_a_file(page: str) -> None:
     """`mkdocs build --strict` follows the links of the site."""
     links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", (ROOT / page).read_text())

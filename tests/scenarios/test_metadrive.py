@@ -21,7 +21,7 @@ need_library("panda3d")  # MetaDrive's engine; MetaDrive itself takes seconds to
 def page(in_tmp: Path) -> str:
     """The text below the class of the page, whose files are in the working directory."""
     write("curve.toml", files_of(PAGE)["curve.toml"])
-    write("my_metadrive.py", (ROOT / "docs" / "my_metadrive.py").read_text())
+    write("my_metadrive.py", (ROOT / "examples/metadrive/my_metadrive.py").read_text())
     return (ROOT / PAGE).read_text().partition("<!-- learned driver -->")[2]
 
 
@@ -45,7 +45,7 @@ def test_the_calls_of_the_page_fit_the_client_of_carla(in_tmp: Path) -> None:
     Path("carla").symlink_to(
         Path(carla.__file__).parent
     )  # which does not say that it has types
-    source = (ROOT / "docs" / "my_carla.py").read_text()
+    source = (ROOT / "examples/carla/my_carla.py").read_text()
     write("my_carla.py", source.replace(".load_world(", ".load_wurld("))
     printed = api.run(["--strict", "--config-file=", "my_carla.py"])[0]
     faults = re.findall("^my_carla.*error: (.*?);", printed, re.MULTILINE)

@@ -1,6 +1,6 @@
 """Where NSGA-II ends on the published landscape, without any physics of ours.
 
-    python docs/landscape.py rain rain_nsga2.csv rain_rs.csv rain_fuzzer.csv
+    python docs/scripts/landscape.py rain rain_nsga2.csv rain_rs.csv rain_fuzzer.csv
 
 A regression forest learns the safety degree from the rows of the published files. NSGA-II then
 searches twice with the study's settings: on the forest's predictions, and on the study itself. The

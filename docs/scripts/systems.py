@@ -1,9 +1,9 @@
 """Every shipped driving system under the same wear: how far each part may wear, alone and together,
 and the repair.
 
-`python docs/systems.py` prints the two tables of the page on repair, in Markdown. A system has the
-parameters of a shipped study that it drives in, or else its defaults; its repair has to survive
-`PROMISE`.
+`python docs/scripts/systems.py` prints the two tables of the page on repair, in Markdown. A system
+has the parameters of a shipped study that it drives in, or else its defaults; its repair has to
+survive `PROMISE`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""All pictures of the pages, drawn anew: `python docs/pictures.py [NAME]...`, by default every one.
+"""All pictures of the pages, drawn anew: `python docs/scripts/pictures.py [NAME]...`, by default
+every one.
 
 Those of published data need the files that `SAFEVAR_PUBLISHED` names the folder of; that of the
 page needs Chromium.
@@ -13,7 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-DOCS = Path(__file__).parent
+SCRIPTS = Path(__file__).parent
 PROGRAM = f"{shlex.quote(sys.executable)} -m safevar_sumo"
 FAILURE = (
     f"{PROGRAM} simulate rain --set dampRateZeroT_CE=1 --set tireFric=1 --set"
@@ -26,15 +27,15 @@ SCREEN = (
 COMMANDS = {
     "failure.png": f"{FAILURE} --plot {{}}",
     "failure.gif": f"{FAILURE} --animate {{}}",
-    "sawtooth.png": f"{shlex.quote(sys.executable)} {DOCS}/boundaries.py sawtooth {{}}",
-    "boundary.png": f"{shlex.quote(sys.executable)} {DOCS}/boundaries.py boundary {{}}",
+    "sawtooth.png": f"{shlex.quote(sys.executable)} {SCRIPTS}/boundaries.py sawtooth {{}}",
+    "boundary.png": f"{shlex.quote(sys.executable)} {SCRIPTS}/boundaries.py boundary {{}}",
     "limits.png": f"{PROGRAM} tolerance native --characteristics decel,brakeDelay --plot {{}}",
     "convergence.png": (
         f"{PROGRAM} study rain --runs 5 --evaluations 2000 --out rain --quiet && "
         f"{PROGRAM} tables rain --figures . > /dev/null && cp rain-convergence.png {{}}"
     ),
-    "stops.png": f"{shlex.quote(sys.executable)} {DOCS}/stops.py {{}}",
-    "encounters.png": f"{shlex.quote(sys.executable)} {DOCS}/encounters.py {{}}",
+    "stops.png": f"{shlex.quote(sys.executable)} {SCRIPTS}/stops.py {{}}",
+    "encounters.png": f"{shlex.quote(sys.executable)} {SCRIPTS}/encounters.py {{}}",
     "sun_nsga2.png": f"{PROGRAM} validate sun {PUBLISHED}/sun_nsga2.csv --plot {{}}",
     "rain_nsga2_half.png": f"{PROGRAM} validate rain {PUBLISHED}/rain_nsga2_half.csv --plot {{}}",
     "lgsvl.png": f"{PROGRAM} validate lgsvl {PUBLISHED}/lgsvl_rs.csv --plot {{}}",
@@ -60,4 +61,4 @@ def draw(name: str, folder: Path) -> Path:
 
 if __name__ == "__main__":
     for chosen in sys.argv[1:] or COMMANDS:
-        print(draw(chosen, DOCS / "pictures"))
+        print(draw(chosen, SCRIPTS.parent / "pictures"))

@@ -1,4 +1,4 @@
-"""CARLA as a simulator of the user's, of which docs/simulators.md tells: a car stands ahead, and
+"""CARLA as a simulator of the user's: a car stands ahead, and
 CARLA's own traffic manager drives.
 """
 

@@ -1,4 +1,4 @@
-"""MetaDrive as a simulator of the user's, of which docs/simulators.md tells: its learned driver
+"""MetaDrive as a simulator of the user's: its learned driver
 comes to a car that stands in a curve.
 """
 

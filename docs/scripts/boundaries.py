@@ -1,7 +1,7 @@
 """Two pictures of where the study rain becomes unsafe.
 
-    python docs/boundaries.py sawtooth docs/pictures/sawtooth.png
-    python docs/boundaries.py boundary docs/pictures/boundary.png
+    python docs/scripts/boundaries.py sawtooth docs/pictures/sawtooth.png
+    python docs/scripts/boundaries.py boundary docs/pictures/boundary.png
 
 `sawtooth` has the safety degree over one characteristic, `boundary` the collisions over two.
 """

@@ -1,6 +1,6 @@
 """The picture of collisions over speed and tread in the ranges of the study wear.
 
-    python docs/encounters.py docs/pictures/encounters.png [count]
+    python docs/scripts/encounters.py docs/pictures/encounters.png [count]
 
 With `count` it prints the numbers of the page, too.
 

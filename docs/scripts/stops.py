@@ -1,6 +1,6 @@
 """The picture of stopping distances against tread depth, with the published points in it.
 
-    python docs/stops.py docs/pictures/stops.png
+    python docs/scripts/stops.py docs/pictures/stops.png
 
 Every line is the car of the study `stop` on one published test's road, with its grip and water, and
 brakes that the tyres alone limit.
@@ -21,7 +21,7 @@ from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles.wet_road import WET_FRICTION
 
-ROWS = Path(__file__).parents[1] / "calibration" / "wet_braking.csv"
+ROWS = Path(__file__).parents[2] / "calibration" / "wet_braking.csv"
 TESTS = {  # label: source in the table, grip, speed [km/h]
     "120 km/h, AutoBild 2019": ("AutoBild 2019", "AutoBild", "120"),
     "112.7 km/h, Tire Rack 2007": ("Tire Rack 2007", "Tire Rack", "112.7"),
