@@ -257,9 +257,10 @@ class Simulation:
         """How the simulation ended: with its impact, its speed or its smallest distance."""
         safety_degree = self.metrics[SAFETY_DEGREE]
         if self.outcome is Outcome.COLLISION and IMPACT_EXCESS.name in self.metrics:
-            speed = self.metrics[IMPACT_SPEED.name]
-            excess = self.metrics[IMPACT_EXCESS.name]
-            return f"has an {impact_in_words(speed, excess)}"
+            impact = impact_in_words(
+                self.metrics[IMPACT_SPEED.name], self.metrics[IMPACT_EXCESS.name]
+            )
+            return f"has an {impact}"
         if self.outcome is Outcome.COLLISION:
             return collision_in_words(
                 -safety_degree, self.collision_speed, self._digits

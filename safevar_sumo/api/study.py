@@ -241,8 +241,11 @@ def _found(
         sentences, changes = _verdict(results, case, jobs, study)
     tables = answer.tables.records
     if changes:
-        title = "The smallest number of changes that the search found to be unsafe"
-        fewest = tabulate(title, CHANGES, changes)
+        fewest = tabulate(
+            "The smallest number of changes that the search found to be unsafe",
+            CHANGES,
+            changes,
+        )
         tables = {"algorithms": tables["algorithms"], "fewest": fewest, **tables}
     return replace(
         answer,

@@ -72,7 +72,6 @@ def answer_of_setting(
     """The answer about a setting and the original vehicle: values, outcomes, metrics, objectives,
     and the results at the points of a matrix. `handle` is None if the setting is no solution.
     """
-    study = simulation.study
     setting = simulation.evaluation.settings[0]
     remarks = _remarks_of(system)
     small = [
@@ -126,7 +125,7 @@ def answer_of_setting(
         numbers = {"solution": str(handle), **numbers}
     return Answer(
         question="simulate",
-        study=study,
+        study=simulation.study,
         verdict=Verdict(sentences),
         numbers=numbers,
         tables=tables,
@@ -215,8 +214,7 @@ def _comparison_of_runs(simulation: Simulation) -> list[Sentence]:
     conclusion = words.NO_DIFFERENCE
     if low > 0 or high < 0:
         conclusion = words.LESS_SAFE if high < 0 else words.SAFER
-    means = words.DIFFERENCE(difference=difference, low=low, high=high)
-    return [means, conclusion]
+    return [words.DIFFERENCE(difference=difference, low=low, high=high), conclusion]
 
 
 def difference_of_means(

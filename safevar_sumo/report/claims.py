@@ -146,8 +146,9 @@ class Packed:
         with about(MANIFEST):
             manifest = convert_table(self.manifest, PackedManifest)
         study = manifest.study
-        stated_tables = self.manifest["study"]
-        for key, _, _ in changed_values(stated_tables, tables_of(study), "study"):
+        for key, _, _ in changed_values(
+            self.manifest["study"], tables_of(study), "study"
+        ):
             raise ValueError(
                 f"{MANIFEST}: {key} is not as the command `study` writes it"
             )
@@ -160,10 +161,13 @@ class Packed:
         codes = np.repeat(numbers, list(outcomes.values()))
         column = pd.Categorical.from_codes(codes, pd.Index(list(outcomes)))
         evaluations = pd.DataFrame({"outcome": column})
-        original = self.manifest["original"]
-        scoring = manifest.scoring or PUBLISHED_SCORING
         self.case = build_case(
-            study, original, solutions, evaluations, packed.runs, scoring=scoring
+            study,
+            self.manifest["original"],
+            solutions,
+            evaluations,
+            packed.runs,
+            scoring=manifest.scoring or PUBLISHED_SCORING,
         )
         self._directory = Path("results", study.name)
         self._answers: dict[str, Answer] = {}
@@ -320,7 +324,6 @@ class Packed:
     def simulated(self) -> tuple[bytes, bytes]:
         """The evaluation of the original vehicle, and the table of solutions, simulated again."""
         names = self.case.characteristics.names
-        solutions = self.case.solutions
         settings = self.case.settings
         evaluations = evaluate_with_workers(
             self.case.study, settings, jobs=self._jobs, progress=self._progress
@@ -328,21 +331,20 @@ class Packed:
         frame = evaluations_frame(
             names, [(("", 0), evaluations.take(range(1, len(settings))))]
         )
-        frame[["algorithm", "run"]] = solutions[["algorithm", "run"]].to_numpy()
+        runs = self.case.solutions[["algorithm", "run"]]
+        frame[["algorithm", "run"]] = runs.to_numpy()
         return json_bytes(record(evaluations)), csv_of(in_order(frame, names))
 
     @cached_property
     def searched(self) -> tuple[bytes, bytes]:
         """Numbers of evaluations by outcome, and the table of solutions, of the same runs again."""
         with temporary_folder() as folder:
-            study = self.case.study
-            runs = self.packed.runs
             results = run(
-                study,
+                self.case.study,
                 Path(folder, "results"),
                 jobs=self._jobs,
                 progress=self._progress,
-                only=runs,
+                only=self.packed.runs,
             )
             return json_bytes(count_outcomes(results.case)), csv_of(results.solutions)
 

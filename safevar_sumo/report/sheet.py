@@ -123,13 +123,11 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
 def _row_of_part(item: Characteristic, row: JsonObject | None) -> tuple[str, ...]:
     """The row of `PARTS` about one item; `row` is its row in the table of limits, if it has one."""
     name = item.meaning or item.short_name
-    limit = _limit_in_words(item, row)
-    blank = f"{BLANK}{item.suffix}"
     return (
         name[:1].upper() + name[1:],
         item.measurement,
-        limit,
-        blank,
+        _limit_in_words(item, row),
+        f"{BLANK}{item.suffix}",
         item.remedy or UNSAID,
     )
 

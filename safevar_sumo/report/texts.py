@@ -133,9 +133,11 @@ def answer_about(  # noqa: PLR0913 - options of the command `report`
     except InputError as error:
         if is_asked:
             raise
-        verdict = f"No answer: {error.problem} (expected: {error.legal})."
-        study = cases[0].study
         return Answer(
-            question=question.name, study=study, verdict=verdict, numbers={}, tables={}
+            question=question.name,
+            study=cases[0].study,
+            verdict=f"No answer: {error.problem} (expected: {error.legal}).",
+            numbers={},
+            tables={},
         )
     return replace(answer, command=command + answer.command)
