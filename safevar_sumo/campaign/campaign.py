@@ -113,8 +113,7 @@ def run_campaign(
     results.manifest["engine"] = {"name": engine_used, "reason": reason}
     results.manifest |= _about_algorithms(study)
     # A batch may hold settings of several runs. Its size changes no result.
-    size = efficient_batch(system)
-    task = Task(study=study, in_sumo=system.in_sumo, batch_size=size)
+    task = Task(study=study, in_sumo=system.in_sumo, batch_size=efficient_batch(system))
 
     evaluations = len(keys) * study.search.evaluations
     repeated = 0
@@ -297,10 +296,10 @@ def journal_progress(
     """Make a function that shows how many evaluations the runs have asked for, as their journals
     say. The total includes all evaluations that unfinished runs may still ask for.
     """
-    readers = []
-    for key in keys:
-        file = journal_file(directory, str(key))
-        readers.append(JournalReader(file, study.search.evaluations))
+    readers = [
+        JournalReader(journal_file(directory, str(key)), study.search.evaluations)
+        for key in keys
+    ]
 
     def show(ended: Sequence[int]) -> None:
         evaluations = 0

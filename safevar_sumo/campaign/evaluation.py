@@ -203,9 +203,12 @@ def evaluate_settings(task: Task, rows: FloatArray) -> Evaluations:
                 failure.place,
             ) from None
         reasons = {rows[0].tobytes(): " ".join(str(failure).split())}
-        changes = characteristics.change_objectives(setting)
         return Evaluations.undefined(
-            rows, Outcome.SIMULATOR_ERROR, METRICS, reasons=reasons, **changes
+            rows,
+            Outcome.SIMULATOR_ERROR,
+            METRICS,
+            reasons=reasons,
+            **characteristics.change_objectives(setting),
         )
     halves = [evaluate_settings(task, half) for half in np.array_split(rows, 2)]
     if isinstance(failure, UserCodeError):

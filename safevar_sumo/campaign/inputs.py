@@ -69,7 +69,6 @@ def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
     """The digests, by name, of the files on which a study's results depend: the files of its
     networks, user code, FMUs and data files, and the files with the names `used` that exist.
     """
-    places = study.origin.places
     opened = list(map(open_network, filter(None, sorted(system.networks))))
     network_files = {
         network.path(name) for network in opened for name, _ in network.digests
@@ -77,7 +76,7 @@ def files_of(study: Study, system: System, used: Iterable[str] = ()) -> Files:
     data = {
         file for path in data_files(study).values() for file in files_in(Path(path))
     }
-    files = digests(network_files | data, places) | code_of(study, used)
+    files = digests(network_files | data, study.origin.places) | code_of(study, used)
     return dict(sorted(files.items()))
 
 

@@ -102,11 +102,11 @@ def files_in(path: Path) -> list[Path]:
     """
     if path.is_file():
         return [path]
-    files = []
-    for file in filter(Path.is_file, path.rglob("*")):
-        if not HIDDEN.search(file.relative_to(path).as_posix()):
-            files.append(file)
-    return files
+    return [
+        file
+        for file in path.rglob("*")
+        if file.is_file() and not HIDDEN.search(file.relative_to(path).as_posix())
+    ]
 
 
 def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:

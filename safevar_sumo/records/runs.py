@@ -270,9 +270,11 @@ class SimulationRuns:
                 if hasattr(record, name)
             }
 
-        trace = replace(self.trace, **changed(self.trace))
-        encounter = self.encounter._replace(**changed(self.encounter))
-        runs = replace(self, trace=trace, encounter=encounter)
+        runs = replace(
+            self,
+            trace=replace(self.trace, **changed(self.trace)),
+            encounter=self.encounter._replace(**changed(self.encounter)),
+        )
         vars(runs)["relative_speed"] = self.relative_speed
         return runs
 

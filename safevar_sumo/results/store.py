@@ -117,8 +117,9 @@ class ResultsDirectory:
         if self._study.scenario.repeats == 1:
             refuse_other_original(self.path, earlier_manifest.get("original", {}), now)
         write_manifest(self.path, {**self.manifest, "original": now})
-        extent = search_extent_of(self.manifest)
-        if earlier_manifest and search_extent_of(earlier_manifest) != extent:
+        if earlier_manifest and (
+            search_extent_of(earlier_manifest) != search_extent_of(self.manifest)
+        ):
             file = self.path / SOLUTIONS
             with disk_errors(file, "removed"):
                 file.unlink(missing_ok=True)

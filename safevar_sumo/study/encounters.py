@@ -197,9 +197,11 @@ def _lists_of(axes: dict[str, AxisTable]) -> Axes:
 
 def _widest(domains: Sequence[Domain]) -> Domain:
     """The first of several domains, with ends that include all of these domains."""
-    lower = min(domain.lower for domain in domains)
-    upper = max(domain.upper for domain in domains)
-    return replace(domains[0], lower=lower, upper=upper)
+    return replace(
+        domains[0],
+        lower=min(domain.lower for domain in domains),
+        upper=max(domain.upper for domain in domains),
+    )
 
 
 class MatrixTest(Table, frozen=True, kw_only=True):
@@ -470,7 +472,7 @@ class StudyEncounters(Table, frozen=True, kw_only=True):
         """
         return replace(self, scenario=replace(self.scenario, margin=None))
 
-    def with_tests(self, tests: Sequence[MatrixTest]) -> Self:
+    def with_tests(self, tests: list[MatrixTest]) -> Self:
         """The study with these tests alone, and with the constraints that apply in any of them."""
         assert self.matrix is not None
         names = {test.name for test in tests}
@@ -479,5 +481,5 @@ class StudyEncounters(Table, frozen=True, kw_only=True):
             common = [name for name in constraint.tests if name in names]
             if common or not constraint.tests:
                 constraints.append(replace(constraint, tests=common))
-        matrix = replace(self.matrix, tests=list(tests))
+        matrix = replace(self.matrix, tests=tests)
         return replace(self, matrix=matrix, constraints=constraints)
