@@ -287,10 +287,8 @@ class DelayLine(NamedTuple):
             # infinity - infinity is NaN: such values are replaced below.
             with np.errstate(invalid="ignore"):
                 delayed = newer + (older - newer) * self.fraction
-            is_defined = np.isfinite(delayed)
-            if not is_defined.all():
-                earlier = np.where(np.equal(self.fraction, 0), newer, older)
-                delayed = np.where(is_defined, delayed, earlier)
+            earlier = np.where(np.equal(self.fraction, 0), newer, older)
+            delayed = np.where(np.isfinite(delayed), delayed, earlier)
         return delayed, DelayLine(self.steps, self.fraction, past)
 
 

@@ -25,6 +25,7 @@ from safevar_sumo.records import (
     BoolArray,
     Command,
     FloatArray,
+    FloatOrArray,
     Nominal,
     Observation,
 )
@@ -141,12 +142,12 @@ class Danger(NamedTuple):
     """
 
     is_present: BoolArray
-    deceleration: FloatArray | float
+    deceleration: FloatOrArray
     reaction_time: float
     jerk: float = JERK
     released: float = 0.0
-    nearness: FloatArray | float = np.inf
-    longest: FloatArray | float = np.inf
+    nearness: FloatOrArray = np.inf
+    longest: FloatOrArray = np.inf
 
 
 class ReferenceDriver(Ads, Table, frozen=True, kw_only=True):

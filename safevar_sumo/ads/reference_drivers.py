@@ -214,7 +214,10 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
         depth = depth_in_the_way(observation, self.corridor)
         memory = self.watch_leader(observation, memory, depth >= 0)
         gap = np.where(depth >= 0, observation.gap, np.inf)
-        pfs = self.proactive_metric(gap, observation.speed, observation.obstacle_speed)
+        unsafe_distance, safe_distance = self.proactive_distances(
+            observation.speed, observation.obstacle_speed
+        )
+        pfs = falling_ramp(gap - self.margin, unsafe_distance, safe_distance)
         cfs = self.critical_metric(
             gap,
             observation.speed,
@@ -228,29 +231,18 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
             np.where(cfs > 0, critical_deceleration, pfs * self.comfortable),
             HARDEST_BRAKING,
         )
-        _, safe_distance = self.proactive_distances(
-            observation.speed, observation.obstacle_speed
-        )
         nearness = np.minimum(depth, safe_distance + self.margin - observation.gap)
         danger = Danger(
             (pfs > 0) | (cfs > 0), deceleration, self.reaction_time, nearness=nearness
         )
         return self.react(observation, memory, danger)
 
-    def proactive_metric(
-        self, gap: FloatArray, v: FloatArray, u: FloatArray
-    ) -> FloatArray:
-        """PFS at a gap [m], the vehicle's speed v and the leader's speed u [m/s], shape (N,). PFS
-        is 0 above the safe distance, and 1 below the unsafe distance.
-        """
-        unsafe_distance, safe_distance = self.proactive_distances(v, u)
-        return _falling_ramp(gap - self.margin, unsafe_distance, safe_distance)
-
     def proactive_distances(
         self, v: FloatArray, u: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """The unsafe and the safe distance of PFS [m], at the vehicle's speed v and the leader's
-        speed u.
+        speed u. PFS is 0 if the gap minus the margin is above the safe distance, and 1 if it is
+        below the unsafe distance.
         """
         leader_stop = u * u / (2 * self.leader_deceleration)
         safe_distance = (
@@ -282,13 +274,13 @@ class FuzzySafety(ReferenceDriver, frozen=True, kw_only=True):
         square = excess * excess
         unsafe_distance = loss_in_reaction + square / (2 * self.hardest)
         safe_distance = loss_in_reaction + square / (2 * self.comfortable)
-        cfs_still_faster = _falling_ramp(gap, unsafe_distance, safe_distance)
+        cfs_still_faster = falling_ramp(gap, unsafe_distance, safe_distance)
         is_too_near = gap < loss_to_leader_speed
         cfs = np.where(speed_after_reaction < u, is_too_near, cfs_still_faster)
         return np.where(v <= u, 0.0, cfs)
 
 
-def _falling_ramp(gap: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+def falling_ramp(gap: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """A ramp over the gap [m]: 1 below `low`, 0 above `high`, linear between them. The gap may be
     infinite.
     """

@@ -13,7 +13,13 @@ import pytest
 
 from safevar_sumo.ads.car_following import Acc, Idm
 from safevar_sumo.ads.competent_driver import CompetentDriver
-from safevar_sumo.ads.reference_drivers import R157, FullBraking, FuzzySafety, Rss
+from safevar_sumo.ads.reference_drivers import (
+    R157,
+    FullBraking,
+    FuzzySafety,
+    Rss,
+    falling_ramp,
+)
 from safevar_sumo.records import FloatArray, Nominal, PedalTables
 from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
@@ -243,9 +249,9 @@ def test_fuzzy_metrics_are_those_worked_out_by_hand() -> None:
     model = FuzzySafety()
     one = np.ones(1)
     for gap, pfs in ((62.0, 0.0), (43.1, 1.0), (52.523809, 0.5)):
-        assert model.proactive_metric(gap * one, 20 * one, 10 * one)[
-            0
-        ] == pytest.approx(pfs, abs=1e-3)
+        unsafe, safe = model.proactive_distances(20 * one, 10 * one)
+        metric = falling_ramp(gap * one - model.margin, unsafe, safe)
+        assert metric[0] == pytest.approx(pfs, abs=1e-3)
     # a = 0: v' = 20; closing = 7.5, d_safe = 7.5 + 12.5 = 20, d_unsafe = 7.5 + 8.333 = 15.833
     for gap, cfs in ((20.1, 0.0), (15.8, 1.0), (17.91667, 0.5)):
         assert model.critical_metric(gap * one, 20 * one, 10 * one, 0 * one)[
