@@ -111,11 +111,9 @@ def _with_declared(tables: Parameters, places: Sequence[str]) -> Parameters:
         }
     completed_tests = []
     for test in tests:
-        with_own_axes = dict(test)
-        if "over" in test:
-            key = f"matrix.tests: {test['name']!r}: over"
-            with_own_axes["over"] = completed(test["over"], key, test)
-        completed_tests.append(with_own_axes)
+        key = f"matrix.tests: {test['name']!r}: over"
+        over = completed(test.get("over", {}), key, test)
+        completed_tests.append({**test, "over": over})
     if completed_tests:
         result["matrix"] = {**(matrix or {}), "tests": completed_tests}
     return result

@@ -215,15 +215,16 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
         if start is None:
             start = LATERAL_START
         lateral = speed * step * times - start
-        turned = np.zeros((samples, 1), bool)
+        if self.turns_after is None:
+            return Layout(self._front(roads), PEDESTRIAN, lateral, speed)
 
-        if self.turns_after is not None:
-            is_past = lateral > self.turns_after + ROUNDING
-            turn = np.where(is_past[-1], np.argmax(is_past, axis=0), samples)
-            turned = times >= turn
-            # At the sample of the turn, the pedestrian is back at the place of two steps before.
-            lateral = lateral - 2 * speed * step * np.maximum(times - turn + 1, 0)
-        return Layout(self._front(roads), PEDESTRIAN, lateral, speed, turned)
+        is_past = lateral > self.turns_after + ROUNDING
+        turn = np.where(is_past[-1], np.argmax(is_past, axis=0), samples)
+        # At the sample of the turn, the pedestrian is back at the place of two steps before.
+        back = 2 * speed * step * np.maximum(times - turn + 1, 0)
+        return Layout(
+            self._front(roads), PEDESTRIAN, lateral - back, speed, times >= turn
+        )
 
     def begin(self, world: World) -> _Memory:
         frame = Frame.through_origin(world.lane_of(VUT))

@@ -141,9 +141,18 @@ class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True)
                 place = np.round((x + 1j * y - front) / direction, DIGITS)
                 facing = np.round(np.exp(1j * heading) / direction, DIGITS)
                 is_there = (now > row_times[0] - SAME) & (now < row_times[-1] + SAME)
-                size = length * is_there, width * is_there
-                columns = place.real, place.imag, facing.real, facing.imag, speed
-                tracks.append(Track(name, "recorded", *size, *columns))
+                track = Track(
+                    name=name,
+                    kind="recorded",
+                    length=length * is_there,
+                    width=width * is_there,
+                    x=place.real,
+                    y=place.imag,
+                    along=facing.real,
+                    left=facing.imag,
+                    speed=speed,
+                )
+                tracks.append(track)
         return tracks
 
 
