@@ -137,8 +137,9 @@ def conflict(runs: SimulationRuns) -> tuple[FloatArray, FloatArray]:
     closing_speed = trace.speed - trace.obstacle_speed
     has_gap = (trace.gap >= 0) & np.isfinite(trace.gap)
     is_counted = runs.is_approach & (closing_speed > 0) & has_gap
-    ttc = np.zeros_like(trace.gap)
-    np.divide(trace.gap, closing_speed, out=ttc, where=is_counted)
+    ttc = np.divide(
+        trace.gap, closing_speed, out=np.zeros_like(trace.gap), where=is_counted
+    )
     lateral_at_arrival = trace.lateral + trace.lateral_speed * ttc
     is_met = is_in_path | (np.abs(lateral_at_arrival) <= reach)
     ttc = np.where(is_counted & is_met, ttc, np.inf)
@@ -178,8 +179,7 @@ def largest_deceleration_rate(
     """
     closing_speed, ttc = conflict(runs)
     is_counted = np.isfinite(ttc) & (ttc > 0)
-    rate = np.zeros_like(ttc)
-    np.divide(closing_speed, 2 * ttc, out=rate, where=is_counted)
+    rate = np.divide(closing_speed, 2 * ttc, out=np.zeros_like(ttc), where=is_counted)
     largest = np.max(rate, axis=0, initial=0.0)
     return mask_collisions(runs, np.where(is_counted.any(axis=0), largest, np.nan))
 
@@ -305,7 +305,7 @@ def average_deceleration(runs: SimulationRuns, thresholds: MetricsTable) -> Floa
     decelerations = (speed[:-1] - speed[1:]) / (stride * runs.trace.step)
     sample_count = np.count_nonzero(is_counted, axis=0)
     deceleration_sum = sum_in_order(np.where(is_counted, decelerations, 0.0))
-    means = np.full_like(deceleration_sum, np.nan)
+    means = nans(deceleration_sum.shape)
     np.divide(deceleration_sum, sample_count, out=means, where=sample_count > 0)
     return means
 

@@ -235,18 +235,17 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         )
 
     def at_rest(self, prepared: _Prepared) -> LgsvlState:
-        p = prepared
         zeros = np.zeros_like(prepared.mass)
         first_ratio = zeros + GEAR_RATIOS[0]
         return LgsvlState(
             speed=zeros,
             wheel_speed=zeros,
-            engine_rpm=p.least_rpm,
+            engine_rpm=prepared.least_rpm,
             gear=zeros + 1,
             old_ratio=first_ratio,
             new_ratio=first_ratio,
             since_shift=zeros + SHIFT_DELAY,
-            traction_torque=TRACTION_START * p.motor_torque,
+            traction_torque=TRACTION_START * prepared.motor_torque,
             lateral=zeros + LATERAL_ERROR,
             heading=zeros + HEADING_ERROR,
             throttle=zeros,

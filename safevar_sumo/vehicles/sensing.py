@@ -138,10 +138,14 @@ class SumoVehicle(
         )
 
     def sumo_type(self, prepared: _PreparedSumo) -> SumoType:
-        p = prepared
-        accel = np.minimum(p.drive, p.grip)
-        decel = np.minimum(p.decel, p.grip)
-        return SumoType(p.mass, accel, decel, p.max_speed, p.actuator_lag, p.tau)
+        return SumoType(
+            mass=prepared.mass,
+            accel=np.minimum(prepared.drive, prepared.grip),
+            decel=np.minimum(prepared.decel, prepared.grip),
+            max_speed=prepared.max_speed,
+            actuator_lag=prepared.actuator_lag,
+            tau=prepared.tau,
+        )
 
     def _acceleration(
         self,

@@ -217,19 +217,18 @@ class SensingVehicle(Vehicle):
     def advance(
         self, prepared: Prepared, state: SensingState, command: Command
     ) -> SensingState:
-        p = prepared
-
         commands = state.brake_commands.extended(command.brake)
         brake = commands.delayed()
-        acceleration = self._acceleration(p, state, command.throttle, brake)
+        acceleration = self._acceleration(prepared, state, command.throttle, brake)
 
         # A vehicle that begins faster than its top speed must not lose speed at once.
-        highest_speed = np.maximum(p.max_speed, state.speed)
-        speed = state.speed + (acceleration - p.slope.back) * p.step
+        back = prepared.slope.back
+        highest_speed = np.maximum(prepared.max_speed, state.speed)
+        speed = state.speed + (acceleration - back) * prepared.step
         speed = np.minimum(np.maximum(speed, 0.0), highest_speed)
         return state._replace(
             speed=speed,
-            acceleration=(speed - state.speed) / p.step + p.slope.back,
+            acceleration=(speed - state.speed) / prepared.step + back,
             throttle=np.where(brake > 0, 0.0, command.throttle),
             brake=brake,
             brake_commands=commands,
