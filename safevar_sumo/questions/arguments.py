@@ -23,7 +23,7 @@ class Kind(NamedTuple):
     Attributes
     ----------
     accepts
-        Whether a value is legal.
+        Whether a value other than None is legal. None is legal if the type names it.
     legal
         The legal values in words.
     """
@@ -45,13 +45,9 @@ def _is_path(value: object) -> bool:
     return isinstance(value, str | PathLike)
 
 
-def _is_path_or_none(value: object) -> bool:
-    return value is None or _is_path(value)
-
-
-def _is_mapping_or_none(value: object) -> bool:
+def _is_mapping(value: object) -> bool:
     # A Series of pandas has names, too.
-    return value is None or isinstance(value, Mapping) or hasattr(value, "keys")
+    return isinstance(value, Mapping) or hasattr(value, "keys")
 
 
 def _object_of(name: str) -> Callable[[object], bool]:
@@ -61,10 +57,6 @@ def _object_of(name: str) -> Callable[[object], bool]:
         return name in [kind.__name__ for kind in type(value).__mro__]
 
     return accepts
-
-
-def _is_pool_or_none(value: object) -> bool:
-    return value is None or _object_of("Pool")(value)
 
 
 FLAG = "bool"
@@ -77,17 +69,14 @@ KINDS = {
         "True for a bar, False for none, or a function of a phase, the number of simulations done,"
         " and their total",
     ),
-    POOL: Kind(
-        _is_pool_or_none,
-        "a Pool, or None for new worker processes",
-    ),
+    POOL: Kind(_object_of("Pool"), "a Pool, or None for new worker processes"),
     "str": Kind(_is_path, "a text"),
     "str | Path": Kind(_is_path, "a text or a path"),
-    "Path | None": Kind(_is_path_or_none, "a text or a path, or None"),
-    "str | None": Kind(_is_path_or_none, "a text, or None"),
-    "str | Path | None": Kind(_is_path_or_none, "a text or a path, or None"),
+    "Path | None": Kind(_is_path, "a text or a path, or None"),
+    "str | None": Kind(_is_path, "a text, or None"),
+    "str | Path | None": Kind(_is_path, "a text or a path, or None"),
     "Mapping[str, float] | None": Kind(
-        _is_mapping_or_none, "values by name, such as {'mass': 2500}, or None"
+        _is_mapping, "values by name, such as {'mass': 2500}, or None"
     ),
     "Comparison": Kind(
         _object_of("Comparison"),
@@ -105,6 +94,8 @@ other types.
 
 def check_kind(argument: str, value: object, kind: str) -> None:
     """Refuse a value that an argument with the annotated type `kind` cannot have."""
+    if value is None and kind.endswith("| None"):
+        return
     if kind in KINDS and not KINDS[kind].accepts(value):
         raise InputError(argument, repr(value), KINDS[kind].legal)
 

@@ -41,9 +41,7 @@ def study_by(study: Study, unsafe: Unsafe) -> Study:
     check_name("unsafe", f"study {study.name!r} has no metric {name!r}", name, legal)
     if name not in measured:
         metrics = replace_in(metrics, also=[*metrics.also, name])
-    allows = matrix is not None and any(
-        test.allowed_impact_speed for test in matrix.tests
-    )
+    allows = any(test.allowed_impact_speed for test in study.tests)
     if allows and not unsafe.is_of_impacts:
         raise InputError(
             "unsafe",

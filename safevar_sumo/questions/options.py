@@ -199,9 +199,7 @@ def _option(parameter: inspect.Parameter, hint: Any, meaning: str) -> Option:
             metavar = str(extra)
     hints = (hint, *get_args(hint))
     is_repeated = any(get_origin(kind) is tuple for kind in hints)
-    kind: type = str
-    if not is_repeated:
-        kind = next(filter(hints.__contains__, (bool, int, float, Path)), str)
+    kind = next(filter(hints.__contains__, (bool, int, float, Path)), str)
     choices = ()
     if get_origin(hint) is Literal:
         choices = get_args(hint)
