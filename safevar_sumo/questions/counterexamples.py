@@ -117,12 +117,12 @@ class Failure(NamedTuple):
 
 def describe(
     model: Model,
-    settings: Mapping[str, FloatArray],
+    settings: Sequence[FloatArray],
     box: Box | None = None,
-    single_names: Mapping[str, str] = MappingProxyType({}),
+    single_names: Mapping[int, str] = MappingProxyType({}),
     further: Sequence[int] = FURTHER_DIGITS,
-) -> dict[str, Failure]:
-    """Describe how unsafe settings of a model fail at their worst points, by the settings' names.
+) -> dict[int, Failure]:
+    """Describe how unsafe settings of a model fail at their worst points, by the settings' rows.
 
     The values of the vehicle are rounded away from the original values, and simulated again. If the
     rounded vehicle is safe, it is rounded to further digits. A setting that is safe with all
@@ -133,26 +133,26 @@ def describe(
     box
         A value within this box stays in it when it is rounded; None for no box.
     single_names
-        By a setting's name, the only characteristic that is rounded.
+        By a setting's row, the only characteristic that is rounded.
     further
         Numbers of digits beyond the digits of a limit, in the order in which they are tried.
     """
     failures = {}
-    waiting = dict(settings)
+    waiting = dict(enumerate(settings))
     for number in further:
         if not waiting:
             break
         members = model.characteristics
-        rows = np.array(
+        candidates = np.array(
             [
-                as_printed(members, setting, number, box, single_names.get(name, ""))
-                for name, setting in waiting.items()
+                as_printed(members, setting, number, box, single_names.get(row, ""))
+                for row, setting in waiting.items()
             ]
         )
-        names = list(waiting)
-        for row, failure in failures_at(model, rows).items():
-            failures[names[row]] = failure
-            del waiting[names[row]]
+        rows = list(waiting)
+        for place, failure in failures_at(model, candidates).items():
+            failures[rows[place]] = failure
+            del waiting[rows[place]]
     return failures
 
 
@@ -170,21 +170,19 @@ def values_as_printed(
     the first of them is used, and the caller simulates the rounded vehicles in fresh runs.
     """
     members = model.characteristics
-    settings = {
-        str(row): members.setting(vehicle, beyond=True)
-        for row, vehicle in enumerate(vehicles)
-    }
-    names = dict(zip(settings, single_names, strict=False))
+    settings = [members.setting(vehicle, beyond=True) for vehicle in vehicles]
+    names = dict(enumerate(single_names))
     if model.evaluator.has_repeats:
         return [
             members.named(
                 as_printed(members, setting, further[0], None, names.get(row, ""))
             )
-            for row, setting in settings.items()
+            for row, setting in enumerate(settings)
         ]
     printed = describe(model, settings, single_names=names, further=further)
-    settings |= {name: failure.setting for name, failure in printed.items()}
-    return list(map(members.named, settings.values()))
+    for row, failure in printed.items():
+        settings[row] = failure.setting
+    return list(map(members.named, settings))
 
 
 def solution_with_fewest_changes(case: Case) -> FloatArray | None:

@@ -27,18 +27,18 @@ def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_ou
 
     found = describe(
         made_up_model(2, sliver),
-        {"a": np.array([7.13005, 5.0]), "b": np.array([7.5, 5.0])},
+        [np.array([7.13005, 5.0]), np.array([7.5, 5.0])],
     )
-    assert [*found] == ["a"], "a setting that is safe is not described"
-    assert sliver(found["a"].setting[np.newaxis])[0]
+    assert [*found] == [0], "a setting that is safe is not described"
+    assert sliver(found[0].setting[np.newaxis])[0]
 
 
 def test_a_described_setting_stays_within_the_limits_that_it_breaks() -> None:
     study = made_up_study(2)
     model = made_up_model(2, lambda rows: rows[:, 0] > 7)
     within = Box(region_of(study), np.array([5.0, 5.0]), np.array([7.1234, 5.0]))
-    found = describe(model, {"": np.array([7.12339, 5.0])}, within)
-    assert within.holds(found[""].setting[np.newaxis])[0]
+    found = describe(model, [np.array([7.12339, 5.0])], within)
+    assert within.holds(found[0].setting[np.newaxis])[0]
 
 
 def test_a_margin_that_the_original_does_not_keep_ends_the_question() -> None:
