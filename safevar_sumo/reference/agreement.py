@@ -131,7 +131,7 @@ def _draw(
         axis.scatter(published, simulated, s=6, alpha=0.4, c=colours, linewidths=0)
         # The line needs a point within the range of the values. Otherwise it would extend the axes.
         defined, _ = defined_pairs(published, simulated)
-        origin = float(next(iter(defined), 0.0))
+        origin = next(iter(defined), 0.0)
         axis.axline(
             (origin, origin), slope=1, color="black", linewidth=0.8, linestyle="--"
         )

@@ -253,7 +253,7 @@ def _new_collisions(evaluators: Evaluators) -> Differences:
     of_a, of_b = map(_runs_of_original, evaluators)
     safe_in_a = [case for case, _, run in of_a if not run.collided[0]]
     new = [
-        (float(-run.f_safe[0]), point)
+        (-run.f_safe[0], point)
         for case, point, run in of_b
         if run.collided[0] and case in safe_in_a
     ]

@@ -133,7 +133,7 @@ class CommonDomain(NamedTuple):
         if is_empty.any():
             raise InputError(
                 second.source,
-                f"{a.names[int(np.argmax(is_empty))]}: the domains of the two studies do not"
+                f"{a.names[np.argmax(is_empty)]}: the domains of the two studies do not"
                 " overlap",
                 "studies with a common domain of each parameter",
             )

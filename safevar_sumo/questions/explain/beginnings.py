@@ -232,7 +232,7 @@ def _begin(
         rows.tolist(), first_unsafe.tolist(), groups, strict=True
     ):
         at = first
-        smaller += [(cause, float(shares[at])) for cause in group]
+        smaller += [(cause, shares[at]) for cause in group]
         if group and not is_free:
             continue
         if group:
@@ -240,13 +240,13 @@ def _begin(
             subcauses = smaller_causes(settings[row, unsafe_at])
             if [] not in subcauses:
                 continue
-            at = int(unsafe_at[subcauses.index([])])
+            at = unsafe_at[subcauses.index([])]
         cause = causes[row]
         named = members.named(settings[row, at])
         # Twelve digits are enough: further digits are rounding errors of the share.
         boundary = {name: float(f"{named[name]:.12g}") for name in cause.changes}
         safe_shares = shares[at + 1 :][is_safe[row, at + 1 :]]
         beginnings[row] = Beginning(
-            cause, float(shares[at]), boundary, min(safe_shares, default=np.nan)
+            cause, shares[at], boundary, min(safe_shares, default=np.nan)
         )
     return beginnings, smaller

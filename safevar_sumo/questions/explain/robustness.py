@@ -45,9 +45,9 @@ def draw_neighbours(
 def robust_shares(
     evaluator: Evaluator, settings: FloatArray, unsafe: Unsafe
 ) -> FloatArray:
-    """The unsafe shares of the neighbours of M settings, shape (M, n), with the study's time step
-    times each of `STEP_FACTORS`; shape (M, factors). With few simulations only the study's step is
-    used. Shares are NaN if there would be too few neighbours.
+    """The unsafe shares of the neighbours of M settings, shape (M, n): the means over the study's
+    time step times each of `STEP_FACTORS`, shape (M,). With few simulations only the study's step
+    is used. Shares are NaN if there would be too few neighbours.
 
     Neighbours are simulated without the filter. A neighbour without a valid simulation does not
     count.
@@ -59,7 +59,7 @@ def robust_shares(
         count = min(count, evaluator.left // (6 * max(len(settings), 1)))
         factors = factors[:1]
     if count < LEAST_NEIGHBOURS:
-        return np.full((len(settings), len(factors)), np.nan)
+        return np.full(len(settings), np.nan)
     neighbours = draw_neighbours(
         evaluator.characteristics, settings, evaluator.seed, count
     )
@@ -78,4 +78,4 @@ def robust_shares(
             unsafe_shares = unsafe.runs(evaluations).mean(axis=0).reshape(-1, count)
             failing = (unsafe_shares * is_valid).sum(axis=1)
             shares.append(failing / np.maximum(is_valid.sum(axis=1), 1))
-    return np.transpose(shares)
+    return np.asarray(np.mean(shares, axis=0))

@@ -93,7 +93,7 @@ def failures_frame(
         "safety_degree": failures.f_safe,
         "changed": failures.f_num_diff.astype(int),
         "largest_change": failures.f_diff,
-        "unsafe_neighbours": robust_shares(evaluator, settings, unsafe).mean(axis=1),
+        "unsafe_neighbours": robust_shares(evaluator, settings, unsafe),
         "ends": sentences,
         "points": points,
         "avoided_by": drivers,
@@ -154,7 +154,7 @@ def causes_table(
             **limits[index]._asdict(),
             **printed[index],
             "size": len(causes[index].changes),
-            "elsewhere": bool(elsewhere[index]),
+            "elsewhere": elsewhere[index],
             "share": shares[index],
             "robust_share": robust[index],
             "holds": holds[index],
@@ -254,9 +254,9 @@ def _count_failing_runs(
     settings = np.array([members.setting(vehicle, beyond=True) for vehicle in vehicles])
     fails = unsafe.failing_runs(evaluator.evaluate_anew(settings))
     for row, of_vehicle in zip(chosen, fails.T, strict=True):
-        row["failing_runs"] = int(of_vehicle.sum())
+        row["failing_runs"] = of_vehicle.sum()
         row["runs"] = len(of_vehicle)
-        row["unsafe_runs"] = float(of_vehicle.mean())
+        row["unsafe_runs"] = of_vehicle.mean()
 
 
 def sureness(
@@ -273,7 +273,7 @@ def sureness(
     robust = np.full(len(causes), np.nan)
     if causes:
         settings = settings_of(evaluator.characteristics, causes)
-        robust = robust_shares(evaluator, settings, unsafe).mean(axis=1)
+        robust = robust_shares(evaluator, settings, unsafe)
     if not (sets and causes and evaluator.study.spread):
         return robust, [None] * len(causes), None
     studies = studies_of_sets(evaluator.study)[:sets]

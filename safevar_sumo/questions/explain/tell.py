@@ -101,7 +101,7 @@ def _leading_of_study(
     share = leading["begins_at"]
     templates = _templates(members, leading["boundary"], share)
     yield _enough(templates, members, unsafe, leading, share)
-    if number_of_others := int((table["size"] == leading["size"]).sum()) - 1:
+    if number_of_others := (table["size"] == leading["size"]).sum() - 1:
         yield words.OTHERS(causes=number_of(number_of_others, "further cause"))
 
     if pd.notna(leading["safe_again"]):
@@ -267,9 +267,8 @@ def failure_sentences(
         yield words.NOT_CONFIRMED if evaluator.has_repeats else words.TOO_FEW
         return
     if causes.empty:
-        degree = float(original.f_safe[0])
         contact = evaluator.system.contact
-        ending = ending_in_words(str(original.outcome[0]), degree, contact)
+        ending = ending_in_words(original.outcome[0], original.f_safe[0], contact)
         yield words.NONE_UNSAFE
         yield words.ENDING(ending=ending)
         return
@@ -367,7 +366,7 @@ def avoidance(verdicts: pd.DataFrame) -> Sentences:
     collisions count on which the driver has a verdict.
     """
     for name, template in AVOIDING.items():
-        number = int(verdicts[name].count())
+        number = verdicts[name].count()
         collisions = f"{number:,} examined collisions"
         if number < len(verdicts):
             collisions = f"{number:,} collisions with a verdict ({len(verdicts):,} were examined)"

@@ -307,7 +307,7 @@ def _equal_solutions(case: Case) -> str:
     solutions are equal. Tables of pooled solutions count all of them.
     """
     run = ["algorithm", "run"] if case.has_runs else ["algorithm"]
-    count = int(case.solutions.duplicated([*run, *case.characteristics.names]).sum())
+    count = case.solutions.duplicated([*run, *case.characteristics.names]).sum()
     if not count:
         return ""
     of_all = f"{count} of {number_of(len(case.solutions), 'solution')}"
@@ -360,7 +360,7 @@ def _on_pooled_tests(
         )
     for metric in case.scoring.metrics:
         values = solutions_for_metric(case.solutions, metric)[metric.name]
-        undefined = int(values.isna().sum())
+        undefined = values.isna().sum()
         if undefined:
             yield (
                 f"{metric.name} is undefined in {undefined} of {len(values)} solutions. The tests"
@@ -400,7 +400,7 @@ def remarks_on_runs(
     tests = frame.dropna(subset="effect_size")
     number = len(tests)
     tests_in_words = number_of(number, "test")
-    few = number - int(tests["enough_runs"].sum())
+    few = number - tests["enough_runs"].sum()
     if few:
         least_number = fewest_runs(rq, alpha, number)
         beginning = f"{few} of {tests_in_words} of {rq} cannot"

@@ -192,7 +192,7 @@ def count_evaluations(case: Case) -> pd.DataFrame:
     search = case.study.search
     rows = []
     for (algorithm, run), group in frames_of_runs(case, case.evaluations):
-        requested = int(group["evaluation"].max()) + 1
+        requested = group["evaluation"].max() + 1
         if requested > search.evaluations - search.population:
             requested = search.evaluations
         rows.append((algorithm, run, requested, len(group), search.evaluations))

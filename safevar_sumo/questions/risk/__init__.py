@@ -150,8 +150,8 @@ def risk(
         **over_sets.numbers(failures / total),
     }
 
-    omissions = int(evaluations.infeasible.sum())
-    failed = samples - total - omissions - int(evaluations.standing.sum())
+    omissions = evaluations.infeasible.sum()
+    failed = samples - total - omissions - evaluations.standing.sum()
     sentences = _share_in_words(study, criterion, numbers, failed)
     sentences += moving_in_words(evaluations)
     if not has_design and total < LEAST_VEHICLES:

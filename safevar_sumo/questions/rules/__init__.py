@@ -171,8 +171,8 @@ def rules(
     if not boxes:
         sentences.append(
             words.TOO_FEW(
-                unsafe=int(of_runs.sum()),
-                safe=int((~of_runs).sum()),
+                unsafe=of_runs.sum(),
+                safe=(~of_runs).sum(),
                 least=MIN_SETTINGS,
             )
         )
@@ -341,15 +341,15 @@ def _boxes_of_leaves(
     # A leaf has no children: scikit-learn states -1.
     if tree.children_left[node] < 0:
         counts = tree.value[node][0]
-        yield box, float(counts[-1] / counts.sum())
+        yield box, counts[-1] / counts.sum()
         return
 
-    column = int(tree.feature[node])
+    column = tree.feature[node]
     threshold = lower[column] + tree.threshold[node] * width[column]
     for end, children in enumerate((tree.children_right, tree.children_left)):
         part = box.copy()
         part[end, column] = threshold
-        yield from _boxes_of_leaves(tree, int(children[node]), part, lower, width)
+        yield from _boxes_of_leaves(tree, children[node], part, lower, width)
 
 
 def _drop_useless_conditions(
@@ -364,7 +364,7 @@ def _drop_useless_conditions(
         flags = is_unsafe[is_within(box, settings)]
         if not len(flags):
             return 0.0
-        return clopper_pearson(int(np.count_nonzero(flags)), len(flags))[0]
+        return clopper_pearson(flags.sum(), len(flags))[0]
 
     while np.isfinite(box).any():
         columns = np.flatnonzero(np.isfinite(box).any(axis=0))
