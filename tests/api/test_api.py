@@ -19,12 +19,6 @@ from safevar_sumo.vehicles import CharacteristicSet
 from tests.in_process import SLOW, run_python, write
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> sv.Results:
-    """Results of a study that the library searched without output."""
-    return sv.run("smoke", tmp_path_factory.mktemp("api") / "out", jobs=1)
-
-
 def test_every_public_name_is_there_and_nothing_else() -> None:
     for name in sv.__all__:
         assert getattr(sv, name) is not None
@@ -220,7 +214,8 @@ def test_what_is_wrong_with_an_argument_names_it_and_not_the_file() -> None:
         sv.simulate("rain", {"mass": "1"})  # type: ignore[dict-item]
 
 
-def test_load_reads_the_results_of_run(results: sv.Results) -> None:
+def test_load_reads_the_results_of_run(tmp_path: Path) -> None:
+    results = sv.run("smoke", tmp_path / "out", jobs=1)
     again = sv.load(results.directory)
     assert_frame_equal(again.solutions, results.solutions)
     assert tables_of(again.study) == tables_of(load_study("smoke"))

@@ -260,17 +260,6 @@ class File:
         return getattr(self._inner, name)
 
 
-@pytest.fixture(scope="module")
-def tiny() -> Study:
-    search = {
-        "algorithms": ["nsga2", "rs"],
-        "population": 10,
-        "evaluations": 20,
-        "runs": 1,
-    }
-    return load_study("smoke", search=search)
-
-
 def carried_out(study: Study, path: Path) -> bytes:
     formulas.carried_out(study, path)
     return formulas.solutions(path)
@@ -292,9 +281,14 @@ def broken(study: Study, path: Path, disk: Disk) -> bool:
 
 @SLOW
 @pytest.mark.parametrize("stays", [False, True])
-def test_every_step_on_the_disk_may_fail(
-    stays: bool, tiny: Study, tmp_path: Path
-) -> None:
+def test_every_step_on_the_disk_may_fail(stays: bool, tmp_path: Path) -> None:
+    search = {
+        "algorithms": ["nsga2", "rs"],
+        "population": 10,
+        "evaluations": 20,
+        "runs": 1,
+    }
+    tiny = load_study("smoke", search=search)
     expected = carried_out(tiny, tmp_path / "whole")
     errors = 0
     for number in range(1, MOST_STEPS):

@@ -64,17 +64,12 @@ factor = 0.7
 """Six members from outside: those of the tutorials."""
 
 
-@pytest.fixture
-def six(in_tmp: Path) -> None:
-    for name, text in files_of(
-        *(f"docs/tutorials/own_{page}.md" for page in ("ads", "vehicle", "metric"))
-    ).items():
+@SLOW
+def test_members_of_user_code_are_searched_and_tabulated(in_tmp: Path) -> None:
+    pages = (f"docs/tutorials/own_{page}.md" for page in ("ads", "vehicle", "metric"))
+    for name, text in files_of(*pages).items():
         write(name, text)
     write("six.toml", SIX)
-
-
-@SLOW
-def test_members_of_user_code_are_searched_and_tabulated(six: None) -> None:
     run("study six.toml --out out --runs 1 --evaluations 20 --quiet")
     solutions = load_runs("out").solutions
     assert set(solutions["algorithm"]) == {"nsga2", "Halving"}

@@ -372,8 +372,8 @@ def commands_of(page: str) -> list[str]:
 DAY = "crossing, clear"
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@SLOW
+def test_all_of_it_is_of_the_point(tmp_path: Path) -> None:
     """A crossing in the clear, where less collides, and in hard_rain."""
     matrix = {
         "aggregate": "worst",
@@ -384,11 +384,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
         matrix=matrix,
         search={"runs": 1, "population": 10, "evaluations": 40, "algorithms": ["rs"]},
     )
-    return searched(study, tmp_path_factory.mktemp("matrix") / "results")
-
-
-@SLOW
-def test_all_of_it_is_of_the_point(results: Path) -> None:
+    results = searched(study, tmp_path / "results")
     page = page_of(results, point=DAY)
     assert f"the test case {DAY} alone" in page
     (whole,) = load_cases([results])

@@ -62,14 +62,11 @@ def batch(number: int) -> Evaluations:
     )
 
 
-def places(number: int) -> list[int]:
-    return [ROWS * number + row for row in range(ROWS)]
-
-
 def append(journal: Journal, first: int = 0) -> None:
     """Append the batches from `first` on."""
     for number in range(first, BATCHES):
-        journal.append(places(number), batch(number))
+        positions = [ROWS * number + row for row in range(ROWS)]
+        journal.append(positions, batch(number))
 
 
 def write(path: Path, finished: bool = True) -> list[int]:

@@ -16,7 +16,6 @@ from safevar_sumo.campaign.campaign import UNSAFE_REPEATED, choose_sample
 from safevar_sumo.campaign.runs import MAX_REPEATED, RunResult
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Evaluations, FloatArray, SimulationRuns
-from safevar_sumo.scenarios import Point
 from safevar_sumo.study import Study
 from safevar_sumo.sumo import matrix, verification
 from safevar_sumo.sumo.system import System, assemble
@@ -27,7 +26,6 @@ from tests.made_up import drawn, made_up_evaluations
 
 TESTS = ("CutIn", "CutOut", "CarToCar")
 """Scenarios of the tests of `alks`."""
-Repeated = list[tuple[Point, FloatArray]]
 
 
 @pytest.fixture
@@ -35,18 +33,6 @@ def study() -> Study:
     return load_study(
         "alks", search={"algorithms": ["rs"], "runs": 1, "evaluations": 8}
     )
-
-
-@pytest.fixture
-def repeated(monkeypatch: pytest.MonkeyPatch) -> Repeated:
-    """The points and settings that SUMO is to repeat."""
-    them = []
-
-    def note(system: System, settings: FloatArray, runs: SimulationRuns) -> None:
-        them.append((system.points[0], settings))
-
-    monkeypatch.setattr(verification, "_verify_point", note)
-    return them
 
 
 def with_fault(test: str) -> Callable[..., Any]:
@@ -81,8 +67,14 @@ def test_a_fault_of_the_fast_engine_in_one_test_of_a_matrix_is_found(
 
 
 def test_each_setting_drives_at_its_worst_point_and_one_of_each_test_has_its_turn(
-    study: Study, repeated: Repeated
+    study: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    repeated = []
+
+    def note(system: System, settings: FloatArray, runs: SimulationRuns) -> None:
+        repeated.append((system.points[0], settings))
+
+    monkeypatch.setattr(verification, "_verify_point", note)
     system = assemble(study)
     settings = drawn(system, 12, 2)
     worst = np.repeat([0, 3], 6)
