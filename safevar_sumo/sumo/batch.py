@@ -4,7 +4,7 @@ SUMO.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 
@@ -18,7 +18,6 @@ from safevar_sumo.scenarios import (
     Scenario,
     WorldScenario,
 )
-from safevar_sumo.sumo.bodies import SceneWorld
 from safevar_sumo.sumo.drive import Listener, drive, last_sample_of
 from safevar_sumo.sumo.encounters import encounter, scenes_of_encounters
 from safevar_sumo.sumo.engine import (
@@ -29,7 +28,7 @@ from safevar_sumo.sumo.engine import (
 )
 from safevar_sumo.sumo.lane_world import LaneWorld
 from safevar_sumo.sumo.network import networks_for, varied_network
-from safevar_sumo.sumo.perception import Observer, SceneObserver, of_vehicles
+from safevar_sumo.sumo.perception import Observer, SceneObserver
 from safevar_sumo.sumo.recorded_world import RecordedWorld
 from safevar_sumo.sumo.recording import Recording
 from safevar_sumo.sumo.simulators import joined, simulate_each
@@ -118,25 +117,23 @@ def drive_all(
         return simulate_each(system, np.tile(settings, (system.repeats, 1)))
     vehicles, encounters = system.split(settings)
     on_road = system.at_encounters(encounters)
-    scenario = on_road.points[0].scenario
     # Compilation may take longer than a simulation: it must not count in the time limit.
     system.vehicle.compile()
     with system.user_code(), end_if_longer(system.time_limit):
         # SUMO is slow. So it simulates only if neither tracks nor a recorded scene suffice; among
         # tracks all points are simulated at once.
         if reason_against_scenes(system):
-            traffic = traffic_of(system, encounters, OVERTIME)
-            with open_points_world(system, encounters, traffic) as sumo_world:
-                observer = observer_of(scenario, sumo_world, traffic)
+            with open_points_world(system, encounters) as (sumo_world, observer):
                 return drive(on_road, vehicles, sumo_world, observer, listen)
         traffic = traffic_of(system, encounters, 0.0)
         if traffic is not None:
-            start_speeds = _start_speeds(on_road.points, len(settings))
-            lane = LaneWorld(traffic, start_speeds, traffic.step)
+            lane = LaneWorld(traffic, traffic.step)
             vehicles = np.tile(vehicles, (len(system.points), 1))
             return drive(on_road, vehicles, lane, traffic, listen)
+        scenario = on_road.points[0].scenario
+        assert isinstance(scenario, WorldScenario)
         world = _recorded_world(system, encounters, scenario)
-        observer = observer_of(scenario, world, None)
+        observer = SceneObserver(scenario, world)
         return drive(on_road, vehicles, world, observer, listen)
 
 
@@ -161,18 +158,6 @@ def _recorded_world(
     assert isinstance(scenario, WorldScenario)
     scenes = scenes_of_encounters(scene, scenario, len(encounters) // size)
     return RecordedWorld(scenes, size)
-
-
-def observer_of(
-    scenario: Scenario, world: SceneWorld, traffic: Traffic | None
-) -> Observer:
-    """The observer of the vehicles: the traffic if bodies move on tracks, else an observer that
-    asks the scenario.
-    """
-    if traffic is not None:
-        return traffic
-    assert isinstance(scenario, WorldScenario)
-    return SceneObserver(scenario, world)
 
 
 def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic | None:
@@ -201,20 +186,15 @@ def traffic_of(system: System, encounters: FloatArray, longer: float) -> Traffic
     )
 
 
-def _start_speeds(points: Sequence[Point], n: int) -> FloatArray:
-    """Speeds at the start of n vehicles at each of K points, shape (K * n,) [m/s]."""
-    return of_vehicles([point.scenario.start_speed for point in points], n)
-
-
 @contextmanager
 def open_points_world(
     system: System,
     encounters: FloatArray,
-    traffic: Traffic | None,
     start: Start = open_in_process,
-) -> Iterator[SumoWorld]:
+) -> Iterator[tuple[SumoWorld, Observer]]:
     """Start SUMO on a copy of the network of the system's only point for each of N encounters,
-    shape (N, k).
+    shape (N, k). Yields the world, and the observer of its vehicles: the traffic if bodies move on
+    tracks, else an observer that asks the scenario.
     """
     (point,) = system.points
     step = system.scenes.step
@@ -228,16 +208,17 @@ def open_points_world(
 
     # SUMO cannot move bodies along tracks: a TrafficWorld puts them at their places.
     create: Create = SumoWorld
+    traffic = traffic_of(system, encounters, OVERTIME)
     if traffic is not None:
-        speeds = _start_speeds(system.at_encounters(encounters).points, n)
-        create = partial(
-            TrafficWorld,
-            traffic=traffic,
-            start_speeds=speeds,
-            start=start_frame(networks[0], step),
-        )
+        start_of_lane = start_frame(networks[0], step)
+        create = partial(TrafficWorld, traffic=traffic, start=start_of_lane)
     with (
         varied_network(networks, n) as files,
         open_world(files, n, step, create, start) as world,
     ):
-        yield world
+        if traffic is not None:
+            yield world, traffic
+            return
+        scenario = system.at_encounters(encounters).points[0].scenario
+        assert isinstance(scenario, WorldScenario)
+        yield world, SceneObserver(scenario, world)

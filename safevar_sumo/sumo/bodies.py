@@ -125,7 +125,6 @@ class Film(NamedTuple):
 class VehicleWorld(Protocol):
     """The contract of a world of N vehicles under test: a lane, a recorded scene or SUMO."""
 
-    n: int
     step_length: float
 
     @property

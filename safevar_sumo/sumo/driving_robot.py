@@ -63,20 +63,17 @@ class DrivingRobot:
         # A scenario that is no test has no speed.
         test_speeds = [point.scenario.test_speed for point in points]
         self._test_speed = of_vehicles(test_speeds, n // len(points))
-        self.has_test_speed = ~np.isnan(self._test_speed)
-        """Whether the scenario of each vehicle has a `test_speed`, shape (N,)."""
-        self._is_driving = self.has_test_speed.copy()
-        self._is_needed = bool(self.has_test_speed.any())
-
+        has_test_speed = ~np.isnan(self._test_speed)
+        self._is_driving = has_test_speed
         self._prepared = prepared
         self._vehicle = vehicle
         self._start_pedal = state.throttle - state.brake
         self._brake_threshold = state.brake + ACTION_THRESHOLD
         self._step = step
         self._integral = np.zeros(n)
-        self._has_braked = ~self.has_test_speed
+        self._has_braked = ~has_test_speed
         self._max_system_pedal = np.full(n, -np.inf)
-        self.error = np.where(self.has_test_speed, 0.0, np.nan)
+        self.error = np.where(has_test_speed, 0.0, np.nan)
         """Deviation from the test speed while the robot drove [m/s], shape (N,): the deviation that
         was largest relative to its tolerance; NaN without a test.
         """
@@ -92,10 +89,9 @@ class DrivingRobot:
         `is_open` is true for runs that have not ended; speeds of other runs are not compared with
         the tolerance.
         """
-        if not self._is_needed:
+        # Once all systems have braked, the robot has nothing to do.
+        if self._has_braked.all():
             return command, state
-        # Once all systems have braked, later calls have nothing to do.
-        self._is_needed = not self._has_braked.all()
 
         error = np.where(self._is_driving, state.speed - self._test_speed, 0.0)
         error_share = np.where(error > 0, error / MAX_ERROR, error / MIN_ERROR)

@@ -168,10 +168,8 @@ def scenes_of_encounters(
         place = frame.point(frame.along(track.motion[[at_lane], :2]), layout.left)
         sign = np.where(layout.backwards, -1.0, 1.0)
         _, _, dir_x, dir_y, _ = track.motion[0]
-        # The empty array gives the other columns (x, y, direction, speed) the shape (samples, n).
-        columns = np.broadcast_arrays(
-            np.empty((samples, n)), *place, sign * dir_x, sign * dir_y, layout.speed
-        )[1:]
+        motion = *place, sign * dir_x, sign * dir_y, layout.speed
+        columns = [np.broadcast_to(column, (samples, n)) for column in motion]
         tracks[layout.pedestrian] = track._replace(motion=np.stack(columns, axis=-1))
     start = layout.front
     if start is None:

@@ -19,12 +19,12 @@ class LaneWorld:
 
     frame = LANE
 
-    def __init__(self, traffic: Traffic, start_speeds: FloatArray, step: float) -> None:
+    def __init__(self, traffic: Traffic, step: float) -> None:
         self.n = traffic.n
         self.step_length = step
         self._traffic = traffic
         self._front = np.zeros(traffic.n)
-        self._speed = start_speeds
+        self._speed = traffic.start_speeds
         self._sample = 0
 
     def enter(

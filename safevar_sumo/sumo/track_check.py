@@ -107,7 +107,7 @@ def check_motion(track: Track, times: FloatArray, step: float) -> None:
     )
     norm = np.square(track.along) + np.square(track.left)
     refuse(
-        ~(np.abs(norm - 1) <= UNIT_TOLERANCE),
+        np.abs(norm - 1) > UNIT_TOLERANCE,
         np.sqrt(norm),
         "has a direction of length {:g}",
         "a unit vector (along, left)",

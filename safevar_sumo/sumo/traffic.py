@@ -31,6 +31,7 @@ from safevar_sumo.sumo.bodies import (
     find_overlaps,
 )
 from safevar_sumo.sumo.moving import TIE, Moving, Sampled, at_sample, tracks_of
+from safevar_sumo.sumo.perception import of_vehicles
 
 APPROACH_SPEED = 0.5
 """Closing speed above which a vehicle approaches a body ahead [m/s]. A vehicle has avoided a body
@@ -83,6 +84,9 @@ class Traffic:
         self.step = step
         # None if all vehicles share a column, or each has its own: then no index is needed.
         self.group = group if 1 < n_groups < self.n else None
+        speeds = [point.scenario.start_speed for point in points]
+        self.start_speeds = of_vehicles(speeds, n_encounters)[group]
+        """Speeds of the vehicles at the start, shape (N,) [m/s]."""
         self._points = points
         self._n_encounters = n_encounters
         self._sample = 0

@@ -99,15 +99,13 @@ class TrafficWorld(SumoWorld):
     last bit. A SimulationError is raised if SUMO has a vehicle at another place.
     """
 
-    def __init__(
-        self, api: Api, n: int, traffic: Traffic, start_speeds: FloatArray, start: Frame
-    ) -> None:
+    def __init__(self, api: Api, n: int, traffic: Traffic, start: Frame) -> None:
         super().__init__(api, n)
         self._traffic = traffic
         self._start = start
 
         self._sample = 0
-        self._lane = LaneWorld(traffic, start_speeds, self.step_length)
+        self._lane = LaneWorld(traffic, self.step_length)
         self._actors = [
             Placed.of(track, self.ids(track.name), start)
             for track in traffic.tracks

@@ -22,9 +22,7 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.sumo.batch import (
     drive_all,
-    observer_of,
     open_points_world,
-    traffic_of,
 )
 from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.drive import enter
@@ -32,7 +30,6 @@ from safevar_sumo.sumo.encounters import met_at
 from safevar_sumo.sumo.engine import Start, open_in_process
 from safevar_sumo.sumo.matrix import most_at_once
 from safevar_sumo.sumo.system import System
-from safevar_sumo.sumo.traffic import OVERTIME
 from safevar_sumo.sumo.world import SumoWorld
 
 COMPARED = ("position", "gap", "lateral", "obstacle_speed")
@@ -59,13 +56,11 @@ def drive_again(
     vehicles, encounters = system.split(settings)
     on_road = system.at_encounters(encounters)
     point = on_road.points[0]
-    traffic = traffic_of(system, encounters, OVERTIME)
     with (
         system.user_code(),
-        open_points_world(system, encounters, traffic, start) as world,
+        open_points_world(system, encounters, start) as (world, observer),
     ):
         motion = enter(on_road, vehicles, world).motion
-        observer = observer_of(point.scenario, world, traffic)
         is_open = np.ones(n, bool)
         frame = world.frame
         contacts = FirstContacts(n, np.full(n, point.scenario.is_hit_in_front))
@@ -137,21 +132,14 @@ def _verify_point(system: System, settings: FloatArray, runs: SimulationRuns) ->
     size = most_at_once(replace(system, in_sumo=True))
     for start in range(0, len(order), size):
         rows = order[start : start + size]
-        chosen = runs.of(rows)
-        _compare(
-            system, settings[rows], chosen, drive_again(system, settings[rows], chosen)
-        )
+        _compare(system, settings[rows], runs.of(rows))
 
 
-def _compare(
-    system: System,
-    settings: FloatArray,
-    runs: SimulationRuns,
-    in_sumo: dict[str, FloatArray],
-) -> None:
+def _compare(system: System, settings: FloatArray, runs: SimulationRuns) -> None:
     """Compare the quantities of N runs in recorded scenes, shape (T, N), with the same quantities
     in SUMO. Raises an InputError about the first difference.
     """
+    in_sumo = drive_again(system, settings, runs)
     trace = runs.trace
     collision = nans(trace.speed.shape)
     collision[trace.last_active, np.arange(len(settings))] = runs.collision_speed

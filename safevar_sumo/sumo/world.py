@@ -60,8 +60,8 @@ class SumoWorld:
         the road keeps its last values.
         """
         self._persons: dict[str, FloatArray] = {}
-        """Positions of persons in all copies by actor, shape (N, 2) [m]. Positions stay the last
-        ones in copies without a vehicle under test, where a person may leave the road.
+        """Positions of persons in all copies by actor, shape (N, 2) [m]. Once a person has left the
+        road in a copy, positions are the last ones in copies without a vehicle under test.
         """
         self._commanded_speeds = nans(n)
         self._struck_ids: dict[int, str] = {}
@@ -243,8 +243,14 @@ class SumoWorld:
     def person_positions(self, actor: str) -> FloatArray:
         ids = self.ids(actor)
         copies = list(self.driving.values())
-        positions = self._persons.get(actor, np.zeros((self.n, 2))).copy()
-        positions[copies] = [self._get_person_position(ids[copy]) for copy in copies]
+        try:
+            positions = np.array([self._get_person_position(name) for name in ids])
+        # A person has left the road in a copy: ask SUMO only where a vehicle is still driving.
+        except self.api.TraCIException:
+            positions = self._persons.get(actor, np.zeros((self.n, 2))).copy()
+            positions[copies] = [
+                self._get_person_position(ids[copy]) for copy in copies
+            ]
         self._persons[actor] = positions
         return positions
 

@@ -55,7 +55,7 @@ def met_at_once(
         points, np.arange(n), n_encounters=n, n_samples=samples, step=STEP
     )
     settings = np.tile(system.characteristics.original, (n, 1))
-    world = LaneWorld(traffic, np.zeros(n) + scenario.start_speed, STEP)
+    world = LaneWorld(traffic, STEP)
     return drive(replace(system, ads=ads, points=points), settings, world, traffic)
 
 
