@@ -246,13 +246,19 @@ class Constraint(Table, frozen=True, kw_only=True):
         low = -math.inf if self.at_least is None else self.at_least
         return low, math.inf if self.at_most is None else self.at_most
 
+    def total(self, values: Mapping[str, Any]) -> Any:
+        """The weighted sum of values, which are numbers or arrays of shape (N,). It is added term
+        by term, because the last bits of a product of matrices depend on the number of settings.
+        """
+        return sum(weight * values[name] for name, weight in self.sum.items())
+
     def allows(self, values: Mapping[str, Any]) -> Any:
         """Whether the sum is within its bounds. The `values` are numbers or arrays of shape (N,). A
         constraint allows everything if one of its characteristics has no value.
         """
         if not self.sum.keys() <= values.keys():
             return True
-        total = sum(weight * values[name] for name, weight in self.sum.items())
+        total = self.total(values)
         low, high = self.ends
         return (total >= low) & (total <= high)
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from safevar_sumo.errors import InputError, about, subject
-from safevar_sumo.records import BoolArray, FloatArray
+from safevar_sumo.records import BoolArray, FloatArray, Quantity
 from safevar_sumo.study import Constraint, Study, unit_text
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
@@ -32,13 +32,11 @@ LEAST_SHARE = 0.002
 class _BoundedSum(NamedTuple):
     """A weighted sum of characteristics with bounds, ready to compute: a constraint of a study.
 
-    `weights` are pairs of a column of a setting and its weight. `width` is the range of the sum
-    over the domains. `minimum` and `maximum` bound the sum. `condition` states the bounds in words,
-    `suffix` the unit.
+    `width` is the range of the sum over the domains. `minimum` and `maximum` bound the sum.
+    `condition` states the bounds in words, `suffix` the unit.
     """
 
     constraint: Constraint
-    weights: tuple[tuple[int, float], ...]
     width: float
     minimum: float
     maximum: float
@@ -51,37 +49,25 @@ class _BoundedSum(NamedTuple):
     ) -> _BoundedSum:
         """The computation of a study's constraint."""
         domains = study.domains
-        widths = characteristics.upper - characteristics.lower
-        weights = tuple(
-            (characteristics.names.index(name), weight)
-            for name, weight in constraint.sum.items()
+        widths = characteristics.named(characteristics.upper - characteristics.lower)
+        width = sum(
+            abs(weight) * widths[name] for name, weight in constraint.sum.items()
         )
-        width = float(sum(abs(weight) * widths[column] for column, weight in weights))
         return cls(
             constraint,
-            weights,
             width,
             *constraint.ends,
             constraint.bounds_in_words(domains),
             unit_text(constraint.unit_of(domains)),
         )
 
-    def sums(self, settings: FloatArray) -> FloatArray:
-        """The weighted sum of each setting, shape (N,). It is added term by term, because the last
-        bits of a product of matrices depend on the number of settings.
+    def excess(self, values: Mapping[str, Quantity]) -> Quantity:
+        """The violation of the bounds by values of characteristics, numbers or arrays of shape
+        (N,), as a share of `width`; 0 within the bounds.
         """
-        total = np.zeros(len(settings))
-        for column, weight in self.weights:
-            total = total + weight * settings[:, column]
-        return total
-
-    def excess(self, settings: FloatArray) -> FloatArray:
-        """The violation of the bounds by each setting, as a share of `width`, shape (N,); 0 within
-        the bounds.
-        """
-        values = self.sums(settings)
+        total = self.constraint.total(values)
         return (
-            np.maximum(np.maximum(self.minimum - values, values - self.maximum), 0.0)
+            np.maximum(np.maximum(self.minimum - total, total - self.maximum), 0.0)
             / self.width
         )
 
@@ -106,9 +92,10 @@ class FeasibleRegion:
         """The sum of a setting's violations of all constraints, shape (N,); 0 if it is feasible. A
         violation is a share of the range of the constraint's sum over the domains.
         """
+        columns = self.characteristics.columns(settings)
         excess = np.zeros(len(settings))
         for bound in self.bounds:
-            excess = excess + bound.excess(settings)
+            excess = excess + bound.excess(columns)
         return np.where(excess <= SLACK, 0.0, excess)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
@@ -127,20 +114,20 @@ class FeasibleRegion:
         """
         # The error is about the first infeasible setting, if there is any.
         for setting in settings[~self.feasible(settings)][:1]:
-            row = setting[None]
+            named = self.characteristics.named(setting)
             # The sum of all violations is above `SLACK`, so that one is above this share.
             bound = next(
                 bound
                 for bound in self.bounds
-                if bound.excess(row)[0] > SLACK / len(self.bounds)
+                if bound.excess(named) > SLACK / len(self.bounds)
             )
-            values = []
-            for member, value in zip(self.characteristics, setting, strict=True):
-                if member.name in bound.constraint.sum:
-                    values.append(f"{member.name} = {value:g}{member.suffix}")
-            quantity = (
-                f"{bound.constraint.quantity} = {bound.sums(row)[0]:g}{bound.suffix}"
-            )
+            values = [
+                f"{member.name} = {named[member.name]:g}{member.suffix}"
+                for member in self.characteristics
+                if member.name in bound.constraint.sum
+            ]
+            total = f"{bound.constraint.total(named):g}{bound.suffix}"
+            quantity = f"{bound.constraint.quantity} = {total}"
             raise InputError(
                 "",
                 f"violates a constraint: {quantity} ({', '.join(values)})",
