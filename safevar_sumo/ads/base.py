@@ -238,12 +238,10 @@ def pedal_tables_at(nominal: Nominal, speed: Quantity) -> list[FloatArray]:
     position = np.minimum(speed / tables.speeds[1], len(tables.speeds) - 1.001)
     row = position.astype(np.intp)
     share = position - row
-
-    def interpolate(table: FloatArray) -> FloatArray:
-        low = table[row]
-        return np.asarray(low + (table[row + 1] - low) * share)
-
-    return [interpolate(tables.coasting), interpolate(tables.full_throttle)]
+    return [
+        table[row] + (table[row + 1] - table[row]) * share
+        for table in (tables.coasting, tables.full_throttle)
+    ]
 
 
 STEP_DECIMALS = 6

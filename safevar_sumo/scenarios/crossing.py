@@ -79,9 +79,6 @@ class _Start(NamedTuple):
 
     Attributes
     ----------
-    side
-        1 for a target that starts at the right of the lane and moves to the left; -1 for a target
-        that starts at the left and moves to the right.
     direction
         The direction in which the target moves.
     extent
@@ -96,7 +93,6 @@ class _Start(NamedTuple):
         The target's speed over time.
     """
 
-    side: float
     direction: Direction
     extent: float
     impact_left: Quantity
@@ -115,12 +111,10 @@ class _Start(NamedTuple):
         """
         lateral_start = test.parameter("lateral_start")
         speed = test.parameter("target_speed") * KMH
-        side = -1.0
-        direction = FROM_LEFT
+        side = FROM_LEFT
         if test.parameter("side") == "near":
-            side = 1.0
-            direction = FROM_RIGHT
-        direction = direction.turned(test.heading)
+            side = FROM_RIGHT
+        direction = side.turned(test.heading)
         impact_lateral = lateral_offset(test.impact_location, test.vut_width)
         if lateral_start is None:
             if test.acceleration_distance is not None:
@@ -145,9 +139,8 @@ class _Start(NamedTuple):
                 distance, time - test.lead, speed, run_up
             )
         extent = direction.extent(BODIES[test.parameter("target")])
-        return cls(
-            side, direction, extent, side * impact_lateral, distance, time, profile
-        )
+        impact_left = side.left * impact_lateral
+        return cls(direction, extent, impact_left, distance, time, profile)
 
 
 class Crossing(ProtocolTest, frozen=True, kw_only=True):
@@ -296,7 +289,8 @@ class Crossing(ProtocolTest, frozen=True, kw_only=True):
         # The distance from the start at which the target stops: only a pedestrian stops.
         end = np.inf
         if self.is_on_foot:
-            end = start.distance_to_impact + self.stop - start.side * start.impact_left
+            impact_lateral = lateral_offset(self.impact_location, self.vut_width)
+            end = start.distance_to_impact + self.stop - impact_lateral
         # The distance of the target past the place of the impact; below 0 before the impact.
         path = np.minimum(way, end) - start.distance_to_impact
         speed = np.where(way < end, start.profile.speed_at(times), 0.0)

@@ -169,13 +169,13 @@ def _contradiction(
     """
     speed = columns["speed"]
     separation = columns["separation"]
-    braked = max(float(np.abs(np.diff(speed)).max()), MOST_DECELERATION * step)
+    braked = max(np.abs(np.diff(speed)).max(), MOST_DECELERATION * step)
     if outcome == Outcome.COLLISION:
         # The struck body may be as fast as any obstacle in the trace.
         obstacle_speeds = [ends[STRUCK_SPEED], *columns.get("obstacle_speed", ())]
         finite = separation[np.isfinite(separation)]
         reach = (speed.max() + braked + np.abs(obstacle_speeds).max()) * step
-        reach += float(np.abs(np.diff(finite)).max(initial=0.0))
+        reach += np.abs(np.diff(finite)).max(initial=0.0)
         if finite.size and finite.min() > reach + SLACK:
             return f"a collision at a separation of {significant(finite.min(), 3)} m"
         impact = ends[IMPACT_SPEED]

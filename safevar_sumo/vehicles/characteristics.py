@@ -132,15 +132,14 @@ class Characteristic(CharacteristicTable, frozen=True, kw_only=True):
         """A limit rounded to the digits of `text`, upwards or downwards. If rounding would carry
         the limit past the original value, the original value is returned.
         """
-        scaled = value * 10**self.digits
-        original = self.original
-        up = math.ceil(scaled - ROUNDING)
-        down = math.floor(scaled + ROUNDING)
-        rounded = (up if upwards else down) / 10**self.digits
-        is_beyond = (
-            rounded > original >= value if upwards else rounded < original <= value
-        )
-        return original if is_beyond else rounded
+        scale = 10**self.digits
+        if upwards:
+            rounded = math.ceil(value * scale - ROUNDING) / scale
+            is_beyond = rounded > self.original >= value
+        else:
+            rounded = math.floor(value * scale + ROUNDING) / scale
+            is_beyond = rounded < self.original <= value
+        return self.original if is_beyond else rounded
 
     def rounded_inwards(self, interval: Interval) -> Interval:
         """An interval around the original value, with both ends rounded towards this value. An end
