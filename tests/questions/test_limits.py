@@ -307,7 +307,7 @@ def test_causes_are_as_few_changes_as_possible_and_places_where_the_box_was_unsa
     assert known.drives.vehicle[:, 0].min() == pytest.approx(7, abs=0.02), (
         "nearly the first on its way"
     )
-    assert known.shares.tolist() == [[0.8, -0.8, 0]]
+    assert known.positions.vehicle.tolist() == [[0.8, -0.8, 0]]
     assert known.in_box(boxes, np.full((2, 3), 2.5)).vehicle.tolist() == [[7, 3, 5]]
 
 
@@ -316,7 +316,7 @@ def test_a_box_grows_up_to_a_wall_and_shrinks_from_what_is_beyond() -> None:
         lambda drives: (drives.vehicle[:, 0] > 7) & (drives.vehicle[:, 1] > 4)
     )
     boxes = boxes_of(2, judge)
-    known = nothing(2)._replace(shares=np.array([[1.0, 0.0]]), encounters=places(0.0))
+    known = nothing(2)._replace(positions=drives_of([1.0, 0.0]))
     inner = shrink(boxes, known, boxes.longest)
     assert inner[1, 0] == pytest.approx(2, abs=0.02)
     sides = widen(boxes, known, inner, default_rng(0))
@@ -386,4 +386,4 @@ def test_a_box_settles_a_step_further_inwards_after_each_failure() -> None:
     assert settled.attack == (21, 1, 0.25, 0)
     assert [scope.upper[0] for scope in scopes] == [10, 5 + settled.sides[1, 0]]
     assert settled.failures.boxes == 1
-    assert settled.failures.shares[:, 0].tolist() == [1]
+    assert settled.failures.positions.vehicle[:, 0].tolist() == [1]
