@@ -264,7 +264,7 @@ def test_a_search_begins_where_encounters_only_just_count() -> None:
         question = task._replace(bench=bench, effort=effort)
         search = question.search(Stream.VALIDATION, 0)
         scope = bench.scope(0, task.lower, task.upper)
-        assert bool(len(search(scope, question.nothing).unsafe)) == bool(lines)
+        assert bool(len(search(scope, scope.nothing).unsafe)) == bool(lines)
 
 
 def test_the_case_beyond_a_joint_limit_is_a_step_away_and_all_else_within() -> None:
