@@ -81,7 +81,7 @@ class Fleet(NamedTuple):
     settings: FloatArray
     measured: BoolArray
     table: pd.DataFrame
-    is_rough: bool = False
+    is_rough: bool
 
 
 class _Cells(NamedTuple):
@@ -162,10 +162,9 @@ def read_fleet(
     settings, measured = _values(cells, columns, vehicle)
     settings = _completed(cells, settings, study, vehicle, others)
     _check_constraints(cells, settings, study, vehicle)
-    table = pd.DataFrame(cells.rows, columns=pd.Index(cells.header), dtype=str)
-    is_rough = False
+    table = pd.DataFrame(cells.rows, columns=cells.header, dtype=str)
+    is_rough = is_answer and YES in [text.strip() for text in table[ROUGH]]
     if is_answer:
-        is_rough = YES in [text.strip() for text in table[ROUGH]]
         table = table.drop(columns=list(written))
     return Fleet(names, settings, measured, table, is_rough)
 

@@ -1,7 +1,8 @@
 """The sentences of `permit`.
 
 The slots `{may}` and `{may_not}` are what safe and unsafe cars do. `{reach}` is how far cars are
-safe, `{name}` is the parameter over which cars are driven, and `{event}` is how a car fails.
+safe, `{name}` is the parameter over which cars are driven, from `{low}` to `{top}`, and `{event}`
+is how a car fails.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ FURTHER_ASSUMED = condition(
     'In {count}, further values are assumed, which the column "assumed" names (--details).'
 )
 WORST_END = evidence(
-    "The assumed {name} matters most: with {end} in place of the assumed {assumed}, the car"
+    "The assumed {assumption} matters most: with {end} in place of the assumed {assumed}, the car"
     " {would_fail} already at {value}. The ends of all domains were tried, with the parameter set"
     " that limits the car."
 )
