@@ -23,12 +23,12 @@ from safevar_sumo.study.encounters import (
 )
 from safevar_sumo.study.extending import StudyTables as StudyTables
 from safevar_sumo.study.file import (
-    SCHEMA_LINE as SCHEMA_LINE,
     checked_study as checked_study,
     plain_values as plain_values,
     read_tables as read_tables,
     study_names as study_names,
     write_study as write_study,
+    write_tables as write_tables,
 )
 from safevar_sumo.study.limits import Limit as Limit, limits_of as limits_of
 from safevar_sumo.study.marks import (

@@ -306,21 +306,26 @@ def _with_base(
 
 
 def write_study(path: Path, study: Study, comment: str) -> None:
-    """Write a complete study file, which begins with `SCHEMA_LINE` and a comment. The study gets
-    the file's name, if this name is a legal name of a study.
+    """Write a complete study file as `write_tables` does. The study gets the file's name, if this
+    name is a legal name of a study.
+    """
+    if re.fullmatch(NAME_PATTERN, path.stem):
+        study = replace(study, name=path.stem)
+    write_tables(path, tables_of(study), comment)
+
+
+def write_tables(path: Path, tables: Parameters, comment: str) -> None:
+    """Write the tables of a study to a file, which begins with `SCHEMA_LINE` and a comment.
 
     Raises
     ------
     InputError
         If the file cannot be written.
     """
-    if re.fullmatch(NAME_PATTERN, path.stem):
-        study = replace(study, name=path.stem)
-
     # TOML refuses control characters in comments.
     text = SCHEMA_LINE
     for line in comment.splitlines():
         text += f"# {printable(line)}".rstrip() + "\n"
-    text += "\n" + tomli_w.dumps(tables_of(study))
+    text += "\n" + tomli_w.dumps(tables)
     with whole_file(path, "out") as file:
         file.write_text(text, encoding="utf-8")

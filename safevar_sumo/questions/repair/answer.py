@@ -11,7 +11,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.answer import Answer, tabulate
 from safevar_sumo.questions.between import remark_on_phases
 from safevar_sumo.questions.box import Proof
-from safevar_sumo.questions.models import Models, fit_names
+from safevar_sumo.questions.models import fit_names
 from safevar_sumo.questions.repair import words
 from safevar_sumo.questions.repair.price import price_of
 from safevar_sumo.questions.repair.problem import RepairProblem
@@ -37,7 +37,7 @@ SHOWN_LIMITS = 3
 
 def answer_of(
     problem: RepairProblem,
-    models: Models,
+    sets: int,
     survivors: Survivors,
     worst_today: Evaluations,
     not_repairable: list[NamedValues],
@@ -47,6 +47,8 @@ def answer_of(
 
     Parameters
     ----------
+    sets
+        Number of parameter sets in which changes were tested.
     worst_today
         The evaluation, with today's driving system, of the worst promised vehicle that was tried
         and that a driving system can keep safe.
@@ -62,8 +64,6 @@ def answer_of(
     if not kept_today:
         rows = [_row(problem, *change, survivors.fits) for change in survivors.changes]
         repairs = sorted(rows, key=_cost_of)
-    tables = {"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))}
-    worlds = problem.bench.worlds
     numbers = {
         "unsafe": str(unsafe),
         "margin": unsafe.keep if unsafe.is_collision else None,
@@ -72,9 +72,11 @@ def answer_of(
         "kept_today": kept_today,
         "repairs": len(repairs),
         "not_repairable": not_repairable,
-        "simulations": sum(world.model.evaluator.simulated for world in worlds),
+        "simulations": sum(
+            world.model.evaluator.simulated for world in problem.bench.worlds
+        ),
         "fits": survivors.fits * bool(survivors.changes),
-        "fits_tried": len(models.members),
+        "fits_tried": sets,
     }
     ending = f"has a safety degree of {distance_in_words(worst, unsafe.contact)}"
     if unsafe.bound:
@@ -88,13 +90,13 @@ def answer_of(
     tested = []
     if survivors.changes:
         proof = repairs[0] if repairs else _columns_of(survivors.changes[0][1])
-        tested = list(_tested(models, survivors, proof))
+        tested = list(_tested(problem, sets, survivors, proof))
     return Answer(
         question="repair",
         study=problem.study,
         verdict=Verdict([*sentences, *_notes(problem, not_repairable)]),
         numbers=numbers,
-        tables=tables,
+        tables={"repairs": tabulate("Repairs", REPAIRS, pd.DataFrame(repairs))},
         tested=Verdict(tested),
     )
 
@@ -147,28 +149,25 @@ def _notes(problem: RepairProblem, not_repairable: Sequence[NamedValues]) -> Sen
         yield words.MORE_NOT_REPAIRABLE(number=number)
 
 
-def _tested(models: Models, survivors: Survivors, proof: JsonObject) -> Sentences:
+def _tested(
+    problem: RepairProblem, sets: int, survivors: Survivors, proof: JsonObject
+) -> Sentences:
     """Say how a change was tested, and in how many parameter sets it holds."""
     bound = bound_in_words(proof["at_most"])
     yield words.PROOF(
         samples=proof["proof_samples"],
         bound=bound,
     )
-    number = len(models.members)
-    if number > 1:
+    if sets > 1:
         yield words.SETS(
             fits=survivors.fits,
-            number=number,
+            number=sets,
         )
-    evaluator = models.own.evaluator
-    if not models.exclusions and evaluator.account.effort >= 1:
-        yield single_set_in_words(evaluator.study, number)
+    if problem.evaluator.account.effort >= 1:
+        yield single_set_in_words(problem.study, sets)
     if survivors.broken:
         yield words.BROKEN(sets=fit_names(survivors.broken))
-    if models.exclusions and number > 1:
-        sets = fit_names([model.fit for model in models.exclusions])
-        yield words.LEFT_OUT(sets=sets)
-    yield condition(remark_on_phases(models.own.in_phases))
+    yield condition(remark_on_phases(problem.bench.own.in_phases))
 
 
 def _row(

@@ -116,7 +116,7 @@ def needless_braking(system: System, benign: list[Point]) -> list[bool]:
     without_actors = replace(with_scenes, points=tuple(one_per_speed), sees_nobody=True)
     brakes = []
     for variant in (with_scenes, without_actors):
-        for result in simulate_all_points(variant, vehicle.original[np.newaxis]):
+        for result in simulate_all_points(variant, vehicle.original_settings):
             trace = result.runs.trace
             is_braking = trace.active & (trace.brake > NEEDLESS_BRAKE)
             brakes.append(bool(is_braking.any()))

@@ -69,6 +69,3 @@ SETS = evidence(
     " required wear)."
 )
 BROKEN = condition("In {sets}, a vehicle within the required wear collides.")
-LEFT_OUT = condition(
-    "The answer does not cover {sets}, because even the original vehicle is unsafe."
-)
