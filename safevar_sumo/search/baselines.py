@@ -121,27 +121,29 @@ class Ranges:
         drawn uniformly from 1 to `max_changes`. The encounter is drawn uniformly from its ranges.
         """
         settings = [self._draw_feasible_setting(rng) for _ in range(number)]
-        return self._characteristics.filter(np.stack(settings))
+        return self._characteristics.filter(np.concatenate(settings))
 
     def _draw_feasible_setting(self, rng: Generator) -> FloatArray:
-        """Draw a feasible setting. If `MAX_REDRAWS` further draws are infeasible, too, the last
-        setting is moved towards the original until it is feasible.
+        """Draw a feasible setting, shape (1, n). If `MAX_REDRAWS` further draws are infeasible, the
+        last setting is moved towards the original until it is feasible.
         """
         for _ in range(1 + MAX_REDRAWS):
             setting = self._draw_setting(rng)
-            if self._problem.feasible(setting[np.newaxis])[0]:
+            if self._problem.feasible(setting)[0]:
                 return setting
-        return np.asarray(self._problem.repaired(setting[np.newaxis])[0])
+        return self._problem.repaired(setting)
 
     def _draw_setting(self, rng: Generator) -> FloatArray:
-        """Draw a setting with changes of some characteristics, which may violate constraints."""
-        setting = self._characteristics.original.copy()
+        """Draw a setting with changes of some characteristics, which may violate constraints, shape
+        (1, n).
+        """
+        setting = self._characteristics.original_settings.copy()
         # The characteristics of the vehicle come first, then the parameters of the encounter.
         n_vehicle = len(self._characteristics.vehicle)
         n_changes = rng.integers(1, self.max_changes, endpoint=True)
         changed = rng.choice(n_vehicle, n_changes, replace=False)
-        for i in [*changed, *range(n_vehicle, len(setting))]:
-            setting[i] = self._draw_value(i, rng)
+        for i in [*changed, *range(n_vehicle, len(self._characteristics))]:
+            setting[0, i] = self._draw_value(i, rng)
         return setting
 
     def _draw_value(self, i: int, rng: Generator) -> float:

@@ -174,10 +174,9 @@ def compare(
     settings = _settings_frame(common, valid, criteria)
     tested = _test(settings)
     counts = counts_of(settings.drop_duplicates(list(evaluator.characteristics.names)))
-    names = (study.name, second.study.name)
-    if names[0] == names[1]:
-        names = ("A", "B")
-    titles = dict(zip(SIDES, names, strict=True))
+    titles = {"a": study.name, "b": second.study.name}
+    if titles["a"] == titles["b"]:
+        titles = {"a": "A", "b": "B"}
 
     alone = limits_of_both(evaluators, criteria, restriction, at_tests=at_tests)
     changes = alone.frame["change"]

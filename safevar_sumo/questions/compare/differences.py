@@ -271,8 +271,7 @@ def _runs_of_original(side: Evaluator) -> list[tuple[TestCase, Point, Evaluation
     """The test cases of a version, each with its point of the matrix and the evaluation of the
     version's original vehicle.
     """
-    original = side.characteristics.original[np.newaxis]
-    results = simulate_all_points(side.system, original)
+    results = simulate_all_points(side.system, side.characteristics.original_settings)
     return [
         (case, point, result.evaluations)
         for (_, point, case), result in zip(cases_of(side), results, strict=True)
@@ -298,15 +297,12 @@ def _needless_braking(a: Evaluator, b: Evaluator) -> JsonObject:
     """The numbers of A's benign scenes (nobody needs to brake there) in which the original vehicles
     of A and B brake, None without such scenes; and the number of these scenes.
     """
-    # A benign scene has no searched parameters of the scenario: only the vehicle's values remain.
-    systems = [
-        replace(side.system, characteristics=side.characteristics.vehicle)
-        for side in (a, b)
-    ]
-    scenes = benign_scenes(a.study, systems[0])
+    # No searched parameter of the scenario varies: the scenes are those of the original encounter.
+    system = replace(a.system, characteristics=a.characteristics.vehicle)
+    scenes = benign_scenes(a.study, system)
     counts = []
-    for system in systems:
-        brakes = needless_braking(system, scenes)
+    for side in (a, b):
+        brakes = needless_braking(side.system, scenes)
         counts.append(sum(brakes) if brakes else None)
     return {
         "a_needless_braking": counts[0],
@@ -341,6 +337,6 @@ def _onset_places(evaluator: Evaluator) -> FloatArray:
     [m], shape (N,); NaN if the vehicle does not brake.
     """
     onsets, _ = drive_new_cars(
-        evaluator.system, evaluator.characteristics.original[np.newaxis]
+        evaluator.system, evaluator.characteristics.original_settings
     )
     return np.asarray(onsets[0])
