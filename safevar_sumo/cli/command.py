@@ -372,7 +372,7 @@ def _flag(option: Option) -> click.Option:
     if option.limits:
         meaning += f"  [{option.limits}]"
     return click.Option(
-        [f"--{option.name.replace('_', '-')}", option.name],
+        [option.flag, option.name],
         type=kind,
         is_flag=option.kind is bool,
         multiple=option.is_repeated,

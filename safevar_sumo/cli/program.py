@@ -121,10 +121,11 @@ class LazyCommands(click.Group):
             return super().invoke(ctx)
         except InputError as error:
             command = self.get_command(ctx, str(ctx.invoked_subcommand))
-            long_flags = {}
-            for option in command.params if command else ():
-                if isinstance(option, click.Option):
-                    long_flags[option.name] = option.opts[-1]
+            long_flags = {
+                option.name: option.opts[-1]
+                for option in (command.params if command else ())
+                if isinstance(option, click.Option)
+            }
             # The source of an error may also be a path: only a text may name an argument.
             if isinstance(error.source, str):
                 error.source = long_flags.get(error.source, error.source)

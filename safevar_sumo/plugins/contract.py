@@ -427,10 +427,11 @@ def violation(candidate: Any, base: type) -> str:
 
 def contract_of(base: type) -> str:
     """Describe the class and the abstract methods that a user's class must have."""
-    methods = []
-    for name, parameters in _methods(base).items():
-        if hasattr(getattr(base, name), ABSTRACT):
-            methods.append(f"{name}({', '.join(parameters)})")
+    methods = [
+        f"{name}({', '.join(parameters)})"
+        for name, parameters in _methods(base).items()
+        if hasattr(getattr(base, name), ABSTRACT)
+    ]
     return (
         f"a class such as {base.__module__.rpartition('.')[0]}.{base.__name__} with"
         f" {', '.join(methods)}"

@@ -117,11 +117,13 @@ def digests(paths: Iterable[Path], folders: Sequence[str]) -> Files:
     folders
         The folders of the study's file and of the files that the study extends.
     """
-    files = Files()
-    for path in paths:
-        name = name_of_file(Path(os.path.abspath(path)), folders)
-        files[name] = sha256(path.read_bytes()).hexdigest()[:DIGEST_LENGTH]
-    return dict(sorted(files.items()))
+    named_paths = {
+        name_of_file(Path(os.path.abspath(path)), folders): path for path in paths
+    }
+    return {
+        name: sha256(path.read_bytes()).hexdigest()[:DIGEST_LENGTH]
+        for name, path in sorted(named_paths.items())
+    }
 
 
 def name_of_file(path: Path, folders: Sequence[str]) -> str:

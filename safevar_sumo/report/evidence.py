@@ -273,10 +273,9 @@ def _files_of_user(
             options = options_in(Path(file_by_name(name, places)))
             if view := options.get("gui-settings-file"):
                 names.append(str(Path(name).with_name(view)))
-    paths = {}
-    for name in names:
-        if place := file_by_name(name, places):
-            paths[name] = Path(place)
+    paths = {
+        name: Path(place) for name in names if (place := file_by_name(name, places))
+    }
 
     modules = [
         text.partition(":")[0] for text in questions if ":" in text.partition(" ")[0]

@@ -356,10 +356,11 @@ class StudyEncounters(Table, frozen=True, kw_only=True):
         """The axes of all tests, with their names; a name occurs once for each test that has the
         axis.
         """
-        pairs = list[tuple[str, AxisTable]]()
-        for test in self._tests_or_none:
-            pairs += self.axes_of(test).items()
-        return pairs
+        return [
+            named_axis
+            for test in self._tests_or_none
+            for named_axis in self.axes_of(test).items()
+        ]
 
     @property
     def _tests_or_none(self) -> list[MatrixTest | None]:

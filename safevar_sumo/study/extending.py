@@ -104,14 +104,13 @@ def _dropped_keys(base: Tables, tables: Tables) -> list[str]:
     """The tables and parameters of the base that the new study lacks, as a remark names them."""
     # Keys of a single study are dropped without a remark, because no study inherits them.
     named_keys = {*tables, *keys_with(OF_STUDY, Study)}
-    dropped = []
-    for key, value in base.items():
-        if isinstance(value, dict) and key not in named_keys:
-            dropped.append(f"[{key}]")
+    dropped = [
+        f"[{key}]"
+        for key, value in base.items()
+        if isinstance(value, dict) and key not in named_keys
+    ]
     parameters = _scenario_parameters(base) - _scenario_parameters(tables)
-    for name in sorted(parameters):
-        dropped.append(f"{name} of [scenario]")
-    return dropped
+    return [*dropped, *(f"{name} of [scenario]" for name in sorted(parameters))]
 
 
 def _with_axes_for(overrides: Tables, scenario: Parameters) -> Parameters:

@@ -77,10 +77,11 @@ def with_effect(value: Any, kind: Any) -> Any:
     if not (isinstance(kind, type) and issubclass(kind, Table)):
         return value
     kinds = {field.name: field.type for field in fields_of(kind)}
-    effects = {}
-    for key in keys_with(ORDERED, kind):
-        if key in value:
-            effects[f"order of {key}"] = list(value[key])
+    effects = {
+        f"order of {key}": list(value[key])
+        for key in keys_with(ORDERED, kind)
+        if key in value
+    }
     without_effect = keys_with(WITHOUT_EFFECT, kind)
     for key, item in value.items():
         if key not in without_effect:
