@@ -287,7 +287,7 @@ class Simulation:
         """Study, setting (`vcs`: vehicle characteristics), outcome and all numbers, as plain
         values.
         """
-        return {"study": self.study.name, "vcs": dict(self.setting), **self.numbers}
+        return {"study": self.study.name, "vcs": self.setting, **self.numbers}
 
     def _repr_html_(self) -> str:
         """A table of the original and the simulated vehicle, for notebooks."""

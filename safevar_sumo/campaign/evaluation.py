@@ -277,8 +277,9 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
 
     # If the ADS can take an array for each parameter, it drives all rows at once.
     if selection.arrays:
-        ads = VariedAds(system.ads, selection.parameters, values)
-        varied = replace(system, ads=ads)
+        varied = replace(
+            system, ads=VariedAds(system.ads, selection.parameters, values)
+        )
         evaluations = drive_and_score(varied, settings, with_originals=False)
         return replace(evaluations, settings=rows)
 
@@ -289,8 +290,7 @@ def _evaluate_parameters(system: System, task: Task, rows: FloatArray) -> Evalua
     for number, parameter_set in enumerate(parameter_sets.tolist()):
         group = np.flatnonzero(set_of_row.ravel() == number)
         parameters = dict(zip(selection.parameters, parameter_set, strict=True))
-        study = with_parameters(task.study, parameters)
-        varied_system = assemble(study)
+        varied_system = assemble(with_parameters(task.study, parameters))
         driven = replace(system, ads=varied_system.ads, modules=varied_system.modules)
         evaluations = drive_and_score(driven, settings[group], with_originals=False)
         groups.append(replace(evaluations, settings=rows[group]))

@@ -99,10 +99,9 @@ def carry_share(task: Task, share: Share) -> list[RunResult]:
     study = task.study
     refuse_changed_inputs(study, system_of(study), share.manifest)
     with about(study.source), ExitStack() as stack:
-        runs = []
-        for key in share.keys:
-            run = closing(_begin(task, share, key))
-            runs.append(stack.enter_context(run))
+        runs = [
+            stack.enter_context(closing(_begin(task, share, key))) for key in share.keys
+        ]
         # Each search goes on until it asks for settings that are in no journal. The settings of a
         # run follow each other, so that `groupby` finds them.
         while requests := [(run, setting) for run in runs for setting in run.look_up()]:

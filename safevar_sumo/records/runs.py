@@ -105,10 +105,11 @@ class Trace:
 
     def of(self, vehicles: slice | IntArray) -> Trace:
         """The trace of a part of the vehicles."""
-        columns = {}
-        for name, value in vars(self).items():
-            if np.ndim(value) == 2:
-                columns[name] = value[:, vehicles]
+        columns = {
+            name: value[:, vehicles]
+            for name, value in vars(self).items()
+            if np.ndim(value) == 2
+        }
         return replace(self, **columns)
 
 

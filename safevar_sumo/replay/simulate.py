@@ -237,8 +237,8 @@ def load_target(
             if choice in CHOICES
             else SolutionId.parse(solution)
         )
-    row = subject.solutions.iloc[row_of_handle(subject.solutions, handle)]
-    values: dict[Any, Any] = row.to_dict()
+    row = row_of_handle(subject.solutions, handle)
+    values: dict[Any, Any] = subject.solutions.iloc[row].to_dict()
     if choice == "fewest" and (fewest := fewest_changes(subject)):
         values = subject.characteristics.named(fewest.settings[0])
     return Target(study, source, handle, values)
