@@ -177,8 +177,6 @@ def select_affordable_rows(
     provided that the simulations suffice for each single change.
     """
     costs = 2.0 ** evaluator.characteristics.number_changed(settings)
-    if costs.sum() <= max_evaluations:
-        return list(range(len(settings)))
     order = np.random.default_rng(evaluator.seed).permutation(len(settings))
     smallest_number = int(
         evaluator.account.is_limited

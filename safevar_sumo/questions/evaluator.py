@@ -479,7 +479,8 @@ class Evaluator:
         """
         settings = self.characteristics.original_settings
         evaluations = self.evaluate(settings, "original vehicle")
-        if len(self.characteristics.scenario) and evaluations.infeasible[0]:
+        # The original vehicle satisfies the constraints: then its encounter does not count.
+        if evaluations.infeasible[0]:
             raise InputError(
                 self.study.source,
                 "encounters: the original vehicle is not safe in the encounter of the original"

@@ -62,7 +62,7 @@ def sobol_points(number: int, dimensions: int, seed: int) -> FloatArray:
     import scipy
 
     sequence = scipy.stats.qmc.Sobol(dimensions, rng=default_rng(seed))
-    points: FloatArray = sequence.random_base2(max(0, math.ceil(math.log2(number))))
+    points: FloatArray = sequence.random_base2(math.ceil(math.log2(number)))
     return points[:number]
 
 
