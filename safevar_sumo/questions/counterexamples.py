@@ -52,28 +52,6 @@ LEAST_IMPACT = 1.0
 BEYOND_STAGE = "find what fails first"
 
 
-class Place(NamedTuple):
-    """Where a vehicle fails, in words for readers: the test, its speed, and other values of the
-    encounter, each "" if there is none; and the number of the parameter set.
-    """
-
-    test: str
-    speed: str
-    values: str
-    fit: int
-
-    @property
-    def words(self) -> str:
-        """The place in words, such as `test CPNA, driven at 40 km/h, impact location 25 %;
-        parameter set 9`; "" if there is only one place. Parameter set 0 is not named.
-        """
-        test = f"test {self.test}" if self.test else ""
-        speed = f"driven at {self.speed}" if self.speed else ""
-        encounter = ", ".join(filter(None, (test, speed, self.values)))
-        fit = f"parameter set {self.fit}" if self.fit else ""
-        return "; ".join(filter(None, (encounter, fit)))
-
-
 class Failure(NamedTuple):
     """An unsafe vehicle, in words for readers.
 
@@ -81,38 +59,22 @@ class Failure(NamedTuple):
     ----------
     setting
         The vehicle's values, and those of its encounter, as they are printed, shape (n,).
-    event
-        How the vehicle fails, such as `hits a pedestrian`.
-    impact
-        The impact, such as `impact at 12 km/h`; "" without a noteworthy impact.
-    place
-        Where the vehicle fails.
+    words
+        How and where the vehicle fails, such as `the vehicle hits a pedestrian (impact at 12 km/h;
+        test CPNA)`. If runs differ, the words also say how many fresh runs fail.
     point
         The parameters of the point of the matrix at which the vehicle fails.
     breach
         How the vehicle breaks the criterion, such as `collides at 3.21 m/s`.
     command
         The command that simulates the vehicle.
-    runs
-        If runs differ, how many fresh runs fail, such as `fails in 3 of 20 repeated runs (95 %: 3.2
-        to 38 %)`; else "".
     """
 
     setting: FloatArray
-    event: str
-    impact: str
-    place: Place
+    words: str
     point: JsonObject
     breach: str
     command: str
-    runs: str = ""
-
-    @property
-    def words(self) -> str:
-        """The failure, such as `the vehicle hits a pedestrian (impact at 12 km/h; test CPNA)`."""
-        details = "; ".join(filter(None, (self.impact, self.place.words)))
-        event = f"{self.event}{f' ({details})' if details else ''}"
-        return f"the vehicle {' and '.join(filter(None, (event, self.runs)))}"
 
 
 def describe(
@@ -296,15 +258,17 @@ def failures_at(model: Model, settings: FloatArray) -> dict[int, Failure]:
             event = breach
         elif collided and speed >= LEAST_IMPACT:
             impact = f"impact at {float(f'{speed:.2g}'):g} km/h"
+        place = place_of(points, point, scenario, values, model.fit)
+        if details := "; ".join(filter(None, (impact, place))):
+            event += f" ({details})"
+        if fails_in := runs_in_words(model.unsafe.failing_runs(run)[:, 0]):
+            event += f" and {fails_in}"
         failures[row] = Failure(
             setting,
-            event,
-            impact,
-            place_of(points, point, scenario, values, model.fit),
+            f"the vehicle {event}",
             point.parameters,
             breach,
             _command(model, setting, point),
-            runs_in_words(model.unsafe.failing_runs(run)[:, 0]),
         )
     return failures
 
@@ -319,7 +283,8 @@ def _command(model: Model, setting: FloatArray, point: Point) -> str:
     for name, value in point.parameters.items():
         if name in searchable and isinstance(value, int | float):
             words.append(f"--set {name}={value!r}")
-    words += [f"--fit {model.fit}"] * (model.fit > 0)
+    if model.fit:
+        words.append(f"--fit {model.fit}")
     return " ".join(filter(None, words))
 
 
@@ -329,8 +294,9 @@ def place_of(
     scenario: Scenario,
     values: NamedValues,
     fit: int = 0,
-) -> Place:
-    """The place of a failure in words.
+) -> str:
+    """The place of a failure in words, such as `test CPNA, driven at 40 km/h, impact location 25 %;
+    parameter set 9`; "" if there is only one place. Parameter set 0 is not named.
 
     No sentence states the phase: the command of the failure has it.
 
@@ -358,8 +324,13 @@ def place_of(
     speed = texts.pop(SPEED_DIMENSION, "")
     if not speed and scenario.test_speed is not None:
         speed = f"{significant(KMH_PER_MS * scenario.test_speed, 4)} km/h"
-    place = ", ".join(f"{name} {text}" for name, text in texts.items())
-    return Place(test, speed, place.replace("_", " "), fit)
+    phrases = [f"{name} {text}".replace("_", " ") for name, text in texts.items()]
+    if speed:
+        phrases.insert(0, f"driven at {speed}")
+    if test:
+        phrases.insert(0, f"test {test}")
+    set_name = f"parameter set {fit}" if fit else ""
+    return "; ".join(filter(None, (", ".join(phrases), set_name)))
 
 
 def texts_of(point: Point, values: JsonObject) -> dict[str, str]:

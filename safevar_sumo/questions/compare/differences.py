@@ -260,7 +260,7 @@ def _new_collisions(evaluators: Evaluators) -> Differences:
     if new:
         speed, point = max(new, key=lambda pair: pair[0])
         points = evaluators[1].system.points
-        place = place_of(points, point, point.scenario, {}).words
+        place = place_of(points, point, point.scenario, {})
         template = words.NEW_COLLISIONS if len(new) > 1 else words.NEW_COLLISION
         where = f" ({place})" if place else ""
         values = {"speed": speed, "place": where, "number": len(new)}
