@@ -121,8 +121,11 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
         step = memory.reaction.step
         is_same = observation.obstacle == memory.reaction.leader
         is_perceived, memory = self._perceive(observation, memory, is_same)
-        enters = is_in_the_way(observation, self.corridor) | _cuts_in(observation)
-        is_in_way = is_perceived & enters
+        # Somebody cuts in who moves towards the middle of the lane, and faster along the lane than
+        # across it.
+        moves_along = observation.obstacle_speed >= np.abs(observation.lateral_speed)
+        cuts_in = is_ahead(observation) & moves_inwards(observation) & moves_along
+        is_in_way = is_perceived & (is_in_the_way(observation, self.corridor) | cuts_in)
         reaction = self.watch_leader(observation, memory.reaction, is_in_way)
 
         # The time since a leader began to brake so hard that the braking is a danger. The driver
@@ -205,11 +208,3 @@ class CompetentDriver(ReferenceDriver, frozen=True, kw_only=True):
             appeared_in_way=appeared_in_way,
             stray_time=stray_time,
         )
-
-
-def _cuts_in(observation: Observation) -> BoolArray:
-    """Return whether somebody ahead moves towards the middle of the lane, and moves faster along
-    the lane than across it.
-    """
-    along = observation.obstacle_speed >= np.abs(observation.lateral_speed)
-    return is_ahead(observation) & moves_inwards(observation) & along

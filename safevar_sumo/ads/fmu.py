@@ -27,18 +27,28 @@ NOMINAL = "nominal_"
 """Prefix of the names of numbers of the original vehicle that an FMU may receive."""
 NOMINAL_UNITS: Mapping[str, str] = {
     "mass": "kg",
-    **dict.fromkeys(("accel", "decel"), "m/s2"),
+    "accel": "m/s2",
+    "decel": "m/s2",
     "max_speed": "m/s",
     "actuator_lag": "s",
-    **dict.fromkeys(("length", "width"), "m"),
+    "length": "m",
+    "width": "m",
 }
 """The numbers of the original vehicle that an FMU may receive, with their units."""
 UNITS: Mapping[str, str] = {
-    **dict.fromkeys(
-        ("speed", "closing_speed", "lateral_speed", "obstacle_speed"), "m/s"
-    ),
-    **dict.fromkeys(("gap", "lateral", "obstacle_width", "obstacle_length"), "m"),
-    **dict.fromkeys(("throttle", "brake", "visibility", "detected", "warns"), "1"),
+    "speed": "m/s",
+    "closing_speed": "m/s",
+    "lateral_speed": "m/s",
+    "obstacle_speed": "m/s",
+    "gap": "m",
+    "lateral": "m",
+    "obstacle_width": "m",
+    "obstacle_length": "m",
+    "throttle": "1",
+    "brake": "1",
+    "visibility": "1",
+    "detected": "1",
+    "warns": "1",
     "time": "s",
     "step": "s",
     "acceleration": "m/s2",
@@ -194,7 +204,7 @@ class FmuAds(ScalarAds):
     def start(self, nominal: Nominal, step: float) -> None:
         super().start(nominal, step)
         self._known = {
-            f"{NOMINAL}{name}": nominal._asdict()[name] for name in NOMINAL_UNITS
+            f"{NOMINAL}{name}": getattr(nominal, name) for name in NOMINAL_UNITS
         } | {"step": step}
         self._slave = self._fmu.code.call(
             "initialisation", self._fmu.new_instance, step

@@ -17,6 +17,7 @@ from safevar_sumo.records import (
     FloatArray,
     Nominal,
     Observation,
+    clip_to_share,
 )
 from safevar_sumo.study import Proportion, Table
 
@@ -306,9 +307,7 @@ class WorldOnRails(Ads, Table, frozen=True, kw_only=True):
         is_waiting = (observation.speed == 0) & (observation.time < self.first_command)
         low, middle, high = self.throttle
         level = observation.speed / SPEED_LEVEL
-        above_first_level = middle + (high - middle) * np.minimum(
-            np.maximum(level - 1, 0.0), 1.0
-        )
+        above_first_level = middle + (high - middle) * clip_to_share(level - 1)
         throttle = np.where(
             is_braking | is_waiting | (observation.speed > SPEED_LIMIT),
             0.0,
