@@ -128,7 +128,7 @@ def _accelerations(speeds: list[float]) -> FloatArray:
     drive reaches fewer than two of `SPEEDS`.
     """
     distinct_speeds, samples = np.unique(
-        np.maximum.accumulate(np.array(speeds)), return_index=True
+        np.maximum.accumulate(speeds), return_index=True
     )
     reached = np.flatnonzero(
         (distinct_speeds[0] <= SPEEDS) & (distinct_speeds[-1] >= SPEEDS)

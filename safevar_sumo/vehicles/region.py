@@ -32,14 +32,12 @@ LEAST_SHARE = 0.002
 class _BoundedSum(NamedTuple):
     """A weighted sum of characteristics with bounds, ready to compute: a constraint of a study.
 
-    `width` is the range of the sum over the domains. `minimum` and `maximum` bound the sum.
-    `condition` states the bounds in words, `suffix` the unit.
+    `width` is the range of the sum over the domains. `condition` states the bounds in words,
+    `suffix` the unit.
     """
 
     constraint: Constraint
     width: float
-    minimum: float
-    maximum: float
     condition: str
     suffix: str
 
@@ -56,7 +54,6 @@ class _BoundedSum(NamedTuple):
         return cls(
             constraint,
             width,
-            *constraint.ends,
             constraint.bounds_in_words(domains),
             unit_text(constraint.unit_of(domains)),
         )
@@ -66,10 +63,8 @@ class _BoundedSum(NamedTuple):
         (N,), as a share of `width`; 0 within the bounds.
         """
         total = self.constraint.total(values)
-        return (
-            np.maximum(np.maximum(self.minimum - total, total - self.maximum), 0.0)
-            / self.width
-        )
+        low, high = self.constraint.ends
+        return np.maximum(np.maximum(low - total, total - high), 0.0) / self.width
 
     def __str__(self) -> str:
         return f"{self.constraint.quantity} {self.condition}"
@@ -157,16 +152,15 @@ class FeasibleRegion:
         `filtered`, settings that are feasible after the filter. There are fewer settings if
         `REJECTIONS` draws for each do not suffice. `draw(k)` draws k settings.
         """
-        batches = [np.zeros((0, len(self.characteristics)))]
+        drawn = np.zeros((0, len(self.characteristics)))
         draws = 0
-        while (
-            shortage := number - sum(len(batch) for batch in batches)
-        ) and draws < REJECTIONS * number:
+        while (shortage := number - len(drawn)) and draws < REJECTIONS * number:
             # If few settings are feasible, each batch doubles the number of draws.
             settings = draw(max(shortage, min(draws, LARGEST_DRAW)))
             draws += len(settings)
-            batches.append(settings[self._are_accepted(settings, filtered)][:shortage])
-        return np.concatenate(batches)
+            accepted = settings[self._are_accepted(settings, filtered)]
+            drawn = np.concatenate([drawn, accepted[:shortage]])
+        return drawn
 
     def _are_accepted(self, settings: FloatArray, filtered: bool) -> BoolArray:
         if filtered:
