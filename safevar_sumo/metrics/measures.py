@@ -226,15 +226,15 @@ def post_encroachment_time(
     trace = runs.trace
     number = np.count_nonzero(trace.active, axis=0)
     at_end = np.minimum(number, len(trace.time) - 1), np.arange(len(number))
+    columns = np.broadcast_arrays(
+        trace.speed,
+        trace.gap,
+        trace.lateral,
+        trace.lateral_speed,
+        trace.obstacle_width,
+    )
     speed, gap, lateral, lateral_speed, obstacle_width = (
-        np.broadcast_to(column, trace.speed.shape)[at_end]
-        for column in (
-            trace.speed,
-            trace.gap,
-            trace.lateral,
-            trace.lateral_speed,
-            trace.obstacle_width,
-        )
+        column[at_end] for column in columns
     )
 
     # Either the body has left the vehicle's path (`body_is_first`), or the vehicle has passed the

@@ -125,7 +125,7 @@ class _Start(NamedTuple):
                 )
             # The target moves at its speed from the start: with a smaller share of the way, the run
             # begins later.
-            time = float(test.time_to_impact or TIME_TO_IMPACT) * test.start_share
+            time = (test.time_to_impact or TIME_TO_IMPACT) * test.start_share
             distance = speed * time
             profile = TargetProfile(begin=0.0, speed=speed, run_up=0.0)
         else:

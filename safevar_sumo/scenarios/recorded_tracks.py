@@ -209,13 +209,12 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
 
     groups = values.groupby(table["name"], sort=False)
     bodies = {str(name): rows.sort_values("time") for name, rows in groups}
-    longest_step = 0.0
-    if len(table) > len(bodies):
-        steps = [np.diff(rows["time"]) for rows in bodies.values()]
-        longest_step = LONGEST_STEP * np.median(np.concatenate(steps))
+    times = values.sort_values("time").groupby(table["name"])["time"]
+    longest_step = LONGEST_STEP * times.diff().median()
     for name, rows in bodies.items():
-        _check_steps(f"{key}: {name}", rows["time"].to_numpy(), longest_step)
-        _check_headings(f"{key}: {name}", rows)
+        body = f"{key}: {name}"
+        _check_steps(body, rows["time"].to_numpy(), longest_step)
+        _check_headings(body, rows)
         rows["heading"] = np.unwrap(rows["heading"])
     return bodies
 
