@@ -124,12 +124,12 @@ def system_of(study: Any, **changes: Any) -> System:
 
 def original_of(system: Any) -> FloatArray:
     """The original vehicle as the only row of settings."""
-    return np.asarray(system.characteristics.original_settings)
+    return system.characteristics.original_settings
 
 
 def changed(system: Any, **values: float) -> FloatArray:
     """The original vehicle with some values as the only row of settings."""
-    return np.asarray(system.characteristics.setting(values, beyond=True)[np.newaxis])
+    return system.characteristics.setting(values, beyond=True)[np.newaxis]
 
 
 def uniform(characteristics: CharacteristicSet, number: int, seed: int) -> FloatArray:

@@ -16,6 +16,7 @@ from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, json_of, rows_of, run, write
+from tests.made_up import original_of, system_of
 from tests.manual import files_of
 
 METRICS = """import numpy as np
@@ -95,7 +96,7 @@ def test_code_of_the_package_has_no_oversight() -> None:
     system = assemble(study)
     for name in ALGORITHMS:
         assert not [*oversights._find_duplicates(study, name)], name
-    runs = drive_all(system, system.characteristics.original_settings)
+    runs = drive_all(system, original_of(system))
     for name, measure in system.measuring.measures.items():
         if measure.of == "runs":
             values = measure.of_runs(runs, system.metrics_table)
@@ -104,7 +105,7 @@ def test_code_of_the_package_has_no_oversight() -> None:
 
 @pytest.mark.parametrize("study", ["smoke", "lgsvl", "native", "wear"])
 def test_vehicles_of_the_package_follow_the_time_step(study: str) -> None:
-    assert not [*oversights._find_ignored_step(assemble(load_study(study)))]
+    assert not [*oversights._find_ignored_step(system_of(study))]
 
 
 @pytest.mark.parametrize(

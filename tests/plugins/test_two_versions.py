@@ -16,7 +16,7 @@ import safevar_sumo as sv
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.sumo.matrix import drive_and_score
 from tests.in_process import InlinePool, run
-from tests.made_up import system_of
+from tests.made_up import original_of, system_of
 
 DRIVER = """
 import importlib, pickle, sys, threading
@@ -159,7 +159,7 @@ def test_a_system_that_was_assembled_first_runs_its_own_code_later(
     systems = {name: system_of(path) for name, path in studies.items()}
     for name in ("old", "new", "old"):
         system = systems[name]
-        results = drive_and_score(system, system.characteristics.original_settings)
+        results = drive_and_score(system, original_of(system))
         assert results.f_safe[0] == pytest.approx(DEGREES[name])
 
 

@@ -19,7 +19,7 @@ from safevar_sumo.records import (
 from safevar_sumo.scenarios import Scenario
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import System
-from tests.made_up import system_of
+from tests.made_up import original_of, system_of
 
 CARLA = system_of("sun")
 
@@ -69,7 +69,7 @@ def driven(
     system = replace(alone, ads=ads or Hold())
     return drive_worst(
         system,
-        system.characteristics.original_settings if settings is None else settings,
+        original_of(system) if settings is None else settings,
     )
 
 

@@ -20,41 +20,33 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.scenarios import Crossing, Point
 from safevar_sumo.scenarios.ahead import CarToCar
-from safevar_sumo.study import MatrixTable, MatrixTest, Study
+from safevar_sumo.study import Study
 from safevar_sumo.sumo.bodies import Body, find_touches
 from safevar_sumo.sumo.driving_robot import DrivingRobot
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW
-from tests.made_up import assert_same_results, changed, drawn, original_of
+from tests.made_up import assert_same_results, changed, drawn, original_of, system_of
 from tests.scenarios.holding import CARLA as SUN, Pedals, driven
-
-BASE = load_study("euro_ncap_pedestrian")
-TESTS = [
-    MatrixTest(
-        name="CPNA",
-        parameters={"test": "CPNA"},
-        over={"speed": [20, 50], "impact_location": [25, 75]},
-        weathers=["clear", "carla_hard_rain"],
-    ),
-    MatrixTest(name="CPNCO", parameters={"test": "CPNCO"}, over={"speed": [40]}),
-    MatrixTest(name="CPLA", model="along", over={"speed": [30]}),
-]
-
-
-def study(tests: list[MatrixTest]) -> Study:
-    return replace_in(BASE, matrix=MatrixTable(tests=tests))
-
-
-SYSTEM = assemble(study(TESTS))
 
 
 @SLOW
 def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each_other() -> (
     None
 ):
-    population = drawn(SYSTEM, 3, 3)
-    points = simulate_all_points(SYSTEM, population)
+    tests = [
+        {
+            "name": "CPNA",
+            "parameters": {"test": "CPNA"},
+            "over": {"speed": [20, 50], "impact_location": [25, 75]},
+            "weathers": ["clear", "carla_hard_rain"],
+        },
+        {"name": "CPNCO", "parameters": {"test": "CPNCO"}, "over": {"speed": [40]}},
+        {"name": "CPLA", "model": "along", "over": {"speed": [30]}},
+    ]
+    system = system_of("euro_ncap_pedestrian", matrix={"tests": tests})
+    population = drawn(system, 3, 3)
+    points = simulate_all_points(system, population)
     assert [one.point.name for one in points][:3] == [
         "CPNA, speed 20, impact_location 25, clear",
         "CPNA, speed 20, impact_location 25, carla_hard_rain",
@@ -62,9 +54,9 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
     ]
     assert len(points) == 10
     for one in points[::3]:
-        alone = drive_and_score(SYSTEM.at(one.point), population)
+        alone = drive_and_score(system.at(one.point), population)
         assert_same_results(alone, one.evaluations)
-    whole = drive_and_score(SYSTEM, population)
+    whole = drive_and_score(system, population)
     assert (
         whole.f_safe.tolist()
         == np.min([one.evaluations.f_safe for one in points], axis=0).tolist()
@@ -73,7 +65,6 @@ def test_the_worst_point_decides_a_settings_result_and_points_do_not_affect_each
     assert whole.collided.tolist() == np.any(collided, axis=0).tolist()
 
 
-WEAK = replace(SUN, vehicle=replace_in(SUN.vehicle, engine_torque=0.5))  # type: ignore[type-var]
 EAST = np.array([1.0, 0.0])
 
 
@@ -134,17 +125,11 @@ def test_a_test_is_invalid_beyond_1_km_h_too_fast_and_half_a_km_h_too_slow(
 def test_a_setting_with_an_invalid_test_has_no_verdict_unless_it_collides_elsewhere() -> (
     None
 ):
-    tests = [
-        MatrixTest(
-            name="CCRs",
-            parameters={"test": "CCRs", "grade": 20.0},
-            over={"speed": [10, 50]},
-        )
-    ]
-    steep = assemble(
-        replace_in(load_study("euro_ncap_car_to_car"), matrix=MatrixTable(tests=tests))
-    )
-    steep = replace(steep, vehicle=WEAK.vehicle)
+    parameters = {"test": "CCRs", "grade": 20.0}
+    test = {"name": "CCRs", "parameters": parameters, "over": {"speed": [10, 50]}}
+    steep = system_of("euro_ncap_car_to_car", matrix={"tests": [test]})
+    weak = replace_in(SUN.vehicle, engine_torque=0.5)  # type: ignore[type-var]
+    steep = replace(steep, vehicle=weak)
     original = original_of(SUN)
     assert [
         str(one.evaluations.outcome[0]) for one in simulate_all_points(steep, original)

@@ -7,18 +7,15 @@ from __future__ import annotations
 import sys
 from types import ModuleType
 
-import msgspec
 import numpy as np
 import pytest
 
-from safevar_sumo.api.simulation import load_study
 from safevar_sumo.records import Outcome
-from safevar_sumo.study import ModelTable
 from safevar_sumo.sumo.matrix import drive_worst
-from safevar_sumo.sumo.system import System, assemble
+from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.traci_commands import CommandedSpeed
 from tests.in_process import SLOW, write
-from tests.made_up import changed, original_of
+from tests.made_up import changed, original_of, system_of
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
 SCRIPT = """
@@ -83,12 +80,8 @@ def step(traci, vehicle_id):
 
 def system(name: str, script: str = SCRIPT, **tables: object) -> System:
     write("my_controller.py", script)
-    return assemble(
-        msgspec.structs.replace(
-            load_study("native", **tables),
-            ads=ModelTable(model=f"my_controller:{name}", kind="traci"),
-        )
-    )
+    ads = {"model": f"my_controller:{name}", "kind": "traci", "parameters": {}}
+    return system_of("native", ads=ads, **tables)
 
 
 @SLOW
