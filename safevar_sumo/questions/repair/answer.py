@@ -75,7 +75,7 @@ def answer_of(
         "simulations": sum(
             world.model.evaluator.simulated for world in problem.bench.worlds
         ),
-        "fits": survivors.fits * bool(survivors.changes),
+        "fits": survivors.fits if survivors.changes else 0,
         "fits_tried": sets,
     }
     ending = f"has a safety degree of {distance_in_words(worst, unsafe.contact)}"
