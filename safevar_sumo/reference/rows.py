@@ -159,9 +159,10 @@ def _columns_by_name(
     names = [str(name) for name in table]
     plain_names = [_plain_name(name) for name in names]
     by_plain_name = dict(zip(plain_names, names, strict=True))
-    columns = {}
-    for name in characteristics.names:
-        columns[name] = by_plain_name.get(_plain_name(name), name)
+    columns = {
+        name: by_plain_name.get(_plain_name(name), name)
+        for name in characteristics.names
+    }
     columns |= COLUMNS
     if columns[OPTIONAL_METRIC] not in table:
         del columns[OPTIONAL_METRIC]

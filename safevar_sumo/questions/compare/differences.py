@@ -174,7 +174,7 @@ def _safe_alone(request: Asked, limits: Restriction) -> list[Interval] | list[No
     limits; None for all characteristics if the original vehicle is unsafe.
     """
     model = request.bench.own
-    members = request.bench.vehicle.members
+    members = request.bench.vehicle
     if model.are_unsafe(model.characteristics.original_settings, "original vehicle")[0]:
         return [None] * len(members)
     alone, _ = alone_with_own_set(request, Alone(request.lower, request.upper))

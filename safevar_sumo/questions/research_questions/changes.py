@@ -201,7 +201,7 @@ def count_collisions(case: Case) -> pd.DataFrame:
     counts = groups.agg(solutions="size", collisions="sum")
     counts = counts.reindex(list(case.algorithms), fill_value=0)
     counts["share"] = counts["collisions"] / counts["solutions"]
-    return pd.DataFrame(counts.rename_axis("algorithm").reset_index())
+    return counts.rename_axis("algorithm").reset_index()
 
 
 def frequent_combinations(case: Case) -> pd.DataFrame:

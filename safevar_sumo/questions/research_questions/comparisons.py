@@ -313,12 +313,20 @@ def _test_original(
             runs = case.run_counts[algorithm]
         # Below 0.5, the solutions are more unsafe than the original.
         test = test.oriented(larger_is_better=not metric.more_is_unsafe)
-        row = {"algorithm": algorithm, "metric": metric.name, "runs": runs}
         is_enough = not case.has_runs or can_be_significant(
             "RQ1", runs, 0, choices.alpha
         )
-        row |= {"mean": values.mean(), "original": original, "enough_runs": is_enough}
-        rows.append({**row, **test._asdict()})
+        rows.append(
+            {
+                "algorithm": algorithm,
+                "metric": metric.name,
+                "runs": runs,
+                "mean": values.mean(),
+                "original": original,
+                "enough_runs": is_enough,
+                **test._asdict(),
+            }
+        )
     return rows
 
 
@@ -347,8 +355,15 @@ def _test_opponents(
         test = test.oriented(larger_is_better=more_is_better)
         runs = case.run_counts[algorithm], case.run_counts[baseline]
         is_enough = not case.has_runs or can_be_significant("RQ2", *runs, choices.alpha)
-        row = {"algorithm": algorithm, "baseline": baseline, "metric": metric}
-        rows.append({**row, **test._asdict(), "enough_runs": is_enough})
+        rows.append(
+            {
+                "algorithm": algorithm,
+                "baseline": baseline,
+                "metric": metric,
+                "enough_runs": is_enough,
+                **test._asdict(),
+            }
+        )
     return rows
 
 

@@ -398,7 +398,6 @@ def draw_figures(cases: Sequence[Case]) -> dict[str, Figure]:
     return figures
 
 
-@own_style()
 def save_figures(cases: Sequence[Case], directory: Path) -> None:
     """Draw every figure into a png and a pdf file.
 

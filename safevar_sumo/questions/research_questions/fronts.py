@@ -135,7 +135,7 @@ def valid_evaluations(case: Case, frame: pd.DataFrame) -> pd.DataFrame:
     vehicle is safe in the same encounter.
     """
     is_defined = np.isfinite(minimised_values(case, frame)).all(axis=1)
-    return pd.DataFrame(frame[is_defined & case.scoring.feasible_rows(frame)])
+    return frame[is_defined & case.scoring.feasible_rows(frame)]
 
 
 def nondominated_evaluations(case: Case) -> pd.DataFrame:
