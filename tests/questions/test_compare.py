@@ -15,6 +15,7 @@ from msgspec import to_builtins
 
 import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
+from safevar_sumo.questions.compare import differences
 from safevar_sumo.questions.compare.coverage import missing_in_words
 from safevar_sumo.questions.evaluator import Evaluator, open_evaluator
 from safevar_sumo.questions.research_questions.statistics import compare_samples
@@ -32,6 +33,7 @@ from tests.in_process import (
 from tests.questions.conftest import ONE_TEST
 
 POOL = InlinePool()
+NEEDLESS_BRAKING = differences._needless_braking
 
 
 @pytest.fixture(autouse=True)
@@ -42,10 +44,7 @@ def _coarse_scans_and_no_benign_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
         "b_needless_braking": None,
         "benign_scenes": 0,
     }
-    monkeypatch.setattr(
-        "safevar_sumo.questions.compare.differences._needless_braking",
-        lambda a, b: nothing,
-    )
+    monkeypatch.setattr(differences, "_needless_braking", lambda a, b: nothing)
 
 
 CUT_OUT_SLOWER = [to_builtins(test) for test in load_study("alks").tests]
@@ -254,12 +253,10 @@ def test_none_of_four_worse_versions_is_released(
     brakes later.
     """
     changes, decision, words = VERSIONS[version]
-    monkeypatch.undo()
-    monkeypatch.setattr(asked, "USUAL", asked.USUAL._replace(values=10, alone=256))
-    monkeypatch.chdir(in_tmp)
-    Path("late.py").write_text(LATE)
+    monkeypatch.setattr(differences, "_needless_braking", NEEDLESS_BRAKING)
+    write("late.py", LATE)
     study = {"extends": "wear", "name": version, **ONE_TEST, **changes}
-    Path("version.toml").write_text(tomli_w.dumps(study))
+    write("version.toml", tomli_w.dumps(study))
     answer = sv.compare(
         load_study("wear", **ONE_TEST), "version.toml", samples=40, pool=POOL
     )
@@ -345,10 +342,8 @@ def test_a_report_of_two_results_compares_them(
     weathers: list[Path], in_tmp: Path
 ) -> None:
     dry, wet = map(str, weathers)
-    page = (
-        run(f"report {dry} {wet} --ask compare --out it.html")
-        and Path("it.html").read_text()
-    )
+    run(f"report {dry} {wet} --ask compare --out it.html")
+    page = Path("it.html").read_text()
     assert sv.compare(dry, wet, pool=POOL).render("html").replace("^2", "²") in page
     assert "<h3>Compare</h3>" in page.partition('class="front')[0], "it stands first"
     assert f"python -m safevar_sumo compare {dry} {wet}" in page

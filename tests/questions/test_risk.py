@@ -379,13 +379,11 @@ def test_the_first_sentence_of_rules_says_what_lies_outside_of_the_regions() -> 
         return corner | (settings[:, 0] * 1000 % 1 < 0.02)
 
     answer = rules_of(region, samples=4000)
-    boxes = answer.tables["rules"]
-    said = re.match(
-        r"(\d+) % of all unsafe vehicles lie outside of the", answer.verdict
+    outside = round(100 * (1 - answer.tables["rules"]["coverage"].sum()))
+    assert answer.verdict.startswith(
+        f"{outside} % of all unsafe vehicles lie outside of the"
     )
-    assert said
-    assert int(said[1]) == round(100 * (1 - boxes["coverage"].sum()))
-    assert 5 < int(said[1]) < 15
+    assert 5 < outside < 15
 
 
 def test_sets_without_an_unsafe_vehicle_are_told_by_a_count() -> None:

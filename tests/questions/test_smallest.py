@@ -4,7 +4,6 @@ what the verdict claims of them.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
@@ -25,6 +24,7 @@ from safevar_sumo.questions.explain.smallest import Smallest
 from safevar_sumo.questions.explain.tell import smallest_sentences
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.questions.sentence import Verdict
+from safevar_sumo.questions.words import percentage
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.study import Study
 from tests.in_process import SLOW, InlinePool, json_of, rows_of
@@ -353,15 +353,12 @@ def test_with_repeats_a_cause_has_its_fresh_runs_and_is_not_enough() -> None:
     assert row["runs"] == FRESH_RUNS
     assert row["unsafe_runs"] == row["failing_runs"] / FRESH_RUNS > 0
     assert np.isnan(row["safe_again"])
-    low, high = clopper_pearson(row["failing_runs"], FRESH_RUNS)
-    said = re.search(
-        r"With 1 change the vehicle fails in (\d+) of 20 repeated runs \(95 %: (.*) to (.*)"
-        r" %\): a at",
-        verdict,
-    )
-    assert said
-    assert int(said[1]) == row["failing_runs"]
-    assert np.allclose([float(said[2]), float(said[3])], [100 * low, 100 * high], 0.06)
+    number = row["failing_runs"]
+    low, high = (percentage(end) for end in clopper_pearson(number, FRESH_RUNS))
+    assert (
+        f"With 1 change the vehicle fails in {number} of 20 repeated runs (95 %: {low} to {high}"
+        " %): a at"
+    ) in verdict
     assert "enough" not in verdict
 
 

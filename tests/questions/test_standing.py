@@ -4,6 +4,7 @@ the largest distance, and nobody has tested it.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.evaluator import Evaluator
+from safevar_sumo.questions.explain import failures
 from safevar_sumo.questions.part import with_ranges
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.results import load_runs
@@ -69,7 +71,7 @@ REMARK = "never moved, although the original vehicle moves in the same encounter
 
 
 @pytest.fixture(autouse=True)
-def studies(coarse: None, in_tmp: Path) -> None:
+def studies(coarse: None, few_simulations: None, in_tmp: Path) -> None:
     """The study; one in which only the original car starts; and one in which no car starts."""
     write("stalled.py", STALLED)
     write("some.toml", STUDY)
@@ -80,39 +82,44 @@ def studies(coarse: None, in_tmp: Path) -> None:
 @pytest.mark.parametrize("question", [sv.risk, sv.rules])
 def test_shares_count_the_vehicles_that_moved(question: sv.Question) -> None:
     """One half has the voltage; of this half, (3.6 - 2) / (8 - 2) collide."""
-    answer = question("some.toml", samples=2000, pool=InlinePool())
+    answer = question("some.toml", samples=500, pool=InlinePool())
     moved = answer.numbers["samples"]
-    assert moved == pytest.approx(1000, abs=100)
+    assert moved == pytest.approx(250, abs=50)
     low, high = answer.numbers["interval"]
     assert low < (STOPS - 2) / 6 < high
-    text = f"{2000 - moved:,} of the 2,000 sampled vehicles never moved"
+    text = f"{500 - moved} of the 500 sampled vehicles never moved"
     assert text in answer.verdict
     assert REMARK in answer.verdict
-    assert answer.numbers["never_moved"] >= 2000 - moved
+    assert answer.numbers["never_moved"] >= 500 - moved
 
 
 def test_limits_end_where_vehicles_stand() -> None:
-    answer = sv.tolerance("some.toml", margin=0.0, pool=InlinePool())
+    answer = sv.tolerance("some.toml", margin=0.0, quick=True, pool=InlinePool())
     limits = answer.tables["limits"].set_index("characteristic")
     for column in ("alone_low", "together_low"):
         assert limits[column]["volt"] == pytest.approx(9, abs=0.05)
-        assert limits[column]["decel"] == pytest.approx(STOPS, abs=0.05)
+        assert limits[column]["decel"] == pytest.approx(STOPS, abs=0.06)
     alone = next(text for text in answer.verdict.split(". ") if "alone can" in text)
     assert "decel" in alone
     assert "volt" not in alone
 
 
-def test_causes_are_among_the_vehicles_that_moved() -> None:
+def test_causes_are_among_the_vehicles_that_moved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Of two single changes, the voltage is no simulated one, and no cause."""
+    monkeypatch.setattr(failures, "SAMPLED_SETTINGS", 400)
     answer = sv.explain("some.toml", pool=InlinePool())
-    assert answer.numbers["settings"] == pytest.approx(2048, abs=150)
+    assert answer.numbers["settings"] == pytest.approx(200, abs=40)
     assert answer.numbers["tried"] == 1
     (cause,) = answer.tables["causes"]["causes"]
     assert set(cause) == {"decel"}
     assert REMARK in answer.verdict
 
 
-@pytest.mark.parametrize("question", ["risk", "rules", "explain", "tolerance"])
+@pytest.mark.parametrize(
+    "question", ["risk", "rules", "explain", "tolerance", "compare none.toml"]
+)
 def test_no_verdict_is_given_if_only_the_original_vehicle_moves(question: str) -> None:
     answer = json_of(f"{question} none.toml --simulations 300", expect=3)
     assert answer["numbers"]["driven"] is False
@@ -122,8 +129,7 @@ def test_no_verdict_is_given_if_only_the_original_vehicle_moves(question: str) -
     assert answer["tables"] == {}
 
 
-def test_a_version_whose_vehicles_stand_is_not_released() -> None:
-    assert "No verdict is possible" in run("compare none.toml none.toml", expect=3)[0]
+def test_two_versions_are_compared_by_the_vehicles_that_moved() -> None:
     assert "RELEASE" in run("compare some.toml some.toml --samples 60").stdout
 
 
@@ -189,7 +195,7 @@ def test_the_headline_of_a_search_says_how_many_vehicles_never_moved() -> None:
 def test_rows_of_standing_vehicles_stay_with_their_evaluations() -> None:
     columns = dict.fromkeys(("f_diff", "f_num_diff"), np.zeros(2))
     moving = Evaluations.undefined(np.zeros((2, 1)), Outcome.STOPPED, ["x"], **columns)
-    standing = Evaluations(**{**vars(moving), "stands": np.array([True, False])})
+    standing = replace(moving, stands=np.array([True, False]))
     joined = Evaluations.concatenate([moving, standing])
     assert joined.standing.tolist() == [False, False, True, False]
     assert joined.take([2, 1]).standing.tolist() == [True, False]
