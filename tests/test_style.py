@@ -16,12 +16,10 @@ from tests.size import elements_in, sizes, sources_of
 from tests.support.needs import NOTHING_MISSING
 
 LIMITS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
-DOUBLE = {
-    *("Failure", "Failures", "FullBraking", "Parameter", "Search"),
-    *("Found", "tell"),  # each question has its own
-    *("columns_of", "parameters_of"),
-}
-"""Names that may still have several meanings."""
+DOUBLE = {"Found", "Search"}
+"""Names that still have several meanings."""
+VERSIONS = {"FORMAT"}
+"""Numbers that several modules have: each format of a file has its version."""
 COLLECTION = """
 import sys
 libraries = ["ad_rss", "cma", "distributed", "fmpy", "highway_env", "pymoo", "sumo"]
@@ -55,6 +53,16 @@ def public_names_in(source: str) -> Iterator[str]:
         yield from (name for name in names if not name.startswith("_"))
 
 
+def numbers_in(source: str) -> Iterator[str]:
+    """The constants of a module whose values are numbers."""
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant):
+            (target,) = node.targets
+            is_number = type(node.value.value) in (int, float)
+            if is_number and isinstance(target, ast.Name):
+                yield target.id
+
+
 def test_sizes_are_within_their_limits() -> None:
     for name, size in sizes().items():
         assert size <= LIMITS["size"][name], name
@@ -66,7 +74,17 @@ def test_a_public_name_is_defined_once() -> None:
         if "/web/" not in path:  # scripts that are exported with a simulation
             for name in public_names_in(source):
                 places[name].append(path)
-    assert {name for name, paths in places.items() if len(paths) > 1} <= DOUBLE
+    assert {name for name, paths in places.items() if len(paths) > 1} == DOUBLE
+
+
+def test_a_number_has_a_name_of_its_own() -> None:
+    """A number has a meaning and mostly a unit, which its name alone tells where it is imported."""
+    places = defaultdict[str, list[str]](list)
+    for path, source in sources_of("safevar_sumo").items():
+        for name in numbers_in(source):
+            places[name].append(path)
+    double = {name: paths for name, paths in places.items() if len(paths) > 1}
+    assert not {name: paths for name, paths in double.items() if name not in VERSIONS}
 
 
 @SLOW

@@ -351,7 +351,7 @@ CORRIDOR = 1.15
 is in the way. The middle of an adult in the way is up to 1.4 m from the lane's middle, and the
 middle of a car (1.7 m wide) up to 2.0 m.
 """
-LEAST_CLOSING_SPEED = 0.1
+LEAST_APPROACH_SPEED = 0.1
 """Lower bound of a positive closing speed [m/s]. Without this bound, times would become
 infinite.
 """
@@ -367,7 +367,7 @@ def time_to_reach(observation: Observation) -> FloatArray:
     """
     gap = np.minimum(np.maximum(observation.gap, 0.0), LARGEST_GAP)
     closing_speed = observation.closing_speed
-    time = gap / np.maximum(closing_speed, LEAST_CLOSING_SPEED)
+    time = gap / np.maximum(closing_speed, LEAST_APPROACH_SPEED)
     return np.where(closing_speed > 0, time, LARGEST_GAP)
 
 

@@ -30,7 +30,7 @@ TAPER_TIME = 0.3
 # m/s. The creep begins when the speed is less than this margin above the creep speed.
 CREEP_MARGIN = 0.1
 # m. The planned deceleration divides by the distance: without this lower bound it could be 0.
-LEAST_DISTANCE = 0.05
+LEAST_STOPPING_DISTANCE = 0.05
 # m/s^2. The rise of the needed deceleration is a divisor: without this lower bound it could be 0.
 LEAST_RISE = 1e-9
 # s. Largest rounding error of the time at which the first command is due.
@@ -150,14 +150,18 @@ class Apollo(Ads, Table, frozen=True, kw_only=True):
             np.minimum(observation.gap, self.perception_range) - self.stop_gap,
             np.inf,
         )
-        needed_deceleration = speed * speed / (2 * np.maximum(distance, LEAST_DISTANCE))
+        needed_deceleration = (
+            speed * speed / (2 * np.maximum(distance, LEAST_STOPPING_DISTANCE))
+        )
         # While the pedals lag, and while the deceleration rises at the jerk limit, the vehicle
         # covers distance that braking cannot use.
         lost_distance = speed * (
             self.pedal_lag + 0.5 * self.comfortable_deceleration / self.jerk
         )
         needed_after_lag = (
-            speed * speed / (2 * np.maximum(distance - lost_distance, LEAST_DISTANCE))
+            speed
+            * speed
+            / (2 * np.maximum(distance - lost_distance, LEAST_STOPPING_DISTANCE))
         )
         begins_braking = (
             needed_after_lag > self.comfortable_deceleration

@@ -61,7 +61,7 @@ VERDICT_COST = 80_000
 """The verdict on a search takes about as long as this number of simulations. (The bar of progress
 adds this number to the simulations of the search.)
 """
-FEW = 60
+VERDICT_SIMULATIONS = 60
 """Number of simulations that the verdict takes in a simulator of the user's own, roughly."""
 ALGORITHMS, CHANGES = shipped_columns("study").values()
 MAX_LISTED = 3
@@ -178,7 +178,10 @@ def study(
 
     try:
         with open_progress(not quiet) as show:
-            parts = Parts(show, [0, FEW if system.mover.takes_long else VERDICT_COST])
+            parts = Parts(
+                show,
+                [0, VERDICT_SIMULATIONS if system.mover.takes_long else VERDICT_COST],
+            )
             results = run(
                 loaded,
                 directory,

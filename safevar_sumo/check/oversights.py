@@ -39,13 +39,13 @@ from safevar_sumo.sumo.simulators import WatchedRun, watched_runs
 from safevar_sumo.sumo.system import System
 from safevar_sumo.vehicles import DRY_ROAD_FRICTION, STEP
 
-MANY = 20
+MANY_SETTINGS = 20
 """Number of settings in which a metric must be defined at least once and change at least once, and
 each characteristic must be read.
 """
-FEW = 5
+FEW_SETTINGS = 5
 """The same number for simulations that take long: the original and four corners of the domains."""
-PHASE = 3.0
+PEDAL_TIME = 3.0
 """Time for which the throttle, and then the brake, is pressed with two time steps [s]."""
 FASTER = 1.7
 """Largest change of the speed per time with half the step, over that with the step, from which on a
@@ -58,7 +58,7 @@ def find_oversights(study: Study) -> Iterator[tuple[Mapping[str, str], Findings]
     among which it is. Findings are computed one by one, when the caller asks for the next finding.
     """
     system = trial_system(study)
-    number = FEW if system.mover.takes_long else MANY
+    number = FEW_SETTINGS if system.mover.takes_long else MANY_SETTINGS
     settings = trial_settings(system.characteristics, number)
     settings = system.region.repaired(settings)
     sample = f"{len(settings)} vehicles: the original, and others up to the ends of the domains"
@@ -212,7 +212,7 @@ def _largest_changes(system: System, step: float) -> dict[str, float]:
         prepared = vehicle.prepare(original, DRY_ROAD_FRICTION, step)
         state = vehicle.at_rest(prepared)
         for pedal, command in commands.items():
-            for _ in range(round(PHASE / step)):
+            for _ in range(round(PEDAL_TIME / step)):
                 speed = float(state.speed[0])
                 state = vehicle.advance(prepared, state, command)
                 change = abs(float(state.speed[0]) - speed) / step

@@ -35,8 +35,8 @@ from safevar_sumo.terminal import Progress, show_no_progress
 from safevar_sumo.vehicles import CharacteristicSet, region_of
 
 SIMULATED = 100
-"""Number of settings that are simulated, if this takes at most `LONGEST`."""
-LONGEST = 60.0
+"""Number of settings that are simulated, if this takes at most `LONGEST_CHECK`."""
+LONGEST_CHECK = 60.0
 """Time after which the simulations should end [s]."""
 LEAST_SIMULATED = 3
 """Least number of settings, however slow the code is: the original and two corners of the
@@ -52,7 +52,7 @@ MATRIX_POINTS = 2
 """Approximate number of a study's points that are simulated."""
 TRIED_VALUES = np.nan, 0.0, -1e6, 1e6
 """Values that replace a quantity at all samples. If a metric changes, it reads this quantity."""
-MAX_EVALUATIONS = 57
+MAX_TRIED_EVALUATIONS = 57
 """Largest number of evaluations of an algorithm's run."""
 MAX_POPULATION = 20
 """Largest population of an algorithm's run."""
@@ -231,19 +231,20 @@ def reads_a_difference(
 
 
 def _affordable(system: System, settings: FloatArray) -> tuple[int, float]:
-    """Measure the time of a few settings, and return how many settings take at most `LONGEST`, and
-    their time [s]. In a simulator of the user's own, only one setting is measured.
+    """Measure the time of a few settings, and return how many settings take at most
+    `LONGEST_CHECK`, and their time [s]. In a simulator of the user's own, only one setting is
+    measured.
     """
     timed = settings[: 1 if system.mover.takes_long else TIMED]
     # The first simulation takes longer, because it loads libraries. Its time limit is short, in
     # case the driving system never ends. A simulator of the user's own has simulated before.
     if not system.mover.takes_long:
-        short = replace(system, time_limit=min(system.time_limit, LONGEST))
+        short = replace(system, time_limit=min(system.time_limit, LONGEST_CHECK))
         drive_and_score(short, timed[:1])
     start = time.perf_counter()
     drive_and_score(system, timed)
     seconds = RUNS_OF_ALL * (time.perf_counter() - start) / len(timed)
-    number = min(max(int(LONGEST / seconds), LEAST_SIMULATED), SIMULATED)
+    number = min(max(int(LONGEST_CHECK / seconds), LEAST_SIMULATED), SIMULATED)
     return number, number * seconds
 
 
@@ -350,7 +351,7 @@ def search_with(study: Study, name: str, seeds: tuple[int, ...]) -> Searched:
         region=system.region,
         original=drive_and_score(system, system.characteristics.original_settings),
         population=min(study.search.population, MAX_POPULATION),
-        evaluations=min(study.search.evaluations, MAX_EVALUATIONS),
+        evaluations=min(study.search.evaluations, MAX_TRIED_EVALUATIONS),
         scoring=system.measuring.scoring,
     )
 

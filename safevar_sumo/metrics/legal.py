@@ -7,7 +7,7 @@ import numpy as np
 from safevar_sumo.metrics.base import Measure, mask_collisions
 from safevar_sumo.metrics.measures import safety_degree
 from safevar_sumo.records import (
-    LEAST_CLOSING_SPEED,
+    LEAST_COLLISION_SPEED,
     STANDSTILL,
     FloatArray,
     SimulationRuns,
@@ -141,7 +141,7 @@ def impact_speed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Relative speed at contact along the vehicle's lane [m/s], shape (N,), at least
     `LEAST_CLOSING_SPEED`; NaN for a vehicle that does not collide.
     """
-    return np.maximum(runs.relative_speed, LEAST_CLOSING_SPEED)
+    return np.maximum(runs.relative_speed, LEAST_COLLISION_SPEED)
 
 
 IMPACT_SPEED = Measure(

@@ -45,7 +45,7 @@ CRITERIA = (
 COLLISION = str(Outcome.COLLISION)
 DEGREE_SHARE = 0.5
 """The default limit if nothing collides, as a share of the original's safety degree."""
-LIMIT_DIGITS = 6
+CRITERION_DIGITS = 6
 """Number of significant digits of this limit."""
 SHARE_DECIMALS = 9
 """Decimals to which a sum of shares is rounded, so that three thirds are 1."""
@@ -310,7 +310,7 @@ class Unsafe:
         safety_degree = original.get(SAFETY_DEGREE) or 0.0
         if (outcomes == COLLISION).any() or not safety_degree > 0:
             return cls()
-        half = float(f"{DEGREE_SHARE * safety_degree:.{LIMIT_DIGITS}g}")
+        half = float(f"{DEGREE_SHARE * safety_degree:.{CRITERION_DIGITS}g}")
         return cls(degree=half, is_half=True)
 
     @classmethod

@@ -47,7 +47,7 @@ ABSTRACT = "__isabstractmethod__"
 """The attribute that Python sets on abstract methods."""
 MAX_QUOTED_ELEMENTS = 4
 """Largest number of elements of an array that an error quotes."""
-MAX_QUOTE = 80
+MAX_QUOTED_TEXT = 80
 """Largest length of the text of any other value that an error quotes [characters]."""
 _open_runs: ContextVar[BoolArray | None] = ContextVar("open_runs", default=None)
 """Which of N runs have not ended yet, shape (N,); None outside of a simulation."""
@@ -501,6 +501,6 @@ def quoted(value: object) -> str:
     if isinstance(value, np.ndarray) and value.size > MAX_QUOTED_ELEMENTS:
         return f"an array of {value.dtype}, shape {value.shape}"
     text = " ".join(repr(value).split())
-    if len(text) <= MAX_QUOTE:
+    if len(text) <= MAX_QUOTED_TEXT:
         return text
     return f"a {type(value).__name__}"

@@ -22,7 +22,7 @@ Files = dict[str, str]
 """Digests of files, by the names that `digests` gives to the files."""
 CACHE = "__pycache__"
 """The name of Python's folders for compiled files."""
-HIDDEN = re.compile(rf"(^|/)(\.|{CACHE}(/|\Z))")
+HIDDEN_PATH = re.compile(rf"(^|/)(\.|{CACHE}(/|\Z))")
 """Matches the path of a hidden file or folder, or of a folder with compiled files."""
 LIBRARY_FOLDERS = {"site-packages", "dist-packages"}
 """Names of folders with installed libraries. Such folders may be anywhere."""
@@ -105,7 +105,7 @@ def files_in(path: Path) -> list[Path]:
     return [
         file
         for file in path.rglob("*")
-        if file.is_file() and not HIDDEN.search(file.relative_to(path).as_posix())
+        if file.is_file() and not HIDDEN_PATH.search(file.relative_to(path).as_posix())
     ]
 
 

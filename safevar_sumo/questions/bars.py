@@ -19,7 +19,7 @@ CELLS = 16
 """Width of a bar on the terminal [characters]."""
 WIDTH, HEIGHT = 120, 14
 """Width and height of a bar on a page [px]."""
-MARGIN = HEIGHT / 2
+BAR_MARGIN = HEIGHT / 2
 """Room at each end of a bar, where the dot of the original may stand [px]."""
 LEGEND = {
     "text": "bar: █ together, ▒ alone (all others as new), · domain, o original, | specified",
@@ -66,11 +66,11 @@ class Bar(NamedTuple):
     @property
     def svg(self) -> str:
         """The bar as inline SVG. The page's style sheet gives the colours."""
-        inside = WIDTH - 2 * MARGIN
+        inside = WIDTH - 2 * BAR_MARGIN
 
         def x(share: float) -> str:
             """The horizontal position of a share [px]."""
-            return f"{MARGIN + inside * share:.1f}"
+            return f"{BAR_MARGIN + inside * share:.1f}"
 
         def rectangle(ends: tuple[float, ...], name: str) -> str:
             """A range as an SVG rectangle of the class `name`; "" for an empty range."""

@@ -34,7 +34,7 @@ COUNTS_STEPS = (
     " system or a sensor counts steps. Only encounters that begin within one step were simulated."
 )
 """The remark if the driving system or a sensor has a cycle that is longer than a step."""
-SAME = 1e-6
+SAME_ROBUSTNESS = 1e-6
 """Largest difference of the robustness at two phases that counts as no difference."""
 DOMAIN = Domain(unit=PHASES[PHASE].unit, original=0.0, lower=0.0, upper=1.0)
 """All phases. An encounter that begins a whole step later (phase 1) should end as at phase 0."""
@@ -69,7 +69,7 @@ def remark_on_phases(claim: Model | None) -> str:
     rows = np.repeat(claim.characteristics.original_settings, 2, axis=0)
     rows[1, -1] = 1.0
     at_begin, at_end = claim.robustness(rows, "phases of the original")
-    return "" if np.isclose(at_begin, at_end, atol=SAME) else COUNTS_STEPS
+    return "" if np.isclose(at_begin, at_end, atol=SAME_ROBUSTNESS) else COUNTS_STEPS
 
 
 def in_ranges(

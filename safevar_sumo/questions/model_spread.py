@@ -30,7 +30,7 @@ ROUNDING_TOLERANCE = 1e-5
 """Relative tolerance within which a parameter's value in the study equals its (rounded) value in
 the first set of [spread].
 """
-LEAST_DISTANCE = 0.3
+LEAST_CHANGE_SIZE = 0.3
 """Least distance from the original vehicle to which the model's error is proportional [domain
 widths]. Also near the original, a decision of the driving system may fall one step earlier or
 later.
@@ -102,13 +102,13 @@ def error_distance(study: Study, settings: FloatArray) -> FloatArray:
     proportional, shape (M,).
 
     It is the Euclidean distance, each characteristic in widths of its domain, but at least
-    `LEAST_DISTANCE`.
+    `LEAST_CHANGE_SIZE`.
     """
     characteristics = CharacteristicSet.of(study)
     changes = (settings - characteristics.original) / (
         characteristics.upper - characteristics.lower
     )
-    return np.asarray(np.maximum(np.linalg.norm(changes, axis=1), LEAST_DISTANCE))
+    return np.asarray(np.maximum(np.linalg.norm(changes, axis=1), LEAST_CHANGE_SIZE))
 
 
 def prediction_band(

@@ -27,8 +27,8 @@ from safevar_sumo.sumo.system import assemble
 N_SIMILAR_POINTS = 4
 """Number of similar points that the error about an unknown point lists."""
 FORM = "NAME=V: an axis of the study's encounters, and a number"
-PARTS = 5
-DECIMALS = 9
+PARTS_OF_RANGE = 5
+END_DECIMALS = 9
 """Number of equal parts of a searched range, and number of decimals of their ends. Limits are first
 searched up to the end of the first part, then up to the second end, and so on. Limits up to a
 larger value lie within those up to a smaller value.
@@ -173,8 +173,8 @@ def study_up_to(study: Study, end: UpperEnd) -> Study:
 
 def smaller_cuts(study: Study, end: UpperEnd | None) -> list[Study]:
     """The study cut at each value of the axis that is smaller than `end`, in ascending order. The
-    values are those of the matrix or, if the study searches a range, the ends of `PARTS` equal
-    parts. There are no such studies if `end` is None.
+    values are those of the matrix or, if the study searches a range, the ends of `PARTS_OF_RANGE`
+    equal parts. There are no such studies if `end` is None.
     """
     if end is None:
         return []
@@ -184,8 +184,8 @@ def smaller_cuts(study: Study, end: UpperEnd | None) -> list[Study]:
         values |= {*_values(study, test, name)}
     if name in study.ranges:
         domain = study.ranges[name]
-        ends = np.linspace(domain.lower, domain.upper, PARTS + 1)[1:]
-        values = {*ends.round(DECIMALS).tolist()}
+        ends = np.linspace(domain.lower, domain.upper, PARTS_OF_RANGE + 1)[1:]
+        values = {*ends.round(END_DECIMALS).tolist()}
     smaller_values = sorted(value for value in values if value < highest)
     return [study_up_to(study, UpperEnd(name, value)) for value in smaller_values]
 

@@ -30,13 +30,13 @@ from safevar_sumo.sumo.simulators import simulations_of_setting
 from safevar_sumo.sumo.system import System
 from safevar_sumo.terminal import print_text
 
-LONGEST = 900.0
+LONGEST_QUESTION = 900.0
 """A question that takes at most this time does all its simulations by default [s]. Otherwise the
 question does only as many simulations as fit into this time.
 """
 MEASURED = 2
 """Number of simulations by which the duration of a simulation is measured."""
-BATCH = 512
+TIMED_VEHICLES = 512
 """Number of vehicles in the batch that measures how long a vehicle of a list takes."""
 LEAST_SETTINGS = 3
 """Fewest settings with which a question that samples settings gives an answer."""
@@ -54,7 +54,7 @@ drives, the more a simulation costs, and the fewer simulations are done.
 """
 MOST_EFFORT = 8.0
 """Largest effort if the user allows more simulations than are usual."""
-DIGITS = 2
+TOTAL_DIGITS = 2
 """Number of digits to which a number of simulations is rounded that is derived from a time."""
 
 
@@ -250,7 +250,7 @@ class Account:
             self.effort = min(max(self.effort, effort), MOST_EFFORT)
         if seconds is None:
             return
-        longest = LONGEST / self.questions
+        longest = LONGEST_QUESTION / self.questions
         if allowance is None and expected * seconds > longest:
             self.limit = round_down(longest / seconds)
             parts = sum(spare(self.limit, self.minimum))
@@ -271,9 +271,9 @@ class Account:
 
 
 def round_down(number: float) -> int:
-    """A number of simulations, rounded down to `DIGITS` significant digits, but at least 1."""
+    """A number of simulations, rounded down to `TOTAL_DIGITS` significant digits; at least 1."""
     simulations = max(int(number), 1)
-    unit = 10 ** max(len(str(simulations)) - DIGITS, 0)
+    unit = 10 ** max(len(str(simulations)) - TOTAL_DIGITS, 0)
     return int(simulations // unit * unit)
 
 
@@ -300,9 +300,9 @@ def print_price_of_list(
     one point. It limits nothing, and the account does not count the measured simulations.
     """
     task = Task(study=study, selection=Selection(points=(len(system.points) // 2,)))
-    batch = np.repeat(system.characteristics.original_settings, BATCH, axis=0)
+    batch = np.repeat(system.characteristics.original_settings, TIMED_VEHICLES, axis=0)
     _, seconds = _timed(task, batch, pool)
-    price = _price(simulations, seconds / (BATCH * pool.workers))
+    price = _price(simulations, seconds / (TIMED_VEHICLES * pool.workers))
     print_text(Console(file=sys.stderr), f"{price}; cars that fail early take fewer")
 
 

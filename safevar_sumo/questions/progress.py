@@ -16,7 +16,7 @@ OVERRUN = 0.18
 """In a phase with an unknown number of rounds, at least this share of its simulations so far is
 expected to follow, because nobody knows whether a round is the last.
 """
-LEAST_SHARE = 0.06
+LEAST_SHARE_TO_COME = 0.06
 """In a stage, at least this share of its simulations so far is expected to follow: a failure may
 make more simulations necessary.
 """
@@ -162,7 +162,7 @@ class Phases:
         if self._is_stage:
             # The more a stage exceeds its plan, the more is expected to follow.
             excess = simulations - self._expected
-            remainder = max(remainder, excess, LEAST_SHARE * simulations)
+            remainder = max(remainder, excess, LEAST_SHARE_TO_COME * simulations)
         expected = self._done + remainder + sum(self._later.values())
         total = max(min(expected, self._most), self._done)
         if self._never_grows:

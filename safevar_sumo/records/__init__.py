@@ -6,7 +6,7 @@ from safevar_sumo.records.driving import (
     ALL_TRUE as ALL_TRUE,
     GRAVITY as GRAVITY,
     KMH_PER_MS as KMH_PER_MS,
-    LEAST_CLOSING_SPEED as LEAST_CLOSING_SPEED,
+    LEAST_COLLISION_SPEED as LEAST_COLLISION_SPEED,
     STANDSTILL as STANDSTILL,
     TIME_DECIMALS as TIME_DECIMALS,
     TIME_ROUNDING as TIME_ROUNDING,
@@ -30,7 +30,7 @@ from safevar_sumo.records.driving import (
     significant as significant,
 )
 from safevar_sumo.records.evaluations import (
-    ROUNDING as ROUNDING,
+    RESULT_ROUNDING as RESULT_ROUNDING,
     Evaluations as Evaluations,
     ResultColumns as ResultColumns,
     csv_text as csv_text,

@@ -34,7 +34,7 @@ TIME_ROUNDING = 1e-9
 """Difference below which two sums of time steps count as the same time [s]."""
 TOUCH_OVERLAP = 2e-3
 """Largest overlap of bodies that only touch [m]. SUMO ignores an overlap of a millimetre."""
-LEAST_CLOSING_SPEED = 1e-3
+LEAST_COLLISION_SPEED = 1e-3
 """Least closing speed of a collision [m/s]. The safety degree of a collision is minus its closing
 speed, and must be below 0 even if the struck body is faster than the vehicle.
 """

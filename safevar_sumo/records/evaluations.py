@@ -31,7 +31,7 @@ in place of these arrays.
 """
 ResultColumns = Mapping[str, npt.NDArray[np.generic]]
 """Results by name, as arrays with an element for each setting."""
-ROUNDING = 1e-9
+RESULT_ROUNDING = 1e-9
 """Largest difference between a result in a recorded scene and the same result in SUMO that counts
 as rounding.
 """

@@ -12,7 +12,7 @@ import numpy as np
 
 from safevar_sumo.records.driving import (
     ALL_TRUE,
-    LEAST_CLOSING_SPEED,
+    LEAST_COLLISION_SPEED,
     LENGTH_DECIMALS,
     STANDSTILL,
     TOUCH_OVERLAP,
@@ -313,7 +313,7 @@ class SimulationRuns:
         collision.
         """
         return np.maximum(
-            self.collision_speed - self.contact.speed, LEAST_CLOSING_SPEED
+            self.collision_speed - self.contact.speed, LEAST_COLLISION_SPEED
         )
 
     @cached_property

@@ -47,7 +47,7 @@ ALIASES = {
 """Names of characteristics in the published files -> names in the paper, in lower case without
 underscores.
 """
-SHARE_DECIMALS = 3
+CHANGE_SIZE_DECIMALS = 3
 """Decimals to which the published package rounds the size of a change, as a share of the domain.
 The package then compares the rounded share with beta.
 """
@@ -216,7 +216,7 @@ def package_filter(
     """
     width = characteristics.upper - characteristics.lower
     share = np.round(
-        np.abs(settings - characteristics.original) / width, SHARE_DECIMALS
+        np.abs(settings - characteristics.original) / width, CHANGE_SIZE_DECIMALS
     )
     return np.where(
         share >= characteristics.threshold / width - ROUNDING_ERROR,

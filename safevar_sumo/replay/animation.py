@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from matplotlib.patches import Patch
     from matplotlib.transforms import Affine2D
 
-WIDTH = 8.8
+FRAME_WIDTH = 8.8
 """Width of a frame [inches]."""
 PANEL_HEIGHT = 0.62
 """Height of the panel with texts above the road [inches]."""
-DPI = 100
+FRAME_DPI = 100
 """Resolution of an animation [pixels per inch]."""
 PAGE_DPI = 75
 """Resolution of an animation on a page with other animations [pixels per inch]."""
@@ -70,11 +70,11 @@ IMPACT_STYLE: Any = {
     "color": IMPACT_COLOUR,
     "markeredgecolor": TEXT_COLOUR,
 }
-MARGIN = 4.0
+FREE_SPACE = 4.0
 """Free space around the actors [m]."""
 MIN_HEIGHT = 11.0
 """Smallest height of a view [m]."""
-MAX_LENGTH = 60.0
+MAX_ROAD_LENGTH = 60.0
 """Largest length of road in a view [m]: in a longer scene a camera follows the vehicles."""
 CAMERA_LEAD = 0.45
 """Share of the view's length behind the front bumpers of the vehicles under test [-]."""
@@ -138,13 +138,13 @@ def animate(comparison: Comparison, path: str | Path) -> None:
     with whole_file(path, "animate") as file:
         if ending == ".gif":
             film, fps = film_of(comparison, MAX_FRAMES, LAST_FRAME_DURATION)
-            film.save(file, PillowWriter(fps), dpi=DPI)  # type: ignore[arg-type]
+            film.save(file, PillowWriter(fps), dpi=FRAME_DPI)  # type: ignore[arg-type]
             return
         page = template_environment().get_template("animation.html.j2")
         text = page.render(
             title=comparison.title,
             changes=comparison.changes,
-            player=player_of(comparison, 1, MAX_FRAMES, DPI),
+            player=player_of(comparison, 1, MAX_FRAMES, FRAME_DPI),
         )
         file.write_text(printable(text), encoding="utf-8", newline="\n")
 
@@ -220,9 +220,9 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
 
     bodies, turn = lay_out(comparison)
     left_ends, width, bottom, top = _choose_view(bodies)
-    height = WIDTH * (top - bottom) / width
+    height = FRAME_WIDTH * (top - bottom) / width
     full_height = PANEL_HEIGHT + height
-    figure = Figure(figsize=(WIDTH, full_height))
+    figure = Figure(figsize=(FRAME_WIDTH, full_height))
     axis = figure.add_axes(
         (0, 0, 1, height / full_height),
         facecolor=GROUND_COLOUR,
@@ -230,7 +230,7 @@ def draw_scene(comparison: Comparison) -> tuple[Figure, Callable[[int], list[Pat
         ylim=(bottom, top),
     )
     axis.spines[:].set_visible(False)
-    _draw_road(axis, comparison, turn, points=72 * WIDTH / width)
+    _draw_road(axis, comparison, turn, points=72 * FRAME_WIDTH / width)
 
     is_pair = len(comparison.rows) > 1
     patches = [
@@ -312,14 +312,14 @@ def _choose_view(bodies: Sequence[DrawnBody]) -> tuple[FloatArray, float, float,
     x, y = np.stack([(body.x, body.y) for body in bodies], axis=1)
     sizes = np.array([(body.length, body.width / 2) for body in bodies])
     length, half_width = sizes.T[:, :, None]
-    rear = np.nanmin(x - length) - MARGIN
-    front = np.nanmax(x + length) + MARGIN
-    bottom = np.nanmin(y - half_width) - MARGIN
-    top = np.nanmax(y + half_width) + MARGIN
+    rear = np.nanmin(x - length) - FREE_SPACE
+    front = np.nanmax(x + length) + FREE_SPACE
+    bottom = np.nanmin(y - half_width) - FREE_SPACE
+    top = np.nanmax(y + half_width) + FREE_SPACE
     padding = max(0.0, MIN_HEIGHT - (top - bottom)) / 2
 
     # A camera follows the vehicles where a view of all bodies is too long.
-    width = min(front - rear, MAX_LENGTH)
+    width = min(front - rear, MAX_ROAD_LENGTH)
     fronts = np.mean([body.x for body in bodies if body.is_vut], axis=0)
     left_ends = np.clip(fronts - CAMERA_LEAD * width, rear, front - width)
     return left_ends, width, bottom - padding, top + padding

@@ -28,6 +28,7 @@ from safevar_sumo.records import (
 )
 from safevar_sumo.results import UNKNOWN
 from safevar_sumo.scenarios import VUT, Point
+from safevar_sumo.scenarios.ahead import LANE_WIDTH
 from safevar_sumo.study import unit_text
 from safevar_sumo.sumo.bodies import Film
 from safevar_sumo.sumo.network import NetworkFiles, built_network, network_for
@@ -198,7 +199,6 @@ class Comparison:
 # A simulator of the user's own states no sizes: these sizes are drawn [m].
 BODY_LENGTH = 4.5
 BODY_WIDTH = 1.8
-LANE_WIDTH = 3.5
 ROAD_BEHIND = 20.0
 """How far the lane is drawn behind the vehicle of such a simulator [m]."""
 ROAD_AHEAD = 100.0

@@ -62,7 +62,7 @@ meaning and unit; the radius is in cm in both.
 """
 EGO = "Ego"
 """Name of the vehicle under test in OpenSCENARIO."""
-WHEELBASE = 0.58
+WHEELBASE_SHARE = 0.58
 """Assumed wheelbase over the length of a vehicle [-]; its two overhangs are equal."""
 HEIGHTS = {"pedestrian": 1.8, "bicycle": 1.7, "car": 1.5}
 """Assumed heights by kind of actor [m], because SUMO has no third dimension."""
@@ -104,7 +104,7 @@ class Poses(NamedTuple):
         """
         if self.kind == "pedestrian":
             return 0.0
-        return self.length * WHEELBASE / 2
+        return self.length * WHEELBASE_SHARE / 2
 
     def places(self, distance: float = 0.0) -> list[list[float]]:
         """For each sample the time [s], x, y [m] and heading [rad] of the point that is `distance`
@@ -358,7 +358,7 @@ def write_files(
             road=ROAD,
             actors=[ego, *(_with_next_place(actor) for actor in actors)],
             end=float(ego.time[-1]),
-            wheelbase=WHEELBASE,
+            wheelbase=WHEELBASE_SHARE,
         )
     make_directory(out)
     for name, text in files.items():

@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 BRAKING_MARK = "v"
 NEAREST_MARK = "o"
 IMPACT_MARK = "X"
-LINES = ("-", "--")
+LINE_STYLES = ("-", "--")
 """Line styles of the original and of the changed vehicle."""
 MAX_TTC = 6.0
 """Largest time to collision that is drawn [s]."""
 MIN_DIVERGENCE = 0.1
 """Difference in speed above which two vehicles have diverged [m/s]."""
-FONT_SIZE = 9
+TRACE_FONT_SIZE = 9
 LINE_LENGTH = 118
 """Length of a line of the heading [characters]."""
 
@@ -43,7 +43,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
     with matplotlib.style.context(
         [
             "seaborn-v0_8-whitegrid",
-            {"font.size": FONT_SIZE, "axes.labelsize": FONT_SIZE},
+            {"font.size": TRACE_FONT_SIZE, "axes.labelsize": TRACE_FONT_SIZE},
         ]
     ):
         figure = Figure(
@@ -69,7 +69,7 @@ def draw_comparison(comparison: Comparison) -> Figure:
                 trace.time[:end],
                 values[:end, row],
                 color=COLOURS[row],
-                linestyle=LINES[row],
+                linestyle=LINE_STYLES[row],
                 linewidth=1.6,
                 zorder=3 + row,
             )
@@ -95,7 +95,9 @@ def draw_comparison(comparison: Comparison) -> Figure:
         linewidth=0.9,
         linestyle=":",
     )
-    figure.suptitle(_heading(comparison).replace("$", r"\$"), fontsize=FONT_SIZE + 1)
+    figure.suptitle(
+        _heading(comparison).replace("$", r"\$"), fontsize=TRACE_FONT_SIZE + 1
+    )
     _draw_legend(figure, comparison, divergence_time)
     return figure
 
@@ -193,7 +195,7 @@ def _draw_legend(
 
     for row in comparison.rows:
         label = f"{comparison.name(row)} vehicle: {comparison.verdict(row)}"
-        add(label, color=COLOURS[row], linestyle=LINES[row])
+        add(label, color=COLOURS[row], linestyle=LINE_STYLES[row])
     marks = {"begins to brake": BRAKING_MARK, "nearest": NEAREST_MARK}
     if np.isfinite(comparison.runs.collision_speed).any():
         marks["impact"] = IMPACT_MARK

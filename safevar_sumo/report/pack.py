@@ -32,7 +32,7 @@ DESCRIPTION = "pack.json"
 FileContents = dict[str, bytes]
 """Contents of files, by their names."""
 MAX_FILES = 10_000
-MAX_EVALUATIONS = 100_000_000
+MAX_PACK_EVALUATIONS = 100_000_000
 MORE_IN_DIRECTORY = 16
 """Difference between an entry in the directory of a zip archive and the header of its file [bytes].
 """
@@ -68,7 +68,7 @@ class PackedStudy(Struct, frozen=True, forbid_unknown_fields=True):
     folder: str
     questions: list[str]
     runs: list[tuple[str, int]]
-    outcomes: dict[str, Annotated[int, Meta(ge=0, le=MAX_EVALUATIONS)]]
+    outcomes: dict[str, Annotated[int, Meta(ge=0, le=MAX_PACK_EVALUATIONS)]]
     solutions: list[int]
     unsafe: str | None
     simulations: dict[str, int]

@@ -31,7 +31,7 @@ from safevar_sumo.scenarios.euro_ncap import TESTS
 from safevar_sumo.study import Interval
 from safevar_sumo.vehicles import VEHICLES, Characteristic
 
-PARTS: Columns = {
+SHEET_PARTS: Columns = {
     "item": "characteristic of the vehicle",
     "how to measure": "how a workshop measures it",
     "limit": "values that are allowed, all limits at the same time",
@@ -41,7 +41,7 @@ PARTS: Columns = {
 UNSAID = "the study does not say"
 BLANK = "_" * 8
 """The place for a value that somebody fills in by hand."""
-DIGITS = 16
+DIGEST_DIGITS = 16
 """Number of hexadecimal digits to which the printed digest is cut."""
 
 
@@ -104,7 +104,9 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
             problem or numbers["rough"] or study.later_changes or is_screening
         ),
         "unsafe": unsafe,
-        "parts": Markup(html_table(tabulate("Items and their limits", PARTS, parts))),
+        "parts": Markup(
+            html_table(tabulate("Items and their limits", SHEET_PARTS, parts))
+        ),
         "others": unmeasured,
         "numbers": numbers,
         "claim": claim,
@@ -115,13 +117,15 @@ def sheet_of(study: ReportedStudy) -> JsonObject | None:
         "road": road,
         "in_ranges": ranges,
         "command": limits.command,
-        "digest": sha256(limits.render("json").encode()).hexdigest()[:DIGITS],
+        "digest": sha256(limits.render("json").encode()).hexdigest()[:DIGEST_DIGITS],
         "ranges": domains,
     }
 
 
 def _row_of_part(item: Characteristic, row: JsonObject | None) -> tuple[str, ...]:
-    """The row of `PARTS` about one item; `row` is its row in the table of limits, if it has one."""
+    """The row of `SHEET_PARTS` about one item. `row` is its row in the table of limits, if it has
+    one.
+    """
     name = item.meaning or item.short_name
     return (
         name[:1].upper() + name[1:],

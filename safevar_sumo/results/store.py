@@ -50,7 +50,7 @@ RunKeyT = TypeVar("RunKeyT", bound=RunName)
 """The type of the keys by which a caller names its runs: a `RunName`, or a subtype."""
 
 
-ROUNDING = 1e-6
+MACHINE_ROUNDING = 1e-6
 """Largest difference, relative or absolute, that another machine may cause in the results of the
 original vehicle.
 """
@@ -264,7 +264,7 @@ def refuse_other_original(directory: Path, stored: JsonObject, now: JsonObject) 
     Raises
     ------
     InputError
-        About the first result that differs by more than `ROUNDING`.
+        About the first result that differs by more than `MACHINE_ROUNDING`.
     """
     for name, old in stored.items():
         new = now.get(name, old)
@@ -274,7 +274,7 @@ def refuse_other_original(directory: Path, stored: JsonObject, now: JsonObject) 
             # An undefined value is None, which becomes NaN.
             values = np.array([old, new], float)
             is_same = np.allclose(
-                values[0], values[1], ROUNDING, ROUNDING, equal_nan=True
+                values[0], values[1], MACHINE_ROUNDING, MACHINE_ROUNDING, equal_nan=True
             )
         if not is_same:
             raise InputError(

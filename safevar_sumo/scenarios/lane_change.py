@@ -30,7 +30,7 @@ from safevar_sumo.scenarios.tracks import (
 )
 from safevar_sumo.study import searched
 
-CAR = BodySize(BODIES["car"].length, 1.9)
+OTHER_CAR = BodySize(BODIES["car"].length, 1.9)
 """Size of the other cars [m]. Their width is the width in the regulation."""
 BEGINS_AT = 1.0
 """Time at which the lateral movement begins [s]. Before this time, a driver can see in which lane
@@ -138,7 +138,7 @@ class CutIn(LaneChange, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """Refuse a car that is beside the vehicle before any part of the car is in its lane."""
-        enters_after = (LANE_WIDTH - CAR.width) / 2 / self.lateral_speed
+        enters_after = (LANE_WIDTH - OTHER_CAR.width) / 2 / self.lateral_speed
         closed_gap = (self.start_speed - self.first_speed) * enters_after
         if self.gap - closed_gap <= 0:
             raise InputError(
@@ -157,9 +157,9 @@ class CutIn(LaneChange, frozen=True, kw_only=True):
             0.0,
         )
         first_gap = self.gap + (self.start_speed - self.first_speed) * BEGINS_AT
-        x = first_gap + CAR.length / 2 + travelled(speed, times)
+        x = first_gap + OTHER_CAR.length / 2 + travelled(speed, times)
         y = self.sign * (LANE_WIDTH - self.moved(times))
-        return [Track("target", "car", *CAR, x, y, 1.0, 0.0, speed)]
+        return [Track("target", "car", *OTHER_CAR, x, y, 1.0, 0.0, speed)]
 
 
 class CutOut(LaneChange, frozen=True, kw_only=True):
@@ -201,7 +201,7 @@ class CutOut(LaneChange, frozen=True, kw_only=True):
         return (
             BEGINS_AT
             + self.headway
-            + (CAR.length + self.gap) / self.start_speed
+            + (OTHER_CAR.length + self.gap) / self.start_speed
             + self.time_after
         )
 
@@ -216,18 +216,25 @@ class CutOut(LaneChange, frozen=True, kw_only=True):
         # When the leader reaches the standing car, he must have left its path.
         speed = self.start_speed
         lateral_way = self.gap / self.start_speed * self.lateral_speed
-        if np.any(lateral_way < CAR.width):
+        if np.any(lateral_way < OTHER_CAR.width):
             raise InputError(
                 "",
                 f"gap = {np.min(self.gap):g} m: the leader has moved {np.min(lateral_way):.2f} m"
                 " sideways when he drives through the standing car",
-                f"{CAR.width:g} m or more: a larger gap or lateral_speed",
+                f"{OTHER_CAR.width:g} m or more: a larger gap or lateral_speed",
             )
 
-        front = self.headway * speed + CAR.length
-        x = front - CAR.length / 2 + speed * times
+        front = self.headway * speed + OTHER_CAR.length
+        x = front - OTHER_CAR.length / 2 + speed * times
         leader = Track(
-            "leader", "car", *CAR, x, self.sign * self.moved(times), 1.0, 0.0, speed
+            "leader",
+            "car",
+            *OTHER_CAR,
+            x,
+            self.sign * self.moved(times),
+            1.0,
+            0.0,
+            speed,
         )
-        standing = front + speed * BEGINS_AT + self.gap + CAR.length / 2
-        return [leader, Track.of("target", "car", standing, 0.0, size=CAR)]
+        standing = front + speed * BEGINS_AT + self.gap + OTHER_CAR.length / 2
+        return [leader, Track.of("target", "car", standing, 0.0, size=OTHER_CAR)]

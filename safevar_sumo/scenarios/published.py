@@ -40,7 +40,7 @@ from safevar_sumo.scenarios.roads import NETWORK_KEY, Frame, Roads, World
 from safevar_sumo.study import Table, searched
 
 _Positive = Annotated[float, Meta(gt=0, le=3600)]
-ROUNDING = 1e-6
+TURN_ROUNDING = 1e-6
 """How far a pedestrian may get beyond the place of the turn by rounding errors [m]."""
 VUT_LANE = "approach_0"
 """Id of the lane of the vehicle under test before the crossing."""
@@ -218,7 +218,7 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
         if self.turns_after is None:
             return Layout(self._front(roads), PEDESTRIAN, lateral, speed)
 
-        is_past = lateral > self.turns_after + ROUNDING
+        is_past = lateral > self.turns_after + TURN_ROUNDING
         turn = np.where(is_past[-1], np.argmax(is_past, axis=0), samples)
         # At the sample of the turn, the pedestrian is back at the place of two steps before.
         back = 2 * speed * step * np.maximum(times - turn + 1, 0)
@@ -259,7 +259,7 @@ class PedestrianCrossing(WorldScenario, Table, frozen=True, kw_only=True):
         lateral_speed = (lateral - memory.last_lateral) / step
         if self.turns_after is not None:
             turns_now = ~memory.has_turned & (
-                lateral + step * lateral_speed > self.turns_after + ROUNDING
+                lateral + step * lateral_speed > self.turns_after + TURN_ROUNDING
             )
             if turns_now.any():
                 world.turn_back(PEDESTRIAN, np.flatnonzero(turns_now).tolist())

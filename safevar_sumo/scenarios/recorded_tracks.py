@@ -22,19 +22,19 @@ from safevar_sumo.study import Table
 if TYPE_CHECKING:
     import pandas as pd
 
-COLUMNS = ["time", "name", "x", "y", "heading", "speed", "length", "width"]
+TRACK_COLUMNS = ["time", "name", "x", "y", "heading", "speed", "length", "width"]
 """Columns that a table of tracks must have."""
 ABOVE_ZERO = ["name", "length", "width"]
 """Columns whose values must not be empty or 0."""
-LONGEST_STEP = 2.0
+LONGEST_PAUSE = 2.0
 """Longest time between two rows of a body, as a multiple of the table's median step [-]."""
 WIDEST_PERSON = 1.2
 """Largest width of a body that may be a person, and therefore wider than long [m]."""
-APART = 1.0
+LEAST_WAY_DIFFERENCE = 1.0
 """Distance between two ways that are told from each other [m]."""
-SAME = 1e-6
+SAME_TIME = 1e-6
 """Difference up to which two times count as equal [s]."""
-DIGITS = 9
+PLACE_DECIMALS = 9
 """Decimals of places [m] and of directions. The last bits of a sine differ between machines."""
 
 
@@ -136,11 +136,14 @@ class RecordedTracks(TrackScenario, Table, dict=True, frozen=True, kw_only=True)
             if name != self.ego:
                 row_times = rows["time"].to_numpy()
                 x, y, heading, speed, length, width = (
-                    np.interp(now, row_times, rows[column]) for column in COLUMNS[2:]
+                    np.interp(now, row_times, rows[column])
+                    for column in TRACK_COLUMNS[2:]
                 )
-                place = np.round((x + 1j * y - front) / direction, DIGITS)
-                facing = np.round(np.exp(1j * heading) / direction, DIGITS)
-                is_there = (now > row_times[0] - SAME) & (now < row_times[-1] + SAME)
+                place = np.round((x + 1j * y - front) / direction, PLACE_DECIMALS)
+                facing = np.round(np.exp(1j * heading) / direction, PLACE_DECIMALS)
+                is_there = (now > row_times[0] - SAME_TIME) & (
+                    now < row_times[-1] + SAME_TIME
+                )
                 track = Track(
                     name=name,
                     kind="recorded",
@@ -190,12 +193,12 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
     _check_header(key, first_line.decode("utf-8-sig", "replace"))
 
     # The length of a name replaces the name: an empty name then is an illegal number, like others.
-    values = table[COLUMNS].assign(name=table["name"].str.len())
+    values = table[TRACK_COLUMNS].assign(name=table["name"].str.len())
     values = values.apply(pd.to_numeric, errors="coerce").astype(float)
     legal = np.isfinite(values)
     legal[ABOVE_ZERO] &= values[ABOVE_ZERO] > 0
     for row, column in np.argwhere(~legal.to_numpy())[:1]:
-        name = COLUMNS[column]
+        name = TRACK_COLUMNS[column]
         expected = "a number that is finite"
         if name in ABOVE_ZERO:
             expected = "a number above 0"
@@ -210,7 +213,7 @@ def read_tracks(file: str) -> dict[str, pd.DataFrame]:
     groups = values.groupby(table["name"], sort=False)
     bodies = {str(name): rows.sort_values("time") for name, rows in groups}
     times = values.sort_values("time").groupby(table["name"])["time"]
-    longest_step = LONGEST_STEP * times.diff().median()
+    longest_step = LONGEST_PAUSE * times.diff().median()
     for name, rows in bodies.items():
         body = f"{key}: {name}"
         _check_steps(body, rows["time"].to_numpy(), longest_step)
@@ -230,7 +233,7 @@ def _check_header(key: str, line: str) -> None:
             f"{key}: its columns are separated by {separator[0]!r}",
             "commas between columns, and points in numbers",
         )
-    for name in COLUMNS:
+    for name in TRACK_COLUMNS:
         if header.count(name) > 1:
             raise InputError(
                 "", f"{key}: the column {name!r} is there twice", "each once"
@@ -239,7 +242,7 @@ def _check_header(key: str, line: str) -> None:
             raise InputError(
                 "",
                 f"{key}: there is no column {name}",
-                f"the columns {', '.join(COLUMNS)}",
+                f"the columns {', '.join(TRACK_COLUMNS)}",
             )
 
 
@@ -256,7 +259,7 @@ def _check_headings(body: str, rows: pd.DataFrame) -> None:
         """The distance between the ways by places and by headings, over all steps [m]."""
         return float(np.abs(way - step * np.exp(1j * headings)).sum())
 
-    least = max(APART, float(np.abs(way).sum()) / 3)
+    least = max(LEAST_WAY_DIFFERENCE, float(np.abs(way).sum()) / 3)
     for meaning, degrees in (
         ("degrees", heading),
         ("degrees clockwise from y", 90.0 - heading),
@@ -276,7 +279,7 @@ def _check_steps(body: str, times: FloatArray, longest: float) -> None:
         raise InputError(
             "", f"{body} has two rows at {times[row]:g} s", "one row at a time"
         )
-    for row in np.flatnonzero(steps > longest + SAME)[:1]:
+    for row in np.flatnonzero(steps > longest + SAME_TIME)[:1]:
         raise InputError(
             "",
             f"{body} has no row from {times[row]:g} to {times[row + 1]:g} s",

@@ -62,7 +62,7 @@ MOST_DECELERATION = 20.0
 """Largest deceleration that a trace may show in any case [m/s^2]. A trace with a harder braking may
 show this braking, too.
 """
-SLACK = 0.1
+ROUNDING_SLACK = 0.1
 """Largest rounding error of distances [m] and of speeds [m/s]."""
 CREEPS = 1.0
 """Speed below which a vehicle has stopped [m/s]."""
@@ -176,10 +176,10 @@ def _contradiction(
         finite = separation[np.isfinite(separation)]
         reach = (speed.max() + braked + np.abs(obstacle_speeds).max()) * step
         reach += np.abs(np.diff(finite)).max(initial=0.0)
-        if finite.size and finite.min() > reach + SLACK:
+        if finite.size and finite.min() > reach + ROUNDING_SLACK:
             return f"a collision at a separation of {significant(finite.min(), 3)} m"
         impact = ends[IMPACT_SPEED]
-        if np.abs(speed - impact).min() > braked + SLACK:
+        if np.abs(speed - impact).min() > braked + ROUNDING_SLACK:
             last = significant(speed[-1], 3)
             return f"{IMPACT_SPEED} = {significant(impact, 3)} after a speed of {last}"
         return ""

@@ -9,17 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from safevar_sumo.records import BoolArray, FloatArray, significant
+from safevar_sumo.records import KMH_PER_MS, BoolArray, FloatArray, significant
 
-CREEPS = 1.0
+MOVING_SPEED = 1.0
 """Speed up to which a vehicle does not move, or hardly [m/s]."""
-SHARE = 0.3
+UNEXPLAINED_SHARE = 0.3
 """Share of a way that speeds may leave unexplained: a gap may be measured beside the path."""
-MOST = 0.5
+WRONG_STEPS = 0.5
 """Share of the steps in which a mistake shows. In fewer steps, an obstacle may turn away."""
 SPEED_ERROR = 0.1
 """Relative error that speeds may have: they may be those of slipping wheels."""
-APART = 1.0
+ALLOWED_WAY = 1.0
 """Way that speeds may leave unexplained in any case [m]; also the largest change of the gap in one
 step that cannot be the change to another obstacle.
 """
@@ -27,8 +27,6 @@ UNLIKE = 3.0
 """A step with so many times the usual unexplained way is unlike the others: the gap is then that of
 another obstacle.
 """
-KMH = 3.6
-"""A speed in km/h over the same speed in m/s."""
 LEAST_LAG = 0.05
 """Smallest sum of unexplained ways that is a reason to look for a lag [m]."""
 EXPLAINED = 0.1
@@ -85,12 +83,12 @@ class Ways(NamedTuple):
         """The steps in which the vehicle moves, except those in which another body becomes the
         obstacle, shape (T - 1,).
         """
-        moves = np.isfinite(self.way) & (_ends(self.speed)[1] > CREEPS)
+        moves = np.isfinite(self.way) & (_ends(self.speed)[1] > MOVING_SPEED)
         if not moves.any():
             return moves
         unexplained = np.abs(self.unexplained())
         usual = float(np.median(unexplained[moves]))
-        return moves & (unexplained <= UNLIKE * usual + APART)
+        return moves & (unexplained <= UNLIKE * usual + ALLOWED_WAY)
 
     def disagree(self) -> bool:
         """Whether the speeds do not explain the way, in most steps and in their sum."""
@@ -100,11 +98,13 @@ class Ways(NamedTuple):
         unexplained = self.unexplained()[compared]
         fastest = np.max(np.abs(self.closing_speeds()), axis=0) * self.step
         largest_way = np.maximum(np.abs(self.way), fastest)[compared]
-        in_most = np.mean(np.abs(unexplained) > SHARE * largest_way) > MOST
+        in_most = (
+            np.mean(np.abs(unexplained) > UNEXPLAINED_SHARE * largest_way) > WRONG_STEPS
+        )
         driven = np.maximum(np.abs(self.speed), np.abs(self.obstacle_speed))[1:]
         allowed = max(
-            APART,
-            SHARE * float(largest_way.sum()),
+            ALLOWED_WAY,
+            UNEXPLAINED_SHARE * float(largest_way.sum()),
             SPEED_ERROR * float(driven[compared].sum()) * self.step,
         )
         return bool(in_most and abs(float(unexplained.sum())) > allowed)
@@ -152,8 +152,8 @@ def contradiction_of_speeds(
             continue
         expected = RULES[ways.name]
         compared = ways.compared()
-        own_in_ms = ways._replace(speed=ways.speed / KMH)
-        both_in_ms = own_in_ms._replace(obstacle_speed=ways.obstacle_speed / KMH)
+        own_in_ms = ways._replace(speed=ways.speed / KMH_PER_MS)
+        both_in_ms = own_in_ms._replace(obstacle_speed=ways.obstacle_speed / KMH_PER_MS)
         for in_ms in (own_in_ms, both_in_ms):
             unexplained = np.abs(in_ms.unexplained()[compared])
             if unexplained.sum() < NEARLY_ALL * np.abs(ways.way[compared]).sum():

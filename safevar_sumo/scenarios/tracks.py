@@ -54,7 +54,7 @@ BODIES = {
     "car": BodySize(4.023, 1.712),
 }
 """Bounding boxes of Euro NCAP's targets, including riders, by kind [m]."""
-MAX_LENGTH = 100.0
+MAX_VEHICLE_LENGTH = 100.0
 """Largest length or width of a vehicle [m]."""
 PERSONS = ("adult", "child")
 """Kinds of bodies that are persons in SUMO; all others are vehicles."""
@@ -203,9 +203,9 @@ def check_tracks(
 
 LEGAL_FIELDS = {
     "start_speed": Legal(0.0, MAX_TEST_SPEED),
-    "vut_length": Legal(0.0, MAX_LENGTH, is_open=True),
-    "vut_width": Legal(0.0, MAX_LENGTH, is_open=True),
-    "sensor_setback": Legal(0.0, MAX_LENGTH),
+    "vut_length": Legal(0.0, MAX_VEHICLE_LENGTH, is_open=True),
+    "vut_width": Legal(0.0, MAX_VEHICLE_LENGTH, is_open=True),
+    "sensor_setback": Legal(0.0, MAX_VEHICLE_LENGTH),
 }
 """Legal numbers of fields of a user's scenario of tracks, in addition to the fields of every
 scenario.

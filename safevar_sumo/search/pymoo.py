@@ -85,7 +85,7 @@ TYPES: Parameters = {
     "F": float | list[float],
 }
 """Types of arguments whose default value in pymoo does not show the type."""
-HIDDEN = {
+HIDDEN_ARGUMENTS = {
     "verb_log",
     "cmaes_verbose",
     "maxfevals",
@@ -365,7 +365,7 @@ def _plain_arguments(name: str) -> Parameters:
     return {
         argument: parameter.default
         for argument, parameter in arguments.items()
-        if argument not in HIDDEN
+        if argument not in HIDDEN_ARGUMENTS
         and (
             argument in TYPES or isinstance(parameter.default, bool | int | float | str)
         )

@@ -22,12 +22,12 @@ counts, whatever the last bit of its position is.
 """
 LEAST_SINE = 1e-9
 """Sine of an angle above which a body is rotated against the lane [-]."""
-NOBODY = Track("", SCREEN, 0.0, 0.0, 1e6, 1e6, 1.0, 0.0, 0.0)
+FAR_BODY = Track("", SCREEN, 0.0, 0.0, 1e6, 1e6, 1.0, 0.0, 0.0)
 """A body far away. It fills the place of a body that other scenarios of the same batch have, but
 this scenario lacks.
 """
 Sampled = TypeVar("Sampled", FloatArray, BoolArray)
-BESIDE = 1
+BESIDE_LEVEL = 1
 """Level of a body that moves beside the vehicle's path; the level of scenery is 0."""
 IN_PATH = 2
 """Level of a body that is ever in the vehicle's path."""
@@ -56,8 +56,8 @@ class Moving(NamedTuple):
         path for good, or is gone for good; whether it has entered the path and is in it at the end,
         so that a vehicle that is never faster than the body again has avoided it.
     level
-        `IN_PATH`, `BESIDE` (moves beside the path) or 0 (stands beside the path). Only the bodies
-        with the highest level of an encounter count. Below 0 for a body that is never met.
+        `IN_PATH`, `BESIDE_LEVEL` (moves beside the path) or 0 (stands beside the path). Only the
+        bodies with the highest level of an encounter count. Below 0 for a body that is never met.
     is_rotated, faces_along
         Whether the body is rotated against the lane at any sample; whether it faces along the lane
         at all samples.
@@ -113,7 +113,7 @@ class Moving(NamedTuple):
         # With this sign `lateral` rises while a body crosses, from whichever side it comes.
         sign = np.where((vy > 0).any(axis=0), 1.0, -1.0)
         moves = (is_there & (track.speed > 0)).any(axis=0)
-        level = np.where(is_in_path.any(axis=0), IN_PATH, BESIDE * moves)
+        level = np.where(is_in_path.any(axis=0), IN_PATH, BESIDE_LEVEL * moves)
         if track.kind == SCREEN:
             level = np.full_like(level, -1)
         return cls(
@@ -201,7 +201,7 @@ def tracks_of(
     ]
     for tracks in tracks_of_scenarios:
         check_shapes(tracks, len(times), n_encounters, step)
-    of_bodies = zip_longest(*tracks_of_scenarios, fillvalue=NOBODY)
+    of_bodies = zip_longest(*tracks_of_scenarios, fillvalue=FAR_BODY)
     width = n_encounters if len(points) > 1 else 1
     joined = [_joined(tracks, width) for tracks in of_bodies]
     for track in joined:
@@ -222,5 +222,5 @@ def _joined(tracks: Sequence[Track], width: int) -> Track:
             np.broadcast_to(part, (length, max(width, part.shape[1]))) for part in parts
         ]
         columns.append(slim(np.concatenate(widened, axis=1)))
-    body = next(track for track in tracks if track is not NOBODY)
+    body = next(track for track in tracks if track is not FAR_BODY)
     return Track(body.name, body.kind, *columns)

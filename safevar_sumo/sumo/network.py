@@ -29,6 +29,7 @@ from safevar_sumo.errors import (
     missing_extra,
 )
 from safevar_sumo.output import temporary_folder
+from safevar_sumo.plugins.files import DIGEST_LENGTH
 from safevar_sumo.scenarios import Lane, Scenario
 from safevar_sumo.scenarios.base import XmlChanges
 from safevar_sumo.scenarios.roads import lane_through
@@ -45,16 +46,12 @@ LEGAL_FOLDERS = (
     f"a folder with a recipe of netconvert (*{RECIPE_ENDING}) or a *{NETWORK_ENDING}, "
     f"beside {TRAFFIC_FILE} and {OPTIONS_FILE}"
 )
-NETWORK_KEY = "scenario.parameters.network"
-"""Key of a study that names the network, as errors about a missing network state it."""
 SOURCE_OPTION = re.compile(
     r"sumo-net-file|(osm|opendrive|node|edge|connection|type|tllogic|polygon|additional)-files"
 )
 """Options that name files to read: all such options of netconvert, and those of SUMO except the
 network and its traffic.
 """
-DIGEST_LENGTH = 16
-"""Number of characters of a digest that are used."""
 MESSAGE_LENGTH = 500
 """Number of characters of a program's message that are used."""
 Changes = tuple[tuple[str, tuple[tuple[str, str], ...] | None], ...]

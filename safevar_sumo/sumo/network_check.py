@@ -22,10 +22,10 @@ from safevar_sumo.errors import (
     subject,
 )
 from safevar_sumo.scenarios import VUT
+from safevar_sumo.scenarios.roads import NETWORK_KEY
 from safevar_sumo.sumo.copies import ensure_cached, parse_seconds, parse_xml
 from safevar_sumo.sumo.engine import STEP_LENGTH, as_arguments, open_world, own_options
 from safevar_sumo.sumo.network import (
-    NETWORK_KEY,
     OPTIONS_FILE,
     TRAFFIC_FILE,
     NetworkFiles,
@@ -40,7 +40,7 @@ from safevar_sumo.sumo.network import (
 
 SHORTEST_STEP = 0.001
 """SUMO's shortest time step [s]."""
-LONGEST_STEP = 1.0
+LONGEST_REACTION_STEP = 1.0
 """Longest time step in which a vehicle can still react in time [s]."""
 MAX_SLOPE = 0.005
 """Largest difference in height over the length of a lane that counts as level [-]."""
@@ -109,8 +109,8 @@ SWITCHED_OFF = "-1"
 TRUE_VALUES = ("1", "yes", "true", "on", "x", "t")
 """Words that mean true in SUMO's options."""
 LEGAL_OPTIONS = (
-    f"a step-length from {SHORTEST_STEP:g} to {LONGEST_STEP:g} [s], no remote-port, all traffic in"
-    f" {TRAFFIC_FILE}: safevar_sumo starts SUMO itself"
+    f"a step-length from {SHORTEST_STEP:g} to {LONGEST_REACTION_STEP:g} [s], no remote-port, all"
+    f" traffic in {TRAFFIC_FILE}: safevar_sumo starts SUMO itself"
 )
 LEGAL_VUT = (
     f"type {VUT!r}, a vType of its own, which each setting changes; depart 0; no stops: its ADS"
@@ -227,7 +227,9 @@ def _check_files(network: NetworkFiles) -> None:
         **options_in(network.path(OPTIONS_FILE)),
     }
     is_legal_step = (
-        SHORTEST_STEP <= (parse_seconds(options["step-length"]) or 0.0) <= LONGEST_STEP
+        SHORTEST_STEP
+        <= (parse_seconds(options["step-length"]) or 0.0)
+        <= LONGEST_REACTION_STEP
     )
     if (
         "remote-port" in options

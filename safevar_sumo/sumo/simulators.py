@@ -29,7 +29,7 @@ from safevar_sumo.plugins.process import (
 )
 from safevar_sumo.plugins.time_limit import end_if_longer
 from safevar_sumo.records import (
-    LEAST_CLOSING_SPEED,
+    LEAST_COLLISION_SPEED,
     NO_CONTACT,
     QUANTITIES,
     Encounter,
@@ -306,7 +306,7 @@ def _runs_of(
     impact = np.where(
         np.isnan(number(IMPACT_SPEED)), -number(SAFETY_DEGREE), number(IMPACT_SPEED)
     )
-    closing_speed = np.maximum(impact - struck, LEAST_CLOSING_SPEED)
+    closing_speed = np.maximum(impact - struck, LEAST_COLLISION_SPEED)
     stated = {name: number(name, rigs) for name in system.measuring.measures}
     stated["impact_speed"] = np.where(collided, closing_speed, np.nan)
     stated["impact_excess"] = np.where(

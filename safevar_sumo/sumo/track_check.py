@@ -19,9 +19,9 @@ MOST_SPEED = 100.0
 """Largest speed of a body [m/s]; a faster change of its place is a jump."""
 UNIT_TOLERANCE = 1e-6
 """Largest difference of a direction's length from 1 [-]."""
-LANE = 4.0
+WIDE_LANE = 4.0
 """Width of a wide lane [m]."""
-APART = 1.0
+LEAST_MISPLACEMENT = 1.0
 """Smallest distance of a body from the place where its speed takes it that can be an error [m]. The
 distance is an error if it is more than this, and more than a third of the body's way.
 """
@@ -129,8 +129,8 @@ def check_motion(track: Track, times: FloatArray, step: float) -> None:
     longer_along = np.maximum(*np.abs(along))
     longer_way = np.hypot(longer_along, np.maximum(*np.abs(across)))
     for (way, driven), axis, longer, least in (
-        (along, "x", longer_along, APART),
-        (across, "y", longer_way, LANE),
+        (along, "x", longer_along, LEAST_MISPLACEMENT),
+        (across, "y", longer_way, WIDE_LANE),
     ):
         refuse(
             np.abs(way - driven) > np.maximum(least, longer / 3),

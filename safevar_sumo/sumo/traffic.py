@@ -37,9 +37,9 @@ APPROACH_SPEED = 0.5
 """Closing speed above which a vehicle approaches a body ahead [m/s]. A vehicle has avoided a body
 that it approached as soon as it is never faster than this body again.
 """
-LEAST_DISTANCE = 1e-9
+LEAST_DISTANCE_DIVISOR = 1e-9
 """Lower bound of a distance that is a divisor [m]."""
-LEAST_CLOSING_SPEED = 0.1
+LEAST_CLOSING_DIVISOR = 0.1
 """Lower bound of a closing speed that is a divisor [m/s]."""
 OVERTIME = 30.0
 """Time by which a run is extended if its vehicle would touch somebody within this time [s]."""
@@ -47,14 +47,14 @@ STEADY = 0.05
 """Closing speed up to which a vehicle only follows a body, and does not close in on it [m/s]."""
 LANE = Frame((0.0, 0.0), (1.0, 0.0))
 """Coordinates of the vehicle's lane: tracks state positions in these coordinates."""
-BLOCK = 16_384
+DISTANCES_AT_ONCE = 16_384
 """Number of distances that are computed at once: as many as fit into a processor's cache."""
-NOBODY = -1
+NO_BODY = -1
 """Number that stands for "the vehicle has struck no body"."""
 # Penalties on the gap of a body that is beside the vehicle's way, hidden, passed, or scenery [m].
 # The vehicle sees the body with the least gap and penalty.
 OFF_THE_WAY = 1e4
-HIDDEN = 1e5
+FAR_AWAY = 1e5
 PASSED = 1e6
 NOT_MET = 1e7
 
@@ -90,7 +90,7 @@ class Traffic:
         self._points = points
         self._n_encounters = n_encounters
         self._sample = 0
-        self._struck = np.full(self.n, NOBODY)
+        self._struck = np.full(self.n, NO_BODY)
         self._place(n_samples)
         self._ended = np.zeros((len(self._bodies), n_samples, self.n), dtype=bool)
         # A body outside the path at the start counts as approached when it comes into the path.
@@ -254,7 +254,7 @@ class Traffic:
             rank = (
                 view.gap
                 + OFF_THE_WAY * ~self._is_in_way(view)
-                + HIDDEN * ~view.visible
+                + FAR_AWAY * ~view.visible
                 + PASSED * view.is_passed
                 + NOT_MET * ~is_counted
             )
@@ -277,7 +277,7 @@ class Traffic:
         body = self._bodies[view.body]
         lateral = self._at_sample(body.track.y)
         drift = self._at_sample(body.vy)
-        closing = np.maximum(view.closing, LEAST_CLOSING_SPEED)
+        closing = np.maximum(view.closing, LEAST_CLOSING_DIVISOR)
         time_to_arrival = np.maximum(view.gap, 0.0) / closing
         lateral_at_arrival = lateral + drift * time_to_arrival
         reach = self.width / 2 + self._at_sample(body.half_width)
@@ -295,7 +295,7 @@ class Traffic:
         body, by vehicle number. Vehicles whose runs have ended (not `is_open`) are left out.
         """
         self._sample = sample
-        self._struck = np.full(self.n, NOBODY)
+        self._struck = np.full(self.n, NO_BODY)
         foremost = front.max()
         rear = front - self.length
         for number in self._encountered:
@@ -305,13 +305,13 @@ class Traffic:
                 continue
             is_level = (front > edge) & (rear < self._at_sample(body.far_end))
             may_touch = is_level & self._at_sample(body.is_in_path)
-            vehicles = np.flatnonzero(may_touch & is_open & (self._struck == NOBODY))
+            vehicles = np.flatnonzero(may_touch & is_open & (self._struck == NO_BODY))
             if vehicles.size:
                 vehicle = self._vehicle_body(front[vehicles], speed[vehicles])
                 overlaps = find_overlaps(vehicle, self._body(number, vehicles))
                 self._struck[vehicles[overlaps > TOUCH]] = number
 
-        touched = np.flatnonzero(self._struck != NOBODY)
+        touched = np.flatnonzero(self._struck != NO_BODY)
         return dict(zip(touched.tolist(), speed[touched].tolist(), strict=True))
 
     def bodies(
@@ -353,7 +353,7 @@ class Traffic:
         shrinks, at all samples of a trace. The trace's positions are the vehicles' fronts.
         """
         shape = trace.speed.shape
-        n_rows = max(BLOCK // trace.speed.shape[1], 1)
+        n_rows = max(DISTANCES_AT_ONCE // trace.speed.shape[1], 1)
         distance = np.full(shape, np.inf)
         closing = nans(shape)
         in_conflict = np.zeros(shape, bool)
@@ -395,7 +395,7 @@ class Traffic:
         separation = dx
         if dy.any():
             separation = np.sqrt(dx * dx + dy * dy)
-        divisor = np.maximum(separation, LEAST_DISTANCE)
+        divisor = np.maximum(separation, LEAST_DISTANCE_DIVISOR)
         rate = (closing_along - parting_across) / divisor
         if body.is_rotated:
             columns = (self._at_samples(column, samples) for column in body.track[2:])

@@ -13,7 +13,7 @@ import numpy as np
 
 from safevar_sumo.errors import InputError, SimulationError
 from safevar_sumo.records import (
-    ROUNDING,
+    RESULT_ROUNDING,
     FloatArray,
     IntArray,
     Outcome,
@@ -150,7 +150,7 @@ def _compare(system: System, settings: FloatArray, runs: SimulationRuns) -> None
     recorded["collision"] = collision
     for name, values in recorded.items():
         differs = trace.active & ~np.isclose(
-            in_sumo[name], values, rtol=0, atol=ROUNDING, equal_nan=True
+            in_sumo[name], values, rtol=0, atol=RESULT_ROUNDING, equal_nan=True
         )
         # `collision_speed` is NaN in an invalid test, also if the vehicle has hit somebody.
         if name == "collision":

@@ -22,6 +22,8 @@ from safevar_sumo.records import (
     nans,
 )
 
+WHEELS = 4
+"""Number of wheels of a vehicle."""
 Positive = Annotated[float, Meta(gt=0, le=1e5)]
 """A model's parameter above 0."""
 

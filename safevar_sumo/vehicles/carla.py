@@ -30,6 +30,7 @@ from safevar_sumo.vehicles.base import (
     LEVEL,
     MASS,
     SECONDS,
+    WHEELS,
     Characteristics,
     Plausible,
     Positive,
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
 
 RPM = 2 * math.pi / 60  # rad/s per r/min
 ENGINE_INERTIA = 1.0  # kg m^2; PxVehicleEngineData.mMOI, CARLA's default
-WHEELS = 4
 WHEEL_MASS = 20.0  # kg each; PxVehicleWheelData.mMass
 AIR_DENSITY = 1.2  # kg/m^3
 FRONTAL_AREA = 2.2  # m^2, of the LincolnMkz2017

@@ -15,7 +15,7 @@ import numpy as np
 from safevar_sumo.records import FloatArray, FloatOrArray
 from safevar_sumo.vehicles.compiled import compiled, equation
 
-BLOCK = 64
+VEHICLES_SIDE_BY_SIDE = 64
 """Number of vehicles side by side: LLVM computes several at once, and a block stays in the
 processor's first cache.
 """
@@ -302,15 +302,15 @@ def advance(
     n = states.shape[1]
     # A block has 16 rows of `Car`, 8 of `CarlaState` and 2 of commands. Columns without a vehicle
     # are 1, so that no equation divides by 0.
-    block = np.ones((26, BLOCK))
-    for start in range(0, n, BLOCK):
-        count = min(BLOCK, n - start)
+    block = np.ones((26, VEHICLES_SIDE_BY_SIDE))
+    for start in range(0, n, VEHICLES_SIDE_BY_SIDE):
+        count = min(VEHICLES_SIDE_BY_SIDE, n - start)
         block[:16, :count] = cars[:, start : start + count]
         block[16:24, :count] = states[:, start : start + count]
         block[24:, :count] = commands[:, start : start + count]
         for _ in range(substeps):
             # All columns are computed, even without a vehicle: a fixed number is faster.
-            for i in range(BLOCK):
+            for i in range(VEHICLES_SIDE_BY_SIDE):
                 column = block[:, i]
                 car = car_in(column)
                 s = move(car, law, state_in(column), column[24], column[25])

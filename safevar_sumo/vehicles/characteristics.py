@@ -30,7 +30,7 @@ from safevar_sumo.study import (
 
 PLAUSIBLE_MULTIPLE = 1000.0
 """Values beyond this multiple of the domain's largest magnitude count as typos."""
-ROUNDING = 1e-6
+DIGIT_ROUNDING = 1e-6
 """Difference from a rounded value, in units of its last digit, that counts as a rounding error."""
 FILTER_SHARES = ((1000.0, 0.01), (100.0, 0.02), (1.0, 0.04), (0.0, 0.08))
 """Pairs of a width and a share beta. The first pair whose width a domain reaches gives its beta:
@@ -134,10 +134,10 @@ class Characteristic(CharacteristicTable, frozen=True, kw_only=True):
         """
         scale = 10**self.digits
         if upwards:
-            rounded = math.ceil(value * scale - ROUNDING) / scale
+            rounded = math.ceil(value * scale - DIGIT_ROUNDING) / scale
             is_beyond = rounded > self.original >= value
         else:
-            rounded = math.floor(value * scale + ROUNDING) / scale
+            rounded = math.floor(value * scale + DIGIT_ROUNDING) / scale
             is_beyond = rounded < self.original <= value
         return self.original if is_beyond else rounded
 

@@ -25,6 +25,7 @@ from safevar_sumo.vehicles.base import (
     LEVEL,
     MASS,
     SECONDS,
+    WHEELS,
     Characteristics,
     Plausible,
     Slope,
@@ -34,11 +35,12 @@ from safevar_sumo.vehicles.base import (
 
 RPM_PER_RAD_S = 30 / math.pi  # r/min per rad/s
 RADIANS = math.pi / 180  # rad per degree
-WHEELS = 4
-GEAR_RATIOS = np.array([4.17, 3.14, 2.11, 1.67, 1.28, 1.0, 0.84, 0.67])  # VehicleSMI
-FIRST_GEAR = 1.0
-LAST_GEAR = float(len(GEAR_RATIOS))
-FINAL_RATIO = 2.56  # VehicleSMI
+LGSVL_GEAR_RATIOS = np.array(
+    [4.17, 3.14, 2.11, 1.67, 1.28, 1.0, 0.84, 0.67]
+)  # VehicleSMI
+LGSVL_FIRST_GEAR = 1.0
+LAST_GEAR = float(len(LGSVL_GEAR_RATIOS))
+LGSVL_FINAL_RATIO = 2.56  # VehicleSMI
 SHIFT_DELAY = 0.7  # s, minimum time between two shifts; VehicleSMI
 # Engine speeds above and below which the gearbox shifts, over maxRpm (assumption).
 SHIFT_UP = 0.33
@@ -58,14 +60,14 @@ SLIDING_SLIP = 0.8
 SLIDING_FRICTION = 0.5
 SLIDING_RANGE = SLIDING_SLIP - PEAK_SLIP
 FRICTION_LOSS = 1 - SLIDING_FRICTION
-FRICTION = 1.0  # at the extremum
+LGSVL_FRICTION = 1.0  # at the extremum
 # m/s, smallest speed by which a slip speed is divided (assumption, as in PhysX).
 SLIP_FLOOR = 4.0
 # m/s, smallest rim speed with which the slip limit of the traction control is multiplied.
 LEAST_RIM_SPEED = 1e-3
 # m/s, below which locked wheels hold the vehicle (assumption).
-HOLD_SPEED = 0.05
-WHEELBASE = 2.85  # m
+LGSVL_HOLD_SPEED = 0.05
+LGSVL_WHEELBASE = 2.85  # m
 # Errors at the start that the lane keeping corrects (assumption): without them the steering angle
 # would have no effect.
 LATERAL_ERROR = 0.10  # m
@@ -73,7 +75,7 @@ HEADING_ERROR = 0.01  # rad
 LATERAL_GAIN = 0.02  # rad/m
 HEADING_GAIN = 0.35  # rad/rad
 # Torques over maxMotorTorque (assumption).
-TORQUE_IDLE = 0.4
+LGSVL_TORQUE_IDLE = 0.4
 TORQUE_BEND = 2.4
 SUBSTEPS = 2
 
@@ -195,7 +197,7 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             weight=c["mass"] * slope.down,
             body=c["mass"] + self.wheel_mass_share * WHEELS * c["wheelMass"],
             slope_deceleration=slope.back,
-            standstill=HOLD_SPEED,
+            standstill=LGSVL_HOLD_SPEED,
             radius=c["radius"],
             inertia=inertia,
             damping=WHEELS * self.wheel_damping_share * c["wheelDamping"],
@@ -207,7 +209,7 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             rolling_drag=c["tireDragCoeff"],
             shift_time=c["shiftTime"],
             slip_limit=c["tractionControlSlipLimit"],
-            friction=FRICTION * road_friction,
+            friction=LGSVL_FRICTION * road_friction,
         )
 
         # On a slope even locked wheels creep, with the slip whose tyre force balances the slope:
@@ -217,26 +219,26 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             np.zeros_like(prepared.mass),
             np.abs(prepared.body * prepared.slope_deceleration),
         )
-        return prepared._replace(standstill=HOLD_SPEED + creep_speed)
+        return prepared._replace(standstill=LGSVL_HOLD_SPEED + creep_speed)
 
     def sumo_type(self, prepared: _Prepared) -> SumoType:
         p = prepared
         grip = p.friction * p.weight
-        drive = p.motor_torque * (GEAR_RATIOS[0] * FINAL_RATIO) / p.radius
+        drive = p.motor_torque * (LGSVL_GEAR_RATIOS[0] * LGSVL_FINAL_RATIO) / p.radius
         return SumoType(
             mass=p.mass,
             accel=np.minimum(drive, grip) / p.mass,
             decel=np.minimum(p.brake_torque / p.radius, grip) / p.mass,
             max_speed=p.largest_rpm
             / RPM_PER_RAD_S
-            / (GEAR_RATIOS[-1] * FINAL_RATIO)
+            / (LGSVL_GEAR_RATIOS[-1] * LGSVL_FINAL_RATIO)
             * p.radius,
             actuator_lag=np.full_like(p.mass, p.step + self.pedal_lag),
         )
 
     def at_rest(self, prepared: _Prepared) -> LgsvlState:
         zeros = np.zeros_like(prepared.mass)
-        first_ratio = zeros + GEAR_RATIOS[0]
+        first_ratio = zeros + LGSVL_GEAR_RATIOS[0]
         return LgsvlState(
             speed=zeros,
             wheel_speed=zeros,
@@ -267,13 +269,13 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         wheel_speed = _rim_at(p, speed, force) / p.radius
 
         gear = zeros + 1
-        for lower_ratio in GEAR_RATIOS[:-1]:
+        for lower_ratio in LGSVL_GEAR_RATIOS[:-1]:
             rpm = p.least_rpm + wheel_speed * (
-                lower_ratio * FINAL_RATIO * RPM_PER_RAD_S
+                lower_ratio * LGSVL_FINAL_RATIO * RPM_PER_RAD_S
             )
             gear += rpm > SHIFT_UP * p.largest_rpm
-        ratio = GEAR_RATIOS[gear.astype(np.intp) - 1]
-        gearing = ratio * FINAL_RATIO
+        ratio = LGSVL_GEAR_RATIOS[gear.astype(np.intp) - 1]
+        gearing = ratio * LGSVL_FINAL_RATIO
 
         engine_rpm = p.least_rpm + wheel_speed * gearing * RPM_PER_RAD_S
         full_torque = (
@@ -315,7 +317,7 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             heading=heading,
         )
 
-        gearing = _ratio(p, state) * FINAL_RATIO
+        gearing = _ratio(p, state) * LGSVL_FINAL_RATIO
         for _ in range(SUBSTEPS):
             state = _roll(p, state, gearing, cornering_drag)
         return state._replace(since_shift=state.since_shift + p.step)
@@ -333,7 +335,7 @@ class Lgsvl(Vehicle, Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             self.steering_design_angle * RADIANS
         )
         angle = np.minimum(np.maximum(share, -1.0), 1.0) * p.steering
-        curvature = angle / WHEELBASE
+        curvature = angle / LGSVL_WHEELBASE
         heading = s.heading + s.speed * curvature * p.step
         lateral = s.lateral + s.speed * p.step * 0.5 * (s.heading + heading)
         # The lateral force is m v^2 curvature. Its share `angle` points back; divided by v, it is a
@@ -348,7 +350,7 @@ def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
     rpm_share = s.engine_rpm / p.largest_rpm
     is_ready = s.since_shift >= SHIFT_DELAY
     up = is_ready & (rpm_share > SHIFT_UP) & (s.gear < LAST_GEAR)
-    down = is_ready & (rpm_share < SHIFT_DOWN) & (s.gear > FIRST_GEAR)
+    down = is_ready & (rpm_share < SHIFT_DOWN) & (s.gear > LGSVL_FIRST_GEAR)
     shifts = up | down
     if not np.count_nonzero(shifts):
         return s
@@ -356,7 +358,9 @@ def _shift(p: _Prepared, s: LgsvlState) -> LgsvlState:
     return s._replace(
         gear=gear,
         old_ratio=np.where(shifts, _ratio(p, s), s.old_ratio),
-        new_ratio=np.where(shifts, GEAR_RATIOS[gear.astype(np.intp) - 1], s.new_ratio),
+        new_ratio=np.where(
+            shifts, LGSVL_GEAR_RATIOS[gear.astype(np.intp) - 1], s.new_ratio
+        ),
         since_shift=np.where(shifts, 0.0, s.since_shift),
     )
 
@@ -434,7 +438,7 @@ def _torque_share(rpm_share: FloatArray) -> FloatArray:
     """Engine torque over maxMotorTorque, from the engine speed over maxRpm: a parabola up to
     maxRpm, and 0 from maxRpm on (assumption).
     """
-    torque_share = TORQUE_IDLE + TORQUE_BEND * rpm_share * (1.0 - rpm_share)
+    torque_share = LGSVL_TORQUE_IDLE + TORQUE_BEND * rpm_share * (1.0 - rpm_share)
     torque_share[rpm_share >= 1.0] = 0.0
     return torque_share
 

@@ -13,7 +13,7 @@ from safevar_sumo.records import BoolArray, FloatArray, Quantity
 from safevar_sumo.study import Constraint, Study, unit_text
 from safevar_sumo.vehicles.characteristics import CharacteristicSet
 
-SLACK = 1e-9
+BOUND_SLACK = 1e-9
 """Largest violation of bounds that counts as a rounding error, as a share of `_BoundedSum.width`
 [-].
 """
@@ -25,7 +25,7 @@ LARGEST_DRAW = 10_000
 """Largest number of settings that are drawn at once, unless more are missing."""
 N_PROBES = 10_000
 """Number of random settings that show whether random settings can be drawn."""
-LEAST_SHARE = 0.002
+LEAST_FEASIBLE_SHARE = 0.002
 """Share of these settings that has to be feasible."""
 
 
@@ -91,7 +91,7 @@ class FeasibleRegion:
         excess = np.zeros(len(settings))
         for bound in self.bounds:
             excess = excess + bound.excess(columns)
-        return np.where(excess <= SLACK, 0.0, excess)
+        return np.where(excess <= BOUND_SLACK, 0.0, excess)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
         """Whether each setting satisfies all constraints, shape (N,)."""
@@ -110,11 +110,11 @@ class FeasibleRegion:
         # The error is about the first infeasible setting, if there is any.
         for setting in settings[~self.feasible(settings)][:1]:
             named = self.characteristics.named(setting)
-            # The sum of all violations is above `SLACK`, so that one is above this share.
+            # The sum of all violations is above `BOUND_SLACK`, so that one is above this share.
             bound = next(
                 bound
                 for bound in self.bounds
-                if bound.excess(named) > SLACK / len(self.bounds)
+                if bound.excess(named) > BOUND_SLACK / len(self.bounds)
             )
             values = [
                 f"{member.name} = {named[member.name]:g}{member.suffix}"
@@ -197,11 +197,11 @@ def region_of(study: Study) -> FeasibleRegion:
     )
     share = np.mean(region.feasible(probes))
     share_after_filter = np.mean(region.feasible(characteristics.filter(probes)))
-    if min(share, share_after_filter) < LEAST_SHARE:
+    if min(share, share_after_filter) < LEAST_FEASIBLE_SHARE:
         raise InputError(
             "",
-            f"constraints: fewer than {LEAST_SHARE * 1000:g} in 1,000 random settings satisfy them:"
-            f" {region}",
+            f"constraints: fewer than {LEAST_FEASIBLE_SHARE * 1000:g} in 1,000 random settings"
+            f" satisfy them: {region}",
             "narrower domains or wider bounds, or one characteristic less, whose value your class"
             " computes from the others",
         )

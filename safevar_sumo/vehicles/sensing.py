@@ -32,7 +32,7 @@ TANGENT_DECIMALS = 12
 """Decimals to which a tangent is rounded, because the last bits of tangents differ between
 machines.
 """
-UNLIMITED = 1e6
+UNLIMITED_RANGE = 1e6
 """Range of the sensors of a study without the characteristic `sensorRange` [m]."""
 RELEASED_BRAKE = 1e-6
 """Largest position of a SUMO vehicle's brake pedal that counts as released [-]: while a delayed
@@ -315,7 +315,7 @@ class WornVehicle(
             front_load=1 - rear_load,
             rear_load=rear_load,
             brake_delay=c["brakeResponse"],
-            sensor_range=c.get("sensorRange", UNLIMITED + 0 * mass),
+            sensor_range=c.get("sensorRange", UNLIMITED_RANGE + 0 * mass),
             latency=c.get("sensorLatency", 0 * mass),
             slope=slope,
             tangent=tangent,

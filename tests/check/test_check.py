@@ -374,7 +374,7 @@ def test_what_is_shipped_passes(study: str) -> None:
 def test_a_driving_system_that_does_not_end_is_a_finding_in_time(
     in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trials, "LONGEST", 0.5)
+    monkeypatch.setattr(trials, "LONGEST_CHECK", 0.5)
     write(
         "mine.py",
         "from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
@@ -415,7 +415,7 @@ def test_it_says_how_many_vehicles_it_has_simulated_and_what_it_has_not_tried(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As many as the time allows, unless their number is given."""
-    monkeypatch.setattr(trials, "LONGEST", longest)
+    monkeypatch.setattr(trials, "LONGEST_CHECK", longest)
     write("mine.py", SCALAR.replace("BODY", "pass"))
     test = '[[matrix.tests]]\nname = "it"\nover = { turns_after = [0.5, 0.6, 0.7, 0.8, 0.9] }\n'
     write("mine.toml", STUDY_OF["ads"] + test)

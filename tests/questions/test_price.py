@@ -284,7 +284,7 @@ def test_the_time_of_one_simulation_is_that_of_one(
 def test_a_slow_simulator_gets_a_rough_answer(
     rig: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(price, "LONGEST", 0.5)
+    monkeypatch.setattr(price, "LONGEST_QUESTION", 0.5)
     monkeypatch.setattr(
         "safevar_sumo.questions.evaluator.seconds_of_simulation", lambda *_: 0.001
     )

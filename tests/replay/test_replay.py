@@ -24,7 +24,7 @@ from safevar_sumo.api.simulation import simulate
 from safevar_sumo.questions.case import Case
 from safevar_sumo.replay import animation, gui
 from safevar_sumo.replay.animation import (
-    DPI,
+    FRAME_DPI,
     IMPACT_COLOUR,
     PANEL_HEIGHT,
     animate,
@@ -199,10 +199,10 @@ def frame(comparison: Comparison, sample: int) -> tuple[np.ndarray, float, float
     """
     figure, show = draw_scene(comparison)
     show(sample)
-    figure.set_dpi(DPI)
+    figure.set_dpi(FRAME_DPI)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    picture = np.asarray(canvas.buffer_rgba())[int(PANEL_HEIGHT * DPI) :, :, :3]
+    picture = np.asarray(canvas.buffer_rgba())[int(PANEL_HEIGHT * FRAME_DPI) :, :, :3]
     left, right = figure.axes[0].get_xlim()
     return picture, left, picture.shape[1] / (right - left)
 

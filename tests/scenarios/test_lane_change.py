@@ -12,7 +12,7 @@ import pytest
 
 from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.reaction import ANY_BRAKING
-from safevar_sumo.scenarios.lane_change import CAR, CutIn, CutOut
+from safevar_sumo.scenarios.lane_change import OTHER_CAR, CutIn, CutOut
 from safevar_sumo.sumo.matrix import drive_worst, simulate_all_points
 from tests.in_process import SLOW, verify_everywhere, write
 from tests.made_up import original_of, system_of
@@ -23,7 +23,7 @@ WEAR = system_of("wear", matrix=None)
 IDEAL = ideal(WEAR)
 LENGTH, WIDTH = 4.7, 1.85
 BODY: dict[str, Any] = {"vut_length": LENGTH, "vut_width": WIDTH}
-PATH = (WIDTH + CAR.width) / 2
+PATH = (WIDTH + OTHER_CAR.width) / 2
 HARDEST = 0.774 * 9.81
 
 
@@ -87,12 +87,16 @@ def test_the_competent_driver_answers_cut_outs_by_the_rule() -> None:
     """At the regulation's headway of 2 s."""
     v = draw(20.0, 130.0)
     lateral_speed = draw(0.5, 1.8)
-    gap = v / 3.6 * CAR.width / lateral_speed * draw(1.0, 2.0)
+    gap = v / 3.6 * OTHER_CAR.width / lateral_speed * draw(1.0, 2.0)
     scenario = CutOut(
         speed=v, headway=2.0, gap=gap, lateral_speed=lateral_speed, **BODY
     )
-    perceived = np.maximum(0.375 / lateral_speed + 0.4, CAR.width / 2 / lateral_speed)
-    expected = rule(v / 3.6, 2.0 * v / 3.6 + CAR.length + gap, 0.0, 0.0, perceived)
+    perceived = np.maximum(
+        0.375 / lateral_speed + 0.4, OTHER_CAR.width / 2 / lateral_speed
+    )
+    expected = rule(
+        v / 3.6, 2.0 * v / 3.6 + OTHER_CAR.length + gap, 0.0, 0.0, perceived
+    )
     same, late = agreement(
         met_at_once(IDEAL, scenario, CompetentDriver(), N), expected, PATH
     )
@@ -114,7 +118,7 @@ def test_a_cut_in_moves_as_it_says() -> None:
             side=side,
         )
         (car,) = one.tracks(np.array([[0.0], [1.0], [2.0], [3.0], [5.0], [7.0], [9.0]]))
-        rear = car.x[:, 0] - CAR.length / 2
+        rear = car.x[:, 0] - OTHER_CAR.length / 2
         assert rear[1] - 25.0 == pytest.approx(30.0)
         assert (car.y[:, 0] * sign).tolist() == pytest.approx(
             [3.5, 3.5, 1.75, 0.0, 0.0, 0.0, 0.0]
@@ -134,12 +138,14 @@ def test_a_cut_out_hides_the_standing_car_until_the_leader_is_aside() -> None:
     gap = run.trace.gap[:, 0]
     assert gap[20] == pytest.approx(20.0)
     shown = int(np.argmax(np.diff(gap) > 10)) + 1
-    assert run.trace.time[shown] == pytest.approx(1.0 + CAR.width / 2, abs=2 * STEP)
+    assert run.trace.time[shown] == pytest.approx(
+        1.0 + OTHER_CAR.width / 2, abs=2 * STEP
+    )
     assert gap[shown] == pytest.approx(
-        20.0 + CAR.length + 60.0 - 20.0 * (run.trace.time[shown] - 1.0)
+        20.0 + OTHER_CAR.length + 60.0 - 20.0 * (run.trace.time[shown] - 1.0)
     )
     assert at_contact(run, run.trace.time) == pytest.approx(
-        1.0 + (20.0 + CAR.length + 60.0) / 20.0
+        1.0 + (20.0 + OTHER_CAR.length + 60.0) / 20.0
     )
 
 

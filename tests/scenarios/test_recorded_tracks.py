@@ -13,7 +13,11 @@ import pytest
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Outcome, SimulationRuns
-from safevar_sumo.scenarios.recorded_tracks import COLUMNS, RecordedTracks, read_tracks
+from safevar_sumo.scenarios.recorded_tracks import (
+    TRACK_COLUMNS,
+    RecordedTracks,
+    read_tracks,
+)
 from safevar_sumo.study import data_files
 from safevar_sumo.sumo.system import assemble
 from tests.in_process import SLOW, json_of, refused, run
@@ -44,7 +48,7 @@ def table(*bodies: Any, start: float = 0.0, turn: float = 0.0) -> str:
     Path("walk.csv").write_text(
         "\n".join(
             ",".join(map(str, row))
-            for row in (COLUMNS, *ego, *(row for rows in bodies for row in rows))
+            for row in (TRACK_COLUMNS, *ego, *(row for rows in bodies for row in rows))
         )
     )
     return "walk.csv"
@@ -84,7 +88,7 @@ def test_a_heading_turns_the_way_round_through_pi_as_the_shorter_way(
     halves = [(0.0, 3.1), (1.0, -3.1)]
     row = "{},van,60,30,{},0,4,2\n"
     Path("walk.csv").write_text(
-        f"{','.join(COLUMNS)}\n0,ego,0,0,0,1,4,2\n"
+        f"{','.join(TRACK_COLUMNS)}\n0,ego,0,0,0,1,4,2\n"
         + "".join(row.format(*one) for one in halves)
     )
     (track,) = RecordedTracks(file="walk.csv").tracks(np.array([[0.0], [0.5], [1.0]]))

@@ -857,7 +857,7 @@ def test_a_pack_states_the_number_that_followed_from_time(
     """So that `verify` asks the same on another machine; so does the command of each answer."""
     run("study wall.toml --out results")
     with monkeypatch.context() as patch:
-        patch.setattr("safevar_sumo.questions.price.LONGEST", 0.4)
+        patch.setattr("safevar_sumo.questions.price.LONGEST_QUESTION", 0.4)
         seconds = "safevar_sumo.questions.evaluator.seconds_of_simulation"
         patch.setattr(seconds, lambda *_: 0.001)  # whatever else this machine does
         run("evidence results --out pack.zip --ask 'risk --samples 4000'")

@@ -20,7 +20,7 @@ from safevar_sumo.api.simulation import load_study, simulate
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
 from safevar_sumo.questions.tolerance import tolerance
-from safevar_sumo.records import ROUNDING, FloatArray
+from safevar_sumo.records import RESULT_ROUNDING, FloatArray
 from safevar_sumo.results import load_runs
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.scenarios.tracks import KMH
@@ -135,12 +135,14 @@ def test_an_encounter_is_that_of_a_study_with_these_parameters(case: str) -> Non
         both = np.stack([setting[of_vehicle], other.characteristics.original])
         alone = drive_and_score(other, both)
         assert alone.outcome[0] == evaluations.outcome[row]
-        assert_allclose(evaluations.f_safe[row], alone.f_safe[0], rtol=0, atol=ROUNDING)
+        assert_allclose(
+            evaluations.f_safe[row], alone.f_safe[0], rtol=0, atol=RESULT_ROUNDING
+        )
         assert_allclose(
             evaluations.metrics["original_safety_degree"][row],
             alone.f_safe[1],
             rtol=0,
-            atol=ROUNDING,
+            atol=RESULT_ROUNDING,
         )
     verify_everywhere(system, settings)
 
@@ -167,7 +169,7 @@ def assert_the_same_in_sumo(system: System, settings: FloatArray) -> None:
         for in_sumo in (False, True)
     )
     assert in_sumo.outcome.tolist() == recorded.outcome.tolist()
-    assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=ROUNDING)
+    assert_allclose(in_sumo.f_safe, recorded.f_safe, rtol=0, atol=RESULT_ROUNDING)
 
 
 @pytest.mark.parametrize("case", ["walker", "parked"])

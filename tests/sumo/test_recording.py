@@ -17,7 +17,7 @@ import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.part import at_point
-from safevar_sumo.records import ROUNDING, FloatArray, Observation
+from safevar_sumo.records import RESULT_ROUNDING, FloatArray, Observation
 from safevar_sumo.results import read_manifest
 from safevar_sumo.scenarios import SCENARIOS, Point, weather_of
 from safevar_sumo.scenarios.ahead import CarToCar
@@ -46,7 +46,7 @@ def assert_same(system: System, settings: FloatArray) -> list[str]:
     same to `ROUNDING`; returns all outcomes.
     """
     outcomes = []
-    tolerance = ROUNDING if len(system.characteristics.scenario) else 0.0
+    tolerance = RESULT_ROUNDING if len(system.characteristics.scenario) else 0.0
     results = (
         simulate_all_points(replace(system, in_sumo=in_sumo), settings)
         for in_sumo in (False, True)

@@ -32,7 +32,7 @@ from safevar_sumo.study.characteristics import Domain, Interval
 
 MAX_PARTS_NAMED = 4
 """Maximum number of missing parts that a sentence names."""
-DECIMALS = 9
+CHANGE_DECIMALS = 9
 """Decimals of changes that count. Differences of rounded values have errors beyond them."""
 OF_VEHICLE = "vehicle."
 """Prefix of the parameters of a parameter set that belong to the vehicle. Versions of a driving
@@ -200,8 +200,8 @@ def _outside_of(
 def _has_changes_of(own: Domain, domain: Domain) -> bool:
     """Whether a domain has all changes of another domain, each from its own original value."""
     shift = domain.original - own.original
-    begins = round(own.lower + shift - domain.lower, DECIMALS) <= 0
-    ends = round(own.upper + shift - domain.upper, DECIMALS) >= 0
+    begins = round(own.lower + shift - domain.lower, CHANGE_DECIMALS) <= 0
+    ends = round(own.upper + shift - domain.upper, CHANGE_DECIMALS) >= 0
     return begins and ends
 
 

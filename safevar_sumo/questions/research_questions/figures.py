@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+ALGORITHM_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Colours by Okabe and Ito, which colour-blind readers can distinguish. Each algorithm also has a
 marker of its own (`MARKERS`).
 """
@@ -110,7 +110,7 @@ def draw_pareto_fronts(case: Case) -> Figure:
         values.append(original.get(objective.name, np.nan))
     for axis, pair in zip(axes, pairs, strict=True):
         for (algorithm, points), colour, marker in zip(
-            fronts.items(), cycle(COLOURS), cycle(MARKERS), strict=False
+            fronts.items(), cycle(ALGORITHM_COLOURS), cycle(MARKERS), strict=False
         ):
             label = f"{escape_dollars(case.title_of(algorithm))} ({len(points)})"
             x, y = points[:, pair].T
@@ -175,7 +175,7 @@ def draw_convergence(case: Case) -> Figure:
         style="algorithm",
         estimator="median",
         errorbar=("pi", 50),
-        palette=COLOURS[: len(labels)],
+        palette=ALGORITHM_COLOURS[: len(labels)],
         ax=axis,
     )
     axis.set_xlabel("simulations of different settings")
@@ -192,7 +192,11 @@ def draw_convergence(case: Case) -> Figure:
         .reindex(ends.index)
     )
     axis.scatter(
-        ends, returned, color=COLOURS[: len(ends)], edgecolor="black", zorder=3
+        ends,
+        returned,
+        color=ALGORITHM_COLOURS[: len(ends)],
+        edgecolor="black",
+        zorder=3,
     )
     _add_legend_below(figure, axis)
     axis.get_legend().remove()
