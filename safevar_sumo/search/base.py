@@ -72,6 +72,9 @@ class Problem:
         def draw(count: int) -> FloatArray:
             return rng.uniform(lower, upper, (count, len(lower)))
 
+        # Without constraints, every setting is feasible.
+        if not self.region:
+            return draw(number)
         return self.region.draw_feasible(draw, number, filtered=True)
 
     def feasible(self, settings: FloatArray) -> BoolArray:
