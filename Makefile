@@ -11,7 +11,7 @@ study: .venv/installed
 	$(RUN) -m safevar_sumo study rain
 
 plain:
-	$(PYTHON) -m tests.plain_machine
+	$(PYTHON) -m tools.plain_machine
 
 test: .venv/installed-test
 	$(RUN) -m pytest $(PARALLEL)
@@ -34,7 +34,7 @@ docs: .venv/installed-docs
 	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --quiet --strict
 
 docs-outputs: .venv/installed-test
-	$(RUN) -m tests.pages
+	$(RUN) -m tools.pages
 	$(RUN) docs/generate.py
 
 pictures: .venv/installed-test

@@ -20,20 +20,23 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.campaign import local
 from safevar_sumo.cli.program import COMMANDS, command_function
 from safevar_sumo.plugins import ImportPath
+from safevar_sumo.questions import cases, repair
 from safevar_sumo.questions.answer import Answer, Contents, contents_of
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.questions.explain import explain
+from safevar_sumo.questions.repair import survivors
 from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.sumo.system import System
-from tests.in_process import (
+from tests.support import planted_sled
+from tests.support.in_process import (
     EVERY_STUDY,
     InlinePool,
     allow_few_simulations,
     inline_worker,
     searched,
 )
-from tests.made_up import system_of
+from tests.support.made_up import FITS, system_of
 
 collect_ignore = (
     []
@@ -47,8 +50,6 @@ hypothesis.settings.load_profile("default")
 # Programs that tests start need not compile the package each time.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 WORKER_PROCESSES = local.ProcessWorker
-FITS = 2
-"""Number of parameter sets of the study `slippery`, with which conclusions are repeated."""
 SLIPPERY = """
 extends = "smoke"
 name = "slippery"
@@ -181,3 +182,19 @@ def case(slippery: Path) -> Case:
 def explained(case: Case) -> Answer:
     """Explanations of the failures in the results `slippery`."""
     return explain.compute(case, Evaluator(case.study, InlinePool()), top=3)
+
+
+@pytest.fixture
+def quick_repairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A repair is searched with few simulations, and proved for 99 % of all vehicles."""
+    monkeypatch.setattr(cases, "USUAL_BUDGET", 300)
+    monkeypatch.setattr(repair, "SOBOL_VEHICLES", 32)
+    monkeypatch.setattr(survivors, "MAX_SHARE_REPAIRED", 0.01)
+
+
+@pytest.fixture
+def planted(tmp_path: Path, quick_repairs: None) -> Path:
+    """The study of a sled with the planted parameters."""
+    (tmp_path / "models.py").write_text(planted_sled.MODELS)
+    (tmp_path / "planted.toml").write_text(planted_sled.STUDY)
+    return tmp_path / "planted.toml"

@@ -20,7 +20,7 @@ from safevar_sumo.records import JsonObject
 from safevar_sumo.results import MANIFEST
 from safevar_sumo.study import Study, tables_of
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, refused, write
+from tests.support.in_process import SLOW, refused, write
 
 PIPES = [
     "simulate pipe",

@@ -27,10 +27,10 @@ from safevar_sumo.study import (
     keys_with,
     study_names,
 )
-from tests.in_process import SLOW
-from tests.manual import PROGRAM, ROOT, blocks, written
-from tests.pages import PAGES, run_page
+from tests.support.in_process import SLOW
 from tests.support.needs import need_library
+from tools.manual import PROGRAM, ROOT, blocks, written
+from tools.pages import PAGES, run_page
 
 LIBRARY_OF_PAGE = {"docs/tools.md": "optuna"}
 """Pages whose blocks need a library of the extra `test-all`."""

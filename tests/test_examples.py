@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.in_process import SLOW, run
-from tests.manual import ROOT
-from tests.pages import run_page
+from tests.support.in_process import SLOW, run
+from tools.manual import ROOT
+from tools.pages import run_page
 
 EXAMPLES = sorted(path.parent.name for path in ROOT.glob("examples/*/README.md"))
 ELSEWHERE = {"carla", "metadrive"}

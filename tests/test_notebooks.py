@@ -16,8 +16,8 @@ import pytest
 from PIL import Image
 
 import safevar_sumo as sv
-from tests.in_process import SLOW
-from tests.made_up import SUN, published_rows, uniform
+from tests.support.in_process import SLOW
+from tests.support.made_up import SUN, published_rows, uniform
 from tests.support.needs import need_library
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"

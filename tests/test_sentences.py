@@ -10,10 +10,10 @@ import click
 import pytest
 
 from safevar_sumo.cli.program import COMMANDS, commands
-from tests.manual import ROOT, written
-from tests.pages import PAGES
-from tests.sentences import broken_rules, sentences_in, split
-from tests.size import sources_of
+from tools.manual import ROOT, written
+from tools.pages import PAGES
+from tools.sentences import broken_rules, sentences_in, split
+from tools.size import sources_of
 
 SOURCES = sources_of("safevar_sumo")
 

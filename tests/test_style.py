@@ -10,10 +10,10 @@ import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
 
-from tests.in_process import SLOW, run_python
-from tests.manual import ROOT
-from tests.size import elements_in, sizes, sources_of
+from tests.support.in_process import SLOW, run_python
 from tests.support.needs import NOTHING_MISSING
+from tools.manual import ROOT
+from tools.size import elements_in, sizes, sources_of
 
 LIMITS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]
 DOUBLE = {"Found", "Search"}

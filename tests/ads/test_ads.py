@@ -26,17 +26,17 @@ from safevar_sumo.records import (
     FloatArray,
     Nominal,
     Observation,
-    PedalTables,
     SimulationRuns,
 )
 from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import ModelTable, study_names
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW
-from tests.made_up import MISSING, changed, seen
-from tests.scenarios.holding import CARLA, Hold, driven
-from tests.scenarios.test_crossing import WORN
+from tests.support.holding import CARLA, Hold, driven
+from tests.support.in_process import SLOW
+from tests.support.made_up import MISSING, changed, seen
+from tests.support.pedals import BRAKING, COASTING, FULL, KNOWN
+from tests.support.worn import WORN
 
 STEP = 0.05
 STUDIES = {study.ads.model: study for study in map(read_study, study_names())}
@@ -62,21 +62,6 @@ TAKE_OVER = [
 ]
 """ADSs that keep the initial speed."""
 FAR = 1e6
-COASTING, FULL, BRAKING = 0.1, 2.0, 10.0
-SPEEDS = np.arange(0.0, 20.5, 0.5)
-KNOWN = Nominal(
-    mass=1500.0,
-    accel=3.0,
-    decel=8.0,
-    max_speed=50.0,
-    actuator_lag=0.2,
-    tables=lambda: PedalTables(
-        speeds=SPEEDS,
-        full_throttle=np.full(len(SPEEDS), FULL),
-        coasting=np.full(len(SPEEDS), COASTING),
-        braking=BRAKING,
-    ),
-)
 
 
 @pytest.fixture(params=sorted(SYSTEMS))

@@ -21,8 +21,8 @@ from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.records import Nominal
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System
-from tests.in_process import write
-from tests.made_up import seen, system_of, uniform
+from tests.support.in_process import write
+from tests.support.made_up import seen, system_of, uniform
 
 SOURCE = '''
 from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real

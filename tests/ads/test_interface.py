@@ -19,9 +19,9 @@ from safevar_sumo.records import Command, FloatArray, Nominal, Observation
 from safevar_sumo.scenarios.tracks import BODIES
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
-from tests.ads.test_ads import BRAKING, COASTING, FULL, KNOWN
-from tests.in_process import write
-from tests.made_up import original_of, seen, system_of
+from tests.support.in_process import write
+from tests.support.made_up import original_of, seen, system_of
+from tests.support.pedals import BRAKING, COASTING, FULL, KNOWN
 
 WISHES = [
     (1.0, (1.0 + COASTING) / (FULL + COASTING), 0.0),

@@ -16,9 +16,9 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.records import Observation
 from safevar_sumo.sumo.matrix import simulate_all_points
-from tests.ads.test_ads import COASTING, FULL, KNOWN
-from tests.in_process import run
-from tests.made_up import MISSING, original_of, system_of
+from tests.support.in_process import run
+from tests.support.made_up import MISSING, original_of, system_of
+from tests.support.pedals import COASTING, FULL, KNOWN
 
 needs_ad_rss = pytest.mark.skipif(
     "wear_rss" in MISSING, reason="the extra ad-rss is missing"

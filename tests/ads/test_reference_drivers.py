@@ -25,9 +25,9 @@ from safevar_sumo.shipped import NETWORKS
 from safevar_sumo.sumo.engine import open_world
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
-from tests.in_process import SLOW
-from tests.made_up import original_of, seen, system_of
-from tests.scenarios.ideal import point_mass
+from tests.support.ideal import point_mass
+from tests.support.in_process import SLOW
+from tests.support.made_up import original_of, seen, system_of
 
 STEP = 0.05
 TABLE = np.arange(0.0, 20.5, 0.5)

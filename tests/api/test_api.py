@@ -16,7 +16,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.questions.part import at_point
 from safevar_sumo.study import tables_of
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import SLOW, run_python, write
+from tests.support.in_process import SLOW, run_python, write
 
 
 def test_every_public_name_is_there_and_nothing_else() -> None:

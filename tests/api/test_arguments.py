@@ -13,7 +13,7 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.questions.ask import QUESTIONS
-from tests.in_process import InlinePool
+from tests.support.in_process import InlinePool
 
 CALLS = tomllib.loads(Path(__file__).with_name("arguments.toml").read_text())
 FUNCTIONS = [name for name in sv.__all__ if inspect.isfunction(getattr(sv, name))]

@@ -32,7 +32,7 @@ from safevar_sumo.questions.sampling import sobol_settings
 from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import SLOW, InlinePool, own_network, run_python, write
+from tests.support.in_process import SLOW, InlinePool, own_network, run_python, write
 
 OWN_ADS = """
 from threshold import TTC

@@ -28,15 +28,15 @@ from safevar_sumo.records import Outcome
 from safevar_sumo.results import Journal, journal_file, journal_head, load_runs
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.study import Study
-from tests.campaign.formulas import (
+from tests.support.formulas import (
     FormulaPool,
     carried_out,
     evaluated,
     solutions,
     with_search,
 )
-from tests.in_process import SLOW, InlinePool, searched
-from tests.made_up import SUN
+from tests.support.in_process import SLOW, InlinePool, searched
+from tests.support.made_up import SUN
 
 
 @pytest.fixture
@@ -126,7 +126,7 @@ def test_more_or_fewer_evaluations_go_on_and_end_as_if_there_had_never_been_othe
     assert solutions(tmp_path / "out") == solutions(tmp_path / "fresh")
     results = load_runs(tmp_path / "out")
     assert_frame_equal(results.evaluations, load_runs(tmp_path / "fresh").evaluations)
-    assert not {*before.simulated[1:]} & {*after.simulated[1:]}, "the original apart"
+    assert not {*before.received[1:]} & {*after.received[1:]}, "the original apart"
     carried_out(first, tmp_path / "out", FormulaPool(limit=1))
 
 

@@ -26,9 +26,9 @@ from safevar_sumo.records import Evaluations, FloatArray
 from safevar_sumo.results import load_runs, manifest, read_manifest
 from safevar_sumo.study import Study
 from safevar_sumo.sumo.system import assemble
-from tests.campaign import formulas
-from tests.campaign.formulas import FormulaPool
-from tests.in_process import SLOW, own_network, refused, rewrite, run
+from tests.support import formulas
+from tests.support.formulas import FormulaPool
+from tests.support.in_process import SLOW, own_network, refused, rewrite, run
 
 
 @SLOW
@@ -46,7 +46,7 @@ def test_a_file_that_changes_while_a_study_runs_ends_it_before_a_run_counts_as_f
 
     class Edited(FormulaPool):
         def evaluate(self, task: Task, settings: FloatArray) -> Evaluations:
-            if len(self.simulated) == 1:  # the original vehicle
+            if len(self.received) == 1:  # the original vehicle
                 traffic.write_text(traffic.read_text() + "<!-- -->")
             return super().evaluate(task, settings)
 

@@ -37,10 +37,10 @@ from safevar_sumo.records import Evaluations, FloatArray, Outcome
 from safevar_sumo.study import ModelTable, Origin, Study
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.campaign.formulas import evaluated
-from tests.end_to_end.conftest import workers_of
-from tests.in_process import SLOW
-from tests.made_up import SUN
+from tests.support.formulas import evaluated
+from tests.support.in_process import SLOW
+from tests.support.made_up import SUN
+from tests.support.processes import workers_of
 
 pytestmark = pytest.mark.usefixtures("worker_processes")
 

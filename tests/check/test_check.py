@@ -11,8 +11,8 @@ import pytest
 
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.check import check_study, study_to_check, trials
-from tests.in_process import SLOW, json_of, rows_of, run, write
-from tests.manual import files_of
+from tests.support.in_process import SLOW, json_of, rows_of, run, write
+from tools.manual import files_of
 
 SCALAR = """import random
 import time

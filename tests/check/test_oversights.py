@@ -15,9 +15,9 @@ from safevar_sumo.metrics import OPTIONAL_METRICS
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, json_of, rows_of, run, write
-from tests.made_up import original_of, system_of
-from tests.manual import files_of
+from tests.support.in_process import SLOW, json_of, rows_of, run, write
+from tests.support.made_up import original_of, system_of
+from tools.manual import files_of
 
 METRICS = """import numpy as np
 from safevar_sumo.metrics import Measure

@@ -25,8 +25,16 @@ from safevar_sumo.questions.ask import QUESTIONS
 from safevar_sumo.questions.changes import read_changes
 from safevar_sumo.study import Study
 from safevar_sumo.terminal import open_progress
-from tests.in_process import SLOW, json_of, refused, rows_of, run, run_python, write
-from tests.made_up import SUN
+from tests.support.in_process import (
+    SLOW,
+    json_of,
+    refused,
+    rows_of,
+    run,
+    run_python,
+    write,
+)
+from tests.support.made_up import SUN
 
 HEAVY = {"libsumo", "traci", "matplotlib", "pandas", "scipy", "seaborn", "cma"}
 

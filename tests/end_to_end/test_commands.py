@@ -14,9 +14,17 @@ import pytest
 
 import safevar_sumo as sv
 from safevar_sumo.results import FILES, load_runs, read_manifest
-from tests.campaign.formulas import solutions
-from tests.end_to_end.conftest import study, written
-from tests.in_process import SLOW, json_of, numbers_of, own_network, refused, run, write
+from tests.support.formulas import solutions
+from tests.support.in_process import (
+    SLOW,
+    json_of,
+    numbers_of,
+    own_network,
+    refused,
+    run,
+    write,
+)
+from tests.support.processes import study, written
 
 pytestmark = pytest.mark.usefixtures("small")
 

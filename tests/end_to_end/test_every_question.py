@@ -14,10 +14,10 @@ import pytest
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.study import study_names
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, run, write
-from tests.made_up import MISSING
-from tests.manual import files_of
-from tests.scenarios.test_simulated import MODELS, STUDY
+from tests.support.in_process import SLOW, run, write
+from tests.support.made_up import MISSING
+from tests.support.wall import MODELS, STUDY
+from tools.manual import files_of
 
 WIDTH, MAX_LINES = 100, 30
 NO_NUMBER = re.compile(r"(?<![\w./-])-?(nan|inf)\b|\d[eE]\+\d")

@@ -19,8 +19,9 @@ import pytest
 from safevar_sumo.campaign import batches
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.results import load_runs, write_whole
-from tests.campaign.formulas import solutions
-from tests.end_to_end.conftest import (
+from tests.support.formulas import solutions
+from tests.support.in_process import SLOW, refused, run, write
+from tests.support.processes import (
     ended,
     has_loaded,
     killed,
@@ -29,8 +30,7 @@ from tests.end_to_end.conftest import (
     workers_of,
     written,
 )
-from tests.in_process import SLOW, refused, run, write
-from tests.scenarios.test_simulated import MODELS, STUDY
+from tests.support.wall import MODELS, STUDY
 
 Process = subprocess.Popen[str]
 pytestmark = pytest.mark.usefixtures("small")

@@ -11,8 +11,8 @@ import pytest
 
 from safevar_sumo.reference.rows import COLUMNS, package_filter
 from safevar_sumo.sumo.matrix import drive_and_score
-from tests.in_process import SLOW, json_of, refused, rows_of, run
-from tests.made_up import SUN, published_rows, system_of, uniform
+from tests.support.in_process import SLOW, json_of, refused, rows_of, run
+from tests.support.made_up import SUN, published_rows, system_of, uniform
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,9 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import SafevarError
 from safevar_sumo.results import load_runs
 from safevar_sumo.search import ALGORITHMS
-from tests.campaign.formulas import FormulaPool, carried_out, solutions
-from tests.end_to_end.conftest import study
-from tests.in_process import SLOW, run
+from tests.support.formulas import FormulaPool, carried_out, solutions
+from tests.support.in_process import SLOW, run
+from tests.support.processes import study
 
 QUESTIONS = {
     "explain": "small.toml --quick --top 1",

@@ -16,7 +16,7 @@ from safevar_sumo.questions.figures import new_figure, own_style, save
 from safevar_sumo.records import csv_text
 from safevar_sumo.replay.comparison import comparison_of
 from safevar_sumo.sumo.engine import _numbers_with_points
-from tests.in_process import run_python
+from tests.support.in_process import run_python
 
 DRAW = """
 from pathlib import Path

@@ -21,7 +21,7 @@ from safevar_sumo.campaign.inputs import PLATFORM
 from safevar_sumo.records import JsonObject
 from safevar_sumo.results import CHOICES, RESULTS, load_runs
 from safevar_sumo.study import Study
-from tests.in_process import searched
+from tests.support.in_process import searched
 
 WHY = {
     "sun": (

@@ -12,8 +12,8 @@ import pytest
 from safevar_sumo.metrics import OPTIONAL_METRICS
 from safevar_sumo.records import FloatArray, SimulationRuns
 from safevar_sumo.scenarios.crossing import Crossing
-from tests.made_up import system_of
-from tests.scenarios.ideal import met_at_once
+from tests.support.ideal import met_at_once
+from tests.support.made_up import system_of
 
 WEAR = system_of("wear", matrix=None, weather="clear")
 

@@ -26,7 +26,7 @@ from safevar_sumo.records import (
     SimulationRuns,
 )
 from safevar_sumo.study import MetricsTable
-from tests.made_up import made_up_evaluations, made_up_runs
+from tests.support.made_up import made_up_evaluations, made_up_runs
 
 STEP = 0.01
 THRESHOLDS = MetricsTable(ttc_threshold=2.0)

@@ -14,8 +14,8 @@ from numpy.random import default_rng
 from safevar_sumo.metrics import OPTIONAL_METRICS
 from safevar_sumo.records import Encounter
 from safevar_sumo.sumo.network import program_of_sumo
-from tests.in_process import SLOW
-from tests.made_up import made_up_runs
+from tests.support.in_process import SLOW
+from tests.support.made_up import made_up_runs
 
 ROADS = 50
 """Each with a car that drives up to a slower one."""

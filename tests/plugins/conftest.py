@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from safevar_sumo.sumo.system import System
-from tests.made_up import system_of
-
-Mine = Callable[..., System]
-SCALAR = "from safevar_sumo.ads import ScalarAds\n\n\nclass Mine(ScalarAds):\n"
-ADS = '[ads]\nmodel = "mine:Mine"\n'
-"""Modules and tables that tests write beside a study file."""
+from tests.support.made_up import system_of
+from tests.support.user_code import ADS, Mine
 
 
 @pytest.fixture

@@ -18,9 +18,9 @@ from safevar_sumo.errors import InputError, UserCodeError
 from safevar_sumo.plugins.contract import user_errors
 from safevar_sumo.plugins.process import defer_interrupts, this_process
 from safevar_sumo.sumo.matrix import drive_and_score
-from tests.in_process import run, write
-from tests.made_up import assert_same_results, original_of, system_of
-from tests.plugins.conftest import ADS, SCALAR, Mine
+from tests.support.in_process import run, write
+from tests.support.made_up import assert_same_results, original_of, system_of
+from tests.support.user_code import ADS, SCALAR, Mine
 
 CONSTANT = SCALAR + "    def drive(self, seen):\n        return {}, 0.0\n"
 

@@ -19,11 +19,19 @@ from safevar_sumo.records import Command
 from safevar_sumo.results import load_runs
 from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.vehicles import Vehicle
-from tests.in_process import SLOW, json_of, numbers_of, refused, run, searched, write
-from tests.made_up import assert_same_results, changed, original_of, system_of
-from tests.manual import files_of
-from tests.plugins.conftest import Mine
-from tests.scenarios.holding import Pedals
+from tests.support.holding import Pedals
+from tests.support.in_process import (
+    SLOW,
+    json_of,
+    numbers_of,
+    refused,
+    run,
+    searched,
+    write,
+)
+from tests.support.made_up import assert_same_results, changed, original_of, system_of
+from tests.support.user_code import Mine
+from tools.manual import files_of
 
 SEARCH = """
 class Mine:

@@ -30,9 +30,9 @@ from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import VEHICLES
-from tests.in_process import SLOW, searched, write
-from tests.made_up import assert_same_results, drawn, system_of
-from tests.manual import ROOT
+from tests.support.in_process import SLOW, searched, write
+from tests.support.made_up import assert_same_results, drawn, system_of
+from tools.manual import ROOT
 
 BASES = {"pedestrian_crossing": "sun", "lead_vehicle_stopped": "native", "stop": "stop"}
 """A study with each scenario; all others are driven by the car of `wear`."""

@@ -15,8 +15,8 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.campaign.pool import open_pool
 from safevar_sumo.sumo.matrix import drive_and_score
-from tests.in_process import InlinePool, run
-from tests.made_up import original_of, system_of
+from tests.support.in_process import InlinePool, run
+from tests.support.made_up import original_of, system_of
 
 DRIVER = """
 import importlib, pickle, sys, threading

@@ -35,8 +35,8 @@ from safevar_sumo.questions.render import MAX_LINES, MAX_ROWS
 from safevar_sumo.questions.sentence import Verdict, answer as said, note
 from safevar_sumo.questions.words import change_texts
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import json_of, rows_of, run
-from tests.manual import files_of
+from tests.support.in_process import json_of, rows_of, run
+from tools.manual import files_of
 
 COLUMNS = {
     "part": "part of the vehicle",

@@ -18,8 +18,16 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.questions.by_criterion import SOLUTIONS_STAGE, study_by
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import Evaluations, FloatArray
-from tests.in_process import SLOW, InlinePool, json_of, numbers_of, run, searched, write
-from tests.made_up import HARDEST_BRAKING
+from tests.support.in_process import (
+    SLOW,
+    InlinePool,
+    json_of,
+    numbers_of,
+    run,
+    searched,
+    write,
+)
+from tests.support.made_up import HARDEST_BRAKING
 
 STUDY = """
 extends = "rain"

@@ -10,7 +10,7 @@ from typing import Any
 from safevar_sumo.results.identity import evaluation_keys
 from safevar_sumo.scenarios.declared import read_study
 from safevar_sumo.study import tables_of
-from tests.in_process import json_of, run
+from tests.support.in_process import json_of, run
 
 OWN = """
 extends = "native"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from safevar_sumo import tolerance
 from safevar_sumo.api.simulation import load_study
@@ -11,8 +12,17 @@ from safevar_sumo.questions.counterexamples import describe
 from safevar_sumo.questions.evaluator import Evaluator
 from safevar_sumo.records import BoolArray, FloatArray
 from safevar_sumo.vehicles import region_of
-from tests.in_process import SLOW, InlinePool, json_of, numbers_of, refused, rows_of
-from tests.questions.conftest import made_up_model, made_up_study
+from tests.support.in_process import (
+    SLOW,
+    InlinePool,
+    json_of,
+    numbers_of,
+    refused,
+    rows_of,
+)
+from tests.support.made_up_studies import made_up_model, made_up_study
+
+pytestmark = pytest.mark.usefixtures("made_up_studies")
 
 
 def test_a_counterexample_that_is_safe_as_rounded_gets_more_digits_or_is_left_out() -> (

@@ -12,7 +12,7 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.evaluator import Evaluator
-from tests.in_process import InlinePool, searched, write
+from tests.support.in_process import InlinePool, searched, write
 
 SIMULATOR = """
 import os

@@ -22,7 +22,7 @@ from safevar_sumo.questions.models import Model
 from safevar_sumo.questions.tolerance import asked
 from safevar_sumo.results.identity import identity_digest, manifest_of
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, json_of, refused, rows_of, run, searched
+from tests.support.in_process import SLOW, json_of, refused, rows_of, run, searched
 
 STUDY = """
 extends = "rain"

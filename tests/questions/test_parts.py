@@ -14,9 +14,11 @@ from safevar_sumo.questions.ask import find_question
 from safevar_sumo.questions.bench import moving_tests
 from safevar_sumo.questions.part import at_point, scope_of
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, InlinePool, json_of, numbers_of
-from tests.manual import PROGRAM
-from tests.questions.conftest import model_of
+from tests.support.in_process import SLOW, InlinePool, json_of, numbers_of
+from tests.support.made_up_studies import model_of
+from tools.manual import PROGRAM
+
+pytestmark = pytest.mark.usefixtures("made_up_studies")
 
 
 @SLOW

@@ -31,7 +31,7 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo.batch import drive_all, score
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import (
+from tests.support.in_process import (
     EVERY_STUDY,
     SLOW,
     InlinePool,
@@ -41,7 +41,7 @@ from tests.in_process import (
     rows_of,
     write,
 )
-from tests.made_up import drawn
+from tests.support.made_up import drawn
 
 STEP = 0.05
 

@@ -32,9 +32,11 @@ from safevar_sumo.study import ModelTable, ScenarioTable
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import SLOW, InlinePool
-from tests.made_up import made_up_runs, original_of
-from tests.questions.conftest import box, made_up_evaluator
+from tests.support.in_process import SLOW, InlinePool
+from tests.support.made_up import made_up_runs, original_of
+from tests.support.made_up_studies import box, made_up_evaluator
+
+pytestmark = pytest.mark.usefixtures("made_up_studies")
 
 COLLISION = Unsafe()
 

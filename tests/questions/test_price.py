@@ -16,8 +16,8 @@ from safevar_sumo.questions import price
 from safevar_sumo.questions.price import Account, round_down
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.terminal import show_no_progress
-from tests.in_process import SLOW, InlinePool, refused, run, write
-from tests.scenarios.test_simulated import MODELS, STUDY
+from tests.support.in_process import SLOW, InlinePool, refused, run, write
+from tests.support.wall import MODELS, STUDY
 
 CLEARANCE = 40 - 15 * 0.5
 """What is left for braking [m]."""

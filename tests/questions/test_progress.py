@@ -15,7 +15,7 @@ from hypothesis import given, strategies as st
 import safevar_sumo as sv
 from safevar_sumo.questions.progress import Phases
 from safevar_sumo.terminal import Pace, Parts
-from tests.in_process import SLOW
+from tests.support.in_process import SLOW
 
 RECORDED = Path(__file__).with_name("progress.csv")
 """What `benchmarks/progress.py` recorded: command, time [s], done, total; the last row of a command

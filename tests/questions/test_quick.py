@@ -12,7 +12,7 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.questions import model_spread
 from safevar_sumo.report.page import report
-from tests.in_process import SLOW, InlinePool, rows_of, run
+from tests.support.in_process import SLOW, InlinePool, rows_of, run
 
 
 @SLOW

@@ -12,7 +12,9 @@ from msgspec.structs import replace
 from safevar_sumo.questions.model_spread import band_of, error_distance, prediction_band
 from safevar_sumo.questions.sampling import clopper_pearson
 from safevar_sumo.study import SAFETY_DEGREE
-from tests.questions.conftest import made_up_study
+from tests.support.made_up_studies import made_up_study
+
+pytestmark = pytest.mark.usefixtures("made_up_studies")
 
 
 @pytest.mark.parametrize("total", [3, 2.5])

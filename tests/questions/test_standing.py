@@ -17,7 +17,7 @@ from safevar_sumo.questions.explain import failures
 from safevar_sumo.questions.part import with_ranges
 from safevar_sumo.records import Evaluations, Outcome
 from safevar_sumo.results import load_runs
-from tests.in_process import InlinePool, json_of, run, write
+from tests.support.in_process import InlinePool, json_of, run, write
 
 STALLED = """
 from typing import Annotated

@@ -21,7 +21,13 @@ from safevar_sumo.sumo import drive_worst
 from safevar_sumo.sumo.batch import score
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.made_up import SUN, made_up_evaluations, original_of, system_of, uniform
+from tests.support.made_up import (
+    SUN,
+    made_up_evaluations,
+    original_of,
+    system_of,
+    uniform,
+)
 
 
 def reference(safety: list[float], tet: list[float]) -> ReferenceData:

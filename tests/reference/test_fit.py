@@ -23,8 +23,8 @@ from safevar_sumo.questions.tolerance import tolerance
 from safevar_sumo.reference.rows import ReferenceData
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, InlinePool, write
-from tests.made_up import (
+from tests.support.in_process import SLOW, InlinePool, write
+from tests.support.made_up import (
     SUN,
     changed,
     made_up_evaluations,

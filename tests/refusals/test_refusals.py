@@ -22,7 +22,7 @@ from typing import Any
 
 import pytest
 
-from tests.in_process import SLOW, own_network, refused
+from tests.support.in_process import SLOW, own_network, refused
 
 
 def rows() -> Iterator[Any]:

@@ -25,8 +25,8 @@ from safevar_sumo.replay.export import Poses
 from safevar_sumo.results import write_imported
 from safevar_sumo.study import Study
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.in_process import SLOW, refused, run
-from tests.made_up import made_up_evaluations
+from tests.support.in_process import SLOW, refused, run
+from tests.support.made_up import made_up_evaluations
 from tests.support.needs import (
     is_built_for_this_python,
     need_library,

@@ -40,7 +40,7 @@ from safevar_sumo.replay.comparison import (
 )
 from safevar_sumo.replay.figure import draw_comparison, find_divergence
 from safevar_sumo.replay.gui import show_in_gui
-from tests.in_process import SLOW
+from tests.support.in_process import SLOW
 from tests.support.needs import need_program
 
 

@@ -2,36 +2,14 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from safevar_sumo.campaign import local
 from safevar_sumo.questions.case import Case
-from safevar_sumo.report import report
-from tests.questions.conftest import Plant
-
-ASK = (
-    "tolerance --fits 0 --characteristics tireFric,mass",
-    "explain --quick --top 3",
-    "risk --samples 400",
-    "rules --samples 400",
-)
-
-
-def page_of(
-    *directories: Path,
-    ask: Any = ("rules --samples 20",),
-    jobs: int = 1,
-    **options: Any,
-) -> str:
-    """The page that `report` writes, with one quick answer unless others are asked for."""
-    with tempfile.TemporaryDirectory() as folder:
-        return report(
-            *directories, out=Path(folder, "page.html"), ask=ask, jobs=jobs, **options
-        ).read_text(encoding="utf-8")
+from tests.support.made_up_studies import Plant
+from tests.support.report_pages import ASK, page_of
 
 
 @pytest.fixture(scope="session")

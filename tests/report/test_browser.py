@@ -21,9 +21,9 @@ from safevar_sumo.replay.animation import PLAYER_FOLDER, animate
 from safevar_sumo.replay.comparison import comparison_of
 from safevar_sumo.report.page import TEMPLATE_FOLDER
 from safevar_sumo.study.file import study_names
-from tests.in_process import SLOW
-from tests.report.test_sheet import sheet_of_shipped
+from tests.support.in_process import SLOW
 from tests.support.needs import need_library, need_program
+from tests.support.sheets import sheet_of_shipped
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome

@@ -27,7 +27,7 @@ from safevar_sumo.report import claims
 from safevar_sumo.report.evidence import _files_of_user
 from safevar_sumo.report.pack import DESCRIPTION, _check_entries, digests_of, read_pack
 from safevar_sumo.results import load_runs
-from tests.in_process import (
+from tests.support.in_process import (
     SLOW,
     json_of,
     own_network,
@@ -39,9 +39,7 @@ from tests.in_process import (
     searched,
     write,
 )
-from tests.manual import PROGRAM, files_of
-from tests.questions.conftest import quick_repairs as quick_repairs  # noqa: PLC0414
-from tests.questions.test_repair import planted as planted  # noqa: PLC0414 - a fixture
+from tools.manual import PROGRAM, files_of
 
 MINE = """
 from pathlib import Path

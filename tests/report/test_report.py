@@ -37,20 +37,10 @@ from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.sumo.system import assemble
 from safevar_sumo.terminal import show_no_progress
 from safevar_sumo.vehicles import VEHICLES
-from tests.in_process import SLOW, run, searched
-from tests.manual import PROGRAM
-from tests.report.conftest import ASK, page_of
-
-
-def words_of(page: str) -> str:
-    """The text of a page, between single blanks."""
-    return " ".join(
-        html.unescape(
-            re.sub(
-                "<(style|script).*?</(style|script)>|<[^>]*>", "", page, flags=re.DOTALL
-            )
-        ).split()
-    )
+from tests.support.in_process import SLOW, run, searched
+from tests.support.report_pages import ASK, page_of
+from tests.support.words_of_pages import words_of
+from tools.manual import PROGRAM
 
 
 class Outline(HTMLParser):

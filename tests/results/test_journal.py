@@ -26,7 +26,7 @@ from safevar_sumo.results.journal import (
     open_and_lock,
     read_journal,
 )
-from tests.in_process import SLOW
+from tests.support.in_process import SLOW
 
 BATCHES = 4
 ROWS = 3

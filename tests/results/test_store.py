@@ -39,9 +39,9 @@ from safevar_sumo.results.identity import (
 )
 from safevar_sumo.results.manifest import read_manifest
 from safevar_sumo.study import Study, tables_of
-from tests.campaign.formulas import carried_out, with_search
-from tests.in_process import SLOW, json_of, refused, rows_of, run
-from tests.made_up import made_up_evaluations
+from tests.support.formulas import carried_out, with_search
+from tests.support.in_process import SLOW, json_of, refused, rows_of, run
+from tests.support.made_up import made_up_evaluations
 
 NAMES = ("a", "b")
 

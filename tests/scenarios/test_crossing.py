@@ -20,8 +20,8 @@ from safevar_sumo.scenarios.euro_ncap import TargetProfile
 from safevar_sumo.scenarios.published import LeadVehicleStopped, PedestrianCrossing
 from safevar_sumo.sumo.matrix import drive_worst
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, own_network
-from tests.made_up import made_up_runs, system_of
+from tests.support.in_process import SLOW, own_network
+from tests.support.made_up import made_up_runs, system_of
 
 
 @settings(max_examples=40)
@@ -41,9 +41,6 @@ def test_a_target_arrives_in_time_with_any_speed_profile(
         assert profile.travelled(profile.begin + 2 * run_up / speed) == pytest.approx(
             run_up, abs=1e-9
         )
-
-
-WORN = system_of("wear", matrix=None)
 
 
 TURNS = {"north": (0.0, 1.0), "north-west": (-0.6, 0.8)}

@@ -18,10 +18,10 @@ from safevar_sumo.scenarios.tracks import BODIES
 from safevar_sumo.sumo import drive
 from safevar_sumo.sumo.bodies import FirstContacts
 from safevar_sumo.sumo.matrix import simulate_all_points
-from tests.in_process import SLOW
-from tests.made_up import original_of
-from tests.scenarios.holding import CARLA, Hold, Pedals, at_contact, driven
-from tests.sumo.test_recording import assert_same
+from tests.support.holding import CARLA, Hold, Pedals, at_contact, driven
+from tests.support.in_process import SLOW
+from tests.support.made_up import original_of
+from tests.support.same_runs import assert_same
 
 KMH = 1 / 3.6
 NEAR, FAR = 1, -1

@@ -14,10 +14,10 @@ from safevar_sumo.ads.competent_driver import CompetentDriver
 from safevar_sumo.ads.reaction import ANY_BRAKING
 from safevar_sumo.scenarios.lane_change import OTHER_CAR, CutIn, CutOut
 from safevar_sumo.sumo.matrix import drive_worst, simulate_all_points
-from tests.in_process import SLOW, verify_everywhere, write
-from tests.made_up import original_of, system_of
-from tests.scenarios.holding import Hold, at_contact, driven
-from tests.scenarios.ideal import STEP, Mass, agreement, ideal, met_at_once, point_mass
+from tests.support.holding import Hold, at_contact, driven
+from tests.support.ideal import STEP, Mass, agreement, ideal, met_at_once, point_mass
+from tests.support.in_process import SLOW, verify_everywhere, write
+from tests.support.made_up import original_of, system_of
 
 WEAR = system_of("wear", matrix=None)
 IDEAL = ideal(WEAR)

@@ -10,8 +10,8 @@ import pytest
 import safevar_sumo as sv
 from safevar_sumo.scenarios import Along, CarToCar
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
-from tests.in_process import SLOW, InlinePool, run
-from tests.made_up import changed, system_of
+from tests.support.in_process import SLOW, InlinePool, run
+from tests.support.made_up import changed, system_of
 
 KMH = 1 / 3.6
 ALLOWED = {

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from mypy import api
 
-from tests.in_process import SLOW, json_of, run, write
-from tests.manual import ROOT, files_of
+from tests.support.in_process import SLOW, json_of, run, write
 from tests.support.needs import need_library
+from tools.manual import ROOT, files_of
 
 PAGE = "docs/simulators.md"
 pytestmark = SLOW

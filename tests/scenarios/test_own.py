@@ -11,8 +11,8 @@ import numpy as np
 from safevar_sumo.scenarios import SCENARIOS
 from safevar_sumo.sumo import reason_against_scenes
 from safevar_sumo.sumo.matrix import drive_and_score
-from tests.in_process import json_of, rows_of, run, write
-from tests.made_up import drawn, system_of
+from tests.support.in_process import json_of, rows_of, run, write
+from tests.support.made_up import drawn, system_of
 
 MINE = """
 from typing import Annotated

@@ -20,9 +20,9 @@ from safevar_sumo.scenarios.recorded_tracks import (
 )
 from safevar_sumo.study import data_files
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW, json_of, refused, run
-from tests.manual import files_of
-from tests.scenarios.holding import Hold, driven
+from tests.support.holding import Hold, driven
+from tests.support.in_process import SLOW, json_of, refused, run
+from tools.manual import files_of
 
 PAGE = files_of("docs/recorded_tracks.md")
 LENGTH, WIDTH = 4.0, 2.0

@@ -12,7 +12,7 @@ from safevar_sumo.records import GRAVITY, KMH_PER_MS, FloatArray
 from safevar_sumo.replay.simulate import show_simulation
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.system import System
-from tests.made_up import system_of
+from tests.support.made_up import system_of
 
 
 def stops(weather: Any, *speeds: float, **tables: Any) -> System:

@@ -17,7 +17,7 @@ from safevar_sumo.records import Outcome, SimulationRuns
 from safevar_sumo.scenarios import Track, TrackScenario, travelled
 from safevar_sumo.sumo.bodies import Body, distance_between, find_overlaps
 from safevar_sumo.sumo.moving import Moving
-from tests.scenarios.holding import Hold, driven
+from tests.support.holding import Hold, driven
 
 LENGTH, WIDTH = 4.9016, 2.1284
 SPEED = 72.0 / 3.6

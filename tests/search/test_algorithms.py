@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
-from collections.abc import Callable, Iterator
-from functools import partial
 from itertools import zip_longest
 from typing import Any
 
@@ -17,10 +15,10 @@ from deap import tools
 from hypothesis import given, strategies as st
 from numpy.random import default_rng
 
-from safevar_sumo.metrics import PUBLISHED_SCORING, Scoring
+from safevar_sumo.metrics import PUBLISHED_SCORING
 from safevar_sumo.plugins import read_only
 from safevar_sumo.records import Evaluations, FloatArray, Outcome
-from safevar_sumo.search import ALGORITHMS, Algorithm, Problem, Search
+from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.search.baselines import Ranges
 from safevar_sumo.search.genetic import (
     Individual,
@@ -28,48 +26,26 @@ from safevar_sumo.search.genetic import (
     run_tournament,
     select_survivors,
 )
-from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
+from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS
 from safevar_sumo.search.surrogate import _learn
 from safevar_sumo.study import ORIGINAL_DEGREE
-from safevar_sumo.vehicles import Characteristic, CharacteristicSet, FeasibleRegion
-from tests.in_process import SLOW
-from tests.made_up import SUN, made_up_evaluations
+from safevar_sumo.vehicles import Characteristic, CharacteristicSet
+from tests.support.in_process import SLOW
+from tests.support.made_up import SUN
+from tests.support.searches import (
+    POPULATION,
+    TWO,
+    begun,
+    built,
+    evaluated,
+    problem,
+    sphere,
+)
 
-POPULATION = 20
 OURS = [
     pytest.param(name, marks=SLOW if name == "surrogate" else ()) for name in ALGORITHMS
 ]
 """Our algorithms; fitting models takes seconds."""
-REQUIRED = {
-    "pymoo:RNSGA2": {"ref_points": [[0.5, 0.3, 6.0], [1.0, 0.1, 4.0]]},
-    "pymoo:RNSGA3": {"ref_points": [[0.5, 0.3, 6.0]], "pop_per_ref_point": 21},
-}
-"""Arguments without a default value."""
-Evaluate = Callable[[CharacteristicSet, FloatArray], Evaluations]
-
-
-def evaluated(
-    characteristics: CharacteristicSet, settings: FloatArray, safety: FloatArray
-) -> Evaluations:
-    """Vehicles that stop, whatever their safety degree."""
-    return made_up_evaluations(
-        safety,
-        settings=settings,
-        outcome=np.full(len(settings), Outcome.STOPPED.value, dtype="U16"),
-        collision_speed=np.full(len(settings), np.nan),
-        f_diff=characteristics.largest_change(settings),
-        f_num_diff=characteristics.number_changed(settings),
-    )
-
-
-def sphere(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
-    """The nearer a setting is to the lower ends of the domains, the safer it is."""
-    share = (settings - characteristics.lower) / (
-        characteristics.upper - characteristics.lower
-    )
-    return evaluated(
-        characteristics, settings, np.add.accumulate(share**2, axis=1)[:, -1]
-    )
 
 
 def failing(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluations:
@@ -79,46 +55,6 @@ def failing(characteristics: CharacteristicSet, settings: FloatArray) -> Evaluat
     outcome = np.where(fails, Outcome.SIMULATOR_ERROR.value, good.outcome).astype("U16")
     metrics = {"safety_degree": np.where(fails, np.nan, good.f_safe)}
     return dataclasses.replace(good, outcome=outcome, metrics=metrics)
-
-
-def steps_of(
-    search: Search, evaluate: Callable[[FloatArray], Evaluations]
-) -> Iterator[Any]:
-    """The requests of a search, then its result."""
-    answer = None
-    try:
-        while True:
-            asked = search.send(answer)
-            yield asked
-            answer = evaluate(asked)
-    except StopIteration as end:
-        yield end.value
-
-
-def begun(
-    algorithm: Algorithm,
-    seed: int,
-    evaluations: int,
-    evaluate: Evaluate = sphere,
-    scoring: Scoring = PUBLISHED_SCORING,
-    characteristics: CharacteristicSet = SUN,
-) -> Iterator[Any]:
-    problem = Problem(
-        region=FeasibleRegion(characteristics, ()),
-        original=sphere(characteristics, characteristics.original_settings),
-        evaluations=evaluations,
-        population=POPULATION,
-        scoring=scoring,
-    )
-    return steps_of(
-        algorithm.search(problem, default_rng(seed)), partial(evaluate, characteristics)
-    )
-
-
-def built(name: str, **arguments: Any) -> Algorithm:
-    """An algorithm of ours or of pymoo."""
-    kind = ALGORITHMS.get(name) or pymoo_algorithm(name)
-    return msgspec.convert(REQUIRED.get(name, {}) | arguments, kind)  # type: ignore[no-any-return]
 
 
 def searched(
@@ -260,14 +196,6 @@ def test_the_surrogate_uses_its_budget_where_no_original_vehicle_is_safe() -> No
     assert len(np.unique(np.concatenate(asked), axis=0)) == 45
 
 
-TWO = CharacteristicSet(
-    tuple(
-        Characteristic(name=name, unit="-", original=50.0, lower=0.0, upper=100.0)
-        for name in "ab"
-    )
-)
-
-
 def individuals(*objectives: tuple[float, float, float]) -> list[Individual]:
     population = []
     for values in objectives:
@@ -326,15 +254,6 @@ def test_a_tournament_is_won_by_rank_then_by_crowding_distance() -> None:
     assert all(run_tournament([better, worse]) is better for _ in range(20))
     worse.standing = 0, -9.0
     assert all(run_tournament([better, worse]) is worse for _ in range(20))
-
-
-def problem() -> Problem:
-    return Problem(
-        region=FeasibleRegion(TWO, ()),
-        original=evaluated(TWO, TWO.original_settings, np.array([5.0])),
-        evaluations=1000,
-        population=POPULATION,
-    )
 
 
 def window(settings: list[list[float]], safety: list[float]) -> Evaluations:

@@ -23,10 +23,10 @@ from safevar_sumo.results.manifest import write_manifest
 from safevar_sumo.search.pymoo import PYMOO_ALGORITHMS, pymoo_algorithm
 from safevar_sumo.study import ORIGINAL_DEGREE, Study
 from safevar_sumo.vehicles import CharacteristicSet
-from tests.campaign.formulas import carried_out
-from tests.in_process import SLOW
-from tests.search.test_algorithms import POPULATION, begun, built, sphere
-from tests.search.test_standard_problems import PROBLEMS, result_of, standard_problem
+from tests.support.formulas import carried_out
+from tests.support.in_process import SLOW
+from tests.support.searches import POPULATION, begun, built, sphere
+from tests.support.standard_problems import PROBLEMS, result_of, standard_problem
 
 
 def test_arguments_reach_the_algorithm() -> None:

@@ -17,8 +17,8 @@ from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.search import ALGORITHMS
 from safevar_sumo.vehicles import region_of
-from tests.in_process import SLOW, json_of, rows_of, run, write
-from tests.made_up import SUN
+from tests.support.in_process import SLOW, json_of, rows_of, run, write
+from tests.support.made_up import SUN
 
 BOUND = """
 extends = "smoke"

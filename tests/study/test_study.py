@@ -30,7 +30,7 @@ from safevar_sumo.study import (
 )
 from safevar_sumo.study.file_schema import schema_text
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import write
+from tests.support.in_process import write
 
 VALIDATOR = jsonschema.Draft7Validator(json.loads(STUDY_SCHEMA.read_text()))
 

@@ -17,8 +17,8 @@ from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.perception import Perception
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.without_effect import without_effect
-from tests.in_process import EVERY_STUDY, SLOW
-from tests.made_up import assert_same_results, drawn, original_of, system_of
+from tests.support.in_process import EVERY_STUDY, SLOW
+from tests.support.made_up import assert_same_results, drawn, original_of, system_of
 
 
 @SLOW

@@ -13,8 +13,8 @@ import safevar_sumo as sv
 from safevar_sumo.errors import InputError
 from safevar_sumo.sumo.matrix import simulate_all_points
 from safevar_sumo.sumo.network_check import network_remarks
-from tests.in_process import SLOW, json_of, own_network, rewrite, rows_of
-from tests.made_up import changed, system_of
+from tests.support.in_process import SLOW, json_of, own_network, rewrite, rows_of
+from tests.support.made_up import changed, system_of
 
 CHECKED = {"collision.mingap-factor": "0", "collision.check-junctions": "true"}
 OPTIONS = {

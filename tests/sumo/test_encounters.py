@@ -27,15 +27,16 @@ from safevar_sumo.scenarios.tracks import KMH
 from safevar_sumo.study import Study, free_parameters
 from safevar_sumo.sumo.matrix import drive_and_score, efficient_batch
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import SLOW, InlinePool, searched, verify_everywhere
-from tests.made_up import assert_same_results, case_of, drawn, system_of
-from tests.sumo.planted import BRAKING, GAP
+from tests.support.in_process import SLOW, InlinePool, searched, verify_everywhere
+from tests.support.made_up import assert_same_results, case_of, drawn, system_of
+from tests.support.planted import BRAKING, GAP
+from tools.manual import ROOT
 
 
 @pytest.fixture(autouse=True)
 def _models(in_tmp: Path) -> None:
     """The planted models in a file beside no other, as all files of a package count as inputs."""
-    shutil.copy(Path(__file__).with_name("planted.py"), in_tmp)
+    shutil.copy(ROOT / "tests/support/planted.py", in_tmp)
 
 
 MARGIN = 4.0

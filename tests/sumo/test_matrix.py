@@ -25,9 +25,15 @@ from safevar_sumo.sumo.bodies import Body, find_touches
 from safevar_sumo.sumo.driving_robot import DrivingRobot
 from safevar_sumo.sumo.matrix import drive_and_score, simulate_all_points
 from safevar_sumo.sumo.system import assemble
-from tests.in_process import SLOW
-from tests.made_up import assert_same_results, changed, drawn, original_of, system_of
-from tests.scenarios.holding import CARLA as SUN, Pedals, driven
+from tests.support.holding import CARLA as SUN, Pedals, driven
+from tests.support.in_process import SLOW
+from tests.support.made_up import (
+    assert_same_results,
+    changed,
+    drawn,
+    original_of,
+    system_of,
+)
 
 
 @SLOW

@@ -32,8 +32,8 @@ from safevar_sumo.sumo.network import (
 )
 from safevar_sumo.sumo.network_check import check_network
 from safevar_sumo.sumo.system import System
-from tests.in_process import SLOW, own_network, rewrite
-from tests.made_up import system_of
+from tests.support.in_process import SLOW, own_network, rewrite
+from tests.support.made_up import system_of
 
 FOLDERS = sorted(path.name for path in NETWORKS.iterdir() if path.is_dir())
 

@@ -14,8 +14,8 @@ from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.sumo.batch import drive_all
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.system import System, assemble
-from tests.in_process import SLOW
-from tests.made_up import assert_same_results, drawn, original_of, system_of
+from tests.support.in_process import SLOW
+from tests.support.made_up import assert_same_results, drawn, original_of, system_of
 
 CREEPS = (
     "braking lead vehicle, 50 km/h, headway 0.864, target_deceleration 4.905, clear"

@@ -17,20 +17,28 @@ import safevar_sumo as sv
 from safevar_sumo.api.simulation import load_study
 from safevar_sumo.errors import InputError
 from safevar_sumo.questions.part import at_point
-from safevar_sumo.records import RESULT_ROUNDING, FloatArray, Observation
+from safevar_sumo.records import FloatArray, Observation
 from safevar_sumo.results import read_manifest
 from safevar_sumo.scenarios import SCENARIOS, Point, weather_of
 from safevar_sumo.scenarios.ahead import CarToCar
 from safevar_sumo.study import Study
-from safevar_sumo.sumo import reason_against_scenes, recording, simulate_all_points
+from safevar_sumo.sumo import reason_against_scenes, recording
 from safevar_sumo.sumo.bodies import distance_covered
 from safevar_sumo.sumo.empty_road import why_no_verdict
 from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.sumo.recording import Scenes
 from safevar_sumo.sumo.system import System
-from tests.in_process import SLOW, json_of, own_network, run, verify_everywhere, write
-from tests.made_up import drawn, original_of, system_of
-from tests.scenarios.holding import Pedals
+from tests.support.holding import Pedals
+from tests.support.in_process import (
+    SLOW,
+    json_of,
+    own_network,
+    run,
+    verify_everywhere,
+    write,
+)
+from tests.support.made_up import drawn, original_of, system_of
+from tests.support.same_runs import assert_same
 
 CLAIM = """
 from safevar_sumo.scenarios import PedestrianCrossing
@@ -39,36 +47,6 @@ from safevar_sumo.scenarios import PedestrianCrossing
 class Claims(PedestrianCrossing, frozen=True, kw_only=True):
     reactive_actors = False
 """
-
-
-def assert_same(system: System, settings: FloatArray) -> list[str]:
-    """Assert that recorded scenes and SUMO give the same bits, or what is computed of a scene the
-    same to `ROUNDING`; returns all outcomes.
-    """
-    outcomes = []
-    tolerance = RESULT_ROUNDING if len(system.characteristics.scenario) else 0.0
-    results = (
-        simulate_all_points(replace(system, in_sumo=in_sumo), settings)
-        for in_sumo in (False, True)
-    )
-    for recorded, copies in zip(*results, strict=True):
-        theirs_by_name = copies.evaluations.results
-        pairs = [
-            (values, theirs_by_name[name])
-            for name, values in recorded.evaluations.results.items()
-        ]
-        pairs += zip(recorded.runs.contact, copies.runs.contact, strict=True)
-        pairs += [
-            (getattr(recorded.runs, name), getattr(copies.runs, name))
-            for name in ("relative_speed", "warning_ttc")
-        ]
-        for ours, theirs in pairs:
-            if np.asarray(ours).dtype.kind == "f":
-                np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance)
-            else:
-                np.testing.assert_array_equal(ours, theirs)
-        outcomes += recorded.evaluations.outcome.tolist()
-    return outcomes
 
 
 def test_vehicles_in_recorded_scenes_give_the_same_bits_as_in_sumo(

@@ -17,9 +17,9 @@ from safevar_sumo.sumo.matrix import drive_and_score, drive_worst
 from safevar_sumo.sumo.network import CopiedNetwork
 from safevar_sumo.sumo.system import System
 from safevar_sumo.sumo.without_effect import without_effect
-from tests.in_process import SLOW, own_network, rewrite
-from tests.made_up import changed, original_of, system_of
-from tests.sumo.test_traci_controller import system
+from tests.support.controllers import system
+from tests.support.in_process import SLOW, own_network, rewrite
+from tests.support.made_up import changed, original_of, system_of
 
 pytestmark = pytest.mark.usefixtures("in_tmp")
 CONTROLLERS = """

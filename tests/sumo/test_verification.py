@@ -20,9 +20,9 @@ from safevar_sumo.study import Study
 from safevar_sumo.sumo import matrix, verification
 from safevar_sumo.sumo.system import System, assemble
 from safevar_sumo.sumo.verification import verify_in_sumo
-from tests.campaign.formulas import with_search
-from tests.in_process import SLOW, searched
-from tests.made_up import drawn, made_up_evaluations
+from tests.support.formulas import with_search
+from tests.support.in_process import SLOW, searched
+from tests.support.made_up import drawn, made_up_evaluations
 
 TESTS = ("CutIn", "CutOut", "CarToCar")
 """Scenarios of the tests of `alks`."""

@@ -19,8 +19,8 @@ from safevar_sumo.campaign.batches import COMPILING, compile_vehicle
 from safevar_sumo.records import Command
 from safevar_sumo.vehicles import carla_step, compiled
 from safevar_sumo.vehicles.carla_step import Car, CarlaState
-from tests.in_process import SLOW, InlinePool, run_python
-from tests.vehicles.runs import STEP, SYSTEMS, drawn, prepare
+from tests.support.in_process import SLOW, InlinePool, run_python
+from tests.support.runs import STEP, SYSTEMS, drawn, prepare
 
 CARLA = SYSTEMS["carla"].vehicle
 

@@ -18,8 +18,8 @@ from safevar_sumo.vehicles.carla import (
 )
 from safevar_sumo.vehicles.carla_step import FINAL_RATIO, GEAR_RATIOS
 from safevar_sumo.vehicles.lgsvl import _tyre_stiffness
-from tests.made_up import changed, seen
-from tests.vehicles.runs import (
+from tests.support.made_up import changed, seen
+from tests.support.runs import (
     STEP,
     SYSTEMS,
     braking_after,

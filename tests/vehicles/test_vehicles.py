@@ -21,9 +21,9 @@ from safevar_sumo.vehicles import LEVEL, VEHICLES, _accelerations, slope_of
 from safevar_sumo.vehicles.carla import ENGINE_INERTIA, WHEEL_MASS, WHEELS, Carla
 from safevar_sumo.vehicles.lgsvl import Lgsvl
 from safevar_sumo.vehicles.sensors import DelayedSignal
-from tests.in_process import SLOW, own_network, write
-from tests.made_up import original_of, seen, system_of
-from tests.vehicles.runs import (
+from tests.support.in_process import SLOW, own_network, write
+from tests.support.made_up import original_of, seen, system_of
+from tests.support.runs import (
     STEP,
     STUDY_OF,
     SYSTEMS,

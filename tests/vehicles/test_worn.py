@@ -30,8 +30,8 @@ from safevar_sumo.sumo.matrix import drive_and_score
 from safevar_sumo.vehicles import Characteristic, CharacteristicSet, wet_road
 from safevar_sumo.vehicles.sensing import WornVehicle
 from safevar_sumo.vehicles.wet_road import WET_FRICTION, lift_of, lifted_friction
-from tests.in_process import SLOW, InlinePool, run_python
-from tests.made_up import SUN, changed, drawn, seen, system_of
+from tests.support.in_process import SLOW, InlinePool, run_python
+from tests.support.made_up import SUN, changed, drawn, seen, system_of
 
 CAR = WornVehicle()
 HEALTHY = {
