@@ -36,7 +36,7 @@ from safevar_sumo.questions.sentence import Verdict, answer as said, note
 from safevar_sumo.questions.words import change_texts
 from safevar_sumo.vehicles import CharacteristicSet
 from tests.support.in_process import json_of, rows_of, run
-from tools.manual import files_of
+from tools.manual import ROOT
 
 COLUMNS = {
     "part": "part of the vehicle",
@@ -339,7 +339,7 @@ def test_the_question_that_the_manual_adds_from_outside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It has at most 60 lines, and gets a command with the shared options and every format."""
-    code = files_of("CONTRIBUTING.md")["my_questions.py"]
+    code = (ROOT / "examples/own_question/my_questions.py").read_text("utf-8")
     assert code.count("\n") <= 60
     (tmp_path / "my_questions.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -39,7 +39,7 @@ from tests.support.in_process import (
     searched,
     write,
 )
-from tools.manual import PROGRAM, files_of
+from tools.manual import PROGRAM, ROOT
 
 MINE = """
 from pathlib import Path
@@ -235,8 +235,8 @@ def test_a_pack_holds_the_page_and_the_answers_and_verifies(
 def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The example of CONTRIBUTING."""
-    write("my_questions.py", files_of("CONTRIBUTING.md")["my_questions.py"])
+    """The example `own_question`."""
+    write("my_questions.py", (ROOT / "examples/own_question/my_questions.py").read_text("utf-8"))
     monkeypatch.syspath_prepend(str(in_tmp))
     run(f"report {slippery} --ask 'my_questions:ends --unsafe below=0.5' --out it.html")
     page = Path("it.html").read_text()
