@@ -469,10 +469,7 @@ def read_only(value: UserValue) -> Any:
         view.flags.writeable = False
         return view
     if isinstance(value, tuple):
-        views = map(read_only, value)
-        if hasattr(value, "_fields"):
-            return type(value)(*views)
-        return tuple(views)
+        return _read_only_tuple(value)
     if is_dataclass(value) and not isinstance(value, type):
         names = (field.name for field in fields(value))
         return replace(
@@ -483,6 +480,15 @@ def read_only(value: UserValue) -> Any:
     if hasattr(value, "speeds"):
         return _ReadOnlyWorld(value)
     return value
+
+
+def _read_only_tuple(items: tuple[UserValue, ...]) -> tuple[Any, ...]:
+    """Return a tuple of the read-only versions of items. A named tuple stays a named tuple."""
+    views = [read_only(item) for item in items]
+    # Named tuples take their fields as arguments, and `tuple` takes a list.
+    if hasattr(items, "_fields"):
+        return type(items)(*views)
+    return tuple(views)
 
 
 class _ReadOnlyWorld:

@@ -322,20 +322,19 @@ class Question:
         study = study_in(subjects[0])
         with (
             open_progress(progress) as show,
-            open_evaluator(study, pool, jobs, show, cluster) as evaluator,
+            open_evaluator(study, pool, jobs, show, cluster) as opened,
         ):
-            account = evaluator.account
-            evaluator.limit(simulations, questions, quick=is_quick)
+            account = opened.account
+            opened.limit(simulations, questions, quick=is_quick)
             for subject in subjects:
                 if isinstance(subject, Case) and not as_it_is_now:
-                    evaluator.for_study(subject.study).refuse_other_original(subject)
+                    opened.for_study(subject.study).refuse_other_original(subject)
             unsafe, values, cites = self._criterion(values, study)
+            evaluator = opened
             if unsafe is not None:
-                subjects = [
-                    subject_by(subject, unsafe, evaluator) for subject in subjects
-                ]
+                subjects = [subject_by(subject, unsafe, opened) for subject in subjects]
                 study = study_in(subjects[0])
-                evaluator = evaluator.for_study(study)
+                evaluator = opened.for_study(study)
                 evaluator.use(unsafe)
 
             result = self._computed(subjects, evaluator, values)
@@ -347,16 +346,17 @@ class Question:
                 reason = evaluator.no_verdict
             evaluator.end()
         numbers = {"driven": not reason, **result.numbers}
-        beginning = [answer(reason)]
+        rough: list[Sentence] = []
         if is_quick:
-            beginning.append(ROUGH if has_sets else ROUGH_WITHOUT_SETS)
+            rough = [ROUGH if has_sets else ROUGH_WITHOUT_SETS]
         if account.limit is not None:
             numbers |= {"rough": True, "simulations": account.spent}
-            beginning[1:] = [ROUGH_OF_FEW(most=account.limit)]
+            rough = [ROUGH_OF_FEW(most=account.limit)]
         if self.has_rough_answer:
-            numbers["rough"] = bool(beginning[1:] or numbers.get("rough"))
+            numbers["rough"] = bool(rough or numbers.get("rough"))
         sentences = [
-            *beginning,
+            answer(reason),
+            *rough,
             *Verdict.of(result.verdict).sentences,
             *cites,
             note(account.undefined_in_words),

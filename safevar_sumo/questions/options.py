@@ -130,13 +130,20 @@ class Option(NamedTuple):
             return value
         if self.is_repeated:
             return self._texts(value)
-        if self.metavar == CARS_FILE and not isinstance(value, str):
-            return value
+        if self.kind in (int, float):
+            return self._number(value)
+        return self._text(value)
+
+    def _text(self, value: Any) -> Any:
+        """The value of an option that takes a text. A list of cars may be another object."""
         if self.metavar == CRITERION:
             return Unsafe.parse(value)
-        if self.kind not in (int, float):
-            return check_text(self.name, value)
+        if self.metavar == CARS_FILE and not isinstance(value, str):
+            return value
+        return check_text(self.name, value)
 
+    def _number(self, value: Any) -> Any:
+        """The value of an option that takes a number within `limits`."""
         number, words = Real, "a number"
         if self.kind is int:
             number, words = Integral, "a whole number"

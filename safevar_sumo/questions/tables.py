@@ -198,29 +198,38 @@ def plain(value: Any) -> Any:
 
 
 def cell_text(value: Any, number_format: str = ".4g") -> str:
-    """A value as a text; `-` if it is undefined or infinite. Two numbers are an interval."""
+    """A value as a text; `-` if it is undefined, infinite or empty. Two numbers are an interval."""
     value = plain(value)
     if value is None:
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        text = f"{value:{number_format}}"
-        # A large number is written in full, whatever its format.
-        if "e+" in text:
-            return f"{value:,.0f}"
-        return text
-    texts = []
+        return _decimal_text(value, number_format)
     if isinstance(value, dict):
-        for name, item in value.items():
-            texts.append(f"{name} {cell_text(item, number_format)}")
+        texts = [
+            f"{name} {cell_text(item, number_format)}" for name, item in value.items()
+        ]
         return ", ".join(texts) or "-"
     if isinstance(value, list):
-        for item in value:
-            texts.append(cell_text(item, number_format))
-        is_interval = len(value) == 2 and not isinstance(value[0], dict | str)
-        return (" to " if is_interval else "; ").join(texts) or "-"
+        return _list_text(value, number_format)
     return str(value)
+
+
+def _decimal_text(number: float, number_format: str) -> str:
+    """A finite number as a text. A large number is written in full, whatever its format."""
+    text = f"{number:{number_format}}"
+    if "e+" in text:
+        return f"{number:,.0f}"
+    return text
+
+
+def _list_text(values: list[Any], number_format: str) -> str:
+    """A list as a text; `-` if it is empty. Two numbers are an interval."""
+    texts = [cell_text(value, number_format) for value in values]
+    is_interval = len(values) == 2 and not isinstance(values[0], dict | str)
+    separator = " to " if is_interval else "; "
+    return separator.join(texts) or "-"
 
 
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
@@ -395,40 +404,26 @@ def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str
     ]
     columns = [column for column in all_columns if not column.is_long]
     long_columns = [column for column in all_columns if column.is_long]
-    least_width = 1 + sum(map(_least_width, columns))
-    for column in long_columns:
-        least_width += max(_least_width(column), LEAST_TEXT)
-    title = table.title
     has_numbers = any(column.is_number for column in columns)
     if long_columns and len(columns) < 2 and not has_numbers:
         # Each row fits into a line: a table would not say more.
-        yield title
-        cells = [column.texts for column in (*columns, *long_columns)]
-        for label, *texts in zip(*cells, strict=True):
-            yield ": ".join(filter(None, (label, " ".join(filter(None, texts)))))
+        yield table.title
+        yield from _lines_of_rows([*columns, *long_columns])
         return
+    least_width = _least_table_width(columns)
+    for column in long_columns:
+        least_width += max(_least_width(column), LEAST_TEXT)
     if least_width <= width:
         columns = all_columns
         long_columns = []
 
-    # Each block fits into the width, and begins with the labels: the columns of text before the
-    # first column of numbers.
-    labels = list(takewhile(lambda column: not column.is_number, columns))
-    if 1 + sum(map(_least_width, labels)) > width:
-        labels = labels[:1]
-    blocks = [list(labels)]
-    for column in columns[len(labels) :]:
-        block_width = 1 + sum(map(_least_width, [*blocks[-1], column]))
-        if len(blocks[-1]) > len(labels) and block_width > width:
-            blocks.append(list(labels))
-        blocks[-1].append(column)
-
+    blocks = _blocks(columns, width)
     bars = [bar.blocks for bar in table.bars]
     if bars and columns:
-        blocks.insert(
-            0, [labels[0], _ReaderColumn([], LEGEND["text"], "", bars, False)]
-        )
-    for block in filter(None, blocks):
+        ranges = _ReaderColumn([], LEGEND["text"], "", bars, is_number=False)
+        blocks.insert(0, [columns[0], ranges])
+    title = table.title
+    for block in blocks:
         heads_and_texts = [(item.head, item.is_number, item.texts) for item in block]
         yield WholeTable(title, heads_and_texts)
         title = ""
@@ -437,10 +432,45 @@ def terminal_tables(table: AnswerTable, width: int) -> Iterator[WholeTable | str
             yield f"{label}: {text}"
 
 
+def _lines_of_rows(columns: Sequence[_ReaderColumn]) -> Iterator[str]:
+    """Yield a line for each row: its first cell, a colon, and its other cells. Empty cells are left
+    out.
+    """
+    cells = [column.texts for column in columns]
+    for label, *texts in zip(*cells, strict=True):
+        text = " ".join(cell for cell in texts if cell)
+        yield ": ".join(part for part in (label, text) if part)
+
+
+def _blocks(columns: Sequence[_ReaderColumn], width: int) -> list[list[_ReaderColumn]]:
+    """Share columns among tables for a terminal of `width` characters. Each table begins with the
+    labels: the columns of text before the first column of numbers.
+    """
+    labels = list(takewhile(lambda column: not column.is_number, columns))
+    if _least_table_width(labels) > width:
+        labels = labels[:1]
+    blocks = []
+    block = list(labels)
+    for column in columns[len(labels) :]:
+        has_values = len(block) > len(labels)
+        if has_values and _least_table_width([*block, column]) > width:
+            blocks.append(block)
+            block = list(labels)
+        block.append(column)
+    if block:
+        blocks.append(block)
+    return blocks
+
+
+def _least_table_width(columns: Sequence[_ReaderColumn]) -> int:
+    """The least width of a table that breaks no word, with its lines [characters]."""
+    return 1 + sum(_least_width(column) for column in columns)
+
+
 def _least_width(column: _ReaderColumn) -> int:
     """The least width of a column that breaks no word, with a line beside it [characters]."""
     words = " ".join([column.head, *column.texts]).split()
-    return 1 + max(map(len, words), default=0)
+    return 1 + max((len(word) for word in words), default=0)
 
 
 def html_table(table: AnswerTable) -> str:

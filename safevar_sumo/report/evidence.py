@@ -237,12 +237,14 @@ def _with_lists(questions: Sequence[str]) -> tuple[list[str], FileContents]:
     packed = []
     lists = FileContents()
     for text in questions:
-        if path := list_in(text):
-            name = f"{LISTS}/{len(lists) + 1}.csv"
-            ignored = parse_question(text)[1].get("ignore", ())
-            lists[name] = list_without_names(Path(path), ignored)
-            text = with_list(text, name)
-        packed.append(text)
+        path = list_in(text)
+        if not path:
+            packed.append(text)
+            continue
+        name = f"{LISTS}/{len(lists) + 1}.csv"
+        _, options = parse_question(text)
+        lists[name] = list_without_names(Path(path), options.get("ignore", ()))
+        packed.append(with_list(text, name))
     return packed, lists
 
 
@@ -340,21 +342,9 @@ def verify(
         for number, described in enumerate(description.studies):
             place = Path(folder, str(number))
             studies[place] = _unpack(path, described, files, place, jobs, show)
-        unknown = {*files}
-        for packed in studies.values():
-            unknown -= {f"{packed.packed.folder}/{name}" for name in packed.files}
-        if unknown:
-            raise InputError(path, f"{min(unknown)} belongs to no study", PACK)
-
-        # Code of a pack runs only if the user trusts it.
-        if not run_code and (
-            code := [name for packed in studies.values() for name in packed.code]
-        ):
-            raise InputError(
-                path,
-                f"`verify` would run code of the pack: {', '.join(code)}",
-                "`run_code=True`, if you trust it",
-            )
+        _refuse_files_without_study(path, files, studies.values())
+        if not run_code:
+            _refuse_code(path, studies.values())
 
         names = ", ".join(packed.case.study.name for packed in studies.values())
         of_files = Claim(
@@ -370,20 +360,12 @@ def verify(
 
     claims = tabulate("Claims", CLAIMS, rows)
     counts = Counter(claims.frame["verdict"])
-    number = len(rows)
+    sentences = _count_sentences(counts)
+    if claims.frame["verdict"][0] == DIFFERS:
+        sentences.insert(0, ALTERED)
     parts = _not_compared(description, studies.values())
     if counts[UNCHECKED]:
         parts.append("how many simulations had which outcome (--search compares it)")
-    confirmed = count_in_words(counts[SAME], number).capitalize()
-    sentences = [f"{confirmed} claims of the pack are confirmed."]
-    if claims.frame["verdict"][0] == DIFFERS:
-        sentences.insert(0, ALTERED)
-    if counts[DIFFERS]:
-        sentences.append(f"{counts[DIFFERS]} of the {number} claims differ.")
-    if counts[CANNOT]:
-        sentences.append(
-            f"{counts[CANNOT]} of the {number} claims cannot be computed here."
-        )
     if parts:
         sentences.append(f"These parts were not compared: {'; '.join(parts)}.")
     return Answer(
@@ -391,9 +373,9 @@ def verify(
         study=next(iter(studies.values())).case.study,
         verdict=Verdict(answer(sentence) for sentence in sentences),
         numbers={
-            "passed": counts[SAME] + counts[UNCHECKED] == number,
+            "passed": counts[SAME] + counts[UNCHECKED] == len(rows),
             "sha256": digest_of(path),
-            "claims": number,
+            "claims": len(rows),
             **{verdict.partition(" ")[0]: counts[verdict] for verdict in VERDICTS},
         },
         tables={"claims": claims},
@@ -402,6 +384,42 @@ def verify(
 
 ALTERED = "This pack was altered: its files are not those that its description lists."
 """The first sentence about a pack whose files have other digests than the pack states."""
+
+
+def _refuse_files_without_study(
+    pack: Path, files: FileContents, studies: Iterable[Packed]
+) -> None:
+    """Refuse a pack that holds a file of none of its studies."""
+    unknown = {*files}
+    for packed in studies:
+        unknown -= {f"{packed.packed.folder}/{name}" for name in packed.files}
+    if unknown:
+        raise InputError(pack, f"{min(unknown)} belongs to no study", PACK)
+
+
+def _refuse_code(pack: Path, studies: Iterable[Packed]) -> None:
+    """Refuse a pack with user code: such code runs only if the user trusts it."""
+    code = [name for packed in studies for name in packed.code]
+    if code:
+        raise InputError(
+            pack,
+            f"`verify` would run code of the pack: {', '.join(code)}",
+            "`run_code=True`, if you trust it",
+        )
+
+
+def _count_sentences(counts: Counter[str]) -> list[str]:
+    """Sentences on the numbers of claims with each verdict."""
+    number = counts.total()
+    confirmed = count_in_words(counts[SAME], number).capitalize()
+    sentences = [f"{confirmed} claims of the pack are confirmed."]
+    if counts[DIFFERS]:
+        sentences.append(f"{counts[DIFFERS]} of the {number} claims differ.")
+    if counts[CANNOT]:
+        sentences.append(
+            f"{counts[CANNOT]} of the {number} claims cannot be computed here."
+        )
+    return sentences
 
 
 def _not_compared(description: Description, studies: Iterable[Packed]) -> list[str]:

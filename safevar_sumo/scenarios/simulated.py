@@ -110,6 +110,38 @@ def _checked_trace(
     """Check a result with a trace. Return its columns, each of shape (T,), and the numbers of a
     collision.
     """
+    columns = _checked_columns(code, method, result)
+    times = columns[TIME]
+    if not _has_equal_steps(times):
+        raise code.wrong(
+            method, f"{TIME} = {quoted(result[TIME])}", "at least 2 times, equal steps"
+        )
+    if not has_collided and not np.isfinite(columns["separation"]).any():
+        raise code.wrong(method, "separation = inf", "a finite number at some time")
+    step = float(times[1] - times[0])
+    if wrong_speeds := contradiction_of_speeds(columns, step):
+        raise code.wrong(
+            method, f"a trace whose {wrong_speeds.problem}", wrong_speeds.expected
+        )
+
+    numbers = NamedValues()
+    if has_collided:
+        numbers = _checked_collision(code, method, result)
+    if contradiction := _contradiction(str(result[OUTCOME]), columns, numbers, step):
+        raise code.wrong(
+            method,
+            contradiction,
+            "an end that the trace allows within one of its steps",
+        )
+    return {**columns, **numbers}
+
+
+def _checked_columns(
+    code: UserCode, method: str, result: StatedRun
+) -> dict[str, FloatArray]:
+    """Check the names, shapes and numbers of a trace's columns. Return the columns, each in the
+    shape of `time`.
+    """
     sampled = SAMPLED | ALSO_SAMPLED
     legal_keys = {**sampled, **OF_COLLISION, OUTCOME: None}
     for name in result:
@@ -123,39 +155,27 @@ def _checked_trace(
         if name in result:
             values = code.check_numbers(method, name, result[name], shape, legal)
             columns[name] = values.astype(float)
-    steps = np.zeros(0)
-    if len(shape) == 1:
-        steps = np.diff(columns[TIME])
-    if not len(steps) or np.ptp(steps) > STEP_TOLERANCE or steps[0] <= 0:
-        raise code.wrong(
-            method, f"{TIME} = {quoted(result[TIME])}", "at least 2 times, equal steps"
-        )
-    if not has_collided and not np.isfinite(columns["separation"]).any():
-        raise code.wrong(method, "separation = inf", "a finite number at some time")
+    return columns
 
-    step = float(steps[0])
-    if wrong_speeds := contradiction_of_speeds(columns, step):
-        raise code.wrong(
-            method, f"a trace whose {wrong_speeds.problem}", wrong_speeds.expected
-        )
 
-    numbers = NamedValues()
-    if has_collided:
-        if IMPACT_SPEED not in result:
-            raise code.wrong(
-                method,
-                f"a collision without {IMPACT_SPEED}",
-                "the speed at impact [m/s]",
-            )
-        ends = {name: result.get(name, 0.0) for name in OF_COLLISION}
-        numbers = _numbers(code, method, ends, OF_COLLISION)
-    if contradiction := _contradiction(str(result[OUTCOME]), columns, numbers, step):
+def _has_equal_steps(times: FloatArray) -> bool:
+    """Whether the times [s] are a row of at least two times, which increase in equal steps."""
+    if times.ndim != 1 or len(times) < 2:
+        return False
+    steps = np.diff(times)
+    return bool(np.ptp(steps) <= STEP_TOLERANCE and steps[0] > 0)
+
+
+def _checked_collision(code: UserCode, method: str, result: StatedRun) -> NamedValues:
+    """Check the numbers of a collision, and return them. A struck body whose speed is not stated
+    stands.
+    """
+    if IMPACT_SPEED not in result:
         raise code.wrong(
-            method,
-            contradiction,
-            "an end that the trace allows within one of its steps",
+            method, f"a collision without {IMPACT_SPEED}", "the speed at impact [m/s]"
         )
-    return {**columns, **numbers}
+    numbers = {name: result.get(name, 0.0) for name in OF_COLLISION}
+    return _numbers(code, method, numbers, OF_COLLISION)
 
 
 def _contradiction(
