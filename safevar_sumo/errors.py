@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from difflib import get_close_matches
 from os import PathLike
+from types import FrameType
 from typing import Any
 
 MAX_JOBS = 1024
@@ -149,14 +150,17 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
     """Show a warning that names the line of user code that called this package."""
     frame = inspect.currentframe()
     level = 1
-    while (
-        frame is not None
-        and str(frame.f_globals.get("__name__")).partition(".")[0]
-        == __name__.partition(".")[0]
-    ):
+    while frame is not None and _is_of_package(frame):
         frame = frame.f_back
         level += 1
     warnings.warn(message, category, stacklevel=level)
+
+
+def _is_of_package(frame: FrameType) -> bool:
+    """Whether a call runs code of this package."""
+    package, _, _ = __name__.partition(".")
+    caller, _, _ = str(frame.f_globals.get("__name__")).partition(".")
+    return caller == package
 
 
 MAX_MESSAGE_LENGTH = 500

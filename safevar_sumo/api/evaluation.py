@@ -107,7 +107,8 @@ def evaluate(
         columns=["algorithm", "run"]
     )
     frame.insert(len(frame.columns) - 1, "collision_speed", evaluations.collision_speed)
-    if (scoring := system.measuring.scoring).safe_original is not None:
+    scoring = system.measuring.scoring
+    if scoring.safe_original is not None:
         frame["feasible"] = scoring.feasible_rows(frame)
     return frame.set_axis(index)
 
@@ -131,54 +132,66 @@ def evaluate_with_workers(
 
 def _read_settings(
     settings: Any, characteristics: CharacteristicSet, beyond: bool
-) -> tuple[FloatArray, Any]:
+) -> tuple[FloatArray, pd.Index]:
     """Convert a user's settings into an array of shape (M, n), and the index of its rows. Refuse
     illegal values.
     """
     import pandas as pd
 
-    names = list(characteristics.names)
     if isinstance(settings, Sequence):
         settings = plain_values(settings)
         if all(isinstance(setting, Mapping) for setting in settings):
             settings = pd.DataFrame(list(settings), index=range(len(settings)))
     try:
-        # A table may leave out characteristics. An array has a column for each characteristic.
         if isinstance(settings, pd.DataFrame):
-            for name in settings.columns:
-                check_name(
-                    "settings", f"column {name!r} is no characteristic", name, names
-                )
-                _check_numbers(name, settings[name])
-            values = settings.reindex(columns=names).to_numpy(float, na_value=np.nan)
-            array = np.where(np.isnan(values), characteristics.original, values)
+            array = _array_of_table(settings, characteristics)
             index = settings.index
         else:
-            _check_no_flags(settings)
-            array = np.array(settings, float)
-            if array.ndim != 2 or array.shape[1] != len(names):
-                expected = (
-                    f"{SETTINGS_FORMAT}; here n = {len(names)}: {', '.join(names)}"
-                )
-                problem = repr(settings)
-                if array.ndim:
-                    problem = f"an array of shape {array.shape}"
-                raise InputError("settings", problem, expected)
+            array = _array_of_rows(settings, characteristics)
             index = pd.RangeIndex(len(array))
     except (TypeError, ValueError) as error:
         kind = type(settings).__name__
         raise InputError("settings", f"a {kind}: {error}", SETTINGS_FORMAT) from None
 
-    is_legal = [
-        row.is_legal(values, beyond=beyond)
-        for row, values in zip(characteristics, array.T, strict=True)
+    are_legal = [
+        characteristic.is_legal(values, beyond=beyond)
+        for characteristic, values in zip(characteristics, array.T, strict=True)
     ]
-    for row, column in np.argwhere(~np.column_stack(is_legal))[:1]:
+    illegal_places = np.argwhere(~np.column_stack(are_legal))
+    if len(illegal_places):
+        row, column = illegal_places[0]
         with about(f"settings, row {row}"):
-            characteristics.members[column].check(
-                float(array[row, column]), beyond=beyond
-            )
+            value = float(array[row, column])
+            characteristics.members[column].check(value, beyond=beyond)
     return array, index
+
+
+def _array_of_table(
+    table: pd.DataFrame, characteristics: CharacteristicSet
+) -> FloatArray:
+    """The settings of a table as an array of shape (M, n). A missing value, or a missing column,
+    means the original's value.
+    """
+    names = list(characteristics.names)
+    for name in table.columns:
+        check_name("settings", f"column {name!r} is no characteristic", name, names)
+        _check_numbers(name, table[name])
+    values = table.reindex(columns=names).to_numpy(float, na_value=np.nan)
+    return np.where(np.isnan(values), characteristics.original, values)
+
+
+def _array_of_rows(settings: Any, characteristics: CharacteristicSet) -> FloatArray:
+    """Settings with a value for each characteristic as an array of shape (M, n)."""
+    names = characteristics.names
+    _check_no_flags(settings)
+    array = np.array(settings, float)
+    if array.ndim != 2 or array.shape[1] != len(names):
+        problem = repr(settings)
+        if array.ndim:
+            problem = f"an array of shape {array.shape}"
+        expected = f"{SETTINGS_FORMAT}; here n = {len(names)}: {', '.join(names)}"
+        raise InputError("settings", problem, expected)
+    return array
 
 
 def _check_no_flags(settings: Any) -> None:

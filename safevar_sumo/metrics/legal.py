@@ -117,14 +117,16 @@ def mean_fully_developed_deceleration(
     """
     trace = runs.trace
     squares = trace.speed * trace.speed
-    end_squares = np.square(MFDD_SHARES)[:, None] * squares[0]
-    columns = zip(end_squares.T, squares.T, trace.position.T, strict=True)
+    end_squares = np.square(MFDD_SHARES)[:, np.newaxis] * squares[0]
+    vehicles = zip(end_squares.T, squares.T, trace.position.T, strict=True)
     # `np.interp` needs ascending values, but the speed falls: hence the minus signs.
-    places = np.array(
-        [np.interp(-levels, -square, way) for levels, square, way in columns]
-    )
-    ways = 2 * (places[:, 1] - places[:, 0])
-    return _of_stops(runs, (end_squares[0] - end_squares[1]) / ways)
+    places = [
+        np.interp(-ends, -square, position) for ends, square, position in vehicles
+    ]
+    begin_places, end_places = np.transpose(places)
+    first_squares, last_squares = end_squares
+    ways = end_places - begin_places
+    return _of_stops(runs, (first_squares - last_squares) / (2 * ways))
 
 
 MFDD = Measure(
@@ -139,7 +141,7 @@ MFDD = Measure(
 
 def impact_speed(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     """Relative speed at contact along the vehicle's lane [m/s], shape (N,), at least
-    `LEAST_CLOSING_SPEED`; NaN for a vehicle that does not collide.
+    `LEAST_COLLISION_SPEED`; NaN for a vehicle that does not collide.
     """
     return np.maximum(runs.relative_speed, LEAST_COLLISION_SPEED)
 
@@ -160,6 +162,7 @@ def impact_excess(runs: SimulationRuns, thresholds: MetricsTable) -> FloatArray:
     nobody was met.
     """
     excess = impact_speed(runs, thresholds) - runs.allowed_impact_speed
+    # Some scenarios measure between middles of bodies: a clearance is between their bumpers.
     clearance = safety_degree(runs, thresholds) - runs.middles_apart
     return np.where(np.isnan(runs.collision_speed), -clearance, excess)
 

@@ -13,6 +13,8 @@ ALLOWED_ROUNDING = 0.01
 
 LEAST_WITHOUT_DECIMALS = 9.95
 """A percentage from this number on is printed without decimals, others with two digits."""
+MOST_DIGITS = 16
+"""Largest number of digits of a rounded number. With more digits, the number is printed exactly."""
 
 
 def runs_in_words(fails: BoolArray) -> str:
@@ -27,12 +29,16 @@ def runs_in_words(fails: BoolArray) -> str:
         return ""
     count = int(fails.sum())
     low, high = scipy.stats.binomtest(count, len(fails)).proportion_ci(method="exact")
-    ends = [
-        f"{value:.0f}" if value >= LEAST_WITHOUT_DECIMALS else f"{value:.2g}"
-        for value in (100 * low, 100 * high)
-    ]
-    interval = f"95 %: {ends[0]} to {ends[1]} %"
+    interval = f"95 %: {_percentage(low)} to {_percentage(high)} %"
     return f"fails in {count} of {len(fails)} repeated runs ({interval})"
+
+
+def _percentage(share: float) -> str:
+    """A share as a number of percent."""
+    percent = 100 * share
+    if percent >= LEAST_WITHOUT_DECIMALS:
+        return f"{percent:.0f}"
+    return f"{percent:.2g}"
 
 
 def impact_in_words(speed: float, excess: float) -> str:
@@ -63,9 +69,12 @@ def degree_in_words(degree: float) -> str:
 def value_on_side(value: float, limit: float, kind: str, digits: int) -> str:
     """A value with this number of digits, or with as few more digits as keep the text on the
     value's side of the limit. Otherwise a text could read "0.30 m, less than 0.3 m".
+
+    `kind` says which digits count, as in a format: "f" for those after the decimal point, "g" for
+    all significant ones.
     """
     side = np.sign(value - limit)
-    for number in range(digits, 17):
+    for number in range(digits, MOST_DIGITS + 1):
         text = significant(value, number)
         if kind == "f":
             text = f"{value:.{number}f}"

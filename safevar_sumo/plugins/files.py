@@ -30,7 +30,8 @@ KNOWN_FOLDERS = tuple(
     f"{folder}{os.sep}"
     for folder in (
         PACKAGE,
-        *map(sysconfig.get_path, ("stdlib", "platstdlib")),
+        sysconfig.get_path("stdlib"),
+        sysconfig.get_path("platstdlib"),
         Path(sys.base_prefix, "DLLs"),
     )
 )
@@ -62,14 +63,22 @@ def code_files(modules: Iterable[str], folders: Sequence[str]) -> set[Path]:
         if name in visited:
             continue
         visited.add(name)
-        candidates = (_files_of_module(Path(folder, name)) for folder in search_path)
-        files = next(filter(None, candidates), set())
+        files = _files_of_first(name, search_path)
         paths |= files
         for path in files:
             if path.suffix == ".py":
                 for imported in _imported_modules(path):
                     waiting.append((imported, own_folders))
     return paths
+
+
+def _files_of_first(name: str, folders: Iterable[str]) -> set[Path]:
+    """The files of a module in the first folder that has it; no files if no folder has it."""
+    for folder in folders:
+        files = _files_of_module(Path(folder, name))
+        if files:
+            return files
+    return set()
 
 
 def _files_of_module(path: Path) -> set[Path]:
@@ -130,10 +139,12 @@ def name_of_file(path: Path, folders: Sequence[str]) -> str:
     """The path of a file relative to the first folder that contains the file; the whole path if no
     folder does.
     """
-    candidates = filter(path.is_relative_to, _naming_folders(folders))
-    folder = next(candidates, path.anchor)
-    if folder != path.anchor:
-        return path.relative_to(folder).as_posix()
+    for folder in _naming_folders(folders):
+        # The root of the file system contains every file, so that it gives no shorter name.
+        if folder == path.anchor:
+            break
+        if path.is_relative_to(folder):
+            return path.relative_to(folder).as_posix()
     return path.as_posix()
 
 
@@ -148,4 +159,6 @@ def is_of_shipped_network(name: str) -> bool:
 
 
 def _naming_folders(folders: Sequence[str]) -> list[str]:
-    return [str(NETWORKS), *folders, os.getcwd(), *filter(os.path.isabs, sys.path)]
+    """The folders to which names of files are relative, the first one that has a file first."""
+    on_path = [folder for folder in sys.path if os.path.isabs(folder)]
+    return [str(NETWORKS), *folders, os.getcwd(), *on_path]

@@ -42,7 +42,8 @@ class ImportPath(NamedTuple):
 
     def inherit(self) -> None:
         """Set Python's path of this process to this path."""
-        sys.path[:], this_process.added_folders = self
+        sys.path[:] = self.folders
+        this_process.added_folders = self.added
 
 
 def add_import_folders(folders: Iterable[str]) -> None:
@@ -54,14 +55,17 @@ def add_import_folders(folders: Iterable[str]) -> None:
         if folder in sys.path:
             sys.path.remove(folder)
     added = list(dict.fromkeys((*folders, os.getcwd())))
-    of_user = (
-        number
-        for number, folder in enumerate(sys.path)
-        if os.path.isdir(folder or os.curdir) and not _is_of_libraries(folder)
-    )
-    start = next(of_user, len(sys.path))
+    start = _first_entry_of_user()
     sys.path[start:start] = added
     this_process.added_folders = added
+
+
+def _first_entry_of_user() -> int:
+    """The index of the first folder of the user in Python's path; the path's length without one."""
+    for index, folder in enumerate(sys.path):
+        if os.path.isdir(folder or os.curdir) and not _is_of_libraries(folder):
+            return index
+    return len(sys.path)
 
 
 class Modules:
@@ -88,7 +92,8 @@ class Modules:
     @classmethod
     def begin(cls, folders: Sequence[str]) -> Modules:
         """New modules: the next lookup in these folders loads user code anew."""
-        modules = _newest[tuple(folders)] = cls(folders)
+        modules = cls(folders)
+        _newest[tuple(folders)] = modules
         return modules
 
     @classmethod
@@ -133,15 +138,19 @@ class Modules:
             self._stamps.setdefault(file, _stamp_of(file))
 
     def show(self) -> None:
-        """Put the modules into `sys.modules`, in place of all modules that they would meet."""
+        """Put the modules into `sys.modules`, in place of all modules that could have their
+        names.
+        """
         self._outer_path = ImportPath.here()
         self._writes_no_bytecode = sys.dont_write_bytecode
         own_names = {name.partition(".")[0] for name in self._loaded}
         for folder in {*self.folders, os.getcwd()}:
             if os.path.isdir(folder):
                 own_names |= {path.stem for path in Path(folder).iterdir()}
-        met = [name for name in sys.modules if name.partition(".")[0] in own_names]
-        self._hidden = _take_modules(_modules_of_user(met))
+        namesakes = [
+            name for name in sys.modules if name.partition(".")[0] in own_names
+        ]
+        self._hidden = _take_modules(_modules_of_user(namesakes))
         self._names = {*sys.modules}
         sys.modules.update(self._loaded)
         # A compiled file would hide an edit in the second in which it was written.
@@ -154,16 +163,22 @@ class Modules:
         self.note_files()
         self._loaded = _take_modules(self._own_names())
         sys.modules.update(self._hidden)
-        path = ImportPath.here()
-        known = {*self._outer_path.folders, *path.added}
-        start = 0
-        if path.added[0] in sys.path:
-            start = path.folders.index(path.added[0])
-        further = [entry for entry in dict.fromkeys(sys.path) if entry not in known]
-        self._path_before = [entry for entry in further if entry in sys.path[:start]]
-        self._path_after = [entry for entry in further if entry not in sys.path[:start]]
+        self._note_path()
         self._outer_path.inherit()
         sys.dont_write_bytecode = self._writes_no_bytecode
+
+    def _note_path(self) -> None:
+        """Note the entries that user code has added to Python's path."""
+        path = ImportPath.here()
+        known = {*self._outer_path.folders, *path.added}
+        # `add_import_folders` has inserted the study's folders in one place.
+        start = 0
+        if path.added[0] in path.folders:
+            start = path.folders.index(path.added[0])
+        before = path.folders[:start]
+        new = [entry for entry in dict.fromkeys(path.folders) if entry not in known]
+        self._path_before = [entry for entry in new if entry in before]
+        self._path_after = [entry for entry in new if entry not in before]
 
     def _own_names(self) -> list[str]:
         """The names of these modules in `sys.modules`."""
@@ -196,7 +211,8 @@ def only_from(folder: str) -> Iterator[None]:
     path = ImportPath.here()
     names = {*sys.modules}
     user_modules = _take_modules(_modules_of_user(names))
-    ImportPath([*filter(_is_of_libraries, path.folders), folder], []).inherit()
+    libraries = [entry for entry in path.folders if _is_of_libraries(entry)]
+    ImportPath([*libraries, folder], added=[]).inherit()
     try:
         with chdir(folder):
             yield
@@ -207,8 +223,10 @@ def only_from(folder: str) -> Iterator[None]:
 
 
 def _modules_of_user(names: Iterable[str]) -> list[str]:
-    """The modules of user code among imported ones, except the main module, before any of them is
-    removed: a folder without `__init__.py` has no path without its parent.
+    """The modules of user code among imported ones, except the main module.
+
+    The whole list is made before any module is removed: Python finds the path of a package without
+    `__init__.py` only as long as its parent is there.
     """
     return [
         name

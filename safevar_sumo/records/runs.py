@@ -309,7 +309,7 @@ class SimulationRuns:
     @property
     def closing_speed(self) -> FloatArray:
         """The severity of a collision [m/s], shape (N,): `collision_speed` minus the struck body's
-        speed along the lane at that sample. At least `LEAST_CLOSING_SPEED`; NaN without a
+        speed along the lane at that sample. At least `LEAST_COLLISION_SPEED`; NaN without a
         collision.
         """
         return np.maximum(

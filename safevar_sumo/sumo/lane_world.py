@@ -30,16 +30,19 @@ class LaneWorld:
     def enter(
         self, types: SumoType | None, *, keeps_drivers: bool = False
     ) -> VehicleStates:
-        return self._motion(np.ones(self.n, bool))
+        return self._states(np.ones(self.n, bool))
 
     def step(self, speeds: FloatArray, is_open: BoolArray) -> VehicleStates:
         covered = distance_covered(self._speed, speeds, self.step_length)
         self._front = np.where(is_open, self._front + covered, self._front)
         self._speed = np.where(is_open, speeds, self._speed)
         self._sample += 1
-        return self._motion(is_open)
+        return self._states(is_open)
 
-    def _motion(self, is_open: BoolArray) -> VehicleStates:
+    def _states(self, is_open: BoolArray) -> VehicleStates:
+        """The states of the vehicles at this sample. Open runs (`is_open`, shape (N,)) may hit
+        bodies.
+        """
         hits = self._traffic.hits(self._sample, self._front, self._speed, is_open)
         fronts = np.zeros((self.n, 2))
         fronts[:, 0] = self._front

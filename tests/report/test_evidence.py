@@ -236,7 +236,10 @@ def test_a_question_of_the_user_is_on_the_page_and_in_a_pack_with_its_file(
     slippery: Path, in_tmp: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The example `own_question`."""
-    write("my_questions.py", (ROOT / "examples/own_question/my_questions.py").read_text("utf-8"))
+    write(
+        "my_questions.py",
+        (ROOT / "examples/own_question/my_questions.py").read_text("utf-8"),
+    )
     monkeypatch.syspath_prepend(str(in_tmp))
     run(f"report {slippery} --ask 'my_questions:ends --unsafe below=0.5' --out it.html")
     page = Path("it.html").read_text()
