@@ -5,7 +5,7 @@ from safevar_sumo.questions.answer import Answer, Column, contents, tabulate
 from safevar_sumo.questions.ask import Criterion
 
 COLUMNS = {
-    "characteristic": Column("", "one that is at an end of its domain, with all others as in the original"),
+    "characteristic": Column("", "what is at an end of its domain, all others as in the original"),
     "value": Column("", "its value, in its unit"),
     "outcome": Column("", "how the simulation ends"),
     "safety_degree": Column("m", "safety degree", ".2f"),

@@ -61,6 +61,7 @@ from safevar_sumo.results import (
     record,
 )
 from safevar_sumo.study import (
+    PYMOO,
     Origin,
     Study,
     convert_table,
@@ -407,7 +408,7 @@ class Packed:
         named = [
             name
             for name in (*study.search.algorithms, *self.packed.questions)
-            if ":" in name.partition(" ")[0]
+            if ":" in name.partition(" ")[0] and not name.startswith(PYMOO)
         ]
         return [*files, *user_code_names(study), *named]
 

@@ -25,7 +25,7 @@ from safevar_sumo.plugins import (
     only_from,
 )
 from safevar_sumo.questions.answer import Answer, contents
-from safevar_sumo.questions.ask import Criterion
+from safevar_sumo.questions.ask import SIMULATIONS, Criterion
 from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case
 from safevar_sumo.questions.options import Cluster, Jobs, Simulations
@@ -138,6 +138,7 @@ def evidence(
     InputError
         If a directory holds no results, its inputs have changed, or there is no such question.
     """
+    SIMULATIONS.check(simulations)
     out = Path(out)
     check_writable(out, "out", (".zip",))
 

@@ -24,7 +24,7 @@ from safevar_sumo.metrics import Unsafe
 from safevar_sumo.output import check_writable
 from safevar_sumo.questions.answer import Answer
 from safevar_sumo.questions.arguments import checked
-from safevar_sumo.questions.ask import Question
+from safevar_sumo.questions.ask import SIMULATIONS, Question
 from safevar_sumo.questions.by_criterion import cases_by
 from safevar_sumo.questions.case import Case, load_cases
 from safevar_sumo.questions.figures import own_style
@@ -154,6 +154,7 @@ def report(
     """
     if not results:
         raise InputError("report()", "no results", "results, or their directories")
+    SIMULATIONS.check(simulations)
     criterion = None if unsafe is None else Unsafe.parse(unsafe)
     out = Path(out)
     check_writable(out, "out", (".html", ".htm"))
@@ -184,7 +185,7 @@ def report(
         # Joint questions take a part from the first results.
         texts_of[0] += joint
         budgets = parts_of_simulations(
-            at_point, by_criterion, point, texts_of, simulations or None
+            at_point, by_criterion, point, texts_of, simulations
         )
         pool = _pool_of(stack, cases, jobs, cluster, bool(simulations))
         numbers = count(1)

@@ -50,14 +50,19 @@ def parse_question(text: str) -> tuple[Question, JsonObject]:
         option = options[flag]
         if option.name in values and not option.is_repeated:
             raise InputError(f"ask: {name} {flag}", "is given twice", "it once")
-        value: Any = option.kind is bool or next(waiting, None)
-        try:
-            if value is not True:
-                value = option.kind(value)
-        except (TypeError, ValueError):
-            raise InputError(
-                f"ask: {name} {flag}", repr(value), option.kind.__name__
-            ) from None
+        value: Any = True
+        if option.kind is not bool:
+            word = next(waiting, None)
+            if word is None:
+                raise InputError(
+                    f"ask: {name} {flag}", "no value", f"a value after {flag}"
+                )
+            try:
+                value = option.kind(word)
+            except ValueError:
+                raise InputError(
+                    f"ask: {name} {flag}", repr(word), option.kind.__name__
+                ) from None
         if option.is_repeated:
             value = *values.get(option.name, ()), value
         values[option.name] = option.check(value)

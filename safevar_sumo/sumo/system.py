@@ -15,7 +15,7 @@ from safevar_sumo.ads import Ads
 from safevar_sumo.errors import InputError, check_name
 from safevar_sumo.metrics import Unsafe
 from safevar_sumo.plugins import ONE_AT_A_TIME, Lookup, Modules, user_errors
-from safevar_sumo.records import FloatArray, Nominal
+from safevar_sumo.records import TIME_ROUNDING, FloatArray, Nominal
 from safevar_sumo.scenarios import (
     VUT,
     Point,
@@ -270,6 +270,7 @@ def _assemble(study: Study) -> System:
     for network in dict.fromkeys(member.network for member in scenarios):
         if network:
             check_network(network)
+            _check_step(study.step_length)
     if not (matrix or study.ranges):
         scenario.check()
 
@@ -309,6 +310,16 @@ def _assemble(study: Study) -> System:
     limit = study.scenario.margin + system.contact
     scoring = msgspec.structs.replace(measuring.scoring, safe_original=limit)
     return replace(system, measuring=measuring._replace(scoring=scoring))
+
+
+def _check_step(step: float | None) -> None:
+    """Refuse a time step [s] that SUMO, which counts whole milliseconds, would round."""
+    if step is not None and abs(step - round(step, 3)) > TIME_ROUNDING:
+        raise InputError(
+            "",
+            f"step_length = {step:g}",
+            "a multiple of 0.001 s: SUMO counts time in whole milliseconds",
+        )
 
 
 def _check_sensors(study: Study, vehicle: Vehicle, ads: Ads) -> None:

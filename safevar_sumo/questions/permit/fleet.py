@@ -151,9 +151,10 @@ def read_fleet(
     # A file that `--out` wrote has commas between its columns. The columns of the user's list,
     # which the file repeats, may still have decimal commas: hence the separator is ",;".
     written = {*answer_columns} - {CAR}
-    is_answer = bool(written) and written <= {text.strip() for text in cells.header}
+    header = [text.strip() for text in cells.header]
+    is_answer = bool(written) and written <= {*header}
     if is_answer:
-        cells = cells._replace(separator=",;")
+        cells = cells._replace(separator=",;", header=header)
         ignore = [*ignore, *written]
         answer_columns = ()
 

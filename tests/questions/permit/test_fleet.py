@@ -162,6 +162,7 @@ def test_a_written_answer_is_read_as_the_list_that_it_is_about() -> None:
     frame = pd.DataFrame({"plate": ["a"], "treadDepth": ["3,5"]})
     for text, is_rough in (("yes", True), ("no", False)):
         answer = frame.assign(because="", verdict="", up_to="", rough=text)
+        answer = answer.rename(columns={"rough": " rough "})
         fleet = read(answer, others="new")
         assert fleet.settings[0, 0] == 3.5
         assert fleet.is_rough is is_rough
