@@ -14,12 +14,12 @@ plain:
 	$(PYTHON) -m tools.plain_machine
 
 test: .venv/installed-test
-	$(RUN) -m pytest $(PARALLEL)
+	$(RUN) -m pytest $(PARALLEL) --durations=15
 
 test-all: test slow
 
 slow: .venv/installed-test-all
-	$(RUN) -m pytest $(PARALLEL) -m slow
+	$(RUN) -m pytest $(PARALLEL) -m slow --durations=40
 
 test-lowest: .venv/installed-lowest
 	.venv/lowest/bin/python -m pytest $(PARALLEL)
