@@ -242,8 +242,7 @@ class Simulator(Scenario):
     UNITS
         The units of the vehicle's characteristics, by name.
     OPTIONAL
-        Characteristics that a study may leave out. The original value of such a characteristic may
-        be 0.
+        Characteristics that a study may leave out.
     worker
         The object that `open_worker` returned in this process.
     """

@@ -49,12 +49,6 @@ def check_units(study: Study, vehicle: Vehicle) -> None:
             )
         model = study.vehicle.model or study.scenario.model
         check_name("", f"{key}: {model} has no such characteristic", name, units)
-        if entry.original == 0 and name not in vehicle.OPTIONAL:
-            raise InputError(
-                "",
-                f"{key}: original = 0",
-                "a value other than 0: changes are relative to it",
-            )
         if entry.unit != units[name]:
             raise InputError("", f"{key}.unit = {entry.unit!r}", repr(units[name]))
     required = [name for name in units if name not in vehicle.OPTIONAL]

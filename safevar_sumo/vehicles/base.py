@@ -163,8 +163,7 @@ class Vehicle:
     UNITS
         Units of the characteristics by name.
     OPTIONAL
-        Characteristics that a study may leave out: then they have no effect. The original value of
-        such a characteristic may be 0.
+        Characteristics that a study may leave out: then they have no effect.
     PLAUSIBLE
         Plausible values of characteristics and parameters by name. A study with other values is
         refused; a name that is missing here may have any value.

@@ -29,7 +29,7 @@ class Listed(msgspec.Struct, frozen=True):
     '''Drives at a speed towards a wall, and brakes after a delay. Its speed cannot be searched.'''
 
     UNITS = {"decel": "m/s^2", "delay": "s", "load": "-"}
-    OPTIONAL = ("delay", "load")
+    OPTIONAL = ("delay",)
     speed: float = 10.0
     gap: float = 25.0
     grip: float = 1.0
